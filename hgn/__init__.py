@@ -1,0 +1,1 @@
+"""Hierarchical graph networks for learned particle physics."""

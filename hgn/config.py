@@ -1,0 +1,203 @@
+"""The dataclasses behind every command: Hydra composes YAML, these validate it, once per command.
+
+Below this file nobody sees a DictConfig. Numbers that follow from others are properties, never keys.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hgn.scene.material import MATERIALS, material_index
+from hgn.schema import ConfigError, require, require_non_negative, require_one_of, require_positive
+
+OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
+GROUP_SHAPES = ("cube", "sphere")
+
+
+def config_directory() -> Path:
+    """The folder with the Hydra configs: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    for candidate in (package / "conf", package.parent / "conf"):
+        if (candidate / "train.yaml").is_file():
+            return candidate
+    raise ConfigError(f"conf/ must lie inside or beside {package}, got neither; reinstall the package")
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """The distribution that random scenes are drawn from (paper sec. 3.3). Lengths in domain units."""
+
+    domain_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    cell_size: float = 1 / 64
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
+    obstacle_count: int = 5
+    obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES
+    obstacle_size: tuple[float, float] = (0.1, 0.5)
+    group_count: int = 4
+    group_shapes: tuple[str, ...] = GROUP_SHAPES
+    group_size: float = 0.08
+    materials: tuple[str, ...] = MATERIALS
+    particles_per_cell: float = 8.0
+    clearance_cells: float = 2.0  # between obstacles, groups and walls, in solver cells
+    maximum_initial_speed: float = 0.0  # domain units per second; each group draws one velocity
+
+    def __post_init__(self) -> None:
+        for axis, length in zip("xyz", self.domain_size, strict=True):
+            require(length > 0 and math.isfinite(length), f"domain_size ({axis})", "a finite number > 0", length)
+        for axis, value in zip("xyz", self.gravity, strict=True):
+            require(math.isfinite(value), f"gravity ({axis})", "finite", value)
+        require_positive(self, "cell_size", "group_size", "particles_per_cell")
+        require_non_negative(self, "obstacle_count", "group_count", "clearance_cells", "maximum_initial_speed")
+        low, high = self.obstacle_size
+        require(0 < low <= high < math.inf, "obstacle_size", "0 < smallest <= largest", list(self.obstacle_size))
+        for i, name in enumerate(self.materials):
+            material_index(name, f"materials[{i}]")
+        for i, name in enumerate(self.obstacle_shapes):
+            require(name in OBSTACLE_SHAPES, f"obstacle_shapes[{i}]", f"one of {', '.join(OBSTACLE_SHAPES)}", name)
+        for i, name in enumerate(self.group_shapes):
+            require(name in GROUP_SHAPES, f"group_shapes[{i}]", f"one of {', '.join(GROUP_SHAPES)}", name)
+        require(len(self.materials) > 0, "materials", "a list with at least one material", list(self.materials))
+        require(len(self.group_shapes) > 0, "group_shapes", "a list with at least one shape", [])
+        require(
+            self.obstacle_count == 0 or len(self.obstacle_shapes) > 0,
+            "obstacle_shapes",
+            "a list with at least one shape where obstacle_count > 0",
+            [],
+        )
+
+
+@dataclass(frozen=True)
+class MpmConfig:
+    """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml restores it."""
+
+    youngs_modulus_pa: float = 1e6
+    poisson_ratio: float = 0.2
+    density_kg_m3: float = 1000.0
+    sand_friction_angle_deg: float = 45.0
+    sand_friction_law: str = "compression"  # or plane_strain: which plane sin(phi) is matched in
+    sand_volume_correction: str = "tampubolon"  # or taichi_elements
+    snow_hardening: float = 10.0
+    snow_critical_compression: float = 0.025
+    snow_critical_stretch: float = 0.0045
+    snow_maximum_hardening: float = 100.0  # bound on exp(hardening * (1 - Jp)); hits are counted
+    water_minimum_volume_ratio: float = 0.1  # floor on J; hits are counted
+    minimum_singular_value: float = 0.05  # floor on the singular values of F; hits are counted
+    time_step: str = "adaptive"  # or fixed
+    fixed_time_step_s: float = 0.02 / 64
+    stability_fraction: float = 0.5  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
+    speed_fraction: float = 0.3  # of a cell that the fastest particle may cross in a step
+    wall_cells: int = 3  # grid nodes at each face of the domain that stop outgoing motion
+    wall_contact: str = "slip"  # or stick
+    collider_band_cells: float = 1.5
+    collider_friction: float = 0.0  # Coulomb coefficient; 0 separates without friction
+    device: str = "auto"  # or cpu, gpu
+    scenes_per_launch: int | None = None  # none: 1 on a CPU, 64 on a GPU
+    maximum_substeps_per_frame: int = 20_000  # beyond it a scene is stopped and reported
+
+    def __post_init__(self) -> None:
+        require_positive(
+            self,
+            "youngs_modulus_pa",
+            "density_kg_m3",
+            "fixed_time_step_s",
+            "stability_fraction",
+            "speed_fraction",
+            "snow_maximum_hardening",
+            "water_minimum_volume_ratio",
+            "minimum_singular_value",
+            "maximum_substeps_per_frame",
+        )
+        require_non_negative(
+            self,
+            "snow_hardening",
+            "snow_critical_compression",
+            "snow_critical_stretch",
+            "collider_band_cells",
+            "collider_friction",
+            "sand_friction_angle_deg",
+        )
+        require(self.stability_fraction <= 1, "stability_fraction", "at most 1", self.stability_fraction)
+        require(self.speed_fraction <= 1, "speed_fraction", "at most 1", self.speed_fraction)
+        require(0 <= self.poisson_ratio < 0.5, "poisson_ratio", "in [0, 0.5)", self.poisson_ratio)
+        require(self.sand_friction_angle_deg < 90, "sand_friction_angle_deg", "< 90", self.sand_friction_angle_deg)
+        require(self.wall_cells >= 2, "wall_cells", "at least 2, the reach of a particle", self.wall_cells)
+        require_one_of(self, "sand_friction_law", ("compression", "plane_strain"))
+        require_one_of(self, "sand_volume_correction", ("tampubolon", "taichi_elements"))
+        require_one_of(self, "time_step", ("adaptive", "fixed"))
+        require_one_of(self, "wall_contact", ("slip", "stick"))
+        require_one_of(self, "device", ("auto", "cpu", "gpu"))
+        if self.scenes_per_launch is not None:
+            require(self.scenes_per_launch >= 1, "scenes_per_launch", "at least 1", self.scenes_per_launch)
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """How many episodes, how long, and where they are kept."""
+
+    folder: str = "data/obstacles"
+    training_scenes: int = 800
+    validation_scenes: int = 5
+    test_scenes: int = 20
+    frames: int = 300
+    frame_rate_hz: float = 60.0
+    seed: int = 0
+    episodes_per_shard: int = 8  # the first training shards are smaller, so that training can start early
+    workers: int | None = None  # none: one on a GPU, one per two cores on a CPU
+    maximum_attempts: int = 3  # per scene before it is quarantined and replaced
+
+    def __post_init__(self) -> None:
+        require_positive(self, "frame_rate_hz", "episodes_per_shard", "maximum_attempts")
+        require_non_negative(self, "training_scenes", "validation_scenes", "test_scenes", "seed")
+        require(self.frames >= 2, "frames", "at least 2", self.frames)
+        require(self.folder != "", "folder", "a folder name", self.folder)
+        if self.workers is not None:
+            require(self.workers >= 1, "workers", "at least 1", self.workers)
+
+    def scenes(self, split: str) -> int:
+        return {"train": self.training_scenes, "validation": self.validation_scenes, "test": self.test_scenes}[split]
+
+
+@dataclass(frozen=True)
+class DatagenConfig:
+    """`python -m datagen`: everything that defines a data set."""
+
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    mpm: MpmConfig = field(default_factory=MpmConfig)
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The hierarchical graph network (paper sec. 3.1, 3.2). Lengths in domain units."""
+
+    cell_size: float = 0.035  # R, the finest level
+    levels: int = 4  # L
+    message_passing_steps: int = 4  # M, in each of the 2 L - 1 blocks
+    width: int = 128  # latent and hidden
+    velocity_history: int = 5  # m
+    material_embedding: int = 16  # E
+    wall_distance_cells: float = 8.0  # d_max / R
+    obstacle_features: bool = True
+    materials: tuple[str, ...] = MATERIALS
+
+    def __post_init__(self) -> None:
+        require_positive(
+            self,
+            "cell_size",
+            "levels",
+            "message_passing_steps",
+            "width",
+            "velocity_history",
+            "material_embedding",
+            "wall_distance_cells",
+        )
+        for i, name in enumerate(self.materials):
+            material_index(name, f"materials[{i}]")
+        require(len(self.materials) > 0, "materials", "a list with at least one material", [])
+
+    @property
+    def feature_width(self) -> int:
+        """Numbers per particle: velocities, obstacle normal, wall distances, embedding (paper sec. 3.1)."""
+        return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + self.material_embedding

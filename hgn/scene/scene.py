@@ -1,0 +1,59 @@
+"""What is simulated: particles at their initial state, and obstacles as triangle meshes.
+
+A scene is fixed once made. Lengths are in domain units (the paper's domain is 1 x 1 x 1), y points up.
+Shape legend: N particles, V vertices, F triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hgn.scene.material import MATERIALS
+from hgn.schema import ConfigError
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """A static triangle mesh.
+
+    `closed` tells a solid (watertight) body from a sheet; the solver treats the two differently.
+    """
+
+    name: str
+    vertex_V3: np.ndarray  # float64, domain units
+    triangle_F3: np.ndarray  # int32, indices into vertex_V3
+    closed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One scene, ready for the solver and for the network's rollout."""
+
+    position_N3: np.ndarray  # float32, domain units
+    velocity_N3: np.ndarray  # float32, domain units per second
+    material_N: np.ndarray  # uint8, index into MATERIALS
+    obstacles: tuple[Obstacle, ...] = ()
+    domain_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    cell_size: float = 1 / 64  # spacing of the solver's grid and of the obstacle cells
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
+    seed: int = 0  # of the obstacle surface samples
+    specification: dict[str, Any] = field(default_factory=dict)  # JSON-able: how the scene was made
+
+    def __post_init__(self) -> None:
+        count = len(self.position_N3)
+        for name, shape in (("position_N3", (count, 3)), ("velocity_N3", (count, 3)), ("material_N", (count,))):
+            if getattr(self, name).shape != shape:
+                raise ConfigError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
+        for name in ("position_N3", "velocity_N3"):
+            bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(axis=1))
+            if len(bad):
+                raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
+        if count and int(self.material_N.max()) >= len(MATERIALS):
+            raise ConfigError(f"material_N must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
+
+    @property
+    def particle_count(self) -> int:
+        return len(self.position_N3)

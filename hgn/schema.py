@@ -1,0 +1,146 @@
+"""Strict conversion of plain mappings (YAML, JSON) to dataclasses.
+
+Every file a user may write (configs, scene files) and every file that may have been written by another
+version (manifests, weights) passes through `from_mapping`: unknown keys, wrong types and missing fields end
+in one `ConfigError` that names the field, the rule, the value seen and the remedy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A value that a user can mend: the message names field, rule, value and remedy."""
+
+
+def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
+    """Builds dataclass `cls` from `mapping`, recursively.
+
+    Integers are accepted where floats are asked for; nothing else is converted silently. Lists become tuples
+    of the annotated item type. `path` prefixes the names in messages.
+
+    Raises: ConfigError.
+    """
+    if not isinstance(mapping, Mapping):
+        raise ConfigError(f"{path or cls.__name__} must be a mapping of keys to values, got {mapping!r}")
+    hints = typing.get_type_hints(cls)
+    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}  # type: ignore[arg-type]
+    for key in mapping:
+        if key not in fields:
+            close = difflib.get_close_matches(str(key), fields, n=1)
+            remedy = f"did you mean {close[0]}?" if close else f"known keys: {', '.join(fields)}"
+            raise ConfigError(f"{_join(path, str(key))} is not a known key; {remedy}")
+    values: dict[str, Any] = {}
+    for name, field in fields.items():
+        if name in mapping:
+            values[name] = _convert(hints[name], mapping[name], _join(path, name))
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"{_join(path, name)} is missing; it must be given")
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        if path:
+            raise ConfigError(f"{path}.{error}") from None
+        raise
+
+
+def to_mapping(value: Any) -> Any:
+    """The inverse of `from_mapping`: plain dicts, lists and scalars, ready for JSON or YAML."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {
+            field.name: to_mapping(getattr(value, field.name)) for field in dataclasses.fields(value) if field.init
+        }
+    if isinstance(value, Mapping):
+        return {key: to_mapping(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_mapping(item) for item in value]
+    return value
+
+
+def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str = "") -> None:
+    """Raises ConfigError `<field> must be <rule>, got <value>; <remedy>` unless the rule holds."""
+    if not rule_holds:
+        raise ConfigError(f"{field} must be {rule}, got {value!r}" + (f"; {remedy}" if remedy else ""))
+
+
+def require_positive(owner: object, *names: str) -> None:
+    """Each named field of `owner` is a finite number above zero (NaN is refused)."""
+    for name in names:
+        value = getattr(owner, name)
+        require(value > 0 and math.isfinite(value), name, "a finite number > 0", value)
+
+
+def require_non_negative(owner: object, *names: str) -> None:
+    """Each named field of `owner` is a finite number of at least zero (NaN is refused)."""
+    for name in names:
+        value = getattr(owner, name)
+        require(value >= 0 and math.isfinite(value), name, "a finite number >= 0", value)
+
+
+def require_one_of(owner: object, name: str, choices: Sequence[object]) -> None:
+    """The named field of `owner` is one of `choices`."""
+    value = getattr(owner, name)
+    require(value in choices, name, f"one of {', '.join(map(str, choices))}", value)
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _convert(hint: Any, value: Any, path: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        options = [option for option in arguments if option is not type(None)]
+        if len(options) == 1:
+            return _convert(options[0], value, path)
+        for option in options:
+            try:
+                return _convert(option, value, path)
+            except ConfigError:
+                continue
+        raise ConfigError(f"{path} must be {_name(hint)}, got {value!r}")
+    if dataclasses.is_dataclass(hint):
+        return from_mapping(typing.cast(type, hint), value, path)
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ConfigError(f"{path} must be a list, got {value!r}")
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            return tuple(_convert(arguments[0], item, f"{path}[{i}]") for i, item in enumerate(value))
+        if len(value) != len(arguments):
+            raise ConfigError(f"{path} must be a list of {len(arguments)} values, got {len(value)}: {value!r}")
+        pairs = zip(arguments, value, strict=True)
+        return tuple(_convert(item_hint, item, f"{path}[{i}]") for i, (item_hint, item) in enumerate(pairs))
+    if origin is dict:
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{path} must be a mapping, got {value!r}")
+        return {
+            _convert(arguments[0], key, path): _convert(arguments[1], item, _join(path, str(key)))
+            for key, item in value.items()
+        }
+    if hint is Any:
+        return value
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if hint is bool and isinstance(value, bool):
+        return value
+    if hint is int and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if hint is str and isinstance(value, str):
+        return value
+    raise ConfigError(f"{path} must be {_name(hint)}, got {value!r} ({type(value).__name__})")
+
+
+def _name(hint: Any) -> str:
+    names = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+    return names.get(hint, str(hint))
