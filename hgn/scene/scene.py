@@ -44,13 +44,19 @@ class Scene:
 
     def __post_init__(self) -> None:
         count = len(self.position_N3)
-        for name, shape in (("position_N3", (count, 3)), ("velocity_N3", (count, 3)), ("material_N", (count,))):
+        for name, shape in (
+            ("position_N3", (count, 3)),
+            ("velocity_N3", (count, 3)),
+            ("material_N", (count,)),
+        ):
             if getattr(self, name).shape != shape:
                 raise ConfigError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
         for name in ("position_N3", "velocity_N3"):
             bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(axis=1))
             if len(bad):
-                raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
+                raise ConfigError(
+                    f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}"
+                )
         if count and int(self.material_N.max()) >= len(MATERIALS):
             raise ConfigError(f"material_N must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
 

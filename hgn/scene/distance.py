@@ -1,0 +1,238 @@
+"""Exact distances to triangles, and inside tests for closed meshes.
+
+Pure numpy in float64, without any loop over points or triangles.
+Shape legend: P points (or point-triangle pairs), F triangles, T tree nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hgn.scene.scene import Obstacle
+
+PAIRS_PER_CHUNK = 1 << 17  # bounds the temporaries of the dense solid-angle sums to some 20 MiB
+DIRECT_TRIANGLES = 1024  # above it the tree is faster than the dense sum
+LEAF_TRIANGLES = 16
+FAR_FIELD_RATIO = 2.5  # a cluster is far beyond this many of its radii
+
+
+def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray:
+    """The point of each triangle that is closest to its partner point, as float64 [P, 3].
+
+    `triangle_P33` holds corners, [pair, corner, axis]. The nearest of the foot of the perpendicular
+    (where it lies inside) and of the nearest points of the three edges; it equals the region walk of Ericson,
+    Real-Time Collision Detection, sec. 5.1.5, and needs no area: triangles that are a segment or a single
+    point give the closest point of that segment or point.
+    """
+    point = np.asarray(point_P3, np.float64)
+    corner = np.asarray(triangle_P33, np.float64)
+    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+    best = _closest_on_segment(point, a, b)
+    best_square = _square(point - best)
+    for start, end in ((b, c), (c, a)):
+        candidate = _closest_on_segment(point, start, end)
+        best, best_square = _nearer(point, best, best_square, candidate, np.ones(len(point), bool))
+
+    ab, ac, ap = b - a, c - a, point - a
+    normal = _cross(ab, ac)
+    normal_square = _square(normal)
+    divisor = np.where(normal_square > 0, normal_square, 1.0)
+    u = _dot(_cross(ap, ac), normal) / divisor
+    v = _dot(_cross(ab, ap), normal) / divisor
+    inside = (normal_square > 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
+    # measured from the corner, not the point, so that a sliver's poor normal cannot leave the triangle
+    foot = np.where(inside[:, None], a + u[:, None] * ab + v[:, None] * ac, a)
+    return _nearer(point, best, best_square, foot, inside)[0]
+
+
+def winding_numbers(point_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarray:
+    """The generalised winding number of the triangles about each point, as float64 [P].
+
+    +1 or -1 inside a closed mesh (by its orientation), 0 outside; between for meshes with holes. Zero-area
+    triangles add nothing. Up to DIRECT_TRIANGLES the solid angles are summed exactly (van Oosterom and
+    Strackee 1983; Jacobson et al. 2013), in bounded memory; larger meshes take clusters that are far away as
+    dipoles (Barill et al. 2018), with errors of the order of 0.01.
+    """
+    point = np.asarray(point_P3, np.float64).reshape(-1, 3)
+    triangle = np.asarray(triangle_F33, np.float64).reshape(-1, 3, 3)
+    if len(point) == 0 or len(triangle) == 0:
+        return np.zeros(len(point))
+    if len(triangle) > DIRECT_TRIANGLES:
+        return _tree_winding_numbers(point, triangle)
+    winding = np.empty(len(point))
+    rows = max(1, PAIRS_PER_CHUNK // len(triangle))
+    for start in range(0, len(point), rows):
+        chunk = point[start : start + rows]
+        winding[start : start + rows] = _solid_angles(chunk[:, None, :], triangle[None]).sum(axis=1)
+    return winding / (4 * np.pi)
+
+
+def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
+    """Whether each point lies inside the obstacle, as bool [P]; nothing lies inside a sheet.
+
+    Triangle orientation does not matter: inside is |winding number| > 0.5.
+    """
+    point = np.asarray(point_P3, np.float64).reshape(-1, 3)
+    inside = np.zeros(len(point), bool)
+    if not obstacle.closed or len(obstacle.triangle_F3) == 0 or len(point) == 0:
+        return inside
+    triangle = np.asarray(obstacle.vertex_V3, np.float64)[obstacle.triangle_F3]
+    low, high = triangle.min(axis=(0, 1)), triangle.max(axis=(0, 1))
+    near = np.flatnonzero(((point >= low) & (point <= high)).all(axis=1))
+    inside[near] = np.abs(winding_numbers(point[near], triangle)) > 0.5
+    return inside
+
+
+def _closest_on_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    edge = end - start
+    length_square = _square(edge)
+    along = _dot(point - start, edge) / np.where(length_square > 0, length_square, 1.0)
+    return start + np.clip(along, 0.0, 1.0)[:, None] * edge
+
+
+def _nearer(
+    point: np.ndarray, best: np.ndarray, best_square: np.ndarray, candidate: np.ndarray, allowed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    square = _square(point - candidate)
+    better = allowed & (square < best_square)
+    return np.where(better[:, None], candidate, best), np.where(better, square, best_square)
+
+
+def _solid_angles(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
+    """Signed solid angle of each triangle seen from its point; leading axes broadcast.
+
+    Seen from a point in its own plane a triangle has solid angle 0 outside and is undefined inside.
+    """
+    a, b, c = (triangle[..., corner, :] - point for corner in range(3))
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    cx, cy, cz = c[..., 0], c[..., 1], c[..., 2]
+    la = np.sqrt(ax * ax + ay * ay + az * az)
+    lb = np.sqrt(bx * bx + by * by + bz * bz)
+    lc = np.sqrt(cx * cx + cy * cy + cz * cz)
+    determinant = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+    cosines = (
+        la * lb * lc
+        + (ax * bx + ay * by + az * bz) * lc
+        + (bx * cx + by * cy + bz * cz) * la
+        + (cx * ax + cy * ay + cz * az) * lb
+    )
+    return 2 * np.arctan2(determinant, cosines)
+
+
+@dataclass(frozen=True)
+class _Tree:
+    """A binary tree over triangles sorted so that each node owns the slice [first, last)."""
+
+    first_T: np.ndarray
+    last_T: np.ndarray
+    child_T2: np.ndarray  # -1 in leaves
+    centre_T3: np.ndarray  # area-weighted
+    radius_T: np.ndarray
+    dipole_T3: np.ndarray  # sum of the area vectors
+    triangle_F33: np.ndarray  # sorted
+
+
+def _build_tree(triangle_F33: np.ndarray) -> _Tree:
+    """Splits at the median of the longest axis, one level of the tree at a time."""
+    centroid = triangle_F33.mean(axis=1)
+    order = np.arange(len(triangle_F33))
+    first, last, children = [0], [len(order)], [[-1, -1]]
+    level = [0]
+    while level:
+        grown: list[int] = []
+        for node in level:
+            start, stop = first[node], last[node]
+            if stop - start <= LEAF_TRIANGLES:
+                continue
+            members = order[start:stop]
+            axis = int(np.argmax(np.ptp(centroid[members], axis=0)))
+            middle = (stop - start) // 2
+            order[start:stop] = members[np.argpartition(centroid[members, axis], middle)]
+            children[node] = [len(first), len(first) + 1]
+            grown += children[node]
+            first += [start, start + middle]
+            last += [start + middle, stop]
+            children += [[-1, -1], [-1, -1]]
+        level = grown
+    first_T, last_T = np.array(first), np.array(last)
+    sorted_F33 = triangle_F33[order]
+    area_vector = 0.5 * _cross(sorted_F33[:, 1] - sorted_F33[:, 0], sorted_F33[:, 2] - sorted_F33[:, 0])
+    area = np.sqrt(_square(area_vector)) + np.finfo(np.float64).tiny
+    dipole = _slice_sums(area_vector, first_T, last_T)
+    weight = _slice_sums(area[:, None], first_T, last_T)
+    centre = _slice_sums(area[:, None] * sorted_F33.mean(axis=1), first_T, last_T) / weight
+    # the box of the corners bounds the sphere about the centre
+    radius = np.empty(len(first_T))
+    low, high = np.empty_like(centre), np.empty_like(centre)
+    for node in range(len(first_T) - 1, -1, -1):  # children come after their parent
+        if children[node][0] < 0:
+            corners = sorted_F33[first[node] : last[node]]
+            low[node], high[node] = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        else:
+            low[node] = low[children[node]].min(axis=0)
+            high[node] = high[children[node]].max(axis=0)
+    radius = np.sqrt(_square(np.maximum(high - centre, centre - low)))
+    return _Tree(first_T, last_T, np.array(children), centre, radius, dipole, sorted_F33)
+
+
+def _slice_sums(value: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    running = np.concatenate([np.zeros((1, value.shape[1])), np.cumsum(value, axis=0)])
+    return running[last] - running[first]
+
+
+def _tree_winding_numbers(point: np.ndarray, triangle_F33: np.ndarray) -> np.ndarray:
+    tree = _build_tree(triangle_F33)
+    solid_angle = np.zeros(len(point))
+    rows = 4096  # points at once, which bounds the frontier
+    for start in range(0, len(point), rows):
+        chunk = point[start : start + rows]
+        total = solid_angle[start : start + rows]
+        who, node = np.arange(len(chunk)), np.zeros(len(chunk), np.int64)
+        while len(who):
+            offset = tree.centre_T3[node] - chunk[who]
+            distance = np.sqrt(_square(offset))
+            far = distance > FAR_FIELD_RATIO * tree.radius_T[node]
+            dipole = _dot(tree.dipole_T3[node[far]], offset[far]) / distance[far] ** 3
+            total += np.bincount(who[far], dipole, len(chunk))
+            leaf = ~far & (tree.child_T2[node, 0] < 0)
+            total += _leaf_solid_angles(chunk, who[leaf], node[leaf], tree)
+            inner = ~far & ~leaf
+            who = np.repeat(who[inner], 2)
+            node = tree.child_T2[node[inner]].reshape(-1)
+    return solid_angle / (4 * np.pi)
+
+
+def _leaf_solid_angles(point: np.ndarray, who: np.ndarray, node: np.ndarray, tree: _Tree) -> np.ndarray:
+    total = np.zeros(len(point))
+    slot = np.arange(LEAF_TRIANGLES)
+    rows = PAIRS_PER_CHUNK // LEAF_TRIANGLES
+    for start in range(0, len(who), rows):
+        pair_who, pair_node = who[start : start + rows], node[start : start + rows]
+        index = tree.first_T[pair_node][:, None] + slot
+        owned = index < tree.last_T[pair_node][:, None]
+        corners = tree.triangle_F33[np.where(owned, index, 0)]
+        angle = np.where(owned, _solid_angles(point[pair_who][:, None, :], corners), 0.0).sum(axis=1)
+        total += np.bincount(pair_who, angle, len(point))
+    return total
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def _square(a: np.ndarray) -> np.ndarray:
+    return _dot(a, a)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.stack(
+        [
+            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
+            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
+            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
+        ],
+        axis=-1,
+    )
