@@ -1,0 +1,253 @@
+"""A rollout in one HDF5 file that ParaView plays as an animation.
+
+Two top-level groups:
+
+/VTKHDF  a temporal PolyData of the VTKHDF specification (version 2): one vertex cell a particle, PointData
+         `material` and `velocity`. Topology and materials are stored once; every step points at them again.
+/hgn     what VTK has no place for: domain, gravity, obstacles, how the rollout was made, the ground truth.
+         The specification leaves groups outside /VTKHDF to the writer.
+
+ParaView picks its VTKHDF reader by the endings .vtkhdf and .hdf; a file with another ending opens as well,
+once that reader is chosen in the dialogue.
+
+Shape legend: T frames, N particles, R frames of ground truth, V vertices, F triangles.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from hgn.scene.material import MATERIALS
+from hgn.scene.scene import Obstacle
+from hgn.schema import ConfigError
+
+FORMAT_NAME = "hgn rollout"
+FORMAT_VERSION = 1
+VTKHDF_VERSION = (2, 0)  # the oldest that knows temporal PolyData, so that older ParaViews open the file too
+CELL_CATEGORIES = ("Vertices", "Lines", "Polygons", "Strips")  # in the order of Steps/CellOffsets
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A simulated trajectory with all that is needed to draw it. Frame 0 is the initial state.
+
+    Positions may hold NaN: a rollout that diverged is kept as it is. The ground truth may be shorter or
+    longer than the rollout.
+
+    Raises: ConfigError on shapes or materials that do not fit together.
+    """
+
+    position_TN3: np.ndarray  # float32, domain units
+    material_N: np.ndarray  # uint8, index into MATERIALS
+    obstacles: tuple[Obstacle, ...]
+    domain_size: tuple[float, float, float]
+    frame_rate_hz: float
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
+    cell_size: float = 1 / 64  # of the obstacle cells
+    # JSON-able: weights and their sha256, the scene's specification, settings
+    source: dict[str, Any] = field(default_factory=dict)
+    reference_TN3: np.ndarray | None = None  # float32 [R, N, 3], ground truth at the same frame rate
+
+    def __post_init__(self) -> None:
+        shape = self.position_TN3.shape
+        if len(shape) != 3 or shape[0] < 1 or shape[2] != 3:
+            raise ConfigError(f"position_TN3 must have shape (frames >= 1, particles, 3), got {shape}")
+        if self.material_N.shape != shape[1:2]:
+            raise ConfigError(f"material_N must have shape ({shape[1]},), got {self.material_N.shape}")
+        if len(self.material_N) and int(self.material_N.max()) >= len(MATERIALS):
+            raise ConfigError(f"material_N must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
+        if not (self.frame_rate_hz > 0 and math.isfinite(self.frame_rate_hz)):
+            raise ConfigError(f"frame_rate_hz must be a finite number > 0, got {self.frame_rate_hz}")
+        if self.reference_TN3 is not None:
+            found = self.reference_TN3.shape
+            if len(found) != 3 or found[0] < 1 or found[1:] != shape[1:]:
+                raise ConfigError(f"reference_TN3 must have shape (frames >= 1, {shape[1]}, 3), got {found}")
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.position_TN3)
+
+    @property
+    def particle_count(self) -> int:
+        return self.position_TN3.shape[1]
+
+
+def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray:
+    """Velocities that led to each frame, float32 [T, N, 3] in domain units per second.
+
+    Backward differences, the network's own definition (paper sec. 3.1); frame 0 repeats the first step.
+    """
+    velocity_TN3 = np.zeros(position_TN3.shape, np.float32)
+    velocity_TN3[1:] = np.diff(position_TN3, axis=0) * np.float32(frame_rate_hz)
+    if len(velocity_TN3) > 1:
+        velocity_TN3[0] = velocity_TN3[1]
+    return velocity_TN3
+
+
+def write_rollout(path: str | Path, rollout: Rollout) -> None:
+    """Writes `rollout` to `path`; the file appears whole or not at all, and replaces one that was there."""
+    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+        _write_vtkhdf(file.create_group("VTKHDF"), rollout)
+        _write_own(file.create_group("hgn"), rollout)
+
+
+def read_rollout(path: str | Path) -> Rollout:
+    """Reads what `write_rollout` wrote.
+
+    Raises: ConfigError when the file is missing, damaged, or not a rollout of this version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigError(f"rollout must be an existing file, got {path}; python -m hgn.rollout writes one")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise ConfigError(
+            f"rollout must be a complete HDF5 file, got {path}: {error}; write it again"
+        ) from error
+    with file:
+        _check_format(file, path)
+        try:
+            return _read(file)
+        except (KeyError, OSError) as error:
+            raise ConfigError(f"rollout must be complete, got {path}: {error}; write it again") from error
+        except ConfigError as error:
+            raise ConfigError(f"rollout must be consistent, got {path}: {error}; write it again") from error
+
+
+@contextlib.contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """Gives a temporary path beside `path`; without an exception it is flushed to disk and renamed to `path`.
+
+    Folders are made as needed. After an exception neither file is left behind or changed.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield temporary
+        descriptor = os.open(temporary, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
+    frames, particles = rollout.frame_count, rollout.particle_count
+    group.attrs["Version"] = np.array(VTKHDF_VERSION, np.int64)
+    # VTK compares a fixed-length ASCII string; h5py would otherwise write one of variable length
+    group.attrs.create("Type", np.bytes_("PolyData"))
+
+    group["NumberOfPoints"] = np.full(frames, particles, np.int64)
+    group["Points"] = rollout.position_TN3.reshape(-1, 3).astype(np.float32, copy=False)
+    for name in CELL_CATEGORIES:
+        cells = particles if name == "Vertices" else 0
+        category = group.create_group(name)
+        category["NumberOfCells"] = np.full(frames, cells, np.int64)
+        category["NumberOfConnectivityIds"] = np.full(frames, cells, np.int64)
+        category["Connectivity"] = np.arange(cells, dtype=np.int64)
+        category["Offsets"] = np.arange(cells + 1, dtype=np.int64)
+
+    data = group.create_group("PointData")
+    data["material"] = rollout.material_N.astype(np.uint8, copy=False)
+    data["velocity"] = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz).reshape(-1, 3)
+
+    steps = group.create_group("Steps")
+    steps.attrs["NSteps"] = np.int64(frames)
+    steps["Values"] = np.arange(frames) / rollout.frame_rate_hz  # seconds
+    steps["PartOffsets"] = np.arange(frames, dtype=np.int64)
+    steps["NumberOfParts"] = np.ones(frames, np.int64)
+    steps["PointOffsets"] = np.arange(frames, dtype=np.int64) * particles
+    steps["CellOffsets"] = np.zeros((frames, len(CELL_CATEGORIES)), np.int64)
+    steps["ConnectivityIdOffsets"] = np.zeros((frames, len(CELL_CATEGORIES)), np.int64)
+    offsets = steps.create_group("PointDataOffsets")
+    offsets["material"] = np.zeros(frames, np.int64)
+    offsets["velocity"] = np.arange(frames, dtype=np.int64) * particles
+
+
+def _write_own(group: h5py.Group, rollout: Rollout) -> None:
+    group.attrs["format"] = FORMAT_NAME
+    group.attrs["format_version"] = FORMAT_VERSION
+    group.attrs["materials"] = json.dumps(MATERIALS)
+    group.attrs["frame_rate_hz"] = float(rollout.frame_rate_hz)
+    group.attrs["domain_size"] = np.array(rollout.domain_size, np.float64)
+    group.attrs["gravity"] = np.array(rollout.gravity, np.float64)
+    group.attrs["cell_size"] = float(rollout.cell_size)
+    group["source"] = json.dumps(rollout.source)  # a dataset: attributes end at 64 KiB
+    obstacles = group.create_group("obstacles")
+    for index, obstacle in enumerate(rollout.obstacles):
+        entry = obstacles.create_group(f"{index:04d}")
+        entry.attrs["name"] = obstacle.name
+        entry.attrs["closed"] = bool(obstacle.closed)
+        entry["vertices"] = obstacle.vertex_V3.astype(np.float64, copy=False)
+        entry["triangles"] = obstacle.triangle_F3.astype(np.int32, copy=False)
+    if rollout.reference_TN3 is not None:
+        group["reference"] = rollout.reference_TN3.astype(np.float32, copy=False)
+
+
+def _check_format(file: h5py.File, path: Path) -> None:
+    own = file.get("hgn")
+    name = own.attrs.get("format") if isinstance(own, h5py.Group) else None
+    if name != FORMAT_NAME:
+        raise ConfigError(
+            f"rollout must be a file that python -m hgn.rollout wrote, with format {FORMAT_NAME!r} "
+            f"in group /hgn; got {path} with format {name!r}"
+        )
+    version = int(own.attrs.get("format_version", -1))
+    if version != FORMAT_VERSION:
+        raise ConfigError(
+            f"rollout format_version must be {FORMAT_VERSION}, got {version} in {path}; "
+            "read it with the version of hgn that wrote it, or write it again"
+        )
+
+
+def _read(file: h5py.File) -> Rollout:
+    own, vtk = file["hgn"], file["VTKHDF"]
+    _same_materials(json.loads(own.attrs["materials"]))
+    count_T = vtk["NumberOfPoints"][()]
+    material_N = vtk["PointData/material"][()]
+    points = vtk["Points"]
+    shape = (len(count_T), len(material_N), 3)
+    if points.shape != (shape[0] * shape[1], 3) or (count_T != shape[1]).any():
+        raise ConfigError(
+            f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}"
+        )
+    obstacles = tuple(
+        Obstacle(
+            name=str(entry.attrs["name"]),
+            vertex_V3=entry["vertices"][()],
+            triangle_F3=entry["triangles"][()],
+            closed=bool(entry.attrs["closed"]),
+        )
+        for _, entry in sorted(own["obstacles"].items())
+    )
+    return Rollout(
+        position_TN3=points[()].reshape(shape),
+        material_N=material_N,
+        obstacles=obstacles,
+        domain_size=tuple(float(length) for length in own.attrs["domain_size"]),  # type: ignore[arg-type]
+        frame_rate_hz=float(own.attrs["frame_rate_hz"]),
+        gravity=tuple(float(value) for value in own.attrs["gravity"]),  # type: ignore[arg-type]
+        cell_size=float(own.attrs["cell_size"]),
+        source=json.loads(own["source"][()]),
+        reference_TN3=own["reference"][()] if "reference" in own else None,
+    )
+
+
+def _same_materials(found: list[str]) -> None:
+    if tuple(found) != MATERIALS:
+        raise ConfigError(f"materials must be {', '.join(MATERIALS)}, got {', '.join(found)}")

@@ -1,0 +1,204 @@
+"""The rollout file: a roundtrip without loss, the VTKHDF layout, and messages for files that do not fit."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from hgn.scene.rollout_file import Rollout, frame_velocity, read_rollout, write_rollout
+from hgn.scene.scene import Obstacle
+from hgn.schema import ConfigError
+
+FRAMES, PARTICLES = 4, 7
+
+
+def make_rollout(reference_frames: int | None = 3) -> Rollout:
+    generator = np.random.default_rng(0)
+    triangle = Obstacle("sheet", generator.random((3, 3)), np.array([[0, 1, 2]], np.int32), closed=False)
+    tetrahedron = Obstacle(
+        "tetrahedron",
+        np.eye(4, 3),
+        np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32),
+        closed=True,
+    )
+    reference = None
+    if reference_frames is not None:
+        reference = generator.random((reference_frames, PARTICLES, 3), np.float32)
+    return Rollout(
+        position_TN3=generator.random((FRAMES, PARTICLES, 3), np.float32),
+        material_N=np.arange(PARTICLES, dtype=np.uint8) % 3,
+        obstacles=(triangle, tetrahedron),
+        domain_size=(1.0, 2.0, 0.5),
+        frame_rate_hz=60.0,
+        gravity=(0.0, -1.5, 0.25),
+        cell_size=1 / 32,
+        source={"weights": "model.safetensors", "sha256": "ab" * 32, "specification": {"seed": 3}},
+        reference_TN3=reference,
+    )
+
+
+@pytest.mark.parametrize("reference_frames", [None, 3, 6])
+def test_roundtrip(tmp_path: Path, reference_frames: int | None) -> None:
+    """What is read is bit for bit what was written, ground truth of any length included."""
+    written = make_rollout(reference_frames)
+    write_rollout(tmp_path / "new" / "rollout.vtkhdf", written)
+    read = read_rollout(tmp_path / "new" / "rollout.vtkhdf")
+    for field in dataclasses.fields(Rollout):
+        left, right = getattr(written, field.name), getattr(read, field.name)
+        if isinstance(left, np.ndarray):
+            assert left.dtype == right.dtype
+            np.testing.assert_array_equal(left, right)
+        elif field.name != "obstacles":
+            assert left == right
+    assert [(o.name, o.closed) for o in read.obstacles] == [("sheet", False), ("tetrahedron", True)]
+    for left, right in zip(written.obstacles, read.obstacles, strict=True):
+        np.testing.assert_array_equal(left.vertex_V3, right.vertex_V3)
+        np.testing.assert_array_equal(left.triangle_F3, right.triangle_F3)
+
+
+def test_large_source_survives(tmp_path: Path) -> None:
+    """A scene specification above HDF5's 64 KiB attribute limit is kept."""
+    rollout = dataclasses.replace(make_rollout(), source={"specification": ["x" * 100] * 2000})
+    write_rollout(tmp_path / "rollout.h5", rollout)
+    assert read_rollout(tmp_path / "rollout.h5").source == rollout.source
+
+
+def test_diverged_rollout_is_kept(tmp_path: Path) -> None:
+    """NaN positions are written and read, so that a divergence can be looked at."""
+    rollout = make_rollout()
+    rollout.position_TN3[2:] = np.nan
+    write_rollout(tmp_path / "rollout.h5", rollout)
+    np.testing.assert_array_equal(read_rollout(tmp_path / "rollout.h5").position_TN3, rollout.position_TN3)
+
+
+def test_vtkhdf_layout(tmp_path: Path) -> None:
+    """Datasets have the shapes of a temporal PolyData in VTKHDF; topology is stored once."""
+    rollout = make_rollout()
+    write_rollout(tmp_path / "rollout.h5", rollout)
+    with h5py.File(tmp_path / "rollout.h5") as file:
+        vtk = file["VTKHDF"]
+        assert vtk.attrs["Version"].tolist() == [2, 0]
+        assert vtk.attrs["Type"] == b"PolyData"
+        kind = h5py.h5a.open(vtk.id, b"Type").get_type()
+        assert not kind.is_variable_str()
+        assert vtk["NumberOfPoints"][()].tolist() == [PARTICLES] * FRAMES
+        assert vtk["Points"].shape == (FRAMES * PARTICLES, 3)
+        assert vtk["Vertices/Connectivity"][()].tolist() == list(range(PARTICLES))
+        assert vtk["Vertices/Offsets"][()].tolist() == list(range(PARTICLES + 1))
+        for name, cells in (("Vertices", PARTICLES), ("Lines", 0), ("Polygons", 0), ("Strips", 0)):
+            assert vtk[name]["NumberOfCells"][()].tolist() == [cells] * FRAMES
+            assert vtk[name]["NumberOfConnectivityIds"][()].tolist() == [cells] * FRAMES
+            assert vtk[name]["Offsets"].shape == (cells + 1,)
+        steps = vtk["Steps"]
+        assert steps.attrs["NSteps"] == FRAMES
+        np.testing.assert_allclose(steps["Values"], np.arange(FRAMES) / 60)
+        assert steps["PartOffsets"][()].tolist() == list(range(FRAMES))
+        assert steps["NumberOfParts"][()].tolist() == [1] * FRAMES
+        assert steps["CellOffsets"].shape == steps["ConnectivityIdOffsets"].shape == (FRAMES, 4)
+        assert not steps["CellOffsets"][()].any()
+        for step in range(FRAMES):
+            start = steps["PointOffsets"][step]
+            np.testing.assert_array_equal(
+                vtk["Points"][start : start + PARTICLES], rollout.position_TN3[step]
+            )
+            start = steps["PointDataOffsets/material"][step]
+            np.testing.assert_array_equal(
+                vtk["PointData/material"][start : start + PARTICLES], rollout.material_N
+            )
+            start = steps["PointDataOffsets/velocity"][step]
+            expected = frame_velocity(rollout.position_TN3, 60.0)[step]
+            np.testing.assert_array_equal(vtk["PointData/velocity"][start : start + PARTICLES], expected)
+
+
+def test_frame_velocity() -> None:
+    """Uniform motion has the same velocity in every frame; a single frame has none."""
+    speed = np.array([1.0, -2.0, 0.5], np.float32)
+    position_TN3 = (np.arange(5, dtype=np.float32)[:, None, None] / 50) * speed
+    np.testing.assert_allclose(
+        frame_velocity(position_TN3, 50.0), np.broadcast_to(speed, (5, 1, 3)), rtol=1e-5
+    )
+    assert not frame_velocity(position_TN3[:1], 50.0).any()
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    """An error while writing keeps the file that was there and leaves no temporary file."""
+    path = tmp_path / "rollout.h5"
+    write_rollout(path, make_rollout())
+    before = path.read_bytes()
+    with pytest.raises(TypeError):
+        write_rollout(path, dataclasses.replace(make_rollout(), source={"not JSON": object()}))
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["rollout.h5"]
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    """A missing file is named, with the command that writes one."""
+    with pytest.raises(ConfigError, match=r"existing file, got .*nothing\.h5.*hgn\.rollout"):
+        read_rollout(tmp_path / "nothing.h5")
+
+
+def test_not_hdf5(tmp_path: Path) -> None:
+    """A file of another kind is refused."""
+    (tmp_path / "text.h5").write_text("not a rollout")
+    with pytest.raises(ConfigError, match="complete HDF5 file"):
+        read_rollout(tmp_path / "text.h5")
+
+
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_truncated(tmp_path: Path, share: float) -> None:
+    """A file cut short is refused, wherever it was cut."""
+    path = tmp_path / "rollout.h5"
+    write_rollout(path, make_rollout())
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ConfigError, match="complete HDF5 file"):
+        read_rollout(path)
+
+
+def test_other_format_and_version(tmp_path: Path) -> None:
+    """HDF5 files of other programs and of other versions are told apart in the message."""
+    path = tmp_path / "rollout.h5"
+    with h5py.File(path, "w") as file:
+        file["hgn"] = np.zeros(3)
+    with pytest.raises(ConfigError, match="format None"):
+        read_rollout(path)
+    write_rollout(path, make_rollout())
+    with h5py.File(path, "a") as file:
+        file["hgn"].attrs["format_version"] = 99
+    with pytest.raises(ConfigError, match="format_version must be 1, got 99"):
+        read_rollout(path)
+
+
+def test_damaged_contents(tmp_path: Path) -> None:
+    """A missing dataset, and one of the wrong size, are refused."""
+    path = tmp_path / "rollout.h5"
+    write_rollout(path, make_rollout())
+    with h5py.File(path, "a") as file:
+        del file["VTKHDF/Points"]
+        file["VTKHDF/Points"] = np.zeros((5, 3), np.float32)
+    with pytest.raises(ConfigError, match="4 frames of 7 particles"):
+        read_rollout(path)
+    with h5py.File(path, "a") as file:
+        del file["VTKHDF/Points"]
+    with pytest.raises(ConfigError, match=r"must be complete.*Points"):
+        read_rollout(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"position_TN3": np.zeros((2, 3), np.float32)}, "position_TN3 must have shape"),
+        ({"material_N": np.zeros(3, np.uint8)}, r"material_N must have shape \(7,\)"),
+        ({"material_N": np.full(7, 9, np.uint8)}, "material_N must be below 3, got 9"),
+        ({"frame_rate_hz": float("nan")}, "frame_rate_hz must be a finite number > 0"),
+        ({"reference_TN3": np.zeros((2, 6, 3), np.float32)}, "reference_TN3 must have shape"),
+    ],
+)
+def test_inconsistent_rollouts_are_refused(change: dict, message: str) -> None:
+    """Arrays that do not fit together never reach a file."""
+    with pytest.raises(ConfigError, match=message):
+        dataclasses.replace(make_rollout(), **change)
