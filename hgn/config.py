@@ -20,7 +20,7 @@ def config_directory() -> Path:
     """The folder with the Hydra configs: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).resolve().parent
     for candidate in (package / "conf", package.parent / "conf"):
-        if (candidate / "train.yaml").is_file():
+        if (candidate / "datagen.yaml").is_file():
             return candidate
     raise ConfigError(f"conf/ must lie inside or beside {package}, got neither; reinstall the package")
 

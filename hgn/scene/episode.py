@@ -1,23 +1,47 @@
 """An episode: one scene's simulated trajectory, as stored in shards and read by the trainer.
 
+Stored as plain members, one file a field (`position.npy`, `material.npy`, ..., `json`), so that any WebDataset
+or tar client reads it and a trainer can memory-map the positions. Nothing is ever unpickled.
 Shape legend: T frames, N particles, K obstacle cells.
 """
 
 from __future__ import annotations
 
+import io
+import json
+import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.schema import ConfigError, from_mapping
 
 SCHEMA_VERSION = 1
+
+POSITION_MEMBER = "position.npy"
+VELOCITY_MEMBER = "velocity.npy"
+MATERIAL_MEMBER = "material.npy"
+OBSTACLE_CELL_MEMBER = "obstacle_cell.npy"
+OBSTACLE_NORMAL_MEMBER = "obstacle_normal.npy"
+PARAMETER_PREFIX = "parameter_"
+DESCRIPTION_MEMBER = "json"
+
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """Frame 0 is the initial state, so T frames hold T - 1 steps of 1 / frame_rate_hz seconds."""
+    """Frame 0 is the initial state, so T frames hold T - 1 steps of 1 / frame_rate_hz seconds.
+
+    Raises: ConfigError for a wrong shape, type or value. Only the positions are not scanned for values that are
+    not finite (they may be a memory map of a file that was checked by its hash); `encode_episode` and
+    `decode_episode` scan them.
+    """
 
     key: str  # sample name inside the data set, without dots: train-000012
     position_TN3: np.ndarray  # float32, domain units
@@ -32,3 +56,223 @@ class Episode:
     solver: dict[str, Any]  # settings and counters: substeps, projections, floors hit
     # per-particle material parameters that differ from the solver's defaults, float32 [N] by name
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not _NAME.fullmatch(self.key):
+            raise ConfigError(f"key must be letters, digits, - and _ (a dot would end it), got {self.key!r}")
+        position = self.position_TN3
+        if position.ndim != 3 or position.shape[0] < 1 or position.shape[2] != 3:
+            raise ConfigError(f"{self.key}: position must have shape [frames >= 1, N, 3], got {position.shape}")
+        count, cells = position.shape[1], len(self.obstacle_grid.cell_K3)
+        self._check_array("position", position, np.float32, position.shape, scan=False)
+        self._check_array("velocity", self.initial_velocity_N3, np.float32, (count, 3))
+        self._check_array("material", self.material_N, np.uint8, (count,))
+        self._check_array("obstacle_cell", self.obstacle_grid.cell_K3, np.int32, (cells, 3))
+        self._check_array("obstacle_normal", self.obstacle_grid.normal_K3, np.float32, (cells, 3))
+        for name, value in self.material_parameters.items():
+            if not _NAME.fullmatch(name):
+                raise ConfigError(f"{self.key}: parameter names must be letters, digits, - and _, got {name!r}")
+            self._check_array(PARAMETER_PREFIX + name, value, np.float32, (count,))
+        if count and int(self.material_N.max()) >= len(MATERIALS):
+            raise ConfigError(f"{self.key}: material must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
+        for name, number in (
+            ("frame_rate_hz", self.frame_rate_hz),
+            ("cell_size", self.obstacle_grid.cell_size),
+        ):
+            if not (number > 0 and math.isfinite(number)):
+                raise ConfigError(f"{self.key}: {name} must be a finite number > 0, got {number!r}")
+        if not all(length > 0 and math.isfinite(length) for length in self.domain_size):
+            raise ConfigError(f"{self.key}: domain_size must be finite and > 0, got {self.domain_size!r}")
+        if not all(math.isfinite(value) for value in self.gravity):
+            raise ConfigError(f"{self.key}: gravity must be finite, got {self.gravity!r}")
+
+    @property
+    def frame_count(self) -> int:
+        return int(self.position_TN3.shape[0])
+
+    @property
+    def particle_count(self) -> int:
+        return int(self.position_TN3.shape[1])
+
+    def _check_array(
+        self, name: str, array: np.ndarray, dtype: type, shape: tuple[int, ...], scan: bool = True
+    ) -> None:
+        if array.dtype != np.dtype(dtype):
+            raise ConfigError(f"{self.key}: {name} must be of type {np.dtype(dtype).name}, got {array.dtype}")
+        if array.shape != shape:
+            raise ConfigError(f"{self.key}: {name} must have shape {shape}, got {array.shape}")
+        if scan and not np.isfinite(array).all():
+            raise ConfigError(f"{self.key}: {name} must be finite, got {_first_not_finite(array)}")
+
+
+@dataclass(frozen=True)
+class _Description:
+    """The `json` member: what an episode holds beside its arrays."""
+
+    schema_version: int
+    seed: int
+    specification: dict[str, Any]
+    solver: dict[str, Any]
+    domain_size: tuple[float, float, float]
+    gravity: tuple[float, float, float]
+    frame_rate_hz: float
+    cell_size: float
+
+
+def encode_episode(episode: Episode) -> dict[str, bytes]:
+    """The members of an episode by the part of their name after `<key>.`, in the order they are stored in.
+
+    The same episode gives the same bytes on every machine: plain `.npy` (version 1.0, little-endian, C order)
+    and JSON with sorted keys.
+
+    Raises: ConfigError when positions are not finite or specification, solver cannot be written as JSON.
+    """
+    _require_finite_positions(episode)
+    members = {
+        POSITION_MEMBER: _encode_array(episode.position_TN3, "<f4"),
+        VELOCITY_MEMBER: _encode_array(episode.initial_velocity_N3, "<f4"),
+        MATERIAL_MEMBER: _encode_array(episode.material_N, "|u1"),
+        OBSTACLE_CELL_MEMBER: _encode_array(episode.obstacle_grid.cell_K3, "<i4"),
+        OBSTACLE_NORMAL_MEMBER: _encode_array(episode.obstacle_grid.normal_K3, "<f4"),
+    }
+    for name in sorted(episode.material_parameters):
+        members[f"{PARAMETER_PREFIX}{name}.npy"] = _encode_array(episode.material_parameters[name], "<f4")
+    description = {
+        "schema_version": SCHEMA_VERSION,
+        "seed": episode.seed,
+        "specification": episode.specification,
+        "solver": episode.solver,
+        "domain_size": list(episode.domain_size),
+        "gravity": list(episode.gravity),
+        "frame_rate_hz": episode.frame_rate_hz,
+        "cell_size": episode.obstacle_grid.cell_size,
+    }
+    try:
+        text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{episode.key}: specification and solver must be plain JSON (finite numbers, text, lists, mappings), "
+            f"got {error}"
+        ) from None
+    members[DESCRIPTION_MEMBER] = text.encode()
+    return members
+
+
+def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_positions: bool = True) -> Episode:
+    """The inverse of `encode_episode`.
+
+    Members are bytes or flat uint8 arrays. Arrays are views of the members, not copies: a slice of a memory map
+    stays a memory map. `scan_positions=False` leaves out the check for finite positions, for bytes whose hash was
+    checked.
+
+    Raises: ConfigError for a missing or unknown member, another schema version, a wrong shape, type or value.
+    """
+    if DESCRIPTION_MEMBER not in members:
+        raise ConfigError(f"{key}: member {DESCRIPTION_MEMBER} is missing; generate the data set again")
+    description = _decode_description(key, bytes(members[DESCRIPTION_MEMBER]))
+    arrays: dict[str, np.ndarray] = {}
+    parameters: dict[str, np.ndarray] = {}
+    formats = {
+        POSITION_MEMBER: ("<f4", 3),
+        VELOCITY_MEMBER: ("<f4", 2),
+        MATERIAL_MEMBER: ("|u1", 1),
+        OBSTACLE_CELL_MEMBER: ("<i4", 2),
+        OBSTACLE_NORMAL_MEMBER: ("<f4", 2),
+    }
+    for name, data in members.items():
+        if name in formats:
+            arrays[name] = decode_array(f"{key}.{name}", data, *formats[name])
+        elif name.startswith(PARAMETER_PREFIX) and name.endswith(".npy"):
+            parameter = name.removeprefix(PARAMETER_PREFIX).removesuffix(".npy")
+            parameters[parameter] = decode_array(f"{key}.{name}", data, "<f4", 1)
+        elif name != DESCRIPTION_MEMBER:
+            raise ConfigError(f"{key}.{name} is not a known member; known: {', '.join((*formats, 'json'))}")
+    for name in formats:
+        if name not in arrays:
+            raise ConfigError(f"{key}: member {name} is missing; generate the data set again")
+    episode = Episode(
+        key=key,
+        position_TN3=arrays[POSITION_MEMBER],
+        initial_velocity_N3=arrays[VELOCITY_MEMBER],
+        material_N=arrays[MATERIAL_MEMBER],
+        obstacle_grid=ObstacleGrid(
+            cell_size=description.cell_size,
+            cell_K3=arrays[OBSTACLE_CELL_MEMBER],
+            normal_K3=arrays[OBSTACLE_NORMAL_MEMBER],
+        ),
+        domain_size=description.domain_size,
+        gravity=description.gravity,
+        frame_rate_hz=description.frame_rate_hz,
+        seed=description.seed,
+        specification=description.specification,
+        solver=description.solver,
+        material_parameters=parameters,
+    )
+    if scan_positions:
+        _require_finite_positions(episode)
+    return episode
+
+
+def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: int) -> np.ndarray:
+    """The array in a plain `.npy` file held in memory (bytes or a flat uint8 array), as a view of it.
+
+    Raises: ConfigError naming the member when it is no such file, of another type or number of dimensions, cut, or
+    longer than its header says.
+    """
+    raw = np.frombuffer(data, dtype=np.uint8) if isinstance(data, bytes) else data
+    head = io.BytesIO(raw[:4096].tobytes())
+    try:
+        if np.lib.format.read_magic(head) != (1, 0):
+            raise ValueError("not version 1.0")
+        shape, fortran_order, found = np.lib.format.read_array_header_1_0(head)
+    except (ValueError, EOFError, OSError) as error:
+        raise ConfigError(f"{name} must be a plain .npy file, got {error}") from None
+    if found != np.dtype(dtype) or fortran_order:
+        order = ", Fortran order" if fortran_order else ""
+        raise ConfigError(f"{name} must be of type {dtype} in C order, got {found.str}{order}")
+    if len(shape) != dimensions:
+        raise ConfigError(f"{name} must have {dimensions} dimensions, got shape {shape}")
+    start, size = head.tell(), math.prod(shape) * found.itemsize
+    if len(raw) - start != size:
+        raise ConfigError(f"{name} must hold {size} bytes for shape {shape}, got {len(raw) - start}")
+    return raw[start:].view(found).reshape(shape)
+
+
+def _decode_description(key: str, text: bytes) -> _Description:
+    try:
+        mapping = json.loads(text)
+    except ValueError as error:
+        raise ConfigError(f"{key}.json must be JSON, got {error}") from None
+    require_schema_version(mapping, f"{key}.json")
+    return from_mapping(_Description, mapping, f"{key}.json")
+
+
+def require_schema_version(mapping: object, name: str) -> None:
+    """Raises ConfigError unless `mapping["schema_version"]` is this version's, before anything else is looked at."""
+    found = mapping.get("schema_version") if isinstance(mapping, Mapping) else None
+    if found != SCHEMA_VERSION:
+        raise ConfigError(
+            f"{name}: schema_version must be {SCHEMA_VERSION}, got {found!r}; generate the data set again with this "
+            "version, or use the version that made it"
+        )
+
+
+def _require_finite_positions(episode: Episode) -> None:
+    # frame by frame, so that a memory map is not read whole
+    for frame, position_N3 in enumerate(episode.position_TN3):
+        if not np.isfinite(position_N3).all():
+            raise ConfigError(
+                f"{episode.key}: position must be finite, got {_first_not_finite(position_N3)} in frame {frame}"
+            )
+
+
+def _first_not_finite(array: np.ndarray) -> str:
+    at = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+    return f"{array[at]} at {list(at)}"
+
+
+def _encode_array(array: np.ndarray, dtype: str) -> bytes:
+    buffer = io.BytesIO()
+    plain = np.ascontiguousarray(np.asarray(array), dtype=dtype)
+    np.lib.format.write_array(buffer, plain, version=(1, 0), allow_pickle=False)
+    return buffer.getvalue()

@@ -1,0 +1,92 @@
+"""Mean and spread of velocity and acceleration, mergeable episode by episode and shard by shard.
+
+In frame units, as the network sees them: v^n = x^n - x^(n-1), a^n = v^(n+1) - v^n.
+Shape legend: T frames, N particles.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Count, mean and sum of squared deviations of 3-vectors, per axis, in float64.
+
+    Merging follows Chan, Golub, LeVeque (1979), which loses no digits where the mean is far from zero.
+    """
+
+    count: int = 0
+    mean: Vector = (0.0, 0.0, 0.0)
+    squared_deviation: Vector = (0.0, 0.0, 0.0)
+
+    @staticmethod
+    def of(values: np.ndarray) -> Moments:
+        """The moments of an array [..., 3]."""
+        flat = np.asarray(values, dtype=np.float64).reshape(-1, 3)
+        if not len(flat):
+            return Moments()
+        mean = flat.mean(axis=0)
+        return Moments(len(flat), _vector(mean), _vector(((flat - mean) ** 2).sum(axis=0)))
+
+    def merge(self, other: Moments) -> Moments:
+        """The moments of both sets of values together."""
+        if self.count == 0 or other.count == 0:
+            return other if self.count == 0 else self
+        count = self.count + other.count
+        mean, delta = np.array(self.mean), np.array(other.mean) - np.array(self.mean)
+        deviation = np.array(self.squared_deviation) + np.array(other.squared_deviation)
+        return Moments(
+            count,
+            _vector(mean + delta * (other.count / count)),
+            _vector(deviation + delta**2 * (self.count * other.count / count)),
+        )
+
+    @property
+    def std(self) -> Vector:
+        """Per axis, of the values themselves (divided by the count); zero where there are none."""
+        return _vector(np.sqrt(np.array(self.squared_deviation) / max(self.count, 1)))
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Velocity and acceleration in frame units (domain units per frame, per frame squared)."""
+
+    velocity: Moments = Moments()
+    acceleration: Moments = Moments()
+
+    def merge(self, other: Statistics) -> Statistics:
+        return Statistics(self.velocity.merge(other.velocity), self.acceleration.merge(other.acceleration))
+
+
+def episode_statistics(position_TN3: np.ndarray) -> Statistics:
+    """The statistics of one trajectory. Differences are taken in float64; frame by frame, so that memory stays
+    bounded and the result does not depend on how the caller cuts a data set into shards.
+    """
+    statistics = Statistics()
+    previous: np.ndarray | None = None
+    for before_N3, after_N3 in itertools.pairwise(position_TN3):
+        velocity_N3 = np.asarray(after_N3, np.float64) - np.asarray(before_N3, np.float64)
+        acceleration = Moments() if previous is None else Moments.of(velocity_N3 - previous)
+        statistics = statistics.merge(Statistics(Moments.of(velocity_N3), acceleration))
+        previous = velocity_N3
+    return statistics
+
+
+def merge_statistics(parts: Iterable[Statistics]) -> Statistics:
+    """All parts together, merged in the order given."""
+    total = Statistics()
+    for part in parts:
+        total = total.merge(part)
+    return total
+
+
+def _vector(values: np.ndarray) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

@@ -1,0 +1,221 @@
+"""The episode codec: nothing is lost, the same input gives the same bytes, and every fault is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hgn.scene.episode import SCHEMA_VERSION, Episode, decode_episode, encode_episode
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.schema import ConfigError
+
+
+def make_episode(frames: int = 4, particles: int = 5, cells: int = 3, seed: int = 0, **changes: Any) -> Episode:
+    generator = np.random.default_rng(seed)
+    normal_K3 = generator.normal(size=(cells, 3))
+    values: dict[str, Any] = {
+        "key": "train-000012",
+        "position_TN3": generator.random((frames, particles, 3)).astype(np.float32),
+        "initial_velocity_N3": generator.normal(size=(particles, 3)).astype(np.float32),
+        "material_N": generator.integers(0, 3, particles).astype(np.uint8),
+        "obstacle_grid": ObstacleGrid(
+            cell_size=1 / 64,
+            cell_K3=np.stack([np.arange(cells)] * 3, axis=1).astype(np.int32),
+            normal_K3=(normal_K3 / np.linalg.norm(normal_K3, axis=1, keepdims=True)).astype(np.float32),
+        ),
+        "domain_size": (1.0, 2.0, 1.0),
+        "gravity": (0.0, -9.8, 0.0),
+        "frame_rate_hz": 60.0,
+        "seed": 2**62 + 7,
+        "specification": {"groups": [{"shape": "cube", "centre": [0.1, 0.2, 0.3]}]},
+        "solver": {"substeps": 1234, "projections": 0},
+    }
+    return Episode(**(values | changes))
+
+
+def assert_same(left: Episode, right: Episode) -> None:
+    for field in dataclasses.fields(Episode):
+        one, other = getattr(left, field.name), getattr(right, field.name)
+        if isinstance(one, np.ndarray):
+            assert one.dtype == other.dtype and np.array_equal(one, other), field.name
+        elif field.name == "obstacle_grid":
+            assert one.cell_size == other.cell_size
+            assert np.array_equal(one.cell_K3, other.cell_K3) and np.array_equal(one.normal_K3, other.normal_K3)
+        elif field.name == "material_parameters":
+            assert one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+        else:
+            assert one == other, field.name
+
+
+@settings(max_examples=25, deadline=None)
+@given(frames=st.integers(1, 4), particles=st.integers(0, 9), cells=st.integers(0, 4), seed=st.integers(0, 2**32))
+def test_roundtrip(frames: int, particles: int, cells: int, seed: int) -> None:
+    """Decoding returns every field bitwise, for any sizes, an empty scene and no obstacles included."""
+    episode = make_episode(frames, particles, cells, seed)
+    assert_same(episode, decode_episode(episode.key, encode_episode(episode)))
+
+
+def test_material_parameters_roundtrip() -> None:
+    """Per-particle material parameters are stored under their names."""
+    stiffness = np.linspace(1, 2, 5, dtype=np.float32)
+    episode = make_episode(material_parameters={"youngs_modulus": stiffness})
+    members = encode_episode(episode)
+    assert "parameter_youngs_modulus.npy" in members
+    assert_same(episode, decode_episode(episode.key, members))
+
+
+def test_bytes_are_a_function_of_the_content() -> None:
+    """Memory layout and key order of the input leave no trace in the stored bytes."""
+    episode = make_episode()
+    other = dataclasses.replace(
+        episode,
+        position_TN3=np.asfortranarray(episode.position_TN3),
+        solver=dict(reversed(episode.solver.items())),
+    )
+    assert encode_episode(episode) == encode_episode(other)
+
+
+def test_members_are_readable_with_numpy_and_json_alone() -> None:
+    """No member needs this project to be read."""
+    episode = make_episode()
+    members = encode_episode(episode)
+    position = np.load(io.BytesIO(members["position.npy"]), allow_pickle=False)
+    assert np.array_equal(position, episode.position_TN3)
+    assert json.loads(members["json"])["seed"] == episode.seed
+
+
+def test_decoding_flat_arrays_makes_views() -> None:
+    """Members given as arrays are not copied, so that a memory map stays one."""
+    episode = make_episode()
+    members = {name: np.frombuffer(data, np.uint8) for name, data in encode_episode(episode).items()}
+    decoded = decode_episode(episode.key, members)
+    assert np.shares_memory(decoded.position_TN3, members["position.npy"])
+    assert not decoded.position_TN3.flags.writeable
+
+
+BROKEN_FIELDS: list[tuple[dict[str, Any], str]] = [
+    ({"key": "train.000012"}, "key must be letters"),
+    ({"key": ""}, "key must be letters"),
+    ({"position_TN3": np.zeros((0, 5, 3), np.float32)}, "position must have shape"),
+    ({"position_TN3": np.zeros((4, 5), np.float32)}, "position must have shape"),
+    ({"position_TN3": np.zeros((4, 5, 3))}, "position must be of type float32, got float64"),
+    ({"initial_velocity_N3": np.zeros((4, 3), np.float32)}, "velocity must have shape"),
+    ({"initial_velocity_N3": np.full((5, 3), np.nan, np.float32)}, "velocity must be finite, got nan at"),
+    ({"material_N": np.zeros(5, np.int64)}, "material must be of type uint8"),
+    ({"material_N": np.full(5, 3, np.uint8)}, "material must be below 3, got 3"),
+    ({"frame_rate_hz": float("nan")}, "frame_rate_hz must be a finite number > 0"),
+    ({"domain_size": (1.0, 0.0, 1.0)}, "domain_size must be finite and > 0"),
+    ({"gravity": (0.0, float("inf"), 0.0)}, "gravity must be finite"),
+    ({"material_parameters": {"e": np.zeros(4, np.float32)}}, "parameter_e must have shape"),
+    ({"material_parameters": {"a.b": np.zeros(5, np.float32)}}, "parameter names must be"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BROKEN_FIELDS)
+def test_wrong_fields_are_refused(changes: dict[str, Any], message: str) -> None:
+    """An episode with a wrong shape, type or value cannot be made, and the message names the field."""
+    with pytest.raises(ConfigError, match=message):
+        make_episode(**changes)
+
+
+def test_wrong_obstacle_grid_is_refused() -> None:
+    """Cells and normals must agree in number and type."""
+    cells = np.zeros((3, 3), np.int32)
+    with pytest.raises(ConfigError, match="obstacle_normal must have shape"):
+        make_episode(obstacle_grid=ObstacleGrid(1 / 64, cells, np.zeros((2, 3), np.float32)))
+    with pytest.raises(ConfigError, match="obstacle_cell must be of type int32"):
+        make_episode(obstacle_grid=ObstacleGrid(1 / 64, cells.astype(np.int64), np.zeros((3, 3), np.float32)))
+    with pytest.raises(ConfigError, match="cell_size must be a finite number"):
+        make_episode(obstacle_grid=ObstacleGrid(0.0, cells, np.zeros((3, 3), np.float32)))
+
+
+def test_positions_that_are_not_finite_are_refused_both_ways() -> None:
+    """Neither writing nor reading lets a NaN through, and the message names frame and particle."""
+    episode = make_episode()
+    members = encode_episode(episode)
+    position = episode.position_TN3.copy()
+    position[2, 3, 1] = np.nan
+    with pytest.raises(ConfigError, match=r"position must be finite, got nan at \[3, 1\] in frame 2"):
+        encode_episode(dataclasses.replace(episode, position_TN3=position))
+    with pytest.raises(ConfigError, match="position must be finite"):
+        decode_episode(episode.key, members | {"position.npy": npy(position)})
+
+
+@pytest.mark.parametrize("solver", [{"x": float("nan")}, {"x": np.int64(3)}, {"x": {1, 2}}])
+def test_what_is_not_json_is_refused(solver: dict[str, Any]) -> None:
+    """Solver counters and specifications are plain JSON; a NaN would not be readable elsewhere."""
+    with pytest.raises(ConfigError, match="must be plain JSON"):
+        encode_episode(make_episode(solver=solver))
+
+
+def npy(array: np.ndarray, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, array, **options)
+    return buffer.getvalue()
+
+
+def description(**changes: Any) -> bytes:
+    mapping = json.loads(encode_episode(make_episode())["json"]) | changes
+    return json.dumps({key: value for key, value in mapping.items() if value is not None}).encode()
+
+
+BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
+    ({"json": None}, "member json is missing"),
+    ({"position.npy": None}, "member position.npy is missing"),
+    ({"colour.npy": npy(np.zeros(5))}, "train-000012.colour.npy is not a known member"),
+    ({"json": b"{"}, "train-000012.json must be JSON"),
+    ({"json": b"[]"}, "schema_version must be 1, got None"),
+    (
+        {"json": description(schema_version=SCHEMA_VERSION + 1)},
+        "schema_version must be 1, got 2; generate .* or use the version that made it",
+    ),
+    ({"json": description(seed=None)}, "train-000012.json.seed is missing"),
+    ({"json": description(colour=3)}, "train-000012.json.colour is not a known key"),
+    ({"json": description(gravity=[0.0, 1.0])}, "gravity must be a list of 3 values"),
+    ({"position.npy": b""}, "position.npy must be a plain .npy file"),
+    ({"position.npy": b"PK\x03\x04 zip"}, "position.npy must be a plain .npy file"),
+    (
+        {"position.npy": npy(np.zeros((4, 5, 3), np.float32))[:-1]},
+        "position.npy must hold 240 bytes .*, got 239",
+    ),
+    (
+        {"position.npy": npy(np.zeros((4, 5, 3), np.float32)) + b"x"},
+        "position.npy must hold 240 bytes .*, got 241",
+    ),
+    ({"position.npy": npy(np.zeros((4, 5, 3)))}, "position.npy must be of type <f4 in C order, got <f8"),
+    ({"position.npy": npy(np.zeros((4, 5, 3), np.float32, order="F"))}, "got <f4, Fortran order"),
+    ({"position.npy": npy(np.zeros((4, 15), np.float32))}, "position.npy must have 3 dimensions"),
+    ({"velocity.npy": npy(np.zeros((5, 3), np.float32), version=(2, 0))}, "not version 1.0"),
+]
+
+
+@pytest.mark.filterwarnings("ignore:Stored array in format 2.0")
+@pytest.mark.parametrize(("changes", "message"), BROKEN_MEMBERS)
+def test_wrong_members_are_refused(changes: dict[str, bytes | None], message: str) -> None:
+    """A missing, foreign, cut or altered member ends in one message that names it."""
+    members: dict[str, bytes | None] = dict(encode_episode(make_episode())) | changes
+    with pytest.raises(ConfigError, match=message):
+        decode_episode("train-000012", {name: data for name, data in members.items() if data is not None})
+
+
+class Bomb:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (pytest.fail, ("a pickle was loaded",))
+
+
+def test_nothing_is_unpickled() -> None:
+    """A member with a pickled object is refused without loading it."""
+    members = encode_episode(make_episode())
+    header = npy(np.array([None] * 5, dtype=object), allow_pickle=True)
+    start = header.index(b"\n") + 1
+    for data in (header[:start] + pickle.dumps(Bomb()), pickle.dumps(Bomb())):
+        with pytest.raises(ConfigError, match=r"material\.npy must be"):
+            decode_episode("train-000012", members | {"material.npy": data})
