@@ -1,0 +1,50 @@
+"""Rotations and placements of points by plain sums and products, so that results do not depend on a BLAS."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+_QUARTER_TURNS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
+
+
+def quaternion_rotation(quaternion: tuple[float, float, float, float]) -> np.ndarray:
+    """The rotation matrix, float64 [3, 3], of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def euler_rotation(degrees: tuple[float, float, float]) -> np.ndarray:
+    """The matrix, float64 [3, 3], that turns about the fixed x axis, then y, then z.
+
+    Quarter turns are exact: an axis-aligned mesh stays axis-aligned.
+    """
+    matrix = np.eye(3)
+    for axis, angle in enumerate(degrees):
+        reduced = math.fmod(angle, 360.0) % 360.0
+        radians = math.radians(reduced)
+        cosine, sine = _QUARTER_TURNS.get(reduced, (math.cos(radians), math.sin(radians)))
+        turn = np.eye(3)
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        turn[first, first], turn[first, second] = cosine, -sine
+        turn[second, first], turn[second, second] = sine, cosine
+        matrix = rotate(matrix.T, turn).T  # turn times matrix: rotate() takes the columns as points
+    return matrix
+
+
+def rotate(point_P3: np.ndarray, rotation_33: np.ndarray) -> np.ndarray:
+    """Each row multiplied by the matrix from the left, float64 [P, 3]."""
+    x, y, z = point_P3[:, 0], point_P3[:, 1], point_P3[:, 2]
+    return np.stack([row[0] * x + row[1] * y + row[2] * z for row in rotation_33], axis=1)
+
+
+def round_to_float32(point_P3: np.ndarray) -> np.ndarray:
+    """float64 values that float32 holds exactly: last-bit differences between maths libraries vanish."""
+    return point_P3.astype(np.float32).astype(np.float64)

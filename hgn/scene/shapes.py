@@ -1,0 +1,114 @@
+"""The five obstacles of the paper (sec. 3.3) as small triangle meshes.
+
+Half box and half sphere are bowls without a lid, the square is a sheet; cone and pyramid are closed and
+oriented outwards. The open sides and the tips point along +y before rotation.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+
+from hgn.scene.rotation import rotate, round_to_float32
+from hgn.scene.scene import Obstacle
+
+CLOSED_SHAPES = frozenset({"cone", "pyramid"})
+SEGMENTS = 32  # around a cone
+SPHERE_SEGMENTS, SPHERE_RINGS = 24, 6  # facets stay within 0.9 % of the radius of the true sphere
+
+
+def shape_obstacle(
+    shape: str,
+    size: float,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    rotation_33: np.ndarray | None = None,
+    name: str | None = None,
+) -> Obstacle:
+    """One obstacle of a known shape, with the middle of its unrotated bounding box at `position`.
+
+    `size` in domain units is the side of the square and of the half box (which is half as high), the diameter
+    of the half sphere, the base width and the height of cone and pyramid. Vertices are rounded to float32.
+
+    Raises: KeyError for a shape that is not one of hgn.config.OBSTACLE_SHAPES.
+    """
+    vertex, triangle = unit_shape(shape)
+    scaled = size * vertex
+    turned = scaled if rotation_33 is None else rotate(scaled, rotation_33)
+    placed = round_to_float32(turned + np.array(position, np.float64))
+    return Obstacle(name or shape, placed, triangle, shape in CLOSED_SHAPES)
+
+
+@functools.cache
+def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices, float64 [V, 3], of the shape of size 1 about the origin, and triangles, int32 [F, 3]."""
+    vertex, triangle = _BUILDERS[shape]()
+    vertex_V3 = round_to_float32(np.array(vertex, np.float64))
+    triangle_F3 = np.array(triangle, np.int32)
+    vertex_V3.setflags(write=False)
+    triangle_F3.setflags(write=False)
+    return vertex_V3, triangle_F3
+
+
+Mesh = tuple[list[tuple[float, float, float]], list[tuple[int, int, int]]]
+
+
+def _square() -> Mesh:
+    vertex = [(-0.5, 0.0, -0.5), (-0.5, 0.0, 0.5), (0.5, 0.0, 0.5), (0.5, 0.0, -0.5)]
+    return vertex, [(0, 1, 2), (0, 2, 3)]
+
+
+def _half_box() -> Mesh:
+    ring = [(-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5)]
+    vertex = [(x, y, z) for y in (-0.25, 0.25) for x, z in ring]
+    triangle = [(0, 2, 1), (0, 3, 2)]
+    for i in range(4):
+        j = (i + 1) % 4
+        triangle += [(i, j, j + 4), (i, j + 4, i + 4)]
+    return vertex, triangle
+
+
+def _half_sphere() -> Mesh:
+    vertex = [(0.0, -0.25, 0.0)]
+    for ring in range(1, SPHERE_RINGS + 1):
+        polar = 0.5 * math.pi * ring / SPHERE_RINGS
+        height, radius = 0.25 - 0.5 * math.cos(polar), 0.5 * math.sin(polar)
+        vertex += [(radius * x, height, radius * z) for x, z in _circle(SPHERE_SEGMENTS)]
+    triangle = []
+    for i in range(SPHERE_SEGMENTS):
+        j = (i + 1) % SPHERE_SEGMENTS
+        triangle.append((0, 1 + i, 1 + j))
+        for ring in range(SPHERE_RINGS - 1):
+            lower, upper = 1 + ring * SPHERE_SEGMENTS, 1 + (ring + 1) * SPHERE_SEGMENTS
+            triangle += [(lower + i, upper + i, upper + j), (lower + i, upper + j, lower + j)]
+    return vertex, triangle
+
+
+def _cone() -> Mesh:
+    vertex = [(0.0, 0.5, 0.0), (0.0, -0.5, 0.0)]
+    vertex += [(0.5 * x, -0.5, 0.5 * z) for x, z in _circle(SEGMENTS)]
+    triangle = []
+    for i in range(SEGMENTS):
+        j = (i + 1) % SEGMENTS
+        triangle += [(0, 2 + j, 2 + i), (1, 2 + i, 2 + j)]
+    return vertex, triangle
+
+
+def _pyramid() -> Mesh:
+    vertex = [(0.0, 0.5, 0.0), (-0.5, -0.5, -0.5), (-0.5, -0.5, 0.5), (0.5, -0.5, 0.5), (0.5, -0.5, -0.5)]
+    return vertex, [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 3, 2), (1, 4, 3)]
+
+
+def _circle(segments: int) -> list[tuple[float, float]]:
+    angles = (2 * math.pi * i / segments for i in range(segments))
+    return [(math.cos(angle), math.sin(angle)) for angle in angles]
+
+
+_BUILDERS = {
+    "half_box": _half_box,
+    "square": _square,
+    "half_sphere": _half_sphere,
+    "cone": _cone,
+    "pyramid": _pyramid,
+}

@@ -1,0 +1,128 @@
+"""Points on triangle surfaces: Poisson-disk samples, and splitting of long triangles.
+
+Shape legend: V vertices, F triangles, S samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hgn.schema import ConfigError
+
+CANDIDATES = 1.0  # per spacing^2 and round; a dense Poisson-disk set holds about 0.7
+MINIMUM_ROUNDS, MAXIMUM_ROUNDS = 4, 12
+SETTLED = 0.02  # rounds end when one adds less than this fraction
+MINIMUM_CANDIDATES = 64
+MAXIMUM_SAMPLES = 5_000_000
+
+
+def sample_surface(
+    vertex_V3: np.ndarray, triangle_F3: np.ndarray, spacing: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Random surface points, no two closer than `spacing` (Paper sec. 3: Poisson disks).
+
+    Returns float64 [S, 3] and the triangle of each, int64 [S]. Candidates are drawn by area, slivers narrower
+    than about the spacing by length, and kept unless too near to an earlier one, in rounds until nearly
+    nothing is added. Zero-area triangles get no samples. The result follows from the state of `rng`.
+
+    Raises: ConfigError when the surface is too large for the spacing.
+    """
+    corner = np.asarray(vertex_V3, np.float64).reshape(-1, 3)[np.asarray(triangle_F3).reshape(-1, 3)]
+    weight = _weights(corner, spacing)
+    usable = np.flatnonzero(weight > 0)
+    running = np.cumsum(weight[usable])
+    if len(usable) == 0:
+        return np.zeros((0, 3)), np.zeros(0, np.int64)
+    expected = CANDIDATES * running[-1] / (spacing * spacing)
+    if not expected < MAXIMUM_SAMPLES:
+        raise ConfigError(
+            f"obstacle surface must need fewer than {MAXIMUM_SAMPLES} samples at spacing {spacing:g}, got "
+            f"{expected:.3g}; scale the mesh down, cut away what lies outside the domain, or raise cell_size"
+        )
+    candidate_count = int(expected) + MINIMUM_CANDIDATES
+    points, owners = np.zeros((0, 3)), np.zeros(0, np.int64)
+    for round_index in range(MAXIMUM_ROUNDS):
+        chosen = np.searchsorted(running, rng.random(candidate_count) * running[-1], side="right")
+        owner = usable[np.minimum(chosen, len(usable) - 1)]
+        point = _uniform_in_triangles(corner[owner], rng)
+        if len(points):
+            near = cKDTree(points).query(point, distance_upper_bound=spacing)[0]
+            free = near >= spacing  # infinite where nothing is nearer
+            point, owner = point[free], owner[free]
+        kept = _spread_out(point, spacing)
+        points = np.concatenate([points, point[kept]])
+        owners = np.concatenate([owners, owner[kept]])
+        if round_index + 1 >= MINIMUM_ROUNDS and len(kept) < SETTLED * len(points):
+            break
+    return points, owners
+
+
+def split_long_edges(
+    corner_F33: np.ndarray, longest: float, box: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bisects triangles at their longest edge until no edge exceeds `longest`.
+
+    Returns corners, float64 [F', 3, 3], and the index of the triangle that each came from, int64 [F'].
+    With `box` (lowest and highest corner) pieces whose bounding box misses it are dropped.
+    """
+    corner = np.asarray(corner_F33, np.float64)
+    source = np.arange(len(corner))
+    done_corner, done_source = [corner[:0]], [source[:0]]
+    while len(corner):
+        if box is not None:
+            touches = ((corner.max(axis=1) >= box[0]) & (corner.min(axis=1) <= box[1])).all(axis=1)
+            corner, source = corner[touches], source[touches]
+        edge = np.roll(corner, -1, axis=1) - corner
+        length_square = (edge * edge).sum(axis=2)
+        short = ~(length_square > longest * longest).any(axis=1)
+        done_corner.append(corner[short])
+        done_source.append(source[short])
+        corner, source = corner[~short], source[~short]
+        start = length_square[~short].argmax(axis=1)
+        rows = np.arange(len(corner))
+        a, b, c = (corner[rows, (start + i) % 3] for i in range(3))
+        middle = 0.5 * (a + b)
+        corner = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        source = np.concatenate([source, source])
+    return np.concatenate(done_corner), np.concatenate(done_source)
+
+
+def area_vectors(corner_F33: np.ndarray) -> np.ndarray:
+    """Normals with the length of the area, float64 [F, 3]."""
+    return 0.5 * np.cross(corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0])
+
+
+def _weights(corner: np.ndarray, spacing: float) -> np.ndarray:
+    area = np.sqrt((area_vectors(corner) ** 2).sum(axis=1))
+    edge = np.roll(corner, -1, axis=1) - corner
+    length = np.sqrt((edge * edge).sum(axis=2).max(axis=1, initial=0.0))
+    sliver = (area > 0) & (length > spacing) & (area < spacing * length)
+    return np.where(sliver, spacing * length, area)
+
+
+def _uniform_in_triangles(corner_S33: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    u = np.sqrt(rng.random(len(corner_S33)))[:, None]
+    v = rng.random(len(corner_S33))[:, None]
+    return (1 - u) * corner_S33[:, 0] + u * (1 - v) * corner_S33[:, 1] + u * v * corner_S33[:, 2]
+
+
+def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
+    """Indices that a loop over the points would keep, each unless it is too near to one kept before."""
+    if len(point) == 0:
+        return np.zeros(0, np.int64)
+    pair = cKDTree(point).query_pairs(spacing, output_type="ndarray").astype(np.int64)
+    earlier, later = pair.min(axis=1), pair.max(axis=1)
+    undecided = np.ones(len(point), bool)
+    kept = np.zeros(len(point), bool)
+    while undecided.any():
+        waits = np.zeros(len(point), bool)
+        waits[later] = True
+        settled = undecided & ~waits
+        kept |= settled
+        dropped = later[settled[earlier]]
+        undecided &= ~settled
+        undecided[dropped] = False
+        open_pair = undecided[earlier] & undecided[later]
+        earlier, later = earlier[open_pair], later[open_pair]
+    return np.flatnonzero(kept)
