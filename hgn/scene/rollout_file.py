@@ -15,11 +15,9 @@ Shape legend: T frames, N particles, R frames of ground truth, V vertices, F tri
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +25,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from hgn.files import sync_folder, temporary_path
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
@@ -95,10 +94,24 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
 
 
 def write_rollout(path: str | Path, rollout: Rollout) -> None:
-    """Writes `rollout` to `path`; the file appears whole or not at all, and replaces one that was there."""
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
-        _write_vtkhdf(file.create_group("VTKHDF"), rollout)
-        _write_own(file.create_group("hgn"), rollout)
+    """Writes `rollout` to `path`; the file appears whole or not at all, and replaces one that was there.
+
+    Folders are made as needed.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = temporary_path(path)
+    try:
+        with temporary.open("x+b") as raw:
+            with h5py.File(raw, "w") as file:
+                _write_vtkhdf(file.create_group("VTKHDF"), rollout)
+                _write_own(file.create_group("hgn"), rollout)
+            raw.flush()
+            os.fsync(raw.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    sync_folder(path.parent)
 
 
 def read_rollout(path: str | Path) -> Rollout:
@@ -112,9 +125,7 @@ def read_rollout(path: str | Path) -> Rollout:
     try:
         file = h5py.File(path, "r")
     except OSError as error:
-        raise ConfigError(
-            f"rollout must be a complete HDF5 file, got {path}: {error}; write it again"
-        ) from error
+        raise ConfigError(f"rollout must be a complete HDF5 file, got {path}: {error}; write it again") from error
     with file:
         _check_format(file, path)
         try:
@@ -123,27 +134,6 @@ def read_rollout(path: str | Path) -> Rollout:
             raise ConfigError(f"rollout must be complete, got {path}: {error}; write it again") from error
         except ConfigError as error:
             raise ConfigError(f"rollout must be consistent, got {path}: {error}; write it again") from error
-
-
-@contextlib.contextmanager
-def whole_file(path: str | Path) -> Iterator[Path]:
-    """Gives a temporary path beside `path`; without an exception it is flushed to disk and renamed to `path`.
-
-    Folders are made as needed. After an exception neither file is left behind or changed.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        yield temporary
-        descriptor = os.open(temporary, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
@@ -223,9 +213,7 @@ def _read(file: h5py.File) -> Rollout:
     points = vtk["Points"]
     shape = (len(count_T), len(material_N), 3)
     if points.shape != (shape[0] * shape[1], 3) or (count_T != shape[1]).any():
-        raise ConfigError(
-            f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}"
-        )
+        raise ConfigError(f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")
     obstacles = tuple(
         Obstacle(
             name=str(entry.attrs["name"]),

@@ -1,0 +1,432 @@
+"""Pictures of rollouts: a grid of frames, an animation beside the ground truth, and the error over time.
+
+Shape legend: T frames, N particles.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
+from scipy.spatial import KDTree
+
+from hgn.files import write_atomically
+from hgn.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, Stage, to_bytes
+from hgn.scene.episode import Episode
+from hgn.scene.material import MATERIALS
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.rollout_file import Rollout
+from hgn.scene.rotation import quaternion_rotation
+from hgn.scene.scene import Obstacle
+from hgn.scene.shapes import shape_obstacle
+from hgn.schema import ConfigError
+
+RADIUS_IN_SPACINGS = 0.64  # spheres that overlap a little look like a body, not like a cloud
+TEXT_COLOR = (45, 50, 60)
+FAINT_COLOR = (130, 136, 146)
+PALETTE_SAMPLES = 40_000
+Color = tuple[int, int, int]
+
+
+def draw_frame(
+    position_N3: np.ndarray,
+    material_N: np.ndarray,
+    obstacles: Sequence[Obstacle],
+    domain_size: tuple[float, float, float],
+    title: str = "",
+    size: int = 640,
+    particle_radius: float | None = None,
+) -> Image.Image:
+    """One frame as an RGB picture, `size` pixels wide; lengths in domain units.
+
+    particle_radius: none takes it from the particles' spacing. Particles that are not finite are left out.
+    """
+    radius = particle_spacing(position_N3) * RADIUS_IN_SPACINGS if particle_radius is None else particle_radius
+    panel = Stage(domain_size, obstacles, radius, size).draw(position_N3, material_N)
+    header = _header_height(size) if title else 0
+    picture = Image.new("RGB", (panel.width, panel.height + header), _background())
+    picture.paste(panel, (0, header))
+    if title:
+        _write(picture, (panel.width / 2, header / 2), title, _text_size(size))
+    return picture
+
+
+def compare_picture(rollout: Rollout, frames: Sequence[int], size: int = 360) -> Image.Image:
+    """A grid: a column each frame, the prediction above, the ground truth below where there is one.
+
+    size: width of one panel in pixels.
+
+    Raises: ConfigError when a frame lies outside the rollout.
+    """
+    check_frames(frames, rollout.frame_count)
+    stage = _stage(rollout, size)
+    rows = [("prediction", rollout.position_TN3)]
+    if rollout.reference_TN3 is not None:
+        rows.append(("ground truth", rollout.reference_TN3))
+    elif "weights" not in rollout.source:
+        rows = [("", rollout.position_TN3)]
+    width, height = stage.size
+    gap, header, footer = size // 30, _header_height(size), _header_height(size)
+    left = header if rows[0][0] else 0
+    picture = Image.new(
+        "RGB",
+        (left + len(frames) * (width + gap), header + len(rows) * (height + gap) + footer),
+        _background(),
+    )
+    for column, frame in enumerate(frames):
+        x = left + column * (width + gap)
+        seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
+        _write(picture, (x + width / 2, header / 2), seconds, _text_size(size))
+        for row, (_, position_TN3) in enumerate(rows):
+            panel = _panel(stage, position_TN3, frame, rollout.material_N)
+            picture.paste(panel, (x, header + row * (height + gap)))
+    for row, (label, _) in enumerate(rows):
+        if label:
+            strip = Image.new("RGB", (height, left), _background())
+            _write(strip, (height / 2, left / 2), label, _text_size(size))
+            picture.paste(strip.rotate(90, expand=True), (0, header + row * (height + gap)))
+    _legend(picture, picture.height - footer / 2, rollout, _text_size(size))
+    return picture
+
+
+def animate(
+    rollout: Rollout,
+    path: str | Path,
+    fps: float | None = None,
+    every: int = 3,
+    size: int = 360,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Writes a GIF of every `every`-th frame, the prediction beside the ground truth where there is one.
+
+    fps: pictures per second, none for real time; GIF counts in hundredths of a second. size: width of one
+    panel in pixels. progress: called with (pictures drawn, pictures in all).
+
+    Raises: ConfigError when fps is not in (0, 50], which viewers slow down, or every is below 1.
+    """
+    if not every >= 1:
+        raise ConfigError(f"every must be at least 1, got {every}")
+    rate = rollout.frame_rate_hz / every if fps is None else fps
+    if not 0 < rate <= 50:
+        remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / 50)}" if fps is None else "choose another fps"
+        raise ConfigError(f"fps must be in (0, 50], which GIF viewers keep, got {rate:g}; {remedy}")
+    frames = range(0, rollout.frame_count, every)
+    stage = _stage(rollout, size)
+    palette = _Palette([_animation_picture(stage, rollout, frames[i], size) for i in _spread(len(frames), 6)])
+    pictures = _animation(stage, rollout, frames, size, palette, progress)
+    buffer = io.BytesIO()
+    next(pictures).save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=pictures,
+        duration=10 * round(100 / rate),
+        loop=0,
+        disposal=1,
+        optimize=False,
+    )
+    write_picture(path, buffer.getvalue())
+
+
+def error_curve(
+    error_T: Mapping[str, np.ndarray], frame_rate_hz: float, size: tuple[int, int] = (720, 400)
+) -> Image.Image:
+    """Position error over time, one line an entry of `error_T` (as `position_error` gives it), log scale.
+
+    size in pixels.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    shown = False
+    for name, error in error_T.items():
+        seconds = np.arange(len(error)) / frame_rate_hz
+        positive = np.where(error > 0, error, np.nan)  # frame 0 agrees exactly; a log scale has no zero
+        shown |= bool(np.isfinite(positive).any())
+        if name in MATERIALS:
+            color = tuple(MATERIAL_COLORS[MATERIALS.index(name)] * (0.85 if name == "snow" else 1.0))
+            axes.plot(seconds, positive, label=name, color=color, linewidth=1.8)
+        else:
+            axes.plot(seconds, positive, label=name, color="0.2", linewidth=2.2)
+    if shown:
+        axes.set_yscale("log")
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("position MSE (squared domain units)")
+    axes.set_title("summed over axes, mean over particles", fontsize=9, color="0.4")
+    axes.grid(True, which="major", color="0.9")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, ncols=max(1, len(error_T)), loc="lower right")
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy(), "RGB")
+
+
+def position_error(rollout: Rollout) -> dict[str, np.ndarray]:
+    """Position MSE against the ground truth at each frame, float64 [T] in squared domain units.
+
+    Keys: `all`, and each material of the scene where there is more than one. Squares are summed over axes and
+    averaged over particles, up to the shorter of the two.
+
+    Raises: ConfigError when the rollout has no ground truth.
+    """
+    if rollout.reference_TN3 is None:
+        raise ConfigError("reference must be there to measure an error, got a rollout without ground truth")
+    frames = min(len(rollout.position_TN3), len(rollout.reference_TN3))
+    difference = rollout.position_TN3[:frames].astype(np.float64) - rollout.reference_TN3[:frames]
+    square_TN = (difference**2).sum(axis=2)
+    error = {"all": square_TN.mean(axis=1)}
+    present = np.unique(rollout.material_N)
+    if len(present) > 1:
+        error |= {MATERIALS[i]: square_TN[:, rollout.material_N == i].mean(axis=1) for i in present}
+    return error
+
+
+def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mapping[str, object] | None = None) -> None:
+    """Writes a PNG (or the given bytes) whole or not at all; `source` goes into the PNG's Description."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(picture, Image.Image):
+        buffer = io.BytesIO()
+        text = PngImagePlugin.PngInfo()
+        if source is not None:
+            text.add_text("Description", json.dumps(source))
+        picture.save(buffer, format="PNG", pnginfo=text, optimize=True)
+        picture = buffer.getvalue()
+    write_atomically(path, picture)
+
+
+def particle_spacing(position_N3: np.ndarray) -> float:
+    """The distance between neighbours in the bulk, in the unit of the positions.
+
+    The median distance to the third neighbour: exact on a cubic lattice, up to its corners; 11 % low for
+    random points.
+    """
+    position_N3 = position_N3[np.isfinite(position_N3).all(axis=1)]
+    if len(position_N3) < 4:
+        return 1 / 128  # the usual eight particles in a cell of 1/64
+    some = position_N3[:: max(1, len(position_N3) // 2000)]
+    return max(float(np.median(KDTree(position_N3).query(some, k=4)[0][:, 3])), 1e-6)
+
+
+def episode_rollout(episode: Episode) -> Rollout:
+    """An episode of a data set as a rollout, to draw or to export; its positions stay memory-mapped."""
+    return Rollout(
+        position_TN3=episode.position_TN3,
+        material_N=np.asarray(episode.material_N),
+        obstacles=obstacles_of_episode(episode),
+        domain_size=episode.domain_size,
+        frame_rate_hz=episode.frame_rate_hz,
+        gravity=episode.gravity,
+        cell_size=episode.obstacle_grid.cell_size,
+        source={"episode": episode.key, "seed": episode.seed, "specification": episode.specification},
+    )
+
+
+def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
+    """The meshes of an episode's obstacles, which shards do not hold.
+
+    A random scene's specification has the shape and place of each, so its meshes are built again. Of any other
+    scene (user meshes) only the obstacle cells are known: a square each.
+    """
+    if episode.specification.get("kind") != "random":
+        return cell_obstacles(episode.obstacle_grid)
+    return tuple(
+        shape_obstacle(
+            record["shape"],
+            record["size"],
+            tuple(record["position"]),
+            quaternion_rotation(tuple(record["quaternion"])),
+            f"obstacle_{index}_{record['shape']}",
+        )
+        for index, record in enumerate(episode.specification["obstacles"])
+    )
+
+
+def cell_obstacles(grid: ObstacleGrid) -> tuple[Obstacle, ...]:
+    """One square in each obstacle cell, across its normal: a stand-in where only the cells are known."""
+    if not len(grid.cell_K3):
+        return ()
+    center_K3 = (grid.cell_K3 + 0.5) * grid.cell_size
+    normal_K3 = grid.normal_K3.astype(np.float64)
+    least_K3 = np.eye(3)[np.abs(normal_K3).argmin(axis=1)]
+    side_K3 = np.cross(normal_K3, least_K3)
+    side_K3 /= np.maximum(np.linalg.norm(side_K3, axis=1, keepdims=True), 1e-12)
+    other_K3 = np.cross(normal_K3, side_K3)
+    half = 0.5 * grid.cell_size
+    corner_K43 = np.stack(
+        [center_K3 + half * (a * side_K3 + b * other_K3) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))],
+        axis=1,
+    )
+    first_K = 4 * np.arange(len(center_K3))
+    triangle_F3 = np.concatenate([np.stack((first_K, first_K + i, first_K + i + 1), axis=1) for i in (1, 2)])
+    return (Obstacle("cells", corner_K43.reshape(-1, 3), triangle_F3.astype(np.int32), closed=False),)
+
+
+def check_frames(frames: Sequence[int], frame_count: int) -> None:
+    """Raises ConfigError unless there is a frame and all lie in [0, frame_count)."""
+    if not len(frames):
+        raise ConfigError("frames must name at least one frame, got []")
+    for i, frame in enumerate(frames):
+        if not 0 <= frame < frame_count:
+            raise ConfigError(f"frames[{i}] must be in [0, {frame_count}), the frames of the rollout, got {frame}")
+
+
+def _stage(rollout: Rollout, size: int) -> Stage:
+    radius = particle_spacing(rollout.position_TN3[0]) * RADIUS_IN_SPACINGS
+    radius = min(radius, 0.03 * min(rollout.domain_size))
+    return Stage(rollout.domain_size, rollout.obstacles, radius, size)
+
+
+def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, material_N: np.ndarray) -> Image.Image:
+    if frame < len(position_TN3):
+        position_N3 = position_TN3[frame]
+        panel = stage.draw(position_N3, material_N)
+        lost = int((~np.isfinite(position_N3)).any(axis=1).sum())
+        note = f"{lost} of {len(position_N3)} particles not finite" if lost else ""
+    else:
+        panel = stage.draw(np.empty((0, 3)), material_N[:0])
+        note = f"ends after {len(position_TN3)} frames"
+    if note:
+        _write(panel, (panel.width / 2, panel.height * 0.42), note, _text_size(panel.width), FAINT_COLOR)
+    return panel
+
+
+def _animation(
+    stage: Stage,
+    rollout: Rollout,
+    frames: range,
+    size: int,
+    palette: _Palette,
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[Image.Image]:
+    for done, frame in enumerate(frames, start=1):
+        yield palette.apply(_animation_picture(stage, rollout, frame, size))
+        if progress is not None:
+            progress(done, len(frames))
+
+
+def _animation_picture(stage: Stage, rollout: Rollout, frame: int, size: int) -> Image.Image:
+    panels = [_panel(stage, rollout.position_TN3, frame, rollout.material_N)]
+    labels = ["prediction" if "weights" in rollout.source else ""]
+    if rollout.reference_TN3 is not None:
+        panels.append(_panel(stage, rollout.reference_TN3, frame, rollout.material_N))
+        labels = ["prediction", "ground truth"]
+    width, height = stage.size
+    gap, header = size // 30, _header_height(size)
+    picture = Image.new("RGB", (len(panels) * (width + gap) - gap, height + 2 * header), _background())
+    seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
+    for column, (panel, label) in enumerate(zip(panels, labels, strict=True)):
+        x = column * (width + gap)
+        picture.paste(panel, (x, header))
+        text = f"{label}   {seconds}" if label else seconds
+        _write(picture, (x + width / 2, header / 2), text, _text_size(size))
+    _legend(picture, picture.height - header / 2, rollout, _text_size(size))
+    return picture
+
+
+class _Palette:
+    """The 256 colours of an animation.
+
+    Flat colours and ramps of the materials are taken exactly; the rest is chosen by median cut, half of the
+    samples from where the pictures differ, so that few particles on a large floor still get their share.
+    """
+
+    def __init__(self, pictures: Sequence[Image.Image]) -> None:
+        stack = np.stack([np.asarray(picture) for picture in pictures])
+        moving = stack[:, (stack != stack[0]).any(axis=(0, 3))].reshape(-1, 3)
+        samples = [
+            pixels[np.linspace(0, len(pixels) - 1, PALETTE_SAMPLES).astype(np.int64)]
+            for pixels in (stack[0].reshape(-1, 3), moving)
+            if len(pixels)
+        ]
+        ramp = np.linspace(0.3, 1.0, 12)[:, None, None] * MATERIAL_COLORS
+        flat = to_bytes(np.concatenate((BACKGROUND_COLOR[None], OBSTACLE_COLOR[None], ramp.reshape(-1, 3))))
+        room = 255 - len(flat)
+        chosen = Image.fromarray(np.concatenate(samples)[None], "RGB").quantize(room).getpalette() or []
+        exact = np.concatenate((flat, [TEXT_COLOR])).astype(np.uint8)
+        self.colors = np.concatenate((exact, np.reshape(chosen, (-1, 3))[:room].astype(np.uint8)))
+        # nearest colour for the upper six bits of each channel; Pillow's own search is coarser
+        center = np.stack(np.meshgrid(*[np.arange(64) * 4 + 1.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        self.nearest = KDTree(self.colors.astype(np.float64)).query(center)[1].astype(np.uint8)
+        self.nearest[_upper_bits(exact)] = np.arange(len(exact))
+
+    def apply(self, picture: Image.Image) -> Image.Image:
+        """The picture in these colours, mode P."""
+        result = Image.fromarray(self.nearest[_upper_bits(np.asarray(picture))], "P")
+        result.putpalette(self.colors.tobytes())
+        return result
+
+
+def _upper_bits(color: np.ndarray) -> np.ndarray:
+    """The upper six bits of the three channels, as one number."""
+    bits = color.astype(np.int32) >> 2
+    return (bits[..., 0] << 12) | (bits[..., 1] << 6) | bits[..., 2]
+
+
+def _spread(count: int, wanted: int) -> list[int]:
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
+
+
+def _legend(picture: Image.Image, y: float, rollout: Rollout, text_size: int) -> None:
+    """Swatches of what is in the scene, in the middle of the line at height y."""
+    entries: list[tuple[str, np.ndarray]] = [(MATERIALS[i], MATERIAL_COLORS[i]) for i in np.unique(rollout.material_N)]
+    if rollout.obstacles:
+        entries.append(("obstacle", OBSTACLE_COLOR))
+    font = _font(text_size)
+    dot, space = 0.8 * text_size, 1.6 * text_size
+    widths = [dot + 0.5 * text_size + font.getlength(name) for name, _ in entries]
+    x = (picture.width - sum(widths) - space * (len(entries) - 1)) / 2
+    for (name, color), width in zip(entries, widths, strict=True):
+        swatch = Image.new("L", (4 * math.ceil(dot),) * 2, 0)
+        box = (0, 0, swatch.width - 1, swatch.height - 1)
+        if name == "obstacle":
+            ImageDraw.Draw(swatch).rectangle(box, fill=255)
+        else:
+            ImageDraw.Draw(swatch).ellipse(box, fill=255)
+        swatch = swatch.reduce(4)
+        place = (round(x), round(y - swatch.height / 2))
+        picture.paste(
+            tuple(to_bytes(color).tolist()), (*place, place[0] + swatch.width, place[1] + swatch.height), swatch
+        )
+        _write(picture, (x + dot + 0.5 * text_size, y), name, text_size, anchor="lm")
+        x += width + space
+
+
+def _write(
+    picture: Image.Image,
+    place: tuple[float, float],
+    text: str,
+    size: int,
+    color: Color = TEXT_COLOR,
+    anchor: str = "mm",
+) -> None:
+    ImageDraw.Draw(picture).text(place, text, font=_font(size), fill=color, anchor=anchor)
+
+
+@functools.cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which comes with matplotlib."""
+    import matplotlib
+
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+
+
+def _text_size(panel_size: int) -> int:
+    return max(9, panel_size // 26)
+
+
+def _header_height(panel_size: int) -> int:
+    return 2 * _text_size(panel_size)
+
+
+def _background() -> Color:
+    red, green, blue = to_bytes(BACKGROUND_COLOR).tolist()
+    return red, green, blue
