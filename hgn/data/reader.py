@@ -7,7 +7,7 @@ member boundary would otherwise read as fewer samples without any error.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
@@ -113,7 +113,15 @@ class EpisodeStore:
                 verify_shard(self.folder, shard)
                 # one map a shard, not one an episode: each map holds a file descriptor
                 self._maps[shard.name] = np.memmap(self.folder / shard.name, dtype=np.uint8, mode="r")
-            self._opened[index] = read_episode(self._maps[shard.name], shard.name, entry)
+            episode = read_episode(self._maps[shard.name], shard.name, entry.key, entry.members)
+            found = (episode.seed, episode.particle_count, episode.frame_count)
+            if found != (entry.seed, entry.particles, entry.frames):
+                raise ConfigError(
+                    f"{self.folder / shard.name}: {entry.key} must have seed, particles, frames "
+                    f"{(entry.seed, entry.particles, entry.frames)}, got {found}; delete manifest.json and run the "
+                    "generator again"
+                )
+            self._opened[index] = episode
         return self._opened[index]
 
 
@@ -169,25 +177,24 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_episode(shard_bytes: np.ndarray, name: str, entry: EpisodeEntry, scan_positions: bool = False) -> Episode:
+def read_episode(
+    shard_bytes: np.ndarray,
+    shard_name: str,
+    key: str,
+    located: Mapping[str, tuple[int, int]],
+    scan_positions: bool = False,
+) -> Episode:
     """One episode of a shard whose bytes (flat uint8, mapped or in memory) are given; positions stay a view of them.
 
-    Raises: ConfigError when the entry does not fit the bytes.
+    `located` gives offset and size of each member. Raises: ConfigError when it does not fit the bytes.
     """
     members: dict[str, bytes | np.ndarray] = {}
-    for member, (offset, size) in entry.members.items():
+    for member, (offset, size) in located.items():
         if offset < 0 or size < 0 or offset + size > len(shard_bytes):
             raise ConfigError(
-                f"{name}: {entry.key}.{member} must lie within {len(shard_bytes)} bytes, got offset {offset} and "
+                f"{shard_name}: {key}.{member} must lie within {len(shard_bytes)} bytes, got offset {offset} and "
                 f"{size} bytes; delete manifest.json and run the generator again"
             )
         data = shard_bytes[offset : offset + size]
         members[member] = data if member == POSITION_MEMBER else data.tobytes()
-    episode = decode_episode(entry.key, members, scan_positions)
-    found = (episode.seed, episode.particle_count, episode.frame_count)
-    if found != (entry.seed, entry.particles, entry.frames):
-        raise ConfigError(
-            f"{name}: {entry.key} must have seed, particles, frames {(entry.seed, entry.particles, entry.frames)}, "
-            f"got {found}; delete manifest.json and run the generator again"
-        )
-    return episode
+    return decode_episode(key, members, scan_positions)

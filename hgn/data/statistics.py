@@ -6,13 +6,13 @@ Shape legend: T frames, N particles.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 Vector = tuple[float, float, float]
+_BLOCK_PARTICLES = 1 << 18  # particles times frames handled at once
 
 
 @dataclass(frozen=True)
@@ -66,16 +66,21 @@ class Statistics:
 
 
 def episode_statistics(position_TN3: np.ndarray) -> Statistics:
-    """The statistics of one trajectory. Differences are taken in float64; frame by frame, so that memory stays
-    bounded and the result does not depend on how the caller cuts a data set into shards.
+    """The statistics of one trajectory.
+
+    Differences are taken in float64, over blocks of frames so that memory stays bounded; the blocks depend on the
+    number of particles alone, so the result does not depend on how a data set is cut into shards.
     """
+    frames, particles = position_TN3.shape[:2]
+    block = max(2, _BLOCK_PARTICLES // max(particles, 1))
     statistics = Statistics()
-    previous: np.ndarray | None = None
-    for before_N3, after_N3 in itertools.pairwise(position_TN3):
-        velocity_N3 = np.asarray(after_N3, np.float64) - np.asarray(before_N3, np.float64)
-        acceleration = Moments() if previous is None else Moments.of(velocity_N3 - previous)
-        statistics = statistics.merge(Statistics(Moments.of(velocity_N3), acceleration))
-        previous = velocity_N3
+    for first in range(0, frames - 1, block):
+        # the velocities that end in frames first + 1 ... first + block, and the one before them
+        start = max(first - 1, 0)
+        velocity = np.diff(np.asarray(position_TN3[start : first + block + 1], np.float64), axis=0)
+        statistics = statistics.merge(
+            Statistics(Moments.of(velocity[first - start :]), Moments.of(np.diff(velocity, axis=0)))
+        )
     return statistics
 
 

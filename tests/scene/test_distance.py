@@ -15,9 +15,7 @@ def brute_force(point: np.ndarray, triangle: np.ndarray, steps: int = 200) -> fl
     """Smallest distance to a barycentric lattice on the triangle."""
     u, v = np.meshgrid(np.linspace(0, 1, steps + 1), np.linspace(0, 1, steps + 1))
     u, v = u[u + v <= 1 + 1e-12], v[u + v <= 1 + 1e-12]
-    lattice = (
-        triangle[0] + u[:, None] * (triangle[1] - triangle[0]) + v[:, None] * (triangle[2] - triangle[0])
-    )
+    lattice = triangle[0] + u[:, None] * (triangle[1] - triangle[0]) + v[:, None] * (triangle[2] - triangle[0])
     return float(np.sqrt(((lattice - point) ** 2).sum(axis=1).min()))
 
 

@@ -102,13 +102,9 @@ def test_vtkhdf_layout(tmp_path: Path) -> None:
         assert not steps["CellOffsets"][()].any()
         for step in range(FRAMES):
             start = steps["PointOffsets"][step]
-            np.testing.assert_array_equal(
-                vtk["Points"][start : start + PARTICLES], rollout.position_TN3[step]
-            )
+            np.testing.assert_array_equal(vtk["Points"][start : start + PARTICLES], rollout.position_TN3[step])
             start = steps["PointDataOffsets/material"][step]
-            np.testing.assert_array_equal(
-                vtk["PointData/material"][start : start + PARTICLES], rollout.material_N
-            )
+            np.testing.assert_array_equal(vtk["PointData/material"][start : start + PARTICLES], rollout.material_N)
             start = steps["PointDataOffsets/velocity"][step]
             expected = frame_velocity(rollout.position_TN3, 60.0)[step]
             np.testing.assert_array_equal(vtk["PointData/velocity"][start : start + PARTICLES], expected)
@@ -118,9 +114,7 @@ def test_frame_velocity() -> None:
     """Uniform motion has the same velocity in every frame; a single frame has none."""
     speed = np.array([1.0, -2.0, 0.5], np.float32)
     position_TN3 = (np.arange(5, dtype=np.float32)[:, None, None] / 50) * speed
-    np.testing.assert_allclose(
-        frame_velocity(position_TN3, 50.0), np.broadcast_to(speed, (5, 1, 3)), rtol=1e-5
-    )
+    np.testing.assert_allclose(frame_velocity(position_TN3, 50.0), np.broadcast_to(speed, (5, 1, 3)), rtol=1e-5)
     assert not frame_velocity(position_TN3[:1], 50.0).any()
 
 

@@ -1,0 +1,116 @@
+"""What a data set consists of: keys, seeds, shard ranges and the order of work, all pure functions.
+
+An episode is the unit of simulation, a shard the unit of publication. Training may start after the first shard, so
+the first shards are small and the first validation episode comes early.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from hgn.data.manifest import SPLITS
+
+_SHARD_NAME = re.compile(rf"({'|'.join(SPLITS)})-(\d{{6,}})-(\d{{6,}})\.tar")
+_SINGLE_EPISODE_SHARDS = 5  # of validation and test
+
+
+@dataclass(frozen=True)
+class SceneTask:
+    """One scene to make and simulate."""
+
+    split: str
+    index: int
+    attempt: int  # grows when a seed turned out not to be simulable
+    seed: int
+
+    @property
+    def key(self) -> str:
+        return episode_key(self.split, self.index)
+
+
+@dataclass(frozen=True)
+class ShardRange:
+    """Episodes [first, stop) of a split."""
+
+    split: str
+    first: int
+    stop: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.split}-{self.first:06d}-{self.stop:06d}.tar"
+
+    @property
+    def indices(self) -> range:
+        return range(self.first, self.stop)
+
+
+def episode_key(split: str, index: int) -> str:
+    """The sample name of an episode; without a dot, at which WebDataset would cut it."""
+    return f"{split}-{index:06d}"
+
+
+def scene_seed(dataset_seed: int, split: str, index: int, attempt: int) -> int:
+    """The 63-bit seed of a scene; the same on every machine and in every version of Python."""
+    text = f"{dataset_seed}/{split}/{index}/{attempt}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+
+
+def parse_shard_name(name: str) -> ShardRange | None:
+    """The range that a file name stands for; None when it is no shard of ours."""
+    match = _SHARD_NAME.fullmatch(name)
+    if match is None:
+        return None
+    shard = ShardRange(match[1], int(match[2]), int(match[3]))
+    return shard if shard.name == name and shard.first < shard.stop else None
+
+
+def shard_ranges(split: str, count: int, episodes_per_shard: int) -> list[ShardRange]:
+    """The shards of a split of `count` episodes.
+
+    Training shards double from one episode up to `episodes_per_shard` (0, 1, 2, 4, 8, 16, 24, ... for 8);
+    validation and test have one episode a shard for the first five.
+    """
+    ranges, first = [], 0
+    while first < count:
+        if split == "train":
+            size = min(max(first, 1), episodes_per_shard)
+        else:
+            size = 1 if first < _SINGLE_EPISODE_SHARDS else episodes_per_shard
+        stop = min(first + size, count)
+        ranges.append(ShardRange(split, first, stop))
+        first = stop
+    return ranges
+
+
+def missing_ranges(planned: Iterable[ShardRange], present: Iterable[ShardRange]) -> list[ShardRange]:
+    """The planned shards without the episodes that are present; a shard with a hole becomes several."""
+    have = {(shard.split, index) for shard in present for index in shard.indices}
+    missing = []
+    for shard in planned:
+        first: int | None = None
+        for index in range(shard.first, shard.stop + 1):
+            wanted = index < shard.stop and (shard.split, index) not in have
+            if wanted and first is None:
+                first = index
+            elif not wanted and first is not None:
+                missing.append(ShardRange(shard.split, first, index))
+                first = None
+    return missing
+
+
+def generation_order(requested: Mapping[str, int]) -> list[tuple[str, int]]:
+    """All (split, index) in the order they are simulated: training and validation in turn until validation is done,
+    the rest of training, then test.
+    """
+    train, validation, test = (requested[split] for split in SPLITS)
+    order = []
+    for index in range(max(train, validation)):
+        if index < train:
+            order.append(("train", index))
+        if index < validation:
+            order.append(("validation", index))
+    return order + [("test", index) for index in range(test)]

@@ -1,0 +1,243 @@
+"""Local processes that make the missing episodes of a data set: scene makers in front, solvers behind.
+
+The parent hands out work, publishes shards and replaces workers that die. A scene whose worker dies is tried again,
+alone; after `maximum_attempts` it is quarantined and the next seed takes its place.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+from datagen.plan import SceneTask
+from datagen.progress import Progress
+from datagen.worker import Backend, MadeScene, Worker, start_maker, start_solver
+from datagen.writer import DatasetWriter
+from hgn.config import DatagenConfig
+from hgn.schema import ConfigError
+
+_WAIT_SECONDS = 0.2  # at most until a stop request is seen
+_GPU_SCENES_PER_LAUNCH = 64
+_GPU_FIRST_LAUNCH = 8  # small, so that training can start early
+_MAXIMUM_MAKERS = 8
+
+
+class Stopped(Exception):  # noqa: N818 - a request, not an error
+    """The run was asked to stop; what is staged is kept."""
+
+
+@dataclass(frozen=True)
+class WorkerPlan:
+    """How many processes of each kind, and how much each takes at once."""
+
+    solvers: int
+    threads: int | None  # of each solver; none on a GPU
+    makers: int
+    scenes_per_launch: int
+    first_launch: int
+    gpus: tuple[str, ...] = ()  # CUDA devices, dealt out to the solvers in turn
+
+
+def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int) -> WorkerPlan:
+    """One solver for two cores on a CPU; on GPUs one solver, with scene makers on the cores."""
+    workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
+    if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
+        launch = launch or _GPU_SCENES_PER_LAUNCH
+        makers = max(1, min(_MAXIMUM_MAKERS, cpu_count - 1))
+        return WorkerPlan(workers or 1, None, makers, launch, min(launch, _GPU_FIRST_LAUNCH), gpus)
+    solvers = workers or max(1, cpu_count // 2)
+    threads = max(1, cpu_count // solvers)
+    return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """The CUDA devices of this machine that CUDA_VISIBLE_DEVICES leaves, without starting CUDA."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    count = len(list(Path("/dev").glob("nvidia[0-9]*"))) or int(Path("/dev/dxg").exists())
+    if visible is None:
+        return tuple(str(i) for i in range(count))
+    devices = tuple(device.strip() for device in visible.split(",") if device.strip())
+    return () if count == 0 or "-1" in devices or "NoDevFiles" in devices else devices
+
+
+def available_cpus() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Pool:
+    """Makes every remaining episode of `writer` and publishes the shards."""
+
+    def __init__(
+        self,
+        config: DatagenConfig,
+        writer: DatasetWriter,
+        progress: Progress,
+        plan: WorkerPlan,
+        backend: Backend | None = None,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._config, self._writer, self._progress = config, writer, progress
+        self._plan, self._backend, self._should_stop = plan, backend or Backend(), should_stop
+        self._launched = False
+        self._deaths_in_a_row = 0
+        self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
+
+    def run(self) -> None:
+        """Returns when all is published.
+
+        Raises: Stopped; ConfigError, OSError or RuntimeError from a worker. Workers are gone in any case.
+        """
+        remaining = self._writer.remaining()
+        self._order = {item: place for place, item in enumerate(remaining)}
+        self._todo = [self._writer.task(*item) for item in remaining]
+        self._ready: list[MadeScene] = []
+        self._makers: list[Worker] = []
+        self._solvers: list[Worker] = []
+        self._progress.start(self._writer.done, self._writer.total, self._config.dataset.frames)
+        try:
+            # a solver needs seconds to start, so all start before the first scene is asked for
+            self._solvers = [self._new_solver(i) for i in range(min(self._plan.solvers, len(remaining)))]
+            self._makers = [self._new_maker() for _ in range(min(self._plan.makers, len(remaining)))]
+            while True:
+                if self._should_stop():
+                    raise Stopped
+                self._hand_out()
+                published = self._publish()
+                if not published and self._writer.complete:
+                    return
+                self._receive(0.0 if published else _WAIT_SECONDS)
+        finally:
+            for worker in (*self._makers, *self._solvers):
+                worker.kill()
+            self._progress.close()
+
+    def _new_maker(self) -> Worker:
+        return start_maker(self._config.scene, self._backend)
+
+    def _new_solver(self, number: int) -> Worker:
+        gpus = self._plan.gpus
+        gpu = gpus[number % len(gpus)] if self._plan.solvers > 1 and gpus else None
+        return start_solver(self._config, self._backend, self._plan.threads, gpu)
+
+    def _publish(self) -> bool:
+        shard = self._writer.publish_next()
+        if shard is not None:
+            self._progress.shard(shard.name, len(shard.episodes), self._writer.manifest.revision)
+        return shard is not None
+
+    def _hand_out(self) -> None:
+        for solver in self._solvers:
+            if solver.idle and (batch := self._next_batch()):
+                solver.tasks.update((made.task.key, made) for made in batch)
+                solver.give(batch)
+        ahead = 2 * self._plan.scenes_per_launch * self._plan.solvers
+        for maker in self._makers:
+            making = sum(len(other.tasks) for other in self._makers)
+            if maker.idle and self._todo and len(self._ready) + making < ahead:
+                task = self._todo.pop(0)
+                maker.tasks[task.key] = task
+                maker.give(task)
+
+    def _next_batch(self) -> list[MadeScene]:
+        """The next scenes to simulate; empty when it is better to wait for more of them."""
+        self._ready.sort(key=lambda made: self._place(made.task))
+        for made in self._ready:
+            if made.task.key in self._alone:
+                self._ready.remove(made)
+                return [made]
+        size = self._plan.scenes_per_launch if self._launched else self._plan.first_launch
+        more = self._todo or any(maker.tasks for maker in self._makers)
+        if not self._ready or (more and len(self._ready) < size):
+            return []
+        self._launched = True
+        batch, self._ready = self._ready[:size], self._ready[size:]
+        return batch
+
+    def _receive(self, timeout: float) -> None:
+        workers = {worker.connection: worker for worker in (*self._makers, *self._solvers)}
+        for connection in wait(list(workers), timeout):
+            worker = workers[connection]  # type: ignore[index]
+            try:
+                message = worker.connection.recv()
+            except (EOFError, ConnectionResetError):
+                self._replace(worker)
+            else:
+                self._handle(worker, *message)
+
+    def _handle(self, worker: Worker, kind: str, *values: Any) -> None:
+        if kind == "idle":
+            worker.idle = True
+            if worker in self._solvers:
+                self._progress.frame(self._solvers.index(worker), 0, 0)
+        elif kind == "frame":
+            self._progress.frame(self._solvers.index(worker), *values)
+        elif kind == "made":
+            (made,) = values
+            del worker.tasks[made.task.key]
+            self._ready.append(made)
+        elif kind == "staged":
+            self._accept(_task(worker.tasks.pop(values[0])))
+        elif kind == "failed":
+            key, cause = values
+            self._quarantine(_task(worker.tasks.pop(key)), cause)
+        elif kind == "config_error":
+            raise ConfigError(values[0])
+        elif kind == "os_error":
+            raise OSError(*values)
+        else:
+            raise RuntimeError(f"a worker failed:\n{values[0]}")
+
+    def _accept(self, task: SceneTask) -> None:
+        self._deaths_in_a_row = 0
+        self._writer.add_staged(task.split, task.index)
+        self._progress.episode(task.key)
+
+    def _quarantine(self, task: SceneTask, cause: str) -> None:
+        self._progress.message(f"{task.key} (seed {task.seed}) could not be simulated: {cause}; trying another seed")
+        self._alone.pop(task.key, None)
+        self._put_back(self._writer.quarantine(task, cause))
+
+    def _put_back(self, task: SceneTask) -> None:
+        self._todo.append(task)
+        self._todo.sort(key=self._place)
+
+    def _replace(self, worker: Worker) -> None:
+        cause = worker.cause_of_death()
+        self._deaths_in_a_row += 1
+        attempts = self._config.dataset.maximum_attempts
+        if self._deaths_in_a_row > 3 * attempts + self._plan.solvers:
+            raise RuntimeError(f"workers keep dying before they finish any scene, the last because {cause}")
+        self._progress.message(f"a worker died ({cause}); it is replaced and its scenes are tried again")
+        lost = list(worker.tasks.values())
+        worker.kill()
+        if worker in self._solvers:
+            number = self._solvers.index(worker)
+            self._progress.frame(number, 0, 0)
+            self._solvers[number] = self._new_solver(number)
+        else:
+            self._makers[self._makers.index(worker)] = self._new_maker()
+        for item in lost:
+            task = _task(item)
+            if isinstance(item, MadeScene) and self._writer.is_staged(task.split, task.index):
+                self._accept(task)
+                continue
+            # of several scenes any may be to blame: each is tried alone before it is counted against it
+            self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
+            if self._alone[task.key] >= attempts:
+                self._quarantine(task, cause)
+            elif isinstance(item, MadeScene):
+                self._ready.append(item)
+            else:
+                self._put_back(task)
+
+    def _place(self, task: SceneTask) -> int:
+        return self._order[task.split, task.index]
+
+
+def _task(item: SceneTask | MadeScene) -> SceneTask:
+    return item.task if isinstance(item, MadeScene) else item

@@ -1,0 +1,123 @@
+"""What a person or a program sees of a running generator."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any, TextIO
+
+from tqdm import tqdm
+
+PROGRESS_KINDS = ("bar", "json", "off")
+_SPARSE_SECONDS = 30.0  # between lines where stderr is no terminal
+
+
+class Progress:
+    """Reports nothing; the base of the others."""
+
+    def start(self, done: int, total: int, frames: int) -> None:
+        """`total` episodes of `frames` frames, of which `done` are finished already."""
+
+    def frame(self, worker: int, frame: int, scenes: int) -> None:
+        """A worker has reached `frame` in a launch of `scenes` scenes; scenes = 0 when it has none."""
+
+    def episode(self, key: str) -> None:
+        """An episode was simulated and staged."""
+
+    def shard(self, name: str, episodes: int, revision: int) -> None:
+        """A shard was published."""
+
+    def message(self, text: str) -> None:
+        """Something that a person should know: a quarantined scene, a worker that died."""
+
+    def close(self) -> None:
+        """The end, whatever its cause."""
+
+
+class BarProgress(Progress):
+    """A bar that counts simulated frames, so that it moves within a long episode; sparse lines without a terminal."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stderr
+        self._bar: tqdm | None = None
+        self._done = self._total = self._frames = 0
+        self._running: dict[int, int] = {}
+        self._last_line = 0.0
+
+    def start(self, done: int, total: int, frames: int) -> None:
+        self._done, self._total, self._frames = done, total, frames
+        if self._stream.isatty():
+            self._bar = tqdm(
+                total=total * frames, initial=done * frames, unit="frame", file=self._stream, dynamic_ncols=True
+            )
+        self._show(force=True)
+
+    def frame(self, worker: int, frame: int, scenes: int) -> None:
+        self._running[worker] = frame * scenes
+        self._show()
+
+    def episode(self, key: str) -> None:
+        self._done += 1
+        self._show()
+
+    def shard(self, name: str, episodes: int, revision: int) -> None:
+        self.message(f"published {name} ({episodes} episode{'s' if episodes > 1 else ''})")
+
+    def message(self, text: str) -> None:
+        if self._bar is not None:
+            self._bar.write(text, file=self._stream)
+        else:
+            print(text, file=self._stream, flush=True)
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def _show(self, force: bool = False) -> None:
+        frames = min(self._done * self._frames + sum(self._running.values()), self._total * self._frames)
+        text = f"episodes {self._done}/{self._total}"
+        if self._bar is not None:
+            # a launch that failed takes its frames back; tqdm moves by assignment
+            self._bar.n = frames
+            self._bar.set_description(text, refresh=False)
+            self._bar.update(0)
+            if force:
+                self._bar.refresh()
+        elif force or time.monotonic() - self._last_line > _SPARSE_SECONDS:
+            self._last_line = time.monotonic()
+            print(f"{text}, frames {frames}/{self._total * self._frames}", file=self._stream, flush=True)
+
+
+class JsonProgress(Progress):
+    """One JSON object a line on standard output, each with an `event`."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stdout
+        self._done = self._total = 0
+
+    def start(self, done: int, total: int, frames: int) -> None:
+        self._done, self._total = done, total
+        self._write("start", done=done, total=total, frames=frames)
+
+    def frame(self, worker: int, frame: int, scenes: int) -> None:
+        self._write("frame", worker=worker, frame=frame, scenes=scenes)
+
+    def episode(self, key: str) -> None:
+        self._done += 1
+        self._write("episode", key=key, done=self._done, total=self._total)
+
+    def shard(self, name: str, episodes: int, revision: int) -> None:
+        self._write("shard", name=name, episodes=episodes, revision=revision)
+
+    def message(self, text: str) -> None:
+        self._write("message", text=text)
+
+    def _write(self, event: str, **values: Any) -> None:
+        print(json.dumps({"event": event, "time_s": round(time.time(), 3), **values}), file=self._stream, flush=True)
+
+
+def make_progress(kind: str) -> Progress:
+    """The reporter for `progress=bar|json|off`."""
+    return {"bar": BarProgress, "json": JsonProgress, "off": Progress}[kind]()

@@ -1,0 +1,256 @@
+"""The processes of the pool: makers build scenes, solvers simulate them and stage the episodes.
+
+Started with `spawn` (a forked Taichi hangs). A worker ends when its parent does, and leaves signals from the
+terminal to it. Whatever goes wrong inside is sent to the parent; a worker that dies without a word is its affair too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import pkgutil
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datagen.plan import SceneTask
+from datagen.writer import stage_episode
+from hgn.config import DatagenConfig, SceneConfig
+from hgn.data.identity import dataset_identity, identity_hash, physics_settings
+from hgn.scene.episode import Episode
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.scene import Scene
+from hgn.schema import ConfigError
+
+_FRAME_REPORT_SECONDS = 0.25
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+@dataclass(frozen=True)
+class Backend:
+    """Where the functions that do the work are found, as `module:function`; resolved inside the workers alone, so
+    that the parent imports no solver.
+    """
+
+    generate_scene: str = "hgn.scene.random_scene:generate_scene"
+    build_obstacle_grid: str = "hgn.scene.obstacle_grid:build_obstacle_grid"
+    simulate: str = "datagen.mpm.solver:simulate"
+
+
+@dataclass(frozen=True)
+class MadeScene:
+    """A scene ready for the solver."""
+
+    task: SceneTask
+    scene: Scene
+    obstacle_grid: ObstacleGrid
+
+
+class Worker:
+    """The parent's end of a worker process."""
+
+    def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, child = context.Pipe()
+        self.process = context.Process(target=_run, args=(target, child, *arguments), daemon=True)
+        with _terminal_signals_blocked():
+            self.process.start()
+        child.close()
+        self.idle = True
+        self.tasks: dict[str, SceneTask | MadeScene] = {}  # what it has and has not answered for, by key
+
+    def give(self, message: object) -> None:
+        """Sends work. A worker that has died meanwhile is noticed at the next receive."""
+        self.idle = False
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send(message)
+
+    def kill(self) -> None:
+        """Ends the process at once; staged files appear whole or not at all, so nothing is half-written."""
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+    def cause_of_death(self) -> str:
+        """Why a process that closed its connection has ended."""
+        self.process.join(timeout=10)
+        code = self.process.exitcode
+        if code is not None and code < 0:
+            return f"its process was ended by {signal.Signals(-code).name}"
+        return f"its process ended with exit code {code}"
+
+
+def start_maker(config: SceneConfig, backend: Backend) -> Worker:
+    """A process that answers each SceneTask with a MadeScene, or a cause."""
+    return Worker(_make_scenes, config, backend)
+
+
+def start_solver(config: DatagenConfig, backend: Backend, threads: int | None, gpu: str | None) -> Worker:
+    """A process that simulates lists of MadeScene. `gpu` is the one CUDA device that it may see; none: as given."""
+    return Worker(_solve, config, backend, threads, gpu)
+
+
+def _run(target: Callable[..., None], connection: Connection, *arguments: Any) -> None:
+    _die_with_parent()
+    send = _Sender(connection)
+    with _errors_sent(send):
+        target(connection, send, *arguments)
+
+
+class _Sender:
+    """Sends from the main thread and from the staging thread."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._lock = connection, threading.Lock()
+
+    def __call__(self, *message: object) -> None:
+        with self._lock:
+            try:
+                self._connection.send(message)
+            except (BrokenPipeError, ConnectionResetError):
+                os._exit(0)  # the parent has gone
+
+
+@contextlib.contextmanager
+def _errors_sent(send: _Sender) -> Iterator[None]:
+    try:
+        yield
+    except ConfigError as error:
+        send("config_error", str(error))
+    except OSError as error:
+        send("os_error", error.errno, error.strerror, None if error.filename is None else str(error.filename))
+    except Exception:  # noqa: BLE001 - not swallowed: the parent stops with this text
+        send("error", traceback.format_exc())
+
+
+def _make_scenes(connection: Connection, send: _Sender, config: SceneConfig, backend: Backend) -> None:
+    generate_scene = pkgutil.resolve_name(backend.generate_scene)
+    build_obstacle_grid = pkgutil.resolve_name(backend.build_obstacle_grid)
+    for task in _received(connection):
+        try:
+            scene = generate_scene(config, task.seed)
+            grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed)
+        except ConfigError as error:  # no room for the obstacles, say: another seed may do
+            send("failed", task.key, str(error))
+        else:
+            send("made", MadeScene(task, scene, grid))
+        send("idle")
+
+
+def _solve(
+    connection: Connection,
+    send: _Sender,
+    config: DatagenConfig,
+    backend: Backend,
+    threads: int | None,
+    gpu: str | None,
+) -> None:
+    if gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+    simulate = pkgutil.resolve_name(backend.simulate)
+    dataset = config.dataset
+    config_hash = identity_hash(dataset_identity(config))
+    # one batch is staged while the next is simulated, so that a GPU does not wait for the disk
+    with ThreadPoolExecutor(max_workers=1) as stager:
+        staging: list[Future[None]] = []
+        for batch in _received(connection):
+            results = simulate(
+                [made.scene for made in batch],
+                config.mpm,
+                dataset.frames,
+                dataset.frame_rate_hz,
+                on_frame=_frame_reporter(send, len(batch)),
+                cpu_threads=threads,
+            )
+            for future in staging:
+                future.result()
+            staging = [
+                stager.submit(_stage, send, config, config_hash, made, result)
+                for made, result in zip(batch, results, strict=True)
+            ]
+            send("idle")
+
+
+def _stage(send: _Sender, config: DatagenConfig, config_hash: str, made: MadeScene, result: Any) -> None:
+    with _errors_sent(send):
+        cause = getattr(result, "cause", None)
+        if cause is not None:
+            send("failed", made.task.key, str(cause))
+            return
+        if not np.isfinite(result.position_TN3).all():
+            send("failed", made.task.key, "positions are not finite")
+            return
+        stage_episode(Path(config.dataset.folder), make_episode(made, result, config, config_hash))
+        send("staged", made.task.key)
+
+
+def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_hash: str) -> Episode:
+    """The episode of a scene and what the solver returned for it (`position_TN3`, `counters`)."""
+    return Episode(
+        key=made.task.key,
+        position_TN3=np.ascontiguousarray(result.position_TN3, np.float32),
+        initial_velocity_N3=made.scene.velocity_N3,
+        material_N=made.scene.material_N,
+        obstacle_grid=made.obstacle_grid,
+        domain_size=made.scene.domain_size,
+        gravity=made.scene.gravity,
+        frame_rate_hz=config.dataset.frame_rate_hz,
+        seed=made.task.seed,
+        specification=made.scene.specification,
+        solver={
+            "settings": physics_settings(config),
+            "counters": dict(result.counters),
+            "dataset": {"config_hash": config_hash, "attempt": made.task.attempt},
+        },
+    )
+
+
+def _frame_reporter(send: _Sender, scenes: int) -> Callable[[int], None]:
+    last = 0.0
+
+    def report(frame: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > _FRAME_REPORT_SECONDS:
+            last = time.monotonic()
+            send("frame", int(frame), scenes)
+
+    return report
+
+
+def _received(connection: Connection) -> Iterator[Any]:
+    while True:
+        try:
+            yield connection.recv()
+        except (EOFError, ConnectionResetError):
+            return
+
+
+def _die_with_parent() -> None:
+    # on Linux the kernel does it; elsewhere a worker ends when it next touches its closed pipe
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        parent = multiprocessing.parent_process()
+        if parent is None or os.getppid() != parent.pid:
+            os._exit(0)
+
+
+@contextlib.contextmanager
+def _terminal_signals_blocked() -> Iterator[None]:
+    # a child inherits the mask: Ctrl-C reaches the whole process group, and only the parent may act on it
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)

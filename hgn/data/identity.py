@@ -1,0 +1,55 @@
+"""What makes two data sets the same: everything that the trajectories depend on, and nothing else.
+
+Counts, folder, workers, device and launch size are left out, so a data set can grow, move to another machine and
+be completed there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from hgn.config import DatagenConfig
+from hgn.scene.episode import SCHEMA_VERSION
+from hgn.schema import to_mapping
+
+# of the solver's settings: where and how many at once, which no trajectory depends on beyond rounding
+_NOT_PHYSICS = ("device", "scenes_per_launch")
+
+
+def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
+    """The plain mapping that defines the episodes: scene distribution, physics, frames, rate, seed, schema."""
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "scene": to_mapping(config.scene),
+        "mpm": physics_settings(config),
+        "frames": config.dataset.frames,
+        "frame_rate_hz": config.dataset.frame_rate_hz,
+        "seed": config.dataset.seed,
+    }
+
+
+def physics_settings(config: DatagenConfig) -> dict[str, Any]:
+    """The solver's settings that trajectories depend on, as stored with each episode."""
+    return {key: value for key, value in to_mapping(config.mpm).items() if key not in _NOT_PHYSICS}
+
+
+def identity_hash(identity: Mapping[str, Any]) -> str:
+    """sha256 of the identity as canonical JSON."""
+    text = json.dumps(identity, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def identity_differences(found: Mapping[str, Any], asked: Mapping[str, Any], path: str = "") -> list[str]:
+    """One line for each key in which two identities differ: `scene.obstacle_count is 5 there, 3 is asked for`."""
+    lines = []
+    for key in sorted(found.keys() | asked.keys()):
+        name = f"{path}.{key}" if path else key
+        left, right = found.get(key, "nothing"), asked.get(key, "nothing")
+        if isinstance(left, Mapping) and isinstance(right, Mapping):
+            lines += identity_differences(left, right, name)
+        elif left != right:
+            lines.append(f"{name} is {left} there, {right} is asked for")
+    return lines

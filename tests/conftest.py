@@ -1,0 +1,85 @@
+"""Data sets made with the ballistic stand-in for the solver."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "datagen"))  # spawned workers find the stand-in by name
+
+import ballistic_solver
+
+from datagen.worker import Backend, MadeScene, make_episode
+from datagen.writer import DatasetWriter, stage_episode
+from hgn.config import DatagenConfig, DatasetConfig
+
+BALLISTIC = Backend(
+    generate_scene="ballistic_solver:generate_scene",
+    build_obstacle_grid="ballistic_solver:build_obstacle_grid",
+    simulate="ballistic_solver:simulate",
+)
+
+
+@pytest.fixture
+def backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Backend:
+    folder = tmp_path / "control"
+    folder.mkdir()
+    monkeypatch.setenv(ballistic_solver.FOLDER_VARIABLE, str(folder))
+    return BALLISTIC
+
+
+@pytest.fixture
+def control(backend: Backend, tmp_path: Path) -> Path:
+    """The folder whose files steer the stand-in."""
+    return tmp_path / "control"
+
+
+@pytest.fixture
+def make_config(tmp_path: Path) -> Callable[..., DatagenConfig]:
+    def make(**changes: Any) -> DatagenConfig:
+        values = {
+            "folder": str(tmp_path / "data"),
+            "training_scenes": 5,
+            "validation_scenes": 2,
+            "test_scenes": 1,
+            "frames": 6,
+            "workers": 1,
+        }
+        return DatagenConfig(dataset=DatasetConfig(**(values | changes)))
+
+    return make
+
+
+@pytest.fixture
+def stage(backend: Backend) -> Callable[[DatasetWriter, str, int], None]:
+    """Simulates one episode in this process and stages it."""
+
+    def run(writer: DatasetWriter, split: str, index: int) -> None:
+        config, task = writer.config, writer.task(split, index)
+        scene = ballistic_solver.generate_scene(config.scene, task.seed)
+        grid = ballistic_solver.build_obstacle_grid((), scene.cell_size, 0)
+        (result,) = ballistic_solver.simulate([scene], config.mpm, config.dataset.frames, 60.0)
+        episode = make_episode(MadeScene(task, scene, grid), result, config, writer.config_hash)
+        stage_episode(writer.folder, episode)
+        writer.add_staged(split, index)
+
+    return run
+
+
+@pytest.fixture
+def make_dataset(stage: Callable[[DatasetWriter, str, int], None]) -> Callable[[DatagenConfig], Path]:
+    """Makes a whole data set without any worker process."""
+
+    def make(config: DatagenConfig) -> Path:
+        with DatasetWriter(config) as writer:
+            for split, index in writer.remaining():
+                stage(writer, split, index)
+                while writer.publish_next():
+                    pass
+        return writer.folder
+
+    return make

@@ -1,0 +1,96 @@
+"""The manifest and the identity of a data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hgn.config import DatagenConfig
+from hgn.data.identity import dataset_identity, identity_differences, identity_hash
+from hgn.data.manifest import EpisodeEntry, Manifest, QuarantinedScene, ShardEntry
+from hgn.data.statistics import Moments, Statistics
+from hgn.schema import ConfigError
+
+
+def make_manifest() -> Manifest:
+    entry = EpisodeEntry("train-000000", 0, 2**62, 1, 4296, 300, {"position.npy": (512, 15_465_728)})
+    moments = Moments(7, (0.1, -0.2, 1e-300), (1 / 3, 0.0, 2.0))
+    shard = ShardEntry("train-000000-000001.tar", "train", 0, 1, "ab" * 32, 999, (entry,), Statistics(moments))
+    return Manifest(
+        config_hash="cd" * 32,
+        config={"scene": {"gravity": [0.0, -9.8, 0.0]}},
+        requested={"train": 1, "validation": 1, "test": 0},
+        revision=3,
+        shards=(shard,),
+        quarantined=(QuarantinedScene("train-000000", 0, 5, "diverged"),),
+    )
+
+
+def test_roundtrip(tmp_path: Path) -> None:
+    """Saving and loading returns every field, floats bitwise."""
+    make_manifest().save(tmp_path)
+    assert Manifest.load(tmp_path) == make_manifest()
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+
+
+def test_counts() -> None:
+    """A manifest knows what is published of what is requested."""
+    manifest = make_manifest()
+    assert (manifest.published("train"), manifest.published("validation")) == (1, 0)
+    assert not manifest.complete
+    assert dataclasses.replace(manifest, requested={"train": 1}).complete
+    assert manifest.statistics("train").velocity.count == 7
+    assert manifest.statistics("test") == Statistics()
+
+
+def test_missing_manifest(tmp_path: Path) -> None:
+    """A folder without a data set is named together with the command that makes one."""
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(ConfigError, match=r"manifest\.json must be the manifest .* generate one with"):
+            Manifest.load(folder)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe"])
+def test_garbled_manifest(tmp_path: Path, content: bytes) -> None:
+    """A manifest that is no JSON is refused with the remedy."""
+    (tmp_path / "manifest.json").write_bytes(content)
+    with pytest.raises(ConfigError, match=r"manifest\.json must be JSON .* delete it and run the same command again"):
+        Manifest.load(tmp_path)
+
+
+def test_wrong_manifest(tmp_path: Path) -> None:
+    """Another schema, an unknown key or a wrong type is refused by name."""
+    make_manifest().save(tmp_path)
+    path = tmp_path / "manifest.json"
+    good = json.loads(path.read_text())
+    for changes, message in (
+        ({"schema_version": 2}, "schema_version must be 1, got 2"),
+        ({"colour": 1}, "colour is not a known key"),
+        ({"revision": "3"}, "revision must be a whole number, got '3'"),
+        ({"shards": [good["shards"][0] | {"bytes": None}]}, r"shards\[0\]\.bytes must be a whole number"),
+    ):
+        path.write_text(json.dumps(good | changes))
+        with pytest.raises(ConfigError, match=message):
+            Manifest.load(tmp_path)
+
+
+def test_identity_survives_json(make_config: Callable[..., DatagenConfig]) -> None:
+    """The identity in a manifest hashes to the manifest's hash, in any key order."""
+    identity = dataset_identity(make_config())
+    reread = json.loads(json.dumps(dict(reversed(identity.items()))))
+    assert identity_hash(reread) == identity_hash(identity)
+    assert identity_differences(reread, identity) == []
+
+
+def test_differences_are_named() -> None:
+    """Keys on one side only count as differences too."""
+    lines = identity_differences({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 1, "c": 4}, "e": 5})
+    assert lines == [
+        "a.c is 2 there, 4 is asked for",
+        "d is 3 there, nothing is asked for",
+        "e is nothing there, 5 is asked for",
+    ]

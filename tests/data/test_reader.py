@@ -1,0 +1,167 @@
+"""Reading published episodes: memory-mapped, verified, and growing with the data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hgn.data.reader
+from datagen.writer import DatasetWriter, locate_members
+from hgn.config import DatagenConfig, SceneConfig
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.schema import ConfigError
+
+MakeConfig = Callable[..., DatagenConfig]
+MakeDataset = Callable[[DatagenConfig], Path]
+
+
+@pytest.fixture
+def folder(make_config: MakeConfig, make_dataset: MakeDataset) -> Path:
+    return make_dataset(make_config())
+
+
+def test_positions_are_read_only_memory_maps(folder: Path) -> None:
+    """Positions stay on disk until used; everything else is loaded."""
+    store = EpisodeStore(folder, "train")
+    assert len(store) == 5 and [entry.key for entry in store.entries] == [f"train-{i:06d}" for i in range(5)]
+    for episode, entry in zip(store.episodes, store.entries, strict=True):
+        assert isinstance(episode.position_TN3, np.memmap) and not episode.position_TN3.flags.writeable
+        assert not isinstance(episode.material_N, np.memmap)
+        assert episode.position_TN3.shape == (entry.frames, entry.particles, 3) and episode.seed == entry.seed
+        assert episode.position_TN3.ctypes.data % 64 == 0
+    assert store.episodes[-1].key == "train-000004"
+    assert [episode.key for episode in store.episodes[1:3]] == ["train-000001", "train-000002"]
+    with pytest.raises(IndexError):
+        store.episodes[5]
+
+
+def test_one_map_a_shard(folder: Path) -> None:
+    """A thousand episodes do not need a thousand open files: a shard is mapped once."""
+    store = EpisodeStore(folder, "train")
+    _ = list(store.episodes)
+    assert len(store._maps) == len(store.manifest.shards_of("train")) == 4
+    assert store.episodes[2] is store.episodes[2]
+
+
+def test_store_travels_to_workers(folder: Path) -> None:
+    """A pickled store holds no episode data and opens the same episodes on the other side."""
+    store = EpisodeStore(folder, "train")
+    _ = list(store.episodes)
+    data = pickle.dumps(store)
+    assert len(data) < 20_000
+    there = pickle.loads(data)
+    assert np.array_equal(there.episodes[3].position_TN3, store.episodes[3].position_TN3)
+
+
+def test_store_grows_with_the_dataset(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+    """Refreshing appends new episodes and keeps the places of those that were there."""
+    folder = make_dataset(make_config(training_scenes=3))
+    train, test = EpisodeStore(folder, "train"), EpisodeStore(folder, "test")
+    first = train.episodes[0]
+    assert not train.refresh()
+    make_dataset(make_config(training_scenes=9))
+    assert train.refresh() and not test.refresh()
+    assert len(train) == len(train.episodes) == 9 and train.episodes[0] is first
+    assert train.revision == Manifest.load(folder).revision
+    assert train.statistics() == Manifest.load(folder).statistics("train")
+
+
+def test_store_opens_before_the_first_episode(make_config: MakeConfig) -> None:
+    """A data set that is being made can be opened while it holds nothing yet."""
+    with DatasetWriter(make_config()) as writer:
+        assert EpisodeStore.available(writer.folder)
+        assert len(EpisodeStore(writer.folder, "train").episodes) == 0
+
+
+def test_no_dataset(tmp_path: Path) -> None:
+    """A folder without a manifest is told apart, and opening it names the remedy."""
+    assert not EpisodeStore.available(tmp_path) and not EpisodeStore.available(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match=r"manifest\.json must be the manifest of a data set"):
+        EpisodeStore(tmp_path, "train")
+
+
+def test_unknown_split(folder: Path) -> None:
+    """Only the three splits exist."""
+    with pytest.raises(ConfigError, match="split must be one of train, validation, test, got 'dev'"):
+        EpisodeStore(folder, "dev")
+
+
+def test_shard_cut_at_a_member_boundary_is_refused(folder: Path) -> None:
+    """A tar that lost its last episode still reads as a tar, and is refused by its size."""
+    shard = folder / "train-000002-000004.tar"
+    size = shard.stat().st_size
+    cut = locate_members(shard)["train-000003"]["position.npy"][0] - 512
+    os.truncate(shard, cut)
+    store = EpisodeStore(folder, "train")
+    assert store.episodes[0].key == "train-000000"
+    with pytest.raises(ConfigError, match=rf"000004\.tar must have {size} bytes, got {cut}; delete it and run"):
+        store.episodes[2]
+
+
+def test_altered_byte_is_refused(folder: Path) -> None:
+    """One flipped bit anywhere in a shard is found on first use."""
+    shard = folder / "train-000000-000001.tar"
+    content = bytearray(shard.read_bytes())
+    content[700] ^= 1
+    shard.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"must have sha256 [0-9a-f]{64}, got .* altered; delete it"):
+        EpisodeStore(folder, "train").episodes[0]
+
+
+def test_missing_shard_is_named(folder: Path) -> None:
+    """A shard that was deleted is named with the remedy."""
+    (folder / "train-000000-000001.tar").unlink()
+    with pytest.raises(ConfigError, match=r"train-000000-000001\.tar is listed .* but missing; run the generator"):
+        EpisodeStore(folder, "train").episodes[0]
+
+
+def test_shards_are_hashed_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process verifies a shard once, however many stores open it."""
+    hashed: list[str] = []
+    real = hgn.data.reader.file_sha256
+    monkeypatch.setattr(hgn.data.reader, "file_sha256", lambda path: hashed.append(path.name) or real(path))
+    for _ in range(2):
+        _ = list(EpisodeStore(folder, "train").episodes)
+    assert len(hashed) == len(set(hashed)) == 4
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": 1}, "must have seed, particles, frames"),
+        ({"members": {"position.npy": [10**9, 4]}}, "must lie within"),
+        ({"members": {"position.npy": [0, 2000]}}, "json is missing"),
+    ],
+)
+def test_manifest_that_does_not_fit_its_shard(folder: Path, changes: dict[str, object], message: str) -> None:
+    """Offsets or facts that the shard contradicts are refused, never read out of range."""
+    path = folder / "manifest.json"
+    mapping = json.loads(path.read_text())
+    mapping["shards"][0]["episodes"][0] |= changes
+    path.write_text(json.dumps(mapping))
+    with pytest.raises(ConfigError, match=message):
+        EpisodeStore(folder, "train").episodes[0]
+
+
+def test_refresh_refuses_another_dataset(
+    folder: Path, make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path
+) -> None:
+    """A folder whose data set was replaced, or lost shards, is not read on as if nothing had happened."""
+    store = EpisodeStore(folder, "train")
+    manifest = Manifest.load(folder)
+    dataclasses.replace(manifest, shards=manifest.shards[1:]).save(folder)
+    with pytest.raises(ConfigError, match="must keep the train shards already published"):
+        store.refresh()
+    other = make_config(folder=str(tmp_path / "other"))
+    made = make_dataset(dataclasses.replace(other, scene=SceneConfig(obstacle_count=1)))
+    (folder / "manifest.json").write_bytes((made / "manifest.json").read_bytes())
+    with pytest.raises(ConfigError, match="must keep holding the same data set"):
+        store.refresh()

@@ -1,0 +1,94 @@
+"""A deterministic stand-in for scenes and solver, quick enough to make whole data sets in tests.
+
+Loaded by name inside spawned workers. A file `simulated.log` in the working folder of a test records each key that
+was simulated; files named `kill-<seed>` and `fail-<seed>` there make the solver die or fail at that seed.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hgn.config import MpmConfig, SceneConfig
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.scene import Obstacle, Scene
+from hgn.schema import ConfigError
+
+FOLDER_VARIABLE = "BALLISTIC_FOLDER"
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    position_TN3: np.ndarray
+    counters: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SceneFailure:
+    cause: str
+
+
+def control(name: str) -> Path:
+    return Path(os.environ[FOLDER_VARIABLE]) / name
+
+
+def generate_scene(config: SceneConfig, seed: int) -> Scene:
+    if control(f"refuse-{seed}").exists():
+        raise ConfigError("no room for the obstacles")
+    generator = np.random.default_rng(seed)
+    count = 3 + seed % 4
+    return Scene(
+        position_N3=(0.4 + 0.2 * generator.random((count, 3))).astype(np.float32),
+        velocity_N3=generator.normal(size=(count, 3)).astype(np.float32),
+        material_N=generator.integers(0, 3, count).astype(np.uint8),
+        cell_size=config.cell_size,
+        seed=seed,
+        specification={"seed": seed},
+    )
+
+
+def build_obstacle_grid(obstacles: Sequence[Obstacle], cell_size: float, seed: int) -> ObstacleGrid:
+    return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+
+
+def simulate(
+    scenes: Sequence[Scene],
+    config: MpmConfig,
+    frames: int,
+    frame_rate_hz: float,
+    on_frame: Callable[[int], None] | None = None,
+    cpu_threads: int | None = None,
+) -> list[Simulated | SceneFailure]:
+    results: list[Simulated | SceneFailure] = []
+    for scene in scenes:
+        with control("simulated.log").open("a") as log:
+            log.write(f"{scene.seed}\n")
+        if control("slow").exists():
+            time.sleep(0.5)
+        if control("raise").exists():
+            raise RuntimeError("a fault in the solver")
+        kill = control(f"kill-{scene.seed}")
+        if kill.exists():
+            lives = int(kill.read_text())
+            if lives == 1:
+                kill.unlink()
+            else:
+                kill.write_text(str(lives - 1))
+            os.kill(os.getpid(), signal.SIGKILL)
+        if control(f"fail-{scene.seed}").exists():
+            results.append(SceneFailure("diverged in frame 3"))
+            continue
+        time_T11 = (np.arange(frames) / frame_rate_hz)[:, None, None]
+        position = scene.position_N3 + time_T11 * scene.velocity_N3 + 0.5 * time_T11**2 * np.array(scene.gravity)
+        results.append(Simulated(position.astype(np.float32), {"substeps": frames}))
+    if on_frame is not None:
+        for frame in range(frames):
+            on_frame(frame)
+    return results

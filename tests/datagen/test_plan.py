@@ -1,0 +1,116 @@
+"""Keys, seeds, shard ranges and the order of work."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from datagen.plan import (
+    ShardRange,
+    episode_key,
+    generation_order,
+    missing_ranges,
+    parse_shard_name,
+    scene_seed,
+    shard_ranges,
+)
+
+COUNTS = st.integers(0, 60)
+SPLITS = st.sampled_from(["train", "validation", "test"])
+
+
+def boundaries(split: str, count: int, size: int) -> list[int]:
+    return [shard.stop for shard in shard_ranges(split, count, size)]
+
+
+def test_training_shards_double_up_to_their_size() -> None:
+    """Training can start after one episode; later shards are of full size, the last is cut to the count."""
+    assert boundaries("train", 30, 8) == [1, 2, 4, 8, 16, 24, 30]
+    assert boundaries("train", 12, 3) == [1, 2, 4, 7, 10, 12]
+    assert boundaries("train", 3, 1) == [1, 2, 3]
+
+
+def test_first_validation_and_test_shards_are_single_episodes() -> None:
+    """Five single episodes, then full shards."""
+    for split in ("validation", "test"):
+        assert boundaries(split, 20, 8) == [1, 2, 3, 4, 5, 13, 20]
+        assert boundaries(split, 3, 8) == [1, 2, 3]
+
+
+@given(split=SPLITS, count=COUNTS, size=st.integers(1, 9))
+def test_ranges_cover_each_episode_once(split: str, count: int, size: int) -> None:
+    """Ranges partition the split in order, whatever its size."""
+    covered = [index for shard in shard_ranges(split, count, size) for index in shard.indices]
+    assert covered == list(range(count))
+
+
+@given(split=SPLITS, before=COUNTS, after=COUNTS, sizes=st.tuples(st.integers(1, 9), st.integers(1, 9)))
+def test_growth_makes_just_what_is_missing(split: str, before: int, after: int, sizes: tuple[int, int]) -> None:
+    """A data set that grows, even with another shard size, gains the new episodes once and no others."""
+    present = shard_ranges(split, before, sizes[0])
+    missing = missing_ranges(shard_ranges(split, after, sizes[1]), present)
+    assert [index for shard in missing for index in shard.indices] == list(range(before, after))
+    assert len({shard.name for shard in (*present, *missing)}) == len(present) + len(missing)
+
+
+def test_missing_ranges_split_around_holes() -> None:
+    """Only the episodes that are not there are planned, as one shard a gap."""
+    planned = [ShardRange("train", 0, 8)]
+    present = [ShardRange("train", 2, 3), ShardRange("train", 5, 6), ShardRange("test", 0, 8)]
+    gaps = [(shard.first, shard.stop) for shard in missing_ranges(planned, present)]
+    assert gaps == [(0, 2), (3, 5), (6, 8)]
+
+
+@given(train=COUNTS, validation=COUNTS, test=COUNTS)
+def test_generation_order_holds_each_episode_once(train: int, validation: int, test: int) -> None:
+    """Every episode of every split is made once; within a split in order; test comes last."""
+    order = generation_order({"train": train, "validation": validation, "test": test})
+    for split, count in (("train", train), ("validation", validation), ("test", test)):
+        assert [index for name, index in order if name == split] == list(range(count))
+    assert [name for name, _ in order[train + validation :]] == ["test"] * test
+
+
+def test_generation_starts_with_training_then_validation() -> None:
+    """A trainer can train after one episode and validate after two."""
+    order = generation_order({"train": 4, "validation": 2, "test": 1})
+    assert order == [
+        ("train", 0),
+        ("validation", 0),
+        ("train", 1),
+        ("validation", 1),
+        ("train", 2),
+        ("train", 3),
+        ("test", 0),
+    ]
+
+
+def test_seeds_are_stable_and_distinct() -> None:
+    """Seeds are 63-bit, the same for ever, and differ in data set, split, index and attempt."""
+    assert scene_seed(0, "train", 0, 0) == 9049802857590921173
+    seeds = {
+        scene_seed(seed, split, index, attempt)
+        for seed in range(3)
+        for split in ("train", "validation", "test")
+        for index in range(20)
+        for attempt in range(3)
+    }
+    assert len(seeds) == 3 * 3 * 20 * 3
+    assert all(0 <= seed < 2**63 for seed in seeds)
+
+
+@given(split=SPLITS, first=st.integers(0, 2_000_000), size=st.integers(1, 9))
+def test_shard_names_parse_back(split: str, first: int, size: int) -> None:
+    """A name tells split and range, also past six digits."""
+    shard = ShardRange(split, first, first + size)
+    assert parse_shard_name(shard.name) == shard
+
+
+def test_foreign_names_are_no_shards() -> None:
+    """Files of other people in the folder are left alone."""
+    for name in ("train-0-1.tar", "train-000001-000001.tar", "extra-000000-000001.tar", "train-000000-000001.tar.gz"):
+        assert parse_shard_name(name) is None
+
+
+def test_keys_have_no_dot() -> None:
+    """WebDataset cuts sample names at the first dot."""
+    assert episode_key("train", 12) == "train-000012"
