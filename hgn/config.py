@@ -201,3 +201,140 @@ class NetworkConfig:
     def feature_width(self) -> int:
         """Numbers per particle: velocities, obstacle normal, wall distances, embedding (paper sec. 3.1)."""
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + self.material_embedding
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a network is trained (paper sec. 3.3)."""
+
+    maximum_updates: int = 20_000_000
+    maximum_minutes: float | None = None  # wall time of this start; none: no limit
+    batch_scenes: int = 1  # frames of random scenes in one update, on each device
+    learning_rate: float = 1e-4
+    final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
+    noise_std: float = 0.000848528  # of the last velocity, domain units per frame
+    grid_jitter: bool = True
+    seed: int = 0
+    accelerator: str = "auto"  # or cpu, gpu
+    devices: int | None = None  # none: one on a CPU, all GPUs of the machine
+    nodes: int = 1
+    precision: str = "high"  # float32 matrix products: highest (float32), high (TF32 where there is one)
+    minimum_episodes: int = 1  # training starts once that many training episodes are published
+    generate: bool = True  # start the generator where the data set is missing or incomplete
+    log_every: int = 50  # updates
+    checkpoint_every: int = 1_000  # updates
+    monitor_every: int = 100_000  # updates between measurements of one-step and rollout errors
+    monitor_scenes: int = 5  # fixed scenes of each split
+    monitor_frame_stride: int = 1  # every frame
+    monitor_rollout_frames: int = 300  # 0: no rollouts
+    monitor_particles_per_batch: int = 32_768
+
+    def __post_init__(self) -> None:
+        require_positive(
+            self,
+            "maximum_updates",
+            "batch_scenes",
+            "learning_rate",
+            "final_learning_rate",
+            "nodes",
+            "minimum_episodes",
+            "log_every",
+            "checkpoint_every",
+            "monitor_every",
+            "monitor_scenes",
+            "monitor_frame_stride",
+            "monitor_particles_per_batch",
+        )
+        require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames")
+        require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
+        require_one_of(self, "precision", ("highest", "high"))
+        require(
+            self.final_learning_rate <= self.learning_rate,
+            "final_learning_rate",
+            f"at most learning_rate ({self.learning_rate})",
+            self.final_learning_rate,
+        )
+        if self.maximum_minutes is not None:
+            require_positive(self, "maximum_minutes")
+        if self.devices is not None:
+            require(self.devices >= 1, "devices", "at least 1", self.devices)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """`python -m hgn.train`: the data set it needs, the network, the training, and the run's folder."""
+
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    mpm: MpmConfig = field(default_factory=MpmConfig)
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    run: str = "runs/obstacles"
+
+    def __post_init__(self) -> None:
+        require(self.run != "", "run", "a folder name", self.run)
+        require(
+            self.network.obstacle_features or self.scene.obstacle_count == 0,
+            "network.obstacle_features",
+            "true for scenes with obstacles",
+            False,
+            "or set scene.obstacle_count=0",
+        )
+        unknown = [name for name in self.scene.materials if name not in self.network.materials]
+        require(not unknown, "network.materials", "all of scene.materials", list(self.network.materials))
+
+    @property
+    def datagen(self) -> DatagenConfig:
+        return DatagenConfig(self.scene, self.mpm, self.dataset)
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """`python -m hgn.export`."""
+
+    checkpoint: str
+    out: str
+    half: bool = False  # learned tensors as float16
+
+
+@dataclass(frozen=True)
+class RolloutConfig:
+    """`python -m hgn.rollout`: simulates a scene file, or an episode of a data set beside its truth."""
+
+    weights: str
+    out: str
+    scene: str | None = None  # a scene file
+    data: str | None = None  # or a data set …
+    episode: str | None = None  # … and the key of one of its episodes
+    frames: int = 300
+    device: str = "auto"  # or cpu, cuda, cuda:1, …
+
+    def __post_init__(self) -> None:
+        require(self.frames >= 2, "frames", "at least 2", self.frames)
+        require(
+            (self.scene is None) == (self.data is not None and self.episode is not None),
+            "scene",
+            "given, or data and episode instead",
+            self.scene,
+            "for example scene=conf/scenes/funnel.yaml, or data=data/obstacles episode=validation-000000",
+        )
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """`python -m hgn.evaluate`: one-step and rollout errors on a split of a data set."""
+
+    weights: str
+    data: str
+    split: str = "validation"
+    scenes: int = 5
+    frame_stride: int = 1
+    rollout_frames: int = 300  # 0: none
+    particles_per_batch: int = 32_768
+    device: str = "auto"
+    json: str | None = None  # also write the figures to this file
+
+    def __post_init__(self) -> None:
+        require_positive(self, "scenes", "frame_stride", "particles_per_batch")
+        require_non_negative(self, "rollout_frames")
+        require_one_of(self, "split", ("train", "validation", "test"))

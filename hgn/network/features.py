@@ -1,0 +1,91 @@
+"""Particle features (paper sec. 3.1) and their normalisation.
+
+f_i = (v^n … v^{n-m+1}, n_o, d, e): velocities in frame units, normalised per axis; the obstacle normal as it is;
+distances to the domain's six planes, clamped to d_max and divided by it; a learned embedding of the material.
+Shape legend: N particles, m velocities, S scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from hgn.network.obstacles import ObstacleCells
+from hgn.scene.material import MATERIALS
+from hgn.schema import ConfigError
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleState:
+    """What the network is told of the particles of a batch of scenes."""
+
+    position_N3: torch.Tensor  # domain units
+    velocity_NM3: torch.Tensor  # displacement per frame, newest first
+    material_N: torch.Tensor  # int64, index into the network's materials
+    scene_N: torch.Tensor  # int64, index of the particle's scene
+    domain_S3: torch.Tensor  # domain size of each scene
+    obstacles: ObstacleCells | None
+
+    @property
+    def scene_count(self) -> int:
+        return len(self.domain_S3)
+
+
+class Normaliser(nn.Module):
+    """Mean and standard deviation per axis of velocity and acceleration, in frame units.
+
+    The noise that training adds enters the standard deviations in quadrature, as in GNS (Sanchez-Gonzalez et
+    al. 2020, reference implementation).
+    """
+
+    velocity_mean: torch.Tensor
+    velocity_std: torch.Tensor
+    acceleration_mean: torch.Tensor
+    acceleration_std: torch.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        for quantity in ("velocity", "acceleration"):
+            self.register_buffer(f"{quantity}_mean", torch.zeros(3))
+            self.register_buffer(f"{quantity}_std", torch.ones(3))
+
+    def set(self, quantity: str, mean_3: torch.Tensor, std_3: torch.Tensor, noise_std: float) -> None:
+        """Sets `velocity` or `acceleration` from the data's statistics. An axis without spread keeps a tiny one."""
+        getattr(self, f"{quantity}_mean").copy_(mean_3)
+        total_3 = torch.sqrt(std_3.double() ** 2 + noise_std**2).clamp(min=1e-9)
+        getattr(self, f"{quantity}_std").copy_(total_3)
+
+    def normalise_velocity(self, velocity: torch.Tensor) -> torch.Tensor:
+        return (velocity - self.velocity_mean) / self.velocity_std
+
+    def normalise_acceleration(self, acceleration: torch.Tensor) -> torch.Tensor:
+        return (acceleration - self.acceleration_mean) / self.acceleration_std
+
+    def restore_acceleration(self, normalised: torch.Tensor) -> torch.Tensor:
+        return normalised * self.acceleration_std + self.acceleration_mean
+
+
+def wall_distances(position_N3: torch.Tensor, domain_N3: torch.Tensor, maximum: float) -> torch.Tensor:
+    """Signed distances to the lower and upper planes of the domain, clamped to ±maximum, over it, [N, 6]."""
+    distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
+    return distance_N6.clamp(-maximum, maximum) / maximum
+
+
+def material_rows(material_N: np.ndarray, materials: Sequence[str]) -> torch.Tensor:
+    """Indices into a network's material list, int64 [N], from indices into MATERIALS.
+
+    Raises: ConfigError when the network does not know a material.
+    """
+    row = [materials.index(name) if name in materials else -1 for name in MATERIALS]
+    rows_N = np.asarray(row, np.int64)[material_N]
+    if (rows_N < 0).any():
+        unknown = MATERIALS[int(material_N[rows_N < 0][0])]
+        raise ConfigError(
+            f"material must be one of the network's ({', '.join(materials)}), got {unknown}; "
+            "take weights that were trained with it"
+        )
+    return torch.from_numpy(rows_N)

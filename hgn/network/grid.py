@@ -1,0 +1,99 @@
+"""The sparse grid hierarchy (paper sec. 3.2, fig. 2 and 3), built with plain tensor operations.
+
+Cell k of the finest level spans [k, k + 1) * cell_size + origin. A cell is active if its centre has non-zero
+trilinear weight for some particle; the parent of k is floor(k / 2), active iff a child is. Edges join
+face-adjacent active cells of one level, in both directions.
+Shape legend: N particles, C cells of a level, E directed edges of a level, S scenes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from hgn.network.keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, unpack
+
+# The 8 corners of a unit cube, z fastest: the offsets of a particle's cells, and of children in a parent.
+CORNER_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
+# The 6 directions in which an edge's sender lies, seen from its receiver.
+DIRECTION_63 = torch.tensor([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+
+
+class GridRangeError(ValueError):
+    """A particle is not finite, or too far from the origin for the grid's integer coordinates."""
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level. Cells are sorted by key, edges by receiver."""
+
+    key_C: torch.Tensor
+    sender_E: torch.Tensor
+    receiver_E: torch.Tensor
+    direction_E: torch.Tensor  # row of DIRECTION_63
+    parent_C: torch.Tensor | None = None  # index into the next level; none on the coarsest
+    octant_C: torch.Tensor | None = None  # row of CORNER_83: which child of its parent a cell is
+
+    @property
+    def cell_count(self) -> int:
+        return len(self.key_C)
+
+
+@dataclass(frozen=True, eq=False)
+class GridHierarchy:
+    """All levels, finest first, and the 8 (particle, cell) pairs of each particle."""
+
+    levels: tuple[Level, ...]
+    cell_N8: torch.Tensor  # int64, index into the finest level; corner order of CORNER_83
+    weight_N8: torch.Tensor  # trilinear, sums to 1; zero where the particle lies on a cell centre's plane
+    fraction_N3: torch.Tensor  # particle minus the centre of its first corner's cell, in cells, [0, 1)
+
+
+def build_hierarchy(
+    position_N3: torch.Tensor,
+    scene_N: torch.Tensor,
+    origin_S3: torch.Tensor,
+    cell_size: float,
+    levels: int,
+) -> GridHierarchy:
+    """Builds the grids of all scenes at once; cells of different scenes never meet.
+
+    position_N3 in domain units, scene_N int64 indices into origin_S3 (the finest grid's origin in each scene).
+    Raises: GridRangeError when a particle is not finite or lies beyond ±65,536 cells.
+    """
+    grid_N3 = (position_N3 - origin_S3[scene_N]) / cell_size - 0.5
+    if len(grid_N3) and not bool((grid_N3.abs() < COORDINATE_LIMIT - 2).all()):
+        raise GridRangeError(
+            f"positions must be finite and within {(COORDINATE_LIMIT - 2) * cell_size:.0f} domain units, "
+            f"got {position_N3[(grid_N3.abs() < COORDINATE_LIMIT - 2).logical_not().any(1)][0].tolist()}"
+        )
+    base_N3 = torch.floor(grid_N3)
+    fraction_N3 = grid_N3 - base_N3
+    corner_83 = CORNER_83.to(position_N3.device)
+    weight_N8 = torch.where(corner_83.bool(), fraction_N3[:, None], 1 - fraction_N3[:, None]).prod(-1)
+    # A particle exactly on a plane of centres gives the far corners no weight: they must not become active, so
+    # their pairs point at the near corner instead, with weight zero.
+    reached_N83 = corner_83 * (fraction_N3 > 0)[:, None].long()
+    key_N8 = pack(scene_N[:, None], base_N3.long()[:, None] + reached_N83)
+    key_C, cell_N8 = torch.unique(key_N8, return_inverse=True)
+
+    built = []
+    for level in range(levels):
+        sender_E, receiver_E, direction_E = _edges(key_C)
+        if level == levels - 1:
+            built.append(Level(key_C, sender_E, receiver_E, direction_E))
+            break
+        scene_C, coordinate_C3 = unpack(key_C)
+        parent_key, parent_C = torch.unique(pack(scene_C, coordinate_C3 >> 1), return_inverse=True)
+        octant_C = ((coordinate_C3 & 1) * torch.tensor([4, 2, 1], device=key_C.device)).sum(-1)
+        built.append(Level(key_C, sender_E, receiver_E, direction_E, parent_C, octant_C))
+        key_C = parent_key
+    return GridHierarchy(tuple(built), cell_N8, weight_N8, fraction_N3)
+
+
+def _edges(key_C: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    stride_6 = DIRECTION_63.to(key_C.device) @ torch.tensor(AXIS_STRIDE, device=key_C.device)
+    neighbour_C6, found_C6 = find(key_C, key_C[:, None] + stride_6)
+    receiver_E, direction_E = torch.nonzero(found_C6, as_tuple=True)
+    return neighbour_C6[receiver_E, direction_E], receiver_E, direction_E

@@ -1,0 +1,43 @@
+"""Integer keys of grid cells: scene index and cell coordinates packed into one int64.
+
+Sorted keys group cells by scene, and neighbours differ by a constant, so that a batch of scenes needs no
+other structure than one sorted list. Shape legend: … any leading shape.
+"""
+
+from __future__ import annotations
+
+import torch
+
+COORDINATE_BITS = 17
+COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1)  # cells run from -limit to limit - 1 on each axis
+SCENE_LIMIT = 1 << (63 - 3 * COORDINATE_BITS)
+AXIS_STRIDE = (1 << (2 * COORDINATE_BITS), 1 << COORDINATE_BITS, 1)  # key difference of neighbours in x, y, z
+
+
+def pack(scene: torch.Tensor, cell_3: torch.Tensor) -> torch.Tensor:
+    """Keys int64 […] of scene indices int64 […] and cell coordinates int64 […, 3].
+
+    Coordinates must lie within ±COORDINATE_LIMIT; callers keep particles in range.
+    """
+    shifted = cell_3 + COORDINATE_LIMIT
+    key = scene
+    for axis in range(3):
+        key = (key << COORDINATE_BITS) | shifted[..., axis]
+    return key
+
+
+def unpack(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The inverse of `pack`: scene indices int64 […] and coordinates int64 […, 3]."""
+    mask = (1 << COORDINATE_BITS) - 1
+    shifts = (2 * COORDINATE_BITS, COORDINATE_BITS, 0)
+    cell_3 = torch.stack([(key >> shift) & mask for shift in shifts], dim=-1) - COORDINATE_LIMIT
+    return key >> (3 * COORDINATE_BITS), cell_3
+
+
+def find(sorted_key_K: torch.Tensor, key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Looks keys up in a sorted list: index int64 […] (0 where absent) and whether each is there, bool […]."""
+    if len(sorted_key_K) == 0:
+        return torch.zeros_like(key), torch.zeros_like(key, dtype=torch.bool)
+    index = torch.searchsorted(sorted_key_K, key).clamp_(max=len(sorted_key_K) - 1)
+    found = sorted_key_K[index] == key
+    return index * found, found

@@ -1,0 +1,151 @@
+"""The hierarchical graph network (paper sec. 3.2, fig. 2): plain torch, the reference for every faster path.
+
+Steps: encode particles (0), particles to cells (1), message passing on each level down (2, 4, …) with fine to
+coarse (3, 5, …) between, message passing on each level up (8, 10, …) after coarse to fine (7, 9, …), cells to
+particles (11), decode to the acceleration (12). With L levels there are 2 L - 1 message-passing blocks.
+Shape legend: N particles, C cells, E directed edges, W width, S scenes.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from hgn.config import NetworkConfig
+from hgn.network.fcn import FCN
+from hgn.network.features import Normaliser, ParticleState, wall_distances
+from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
+
+
+class MessagePassing(nn.Module):
+    """Steps 2, 4, …: M iterations on the cells of one level (paper fig. 5), weights unshared."""
+
+    def __init__(self, steps: int, width: int) -> None:
+        super().__init__()
+        self.edge = nn.ModuleList(FCN((width, width, 3 if m == 0 else width), width, width) for m in range(steps))
+        self.cell = nn.ModuleList(FCN((width, width), width, width) for _ in range(steps))
+
+    def forward(self, cell_CW: torch.Tensor, level: Level) -> torch.Tensor:
+        """Returns the updated cell features [C, W]."""
+        edge_EW = None
+        for edge_network, cell_network in zip(self.edge, self.cell, strict=True):
+            assert isinstance(edge_network, FCN) and isinstance(cell_network, FCN)
+            if edge_EW is None:
+                # Receiver minus sender in cells: the opposite of where the sender lies.
+                offset_63 = -DIRECTION_63.to(cell_CW)
+                own_EH = (edge_network.project(2, offset_63) + edge_network.first.bias)[level.direction_E]
+            else:
+                own_EH = edge_network.project(2, edge_EW) + edge_network.first.bias
+            sender_CH, receiver_CH = edge_network.project(0, cell_CW), edge_network.project(1, cell_CW)
+            update_EW = edge_network.finish(sender_CH[level.sender_E] + receiver_CH[level.receiver_E] + own_EH)
+            edge_EW = update_EW if edge_EW is None else edge_EW + update_EW
+            sum_CW = torch.zeros_like(cell_CW).index_add_(0, level.receiver_E, edge_EW)
+            hidden_CH = cell_network.project(0, cell_CW) + cell_network.project(1, sum_CW) + cell_network.first.bias
+            cell_CW = cell_CW + cell_network.finish(hidden_CH)
+        return cell_CW
+
+
+class HierarchicalGraphNetwork(nn.Module):
+    """Predicts the acceleration of every particle, in frame units.
+
+    Without obstacle features the input lacks the normals (the paper's second data set); with them, a scene
+    without obstacles leaves their columns out, which is exact since the normals are zero.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.width
+        self.normaliser = Normaliser()
+        self.embedding = nn.Embedding(len(config.materials), config.material_embedding)
+        normal_width = 3 if config.obstacle_features else 0
+        self.encode = FCN((3 * config.velocity_history, normal_width, 6, config.material_embedding), width, width)
+        self.particle_to_cell = FCN((width, 3), width, width)
+        self.passing_down = nn.ModuleList(
+            MessagePassing(config.message_passing_steps, width) for _ in range(config.levels)
+        )
+        self.fine_to_coarse = nn.ModuleList(FCN((width, 3), width, width) for _ in range(config.levels - 1))
+        self.coarse_to_fine = nn.ModuleList(FCN((width, width, 3), width, width) for _ in range(config.levels - 1))
+        self.passing_up = nn.ModuleList(
+            MessagePassing(config.message_passing_steps, width) for _ in range(config.levels - 1)
+        )
+        self.cell_to_particle = FCN((width, width, 3), width, width)
+        self.decode = FCN((width,), width, 3, layer_norm=False)
+
+    @property
+    def parameter_count(self) -> int:
+        return sum(parameter.numel() for parameter in self.parameters())
+
+    def forward(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+        """Accelerations in frame units [N, 3]; the finest grid's origin in each scene is 0 unless given."""
+        return self.normaliser.restore_acceleration(self.normalised_acceleration(state, origin_S3))
+
+    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+        """The network's raw output [N, 3], which the loss compares with the normalised target."""
+        if origin_S3 is None:
+            origin_S3 = torch.zeros_like(state.domain_S3)
+        config = self.config
+        grid = build_hierarchy(state.position_N3, state.scene_N, origin_S3, config.cell_size, config.levels)
+        return self.propagate(self.encode_particles(state), grid)
+
+    def encode_particles(self, state: ParticleState) -> torch.Tensor:
+        """Step 0: particle features to latent vectors [N, W]. Zero normals are not multiplied."""
+        velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
+        maximum = self.config.wall_distance_cells * self.config.cell_size
+        wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)
+        hidden_NH = self.encode.project(0, velocity_NV) + self.encode.project(2, wall_N6)
+        material_MH = self.encode.project(3, self.embedding.weight) + self.encode.first.bias
+        hidden_NH = hidden_NH + material_MH[state.material_N]
+        if self.config.obstacle_features and state.obstacles is not None:
+            normal_N3 = state.obstacles.normals(state.position_N3, state.scene_N)
+            hidden_NH = hidden_NH + self.encode.project(1, normal_N3)
+        return self.encode.finish(hidden_NH)
+
+    def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
+        """Steps 1 to 12: latent particles and their grids to normalised accelerations [N, 3]."""
+        corner_83 = CORNER_83.to(particle_NW)
+        # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
+        parent_offset_83 = 0.5 - corner_83
+
+        network = self.particle_to_cell
+        hidden_NH = network.project(0, particle_NW) - network.project(1, grid.fraction_N3) + network.first.bias
+        message_N8W = network.finish(hidden_NH[:, None] + network.project(1, corner_83))
+        fine = grid.levels[0]
+        cell_CW = _scatter(message_N8W * grid.weight_N8[..., None], grid.cell_N8, fine.cell_count)
+
+        kept: list[torch.Tensor] = []
+        for i, level in enumerate(grid.levels):
+            cell_CW = self.passing_down[i](cell_CW, level)
+            if level.parent_C is None:
+                break
+            kept.append(cell_CW)
+            network = _fcn(self.fine_to_coarse[i])
+            offset_8H = network.project(1, parent_offset_83) + network.first.bias
+            message_CW = network.finish(network.project(0, cell_CW) + offset_8H[level.octant_C])
+            cell_CW = _scatter(message_CW, level.parent_C, grid.levels[i + 1].cell_count)
+
+        for i in reversed(range(len(kept))):
+            level = grid.levels[i]
+            network = _fcn(self.coarse_to_fine[i])
+            offset_8H = network.project(2, -parent_offset_83) + network.first.bias
+            coarse_CH = network.project(0, cell_CW)[level.parent_C]
+            hidden_CH = coarse_CH + network.project(1, kept[i]) + offset_8H[level.octant_C]
+            cell_CW = self.passing_up[i](kept[i] + network.finish(hidden_CH), level)
+
+        network = self.cell_to_particle
+        hidden_NH = network.project(1, particle_NW) + network.project(2, grid.fraction_N3) + network.first.bias
+        hidden_N8H = network.project(0, cell_CW)[grid.cell_N8] + hidden_NH[:, None]
+        message_N8W = network.finish(hidden_N8H - network.project(2, corner_83))
+        change_NW = (message_N8W * grid.weight_N8[..., None]).sum(1)
+        return self.decode(particle_NW + change_NW)
+
+
+def _scatter(value: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tensor:
+    """Sums rows [..., W] by index [...] into [count, W]."""
+    width = value.shape[-1]
+    return value.new_zeros(count, width).index_add_(0, index.flatten(), value.reshape(-1, width))
+
+
+def _fcn(module: nn.Module) -> FCN:
+    assert isinstance(module, FCN)
+    return module

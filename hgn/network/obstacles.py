@@ -1,0 +1,52 @@
+"""Obstacle normals on the device: the sparse cells of a batch of scenes, found by key.
+
+Paper sec. 3: n_o is the normal of the solver-sized cell that contains the particle, zero where there is none.
+Shape legend: K obstacle cells of all scenes, N particles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hgn.network.keys import find, pack
+from hgn.scene.obstacle_grid import ObstacleGrid
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleCells:
+    """Sorted cell keys int64 [K] and unit normals float32 [K, 3]."""
+
+    key_K: torch.Tensor
+    normal_K3: torch.Tensor
+    cell_size: float
+
+    @staticmethod
+    def of(grids: Sequence[ObstacleGrid]) -> ObstacleCells | None:
+        """The cells of a batch, scene s from grids[s]; none where no scene has an obstacle."""
+        if not any(len(grid.cell_K3) for grid in grids):
+            return None
+        cell_size = grids[0].cell_size
+        assert all(grid.cell_size == cell_size for grid in grids), "scenes of one batch share the cell size"
+        scene_K = np.repeat(np.arange(len(grids)), [len(grid.cell_K3) for grid in grids])
+        cell_K3 = np.concatenate([grid.cell_K3 for grid in grids]).astype(np.int64)
+        normal_K3 = np.concatenate([grid.normal_K3 for grid in grids]).astype(np.float32)
+        key_K = pack(torch.from_numpy(scene_K), torch.from_numpy(cell_K3))
+        assert bool((key_K[1:] > key_K[:-1]).all()), "obstacle cells come sorted and unique"
+        return ObstacleCells(key_K, torch.from_numpy(normal_K3), cell_size)
+
+    def to(self, device: torch.device, non_blocking: bool = False) -> ObstacleCells:
+        return ObstacleCells(
+            self.key_K.to(device, non_blocking=non_blocking),
+            self.normal_K3.to(device, non_blocking=non_blocking),
+            self.cell_size,
+        )
+
+    def normals(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
+        """n_o of each particle, [N, 3] in the positions' dtype; zero where its cell holds no obstacle."""
+        cell_N3 = torch.floor(position_N3 / self.cell_size).long()
+        index_N, found_N = find(self.key_K, pack(scene_N, cell_N3))
+        return (self.normal_K3[index_N] * found_N[:, None]).to(position_N3.dtype)

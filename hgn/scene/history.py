@@ -1,0 +1,52 @@
+"""The past that a simulation lacks when it starts: ballistic motion into the initial state.
+
+Method: history before frame 0 is the ballistic back-extrapolation of the initial state, in training episodes
+and rollouts alike, so that a network can start a scene by itself.
+Shape legend: H history steps, N particles, W = H + 2 window frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hgn.scene.episode import Episode
+
+
+def ballistic_positions(
+    position_N3: np.ndarray,
+    velocity_N3: np.ndarray,
+    gravity: Sequence[float],
+    frame_rate_hz: float,
+    frame_indices: Sequence[int],
+) -> np.ndarray:
+    """Positions at the given frames (0 is now, negative is the past) of particles in free flight.
+
+    Units: domain units, domain units per second (squared). Returns float32 [len(frame_indices), N, 3];
+    computed in float64.
+    """
+    time_T11 = np.asarray(frame_indices, np.float64)[:, None, None] / frame_rate_hz
+    fall_3 = 0.5 * np.asarray(gravity, np.float64)
+    return (position_N3 + velocity_N3 * time_T11 + fall_3 * time_T11**2).astype(np.float32)
+
+
+def window(episode: Episode, frame: int, history: int) -> np.ndarray:
+    """Positions x^{n-H} … x^{n+1} around frame n of an episode, float32 [H + 2, N, 3], a fresh array.
+
+    0 <= frame <= T - 2. Frames before 0 are the ballistic back-extrapolation.
+    """
+    frame_count = len(episode.position_TN3)
+    assert 0 <= frame <= frame_count - 2, (frame, frame_count)
+    first = frame - history
+    stored = np.array(episode.position_TN3[max(first, 0) : frame + 2], np.float32)
+    if first >= 0:
+        return stored
+    past = ballistic_positions(
+        episode.position_TN3[0],
+        episode.initial_velocity_N3,
+        episode.gravity,
+        episode.frame_rate_hz,
+        range(first, 0),
+    )
+    return np.concatenate([past, stored])

@@ -1,0 +1,68 @@
+"""Random network inputs for the tests."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.network.features import ParticleState
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.obstacles import ObstacleCells
+from hgn.scene.obstacle_grid import ObstacleGrid
+
+
+def random_grid(seed: int, cells: int, cell_size: float = 1 / 64, extent: int = 24) -> ObstacleGrid:
+    """Random obstacle cells with random unit normals."""
+    rng = np.random.default_rng(seed)
+    cell_K3 = np.unique(rng.integers(0, extent, (cells, 3)), axis=0).astype(np.int32)
+    normal_K3 = rng.normal(size=cell_K3.shape)
+    normal_K3 /= np.linalg.norm(normal_K3, axis=1, keepdims=True)
+    return ObstacleGrid(cell_size, cell_K3, normal_K3.astype(np.float32))
+
+
+def random_state(
+    counts: tuple[int, ...],
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+    obstacles: bool = True,
+    spread: float = 0.3,
+) -> ParticleState:
+    """Particles of several scenes in a box of side `spread`."""
+    generator = torch.Generator().manual_seed(seed)
+    total = sum(counts)
+    grids = [random_grid(seed + i, 4_000) for i in range(len(counts))]
+    return ParticleState(
+        position_N3=(torch.rand(total, 3, generator=generator, dtype=torch.float64) * spread + 0.02).to(dtype),
+        velocity_NM3=(torch.randn(total, 5, 3, generator=generator, dtype=torch.float64) * 1e-3).to(dtype),
+        material_N=torch.randint(0, 3, (total,), generator=generator),
+        scene_N=torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),
+        domain_S3=torch.ones(len(counts), 3, dtype=dtype),
+        obstacles=ObstacleCells.of(grids) if obstacles else None,
+    )
+
+
+def scene_of(state: ParticleState, scene: int, grid: ObstacleCells | None) -> ParticleState:
+    """One scene taken out of a batch."""
+    mine = state.scene_N == scene
+    return ParticleState(
+        state.position_N3[mine],
+        state.velocity_NM3[mine],
+        state.material_N[mine],
+        torch.zeros(int(mine.sum()), dtype=torch.long),
+        state.domain_S3[scene : scene + 1],
+        grid,
+    )
+
+
+def network_of(dtype: torch.dtype = torch.float64, **changes: object) -> HierarchicalGraphNetwork:
+    """A small network with random weights, norms included, and a normaliser that is not the identity."""
+    values = {"width": 16, "levels": 3, "message_passing_steps": 2} | changes
+    torch.manual_seed(5)
+    network = HierarchicalGraphNetwork(NetworkConfig(**values))  # type: ignore[arg-type]
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    network.normaliser.set("velocity", torch.tensor([1e-4, -2e-3, 0.0]), torch.tensor([1e-3, 2e-3, 3e-3]), 1e-3)
+    network.normaliser.set("acceleration", torch.tensor([0.0, -1e-3, 1e-5]), torch.tensor([1e-3, 2e-3, 1e-3]), 1e-3)
+    return network.to(dtype)
