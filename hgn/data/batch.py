@@ -1,0 +1,89 @@
+"""Batches: the position windows of some frames of some episodes, concatenated over their particles.
+
+Shape legend: H velocity history, W = H + 2 frames, N particles of all scenes, S scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from hgn.data.order import Cursor
+from hgn.network.features import ParticleState, material_rows
+from hgn.network.obstacles import ObstacleCells
+from hgn.scene.episode import Episode
+from hgn.scene.history import window
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Windows x^{n-H} … x^{n+1}; the last frame is the answer, the others the question."""
+
+    window_WN3: torch.Tensor  # float32, domain units
+    material_N: torch.Tensor  # int64, index into the network's materials
+    scene_N: torch.Tensor  # int64
+    particles_S: tuple[int, ...]  # particles of each scene, on the host
+    domain_S3: torch.Tensor
+    gravity_S3: torch.Tensor  # domain units per frame squared
+    obstacles: ObstacleCells | None
+    seeds_S: tuple[int, ...]  # of noise and jitter
+    cursor: Cursor | None = None  # the order's state once this batch is trained on
+
+    def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
+        names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
+        moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
+        obstacles = self.obstacles and self.obstacles.to(device, non_blocking)
+        return replace(self, obstacles=obstacles, **moved)
+
+    def state(self, window_WN3: torch.Tensor | None = None) -> ParticleState:
+        """The network's input at frame n, from this window or a perturbed copy of it."""
+        if window_WN3 is None:
+            window_WN3 = self.window_WN3
+        velocity_MN3 = (window_WN3[1:-1] - window_WN3[:-2]).flip(0)
+        return ParticleState(
+            position_N3=window_WN3[-2],
+            velocity_NM3=velocity_MN3.transpose(0, 1),
+            material_N=self.material_N,
+            scene_N=self.scene_N,
+            domain_S3=self.domain_S3,
+            obstacles=self.obstacles,
+        )
+
+    def acceleration(self, window_WN3: torch.Tensor | None = None) -> torch.Tensor:
+        """v^{n+1} - v^n in frame units, [N, 3]."""
+        if window_WN3 is None:
+            window_WN3 = self.window_WN3
+        return (window_WN3[-1] - window_WN3[-2]) - (window_WN3[-2] - window_WN3[-3])
+
+    def mean_over_scenes(self, value_N: torch.Tensor) -> torch.Tensor:
+        """The mean over scenes of each scene's mean over its particles: a scalar."""
+        share_S = torch.tensor([1 / (len(self.particles_S) * max(count, 1)) for count in self.particles_S])
+        return (value_N * share_S.to(value_N)[self.scene_N]).sum()
+
+
+def make_batch(
+    samples: Sequence[tuple[Episode, int]],
+    history: int,
+    materials: Sequence[str],
+    seeds: Sequence[int] | None = None,
+    cursor: Cursor | None = None,
+) -> Batch:
+    """Reads the windows of (episode, frame) pairs and joins them."""
+    windows = [window(episode, frame, history) for episode, frame in samples]
+    episodes = [episode for episode, _ in samples]
+    particles = tuple(len(episode.material_N) for episode in episodes)
+    gravity_S3 = np.array([np.asarray(e.gravity) / e.frame_rate_hz**2 for e in episodes], np.float32)
+    return Batch(
+        window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
+        material_N=material_rows(np.concatenate([episode.material_N for episode in episodes]), materials),
+        scene_N=torch.from_numpy(np.repeat(np.arange(len(episodes)), particles)),
+        particles_S=particles,
+        domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
+        gravity_S3=torch.from_numpy(gravity_S3),
+        obstacles=ObstacleCells.of([episode.obstacle_grid for episode in episodes]),
+        seeds_S=tuple(seeds) if seeds is not None else (0,) * len(episodes),
+        cursor=cursor,
+    )

@@ -1,0 +1,97 @@
+"""The order in which samples are trained on: a pure function of seed, epoch, episodes, batch and world size.
+
+A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were
+published when it began; epochs follow each other without a gap, so that every sample comes exactly once an
+epoch on any number of ranks, batches are all of one size, and the whole state of the order is a `Cursor`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hgn.schema import ConfigError
+
+
+@dataclass(frozen=True)
+class Cursor:
+    """How far the order has been consumed, over all ranks together."""
+
+    epoch: int = 0
+    position: int = 0  # samples of this epoch already taken
+    episodes: int = 0  # episodes in this epoch; 0: not decided yet
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Frame n of an episode: the network sees frames up to n and predicts n + 1."""
+
+    episode: int
+    frame: int
+    seed: int  # of its noise and grid jitter
+
+
+def epoch_permutation(seed: int, epoch: int, sample_count: int) -> np.ndarray:
+    """The order of an epoch, int64 [sample_count]."""
+    return np.random.Generator(np.random.PCG64([seed, epoch])).permutation(sample_count)
+
+
+class SampleOrder:
+    """Walks through epochs in batches and tells each rank its share.
+
+    `published(epoch)` is asked once when an epoch begins and returns the number of frames of each published
+    episode, oldest publication first; it must return the same on every rank, and a list that continues the
+    one of the epoch before. After a resume it may return more than the cursor's epoch knew: the surplus waits
+    for the next epoch.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        batch_scenes: int,
+        published: Callable[[int], Sequence[int]],
+        cursor: Cursor | None = None,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        assert 0 <= rank < world_size and batch_scenes >= 1
+        self.seed, self.batch_scenes, self.rank, self.world_size = seed, batch_scenes, rank, world_size
+        self.cursor = cursor or Cursor()
+        self._published = published
+        self._order = np.zeros(0, np.int64)
+        self._first_sample = np.zeros(1, np.int64)
+        self._begin_epoch(self.cursor.epoch, self.cursor.position, self.cursor.episodes)
+
+    def next_batch(self) -> list[Sample]:
+        """This rank's `batch_scenes` samples of the next global batch; advances the cursor."""
+        total = self.batch_scenes * self.world_size
+        mine = range(self.rank * self.batch_scenes, (self.rank + 1) * self.batch_scenes)
+        samples = []
+        for slot in range(total):
+            if self.cursor.position == len(self._order):
+                self._begin_epoch(self.cursor.epoch + 1, 0, 0)
+            if slot in mine:
+                samples.append(self._sample(int(self._order[self.cursor.position])))
+            self.cursor = Cursor(self.cursor.epoch, self.cursor.position + 1, self.cursor.episodes)
+        return samples
+
+    def _begin_epoch(self, epoch: int, position: int, episodes: int) -> None:
+        frame_counts = list(self._published(epoch))
+        if episodes > len(frame_counts):
+            raise ConfigError(
+                f"data set must still hold the {episodes} training episodes that epoch {epoch} began with, "
+                f"got {len(frame_counts)}; restore the missing shards or start another run"
+            )
+        frame_counts = frame_counts[: episodes or len(frame_counts)]
+        if not frame_counts:
+            raise ConfigError("data set must hold at least one training episode, got none; generate some first")
+        self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
+        self._order = epoch_permutation(self.seed, epoch, int(self._first_sample[-1]))
+        self.cursor = Cursor(epoch, position, len(frame_counts))
+
+    def _sample(self, index: int) -> Sample:
+        episode = int(np.searchsorted(self._first_sample, index, side="right")) - 1
+        seed = np.random.SeedSequence([self.seed, self.cursor.epoch, index]).generate_state(1, np.uint64)[0]
+        return Sample(episode, index - int(self._first_sample[episode]), int(seed >> np.uint64(1)))

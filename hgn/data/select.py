@@ -1,0 +1,31 @@
+"""Picking episodes out of a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hgn.data.manifest import SPLITS
+from hgn.data.reader import EpisodeStore
+from hgn.scene.episode import Episode
+from hgn.schema import ConfigError
+
+
+def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
+    """The episodes of lowest index, whatever order they were published in: a fixed choice."""
+    ranked = sorted(range(len(store)), key=lambda i: store.entries[i].index)
+    return [store.episodes[i] for i in ranked[:count]]
+
+
+def find_episode(folder: Path | str, key: str) -> Episode:
+    """The episode of that key, for example validation-000000.
+
+    Raises: ConfigError when the data set does not hold it.
+    """
+    split = key.rsplit("-", 1)[0]
+    if split not in SPLITS:
+        raise ConfigError(f"episode must begin with one of {', '.join(SPLITS)}, got {key!r}; e.g. validation-000000")
+    store = EpisodeStore(folder, split)
+    keys = [entry.key for entry in store.entries]
+    if key not in keys:
+        raise ConfigError(f"episode must be one of the {len(keys)} {split} episodes in {folder}, got {key!r}")
+    return store.episodes[keys.index(key)]
