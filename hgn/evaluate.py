@@ -1,0 +1,120 @@
+"""python -m hgn.evaluate weights=… data=…: one-step and rollout errors beside the trivial predictors'."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hgn.command import run_command
+from hgn.config import EvaluateConfig
+from hgn.data.reader import EpisodeStore
+from hgn.data.select import first_episodes
+from hgn.device import choose_device
+from hgn.files import write_atomically
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.progress import bar
+from hgn.provenance import provenance
+from hgn.rollout import require_frame_rate
+from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.runtime.weights import load_weights
+from hgn.scene.episode import Episode
+from hgn.schema import ConfigError, from_mapping
+from hgn.training.errors import (
+    REPORTED_FRAMES,
+    frame_batches,
+    network_predictor,
+    one_step_errors,
+    position_mse,
+    trivial_predictors,
+)
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table, and writes JSON where asked to; returns the exit code."""
+    config = from_mapping(EvaluateConfig, mapping)
+    device = choose_device(config.device)
+    network, info = load_weights(Path(config.weights), device)
+    store = EpisodeStore(config.data, config.split)
+    if not len(store):
+        raise ConfigError(f"data must hold episodes of the split {config.split}, got none in {config.data}")
+    episodes = first_episodes(store, config.scenes)
+    require_frame_rate(info, episodes[0].frame_rate_hz)
+    rows = one_step_rows(network, episodes, config)
+    if config.rollout_frames >= 2:
+        rows.append(rollout_row(network, info.frame_rate_hz, episodes, config.rollout_frames))
+    print(table(rows, config, len(episodes)))
+    if config.json is not None:
+        report = {"meta": provenance(device) | {"weights": config.weights, "updates": info.updates}, "rows": rows}
+        write_atomically(Path(config.json), json.dumps(report, indent=1).encode())
+    return 0
+
+
+def one_step_rows(
+    network: HierarchicalGraphNetwork, episodes: list[Episode], config: EvaluateConfig
+) -> list[dict[str, Any]]:
+    """One row a predictor: {"system", "one_step_mse", "by_material"}."""
+    predictors = {"network": network_predictor(network)} | trivial_predictors(network)
+    device = next(network.parameters()).device
+    total = sum(-(-(len(episode.position_TN3) - 1) // config.frame_stride) for episode in episodes)
+    with bar("one-step errors", total=total, unit="frame") as progress:
+
+        def counted() -> Any:
+            for batch in frame_batches(episodes, network, config.frame_stride, config.particles_per_batch):
+                yield batch
+                progress.update(len(batch.particles_S))
+
+        errors = one_step_errors(predictors, counted(), device, network.config.materials)
+    return [
+        {"system": name, "one_step_mse": error.mse, "by_material": error.by_material()}
+        for name, error in errors.items()
+    ]
+
+
+def rollout_row(
+    network: HierarchicalGraphNetwork, frame_rate_hz: float, episodes: list[Episode], frames: int
+) -> dict[str, Any]:
+    """{"system", "position_mse": {frame: value}, "mean_position_mse"}, or where the rollout diverged."""
+    frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
+    with bar("rollouts", total=frames - 1, unit="frame") as progress:
+        try:
+            initial = [InitialState.of_episode(episode) for episode in episodes]
+            predicted = Simulator(network, frame_rate_hz).rollout(initial, frames, lambda _: progress.update())
+        except DivergenceError as error:
+            return {"system": "network rollout", "diverged_at_frame": error.frame}
+    pairs = zip(predicted, episodes, strict=True)
+    mse_T = np.mean([position_mse(path, episode.position_TN3[:frames]) for path, episode in pairs], axis=0)
+    return {
+        "system": "network rollout",
+        "position_mse": {str(n): float(mse_T[n]) for n in (*REPORTED_FRAMES, frames - 1) if n < frames},
+        "mean_position_mse": float(mse_T.mean()),
+    }
+
+
+def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> str:
+    """The figures for people. Errors sum over axes and average over particles, in frame units."""
+    every = "every frame" if config.frame_stride == 1 else f"every {config.frame_stride}th frame"
+    lines = [f"{config.split}, {scenes} scenes, {every}; sum over axes, mean over particles, frame units"]
+    lines.append(f"{'predictor':<20} {'one-step MSE':>12}  by material")
+    for row in rows:
+        if "one_step_mse" in row:
+            materials = ", ".join(f"{name} {value:.2e}" for name, value in row["by_material"].items())
+            lines.append(f"{row['system']:<20} {row['one_step_mse']:>12.3e}  {materials}")
+        elif "diverged_at_frame" in row:
+            lines.append(f"{row['system']:<20} diverged at frame {row['diverged_at_frame']}")
+        else:
+            frames = ", ".join(f"frame {frame} {value:.2e}" for frame, value in row["position_mse"].items())
+            lines.append(f"{row['system']:<20} position MSE: {frames}")
+    ours = next(row["one_step_mse"] for row in rows if row["system"] == "network")
+    best = min(row["one_step_mse"] for row in rows if "one_step_mse" in row and row["system"] != "network")
+    ratio = best / ours if ours > 0 else float("inf")
+    lines.append(f"the network's one-step MSE is {ratio:.2f} times below the best trivial predictor's")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    torch.set_float32_matmul_precision("high")
+    run_command(main, "evaluate")

@@ -1,0 +1,147 @@
+"""The simulation loop (paper algorithm 1): features, grid, network, integration, all on one device.
+
+Imports torch and the network, nothing of the training stack.
+Shape legend: T frames, N particles of all scenes, S scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from hgn.network.features import ParticleState, material_rows
+from hgn.network.grid import GridRangeError
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.obstacles import ObstacleCells
+from hgn.scene.episode import Episode
+from hgn.scene.history import ballistic_positions
+from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
+from hgn.scene.scene import Scene
+
+
+class DivergenceError(RuntimeError):
+    """Particles are no longer finite, or have left the domain by more than its own size."""
+
+    def __init__(self, frame: int, cause: str) -> None:
+        super().__init__(f"the simulation diverged at frame {frame}: {cause}; train further, or take other weights")
+        self.frame = frame
+
+
+@dataclass(frozen=True, eq=False)
+class InitialState:
+    """Where a simulation starts. Units: domain units, seconds."""
+
+    position_N3: np.ndarray
+    velocity_N3: np.ndarray
+    material_N: np.ndarray  # index into MATERIALS
+    obstacle_grid: ObstacleGrid
+    domain_size: tuple[float, float, float]
+    gravity: tuple[float, float, float]
+
+    @staticmethod
+    def of_episode(episode: Episode) -> InitialState:
+        """Frame 0 of an episode."""
+        return InitialState(
+            np.array(episode.position_TN3[0]),
+            episode.initial_velocity_N3,
+            episode.material_N,
+            episode.obstacle_grid,
+            episode.domain_size,
+            episode.gravity,
+        )
+
+    @staticmethod
+    def of_scene(scene: Scene) -> InitialState:
+        """A scene's initial particles, its obstacles sampled into cells."""
+        return InitialState(
+            scene.position_N3,
+            scene.velocity_N3,
+            scene.material_N,
+            build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed),
+            scene.domain_size,
+            scene.gravity,
+        )
+
+
+class Simulator:
+    """Runs a trained network on one or several scenes at once."""
+
+    def __init__(self, network: HierarchicalGraphNetwork, frame_rate_hz: float) -> None:
+        self.network = network
+        self.frame_rate_hz = frame_rate_hz
+        self.device = next(network.parameters()).device
+
+    def start(self, scenes: Sequence[InitialState]) -> ParticleState:
+        """The state at frame 0, with a ballistic history.
+
+        Raises: ConfigError when a scene holds a material that the network does not know.
+        """
+        config = self.network.config
+        velocities = []
+        for scene in scenes:
+            past = ballistic_positions(
+                scene.position_N3,
+                scene.velocity_N3,
+                scene.gravity,
+                self.frame_rate_hz,
+                range(-config.velocity_history, 0),
+            )
+            positions_HN3 = np.concatenate([past, scene.position_N3[None].astype(np.float32)])
+            velocities.append(np.diff(positions_HN3, axis=0)[::-1].transpose(1, 0, 2))
+        material_N = material_rows(np.concatenate([scene.material_N for scene in scenes]), config.materials)
+        counts = [len(scene.position_N3) for scene in scenes]
+        position_N3 = np.concatenate([scene.position_N3 for scene in scenes]).astype(np.float32)
+        obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes]) if config.obstacle_features else None
+        return ParticleState(
+            position_N3=torch.from_numpy(position_N3).to(self.device),
+            velocity_NM3=torch.from_numpy(np.concatenate(velocities)).to(self.device),
+            material_N=material_N.to(self.device),
+            scene_N=torch.from_numpy(np.repeat(np.arange(len(scenes)), counts)).to(self.device),
+            domain_S3=torch.tensor([scene.domain_size for scene in scenes], dtype=torch.float32).to(self.device),
+            obstacles=obstacles and obstacles.to(self.device),
+        )
+
+    @torch.inference_mode()
+    def step(self, state: ParticleState) -> ParticleState:
+        """One frame: v += a, x += v. Velocity is kept as state, not as a difference of positions."""
+        velocity_N3 = state.velocity_NM3[:, 0] + self.network(state)
+        history_NM3 = torch.cat([velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
+        return replace(state, position_N3=state.position_N3 + velocity_N3, velocity_NM3=history_NM3)
+
+    def rollout(
+        self,
+        scenes: Sequence[InitialState],
+        frames: int,
+        on_frame: Callable[[int], None] | None = None,
+    ) -> list[np.ndarray]:
+        """Simulates `frames` frames, frame 0 included; float32 [frames, N, 3] for each scene.
+
+        Raises: DivergenceError, which says at which frame; the network must be trained further then.
+        """
+        state = self.start(scenes)
+        counts = [len(scene.position_N3) for scene in scenes]
+        positions = [state.position_N3.cpu().numpy()]
+        for frame in range(1, frames):
+            try:
+                state = self.step(state)
+            except GridRangeError as error:
+                raise DivergenceError(frame, str(error)) from None
+            self._check(state, frame)
+            positions.append(state.position_N3.cpu().numpy())
+            if on_frame is not None:
+                on_frame(frame)
+        return np.split(np.stack(positions), np.cumsum(counts)[:-1], axis=1)
+
+    @staticmethod
+    def _check(state: ParticleState, frame: int) -> None:
+        domain_N3 = state.domain_S3[state.scene_N]
+        inside = (state.position_N3 > -domain_N3) & (state.position_N3 < 2 * domain_N3)  # NaN is outside
+        if not bool(inside.all()):
+            left = int(inside.logical_not().any(-1).sum())
+            count = len(state.position_N3)
+            raise DivergenceError(
+                frame, f"{left} of {count} particles are not finite or farther from the domain than its own size"
+            )

@@ -1,0 +1,96 @@
+"""Inference weights: one safetensors file with the network's structure and normaliser inside.
+
+Nothing in it is ever unpickled or executed. The structure travels as JSON in the file's metadata.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from hgn.config import NetworkConfig
+from hgn.files import write_atomically
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.schema import ConfigError, from_mapping, to_mapping
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class WeightsInfo:
+    """What a weights file says of itself, beside the tensors."""
+
+    network: NetworkConfig
+    frame_rate_hz: float  # of the data: one step of the network is one frame
+    obstacle_cell_size: float
+    format_version: int = FORMAT_VERSION
+    updates: int = 0
+    provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
+
+
+def save_weights(path: Path, network: HierarchicalGraphNetwork, info: WeightsInfo, half: bool = False) -> None:
+    """Writes the file whole or not at all. `half` stores the learned tensors as float16, for shipping."""
+    tensors = {}
+    for name, tensor in network.state_dict().items():
+        shrink = half and not name.startswith("normaliser.")
+        tensors[name] = tensor.detach().to("cpu", torch.float16 if shrink else torch.float32).contiguous()
+    payload = save(tensors, metadata={"hgn": json.dumps(to_mapping(info), sort_keys=True)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, payload)
+
+
+def load_weights(path: Path, device: torch.device | str = "cpu") -> tuple[HierarchicalGraphNetwork, WeightsInfo]:
+    """The network in evaluation mode, float32, on `device`.
+
+    Raises: ConfigError when the file is missing, is no weights file of ours, has another format version, or
+    holds tensors that do not fit the structure it declares.
+    """
+    if not path.is_file():
+        raise ConfigError(f"weights must be an existing file, got {path}; write one with python -m hgn.export")
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except SafetensorError as error:
+        raise ConfigError(f"weights must be a safetensors file, got {path}: {error}; export it again") from None
+    if "hgn" not in metadata:
+        raise ConfigError(f"weights must be a file of python -m hgn.export, got {path} without its structure")
+    try:
+        mapping = json.loads(metadata["hgn"])
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"weights must declare their structure as JSON, got {path}: {error}") from None
+    version = mapping.get("format_version") if isinstance(mapping, dict) else None
+    if version != FORMAT_VERSION:
+        raise ConfigError(f"weights format_version must be {FORMAT_VERSION}, got {version!r} in {path}; export again")
+    info = from_mapping(WeightsInfo, mapping, "weights")
+    network = HierarchicalGraphNetwork(info.network)
+    expected = {name: tensor.shape for name, tensor in network.state_dict().items()}
+    found = {name: tensor.shape for name, tensor in tensors.items()}
+    for name in sorted(expected.keys() | found.keys()):
+        if expected.get(name) != found.get(name):
+            raise ConfigError(
+                f"weights tensor {name} must have shape {_shape(expected.get(name))} for the declared network, "
+                f"got {_shape(found.get(name))} in {path}; these are the weights of another network"
+            )
+    network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    return network.to(device).eval(), info
+
+
+def describe_difference(expected: NetworkConfig, found: NetworkConfig) -> str:
+    """The first key in which two structures differ, or an empty text."""
+    for key in dataclasses.fields(NetworkConfig):
+        ours, theirs = getattr(expected, key.name), getattr(found, key.name)
+        if ours != theirs:
+            return f"network.{key.name} must be {theirs!r}, got {ours!r}"
+    return ""
+
+
+def _shape(shape: torch.Size | None) -> str:
+    return "none" if shape is None else str(tuple(shape))

@@ -1,0 +1,214 @@
+"""python -m hgn.train +experiment=obstacles: trains a network, and makes the data it needs.
+
+A run is a folder; the same command again goes on where it stopped. Ctrl-C and SIGTERM end the run at the next
+update, after a checkpoint.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from hgn.command import run_command
+from hgn.config import TrainConfig
+from hgn.data.identity import dataset_identity, identity_hash
+from hgn.data.manifest import SPLITS, Manifest
+from hgn.data.order import Cursor
+from hgn.data.reader import EpisodeStore
+from hgn.files import write_atomically
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.progress import bar
+from hgn.provenance import provenance
+from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.training.checkpoint import DataInfo, check_checkpoint, cursor_of_checkpoint, read_checkpoint
+from hgn.training.generator import Generator
+from hgn.training.stop import StopRequest
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Trains as the resolved configuration says; returns the exit code."""
+    mapping.pop("name", None)
+    config = from_mapping(TrainConfig, mapping)
+    run = Path(config.run)
+    last = run / "checkpoints" / "last.ckpt"
+    checkpoint = _checkpoint_to_resume(config, last) if last.exists() else None
+    stop = StopRequest()
+    stop.listen()
+    with ExitStack() as stack:
+        generator = None
+        if _first_rank() and config.training.generate and not _complete(config):
+            generator = Generator(config.datagen, run / "datagen")
+            stack.callback(generator.stop)
+        store = _wait_for_episodes(config, generator, stop)
+        if store is None:
+            print("stopped before the first episode was published; the same command goes on", file=sys.stderr)
+            return stop.exit_code
+        stop.restart_clock(config.training.maximum_minutes)
+        return _fit(config, run, store, checkpoint, stop, generator)
+
+
+def _fit(
+    config: TrainConfig,
+    run: Path,
+    store: EpisodeStore,
+    checkpoint: tuple[Path, Cursor] | None,
+    stop: StopRequest,
+    generator: Generator | None,
+) -> int:
+    # Lightning loads for seconds: not before the waiting is over, and never for the other commands.
+    from lightning.pytorch import Trainer, seed_everything
+    from lightning.pytorch.loggers import TensorBoardLogger
+
+    from hgn.training.callbacks import Checkpoints, LogLines, Monitor, Stopper
+    from hgn.training.feed import Feed
+    from hgn.training.module import TrainingModule
+
+    training = config.training
+    data = DataInfo(store.manifest.config_hash, config.dataset.frame_rate_hz, config.scene.cell_size)
+    _quieten_lightning()
+    torch.set_float32_matmul_precision(training.precision)
+    seed_everything(training.seed, verbose=False)
+    module = TrainingModule(HierarchicalGraphNetwork(config.network), training, data)
+    module.set_statistics(store.statistics())
+    feed = Feed(store, config.network, training)
+    if checkpoint is not None:
+        feed.cursor = checkpoint[1]
+    _write_run_files(config, run)
+
+    checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every)
+    monitor = Monitor(run, store, Path(config.dataset.folder), stop, checkpoints)
+    lines = LogLines(run, monitor, training.log_every, training.maximum_updates, _published_text(config, generator))
+    trainer = Trainer(
+        accelerator=training.accelerator,
+        devices=training.devices or ("auto" if training.accelerator != "cpu" and torch.cuda.is_available() else 1),
+        num_nodes=training.nodes,
+        max_steps=training.maximum_updates,
+        max_epochs=-1,
+        callbacks=[lines, monitor, checkpoints, Stopper(stop, checkpoints)],
+        logger=TensorBoardLogger(run, name="", version="tensorboard"),
+        default_root_dir=run,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        log_every_n_steps=training.maximum_updates,
+    )
+    trainer.fit(module, feed, ckpt_path=checkpoint[0] if checkpoint else None, weights_only=True)
+    if trainer.is_global_zero:
+        _report(config, run, trainer.global_step, monitor.last, stop)
+    return stop.exit_code
+
+
+def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Cursor]:
+    """The run's last checkpoint, checked before anything is started, and where in the data it stood."""
+    checkpoint = read_checkpoint(path)
+    check_checkpoint(checkpoint, config, identity_hash(dataset_identity(config.datagen)), path)
+    return path, cursor_of_checkpoint(checkpoint)
+
+
+def _complete(config: TrainConfig) -> bool:
+    folder = Path(config.dataset.folder)
+    if not EpisodeStore.available(folder):
+        return False
+    manifest = Manifest.load(folder)
+    return all(manifest.published(split) >= config.dataset.scenes(split) for split in SPLITS)
+
+
+def _wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: StopRequest) -> EpisodeStore | None:
+    """Waits until enough training episodes are published, showing what is awaited; none when asked to stop."""
+    folder, needed = Path(config.dataset.folder), config.training.minimum_episodes
+    needed = min(needed, config.dataset.training_scenes)
+    if generator is None and _first_rank() and not EpisodeStore.available(folder):
+        raise ConfigError(
+            f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
+            f"out={folder}, or set training.generate=true"
+        )
+    progress = None
+    while not stop.requested:
+        store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
+        if store is not None and len(store) >= needed:
+            if progress is not None:
+                progress.close()
+            return store
+        if generator is not None:
+            generator.check()
+            if not generator.running:
+                raise ConfigError(
+                    f"training.minimum_episodes must be reachable, got {needed} where the data set has "
+                    f"{len(store) if store else 0}; ask for more scenes"
+                )
+        elif _first_rank():
+            raise ConfigError(
+                f"dataset.folder must hold {needed} training episodes, got {len(store) if store else 0} in {folder}; "
+                "generate them, or set training.generate=true"
+            )
+        if progress is None and _first_rank():
+            print(f"waiting for training episode {needed} in {folder}", file=sys.stderr)
+            progress = bar("generating", total=needed * config.dataset.frames, unit="frame")
+        if progress is not None and generator is not None:
+            frames = generator.frames_done()
+            progress.update(min(max(frames, progress.n), progress.total) - progress.n)
+        time.sleep(0.5)
+    return None
+
+
+def _published_text(config: TrainConfig, generator: Generator | None) -> Callable[[], str]:
+    total = config.dataset.training_scenes
+
+    def text() -> str:
+        count = Manifest.load(config.dataset.folder).published("train")
+        state = "" if generator is None or generator.running or count >= total else ", generator stopped"
+        return f"{count}/{total} episodes{state}"
+
+    return text
+
+
+def _write_run_files(config: TrainConfig, run: Path) -> None:
+    run.mkdir(parents=True, exist_ok=True)
+    if not _first_rank():
+        return
+    manifest = Manifest.load(config.dataset.folder)
+    record = to_mapping(config)
+    record["provenance"] = provenance("cuda" if torch.cuda.is_available() else "cpu") | {
+        "data_schema_version": manifest.schema_version,
+        "data_config_hash": manifest.config_hash,
+    }
+    write_atomically(run / "config.yaml", yaml.safe_dump(record, sort_keys=False).encode())
+
+
+def _report(config: TrainConfig, run: Path, updates: int, last: dict[str, float], stop: StopRequest) -> None:
+    print(f"trained {updates} of {config.training.maximum_updates} updates in {run}")
+    if "one_step/validation" in last:
+        print(
+            f"one-step validation MSE {last['one_step/validation']:.3e}, "
+            f"{last['one_step_gain/validation']:.2f} times below the best trivial predictor"
+        )
+    if stop.requested:
+        print("stopped; the same command goes on from here")
+
+
+def _first_rank() -> bool:
+    """Whether this process leads: launchers set RANK, SLURM_PROCID or LOCAL_RANK for the others."""
+    ranks = [os.environ.get(name, "0") for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK")]
+    return all(rank == "0" for rank in ranks)
+
+
+def _quieten_lightning() -> None:
+    import logging
+
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", ".*does not have many workers.*")
+    warnings.filterwarnings("ignore", ".*LeafSpec.*")
+
+
+if __name__ == "__main__":
+    run_command(main, "train")

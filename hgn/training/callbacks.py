@@ -1,0 +1,275 @@
+"""What happens beside the updates: checkpoints, monitoring, log lines, stopping.
+
+Files of a run: checkpoints/last.ckpt, checkpoints/best.ckpt (lowest one-step validation error), metrics.jsonl,
+tensorboard/, pictures/.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+from tqdm import tqdm
+
+from hgn.data.reader import EpisodeStore
+from hgn.data.select import first_episodes
+from hgn.files import sync_folder, temporary_path
+from hgn.progress import bar
+from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.scene.episode import Episode
+from hgn.training.errors import (
+    REPORTED_FRAMES,
+    SquaredError,
+    frame_batches,
+    network_predictor,
+    one_step_errors,
+    position_mse,
+    trivial_predictors,
+)
+from hgn.training.module import TrainingModule
+from hgn.training.stop import StopRequest
+
+
+class Checkpoints(Callback):
+    """Writes checkpoints whole or not at all."""
+
+    def __init__(self, folder: Path, every: int) -> None:
+        self.folder, self.every = folder, every
+        self.best_error = math.inf
+        self._saved_update = -1
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best_error": self.best_error}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.best_error = state_dict["best_error"]
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        if trainer.global_step % self.every == 0:
+            self.save_last(trainer)
+
+    def save_last(self, trainer: Trainer) -> None:
+        """All ranks call this; rank 0 writes."""
+        if self._saved_update != trainer.global_step:
+            self._save(trainer, "last.ckpt")
+            self._saved_update = trainer.global_step
+
+    def offer(self, trainer: Trainer, error: float) -> None:
+        """Keeps the network as the best so far if its one-step validation error is the lowest."""
+        if error < self.best_error:
+            self.best_error = error
+            self._save(trainer, "best.ckpt")
+
+    def _save(self, trainer: Trainer, name: str) -> None:
+        path = self.folder / name
+        temporary = temporary_path(path)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            trainer.save_checkpoint(temporary)
+            if trainer.is_global_zero:
+                temporary.replace(path)
+                sync_folder(self.folder)
+        finally:
+            if trainer.is_global_zero:
+                temporary.unlink(missing_ok=True)
+
+
+class Monitor(Callback):
+    """Measures one-step errors on fixed scenes of both splits, and rollouts of the validation scenes."""
+
+    def __init__(self, run: Path, training: EpisodeStore, folder: Path, stop: StopRequest, checkpoints: Checkpoints):
+        self.run, self.stop, self.checkpoints = run, stop, checkpoints
+        self.training_store, self.data_folder = training, folder
+        self.last: dict[str, float] = {}
+        self._measured_update = -1
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        assert isinstance(pl_module, TrainingModule)
+        if trainer.global_step % pl_module.training_config.monitor_every == 0:
+            self.measure(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, TrainingModule)
+        if self.stop.signal is None:
+            self.measure(trainer, pl_module)
+
+    def measure(self, trainer: Trainer, module: TrainingModule) -> None:
+        """All ranks share the one-step frames; rank 0 does the rollouts. Ends early on a stop request."""
+        if self._measured_update == trainer.global_step:
+            return
+        self._measured_update = trainer.global_step
+        config, network = module.training_config, module.network
+        network.eval()
+        started = time.monotonic()
+        scenes = {
+            "training": first_episodes(self.training_store, config.monitor_scenes),
+            "validation": first_episodes(EpisodeStore(self.data_folder, "validation"), config.monitor_scenes),
+        }
+        values: dict[str, float] = {}
+        for split, episodes in scenes.items():
+            if not episodes or self._interrupted(trainer):
+                continue
+            values |= self._one_step(trainer, module, split, episodes)
+        if "one_step/validation" in values and not self._interrupted(trainer):
+            if config.monitor_rollout_frames >= 2 and trainer.is_global_zero:
+                values |= self._rollout(trainer, module, scenes["validation"], config.monitor_rollout_frames)
+            self.checkpoints.offer(trainer, values["one_step/validation"])
+        values["monitor/seconds"] = time.monotonic() - started
+        network.train()
+        self.last |= values
+        log(trainer, self.run, values)
+
+    def _one_step(
+        self, trainer: Trainer, module: TrainingModule, split: str, episodes: list[Episode]
+    ) -> dict[str, float]:
+        config, network = module.training_config, module.network
+        batches = frame_batches(
+            episodes,
+            network,
+            config.monitor_frame_stride,
+            config.monitor_particles_per_batch,
+            trainer.global_rank,
+            trainer.world_size,
+        )
+        predictors = {"network": network_predictor(network)} | trivial_predictors(network)
+        materials = network.config.materials
+        interrupted: Callable[[], bool] = lambda: trainer.world_size == 1 and self.stop.signal is not None  # noqa: E731
+        errors = one_step_errors(predictors, batches, module.device, materials, interrupted)
+        if trainer.world_size > 1:
+            errors = {name: _reduce(trainer, module.device, error, materials) for name, error in errors.items()}
+        values = {f"one_step/{split}": errors["network"].mse}
+        best = min(error.mse for name, error in errors.items() if name != "network")
+        if values[f"one_step/{split}"] > 0:
+            values[f"one_step_gain/{split}"] = best / values[f"one_step/{split}"]
+        for name, mse in errors["network"].by_material().items():
+            values[f"one_step/{split}_{name}"] = mse
+        for name, error in errors.items():
+            if name != "network":
+                values[f"trivial/{split}_{name.replace(' ', '_')}"] = error.mse
+        return values
+
+    def _rollout(
+        self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
+    ) -> dict[str, float]:
+        simulator = Simulator(module.network, episodes[0].frame_rate_hz)
+        frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
+        try:
+            predicted = simulator.rollout([InitialState.of_episode(episode) for episode in episodes], frames)
+        except DivergenceError as error:
+            return {"rollout/finished": 0.0, "rollout/frames": float(error.frame)}
+        mse_T = np.mean(
+            [position_mse(p, e.position_TN3[:frames]) for p, e in zip(predicted, episodes, strict=True)], axis=0
+        )
+        values = {f"rollout/mse_frame_{n}": float(mse_T[n]) for n in REPORTED_FRAMES if n < frames}
+        values |= {"rollout/finished": 1.0, "rollout/frames": float(frames), "rollout/mse": float(mse_T.mean())}
+        self._picture(trainer, predicted[0], episodes[0], frames)
+        return values
+
+    def _picture(self, trainer: Trainer, predicted_TN3: np.ndarray, episode: Episode, frames: int) -> None:
+        from hgn.picture import compare_picture, rollout_of_episode
+
+        rollout = rollout_of_episode(episode, predicted_TN3)
+        image = compare_picture(rollout, np.linspace(0, frames - 1, 4).astype(int).tolist())
+        folder = self.run / "pictures"
+        folder.mkdir(parents=True, exist_ok=True)
+        image.save(folder / f"rollout_{trainer.global_step:09d}.png")
+        logger = trainer.logger
+        if isinstance(logger, TensorBoardLogger):
+            pixels = np.asarray(image.convert("RGB"))
+            logger.experiment.add_image("rollout", pixels, trainer.global_step, dataformats="HWC")
+
+    def _interrupted(self, trainer: Trainer) -> bool:
+        return bool(trainer.strategy.reduce_boolean_decision(self.stop.signal is not None, all=False))
+
+
+class LogLines(Callback):
+    """Loss, learning rate and speed, to TensorBoard, metrics.jsonl and a progress bar."""
+
+    def __init__(self, run: Path, monitor: Monitor, every: int, maximum_updates: int, published: Callable[[], str]):
+        self.run, self.monitor, self.every, self.maximum_updates = run, monitor, every, maximum_updates
+        self.published = published
+        self._bar: tqdm[Any] | None = None
+        self._time, self._update = time.monotonic(), 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._time, self._update = time.monotonic(), trainer.global_step
+        if trainer.is_global_zero:
+            self._bar = bar("training", total=self.maximum_updates, initial=trainer.global_step, unit="update")
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        assert isinstance(pl_module, TrainingModule)
+        if trainer.global_step % self.every:
+            return
+        loss_sum, count = pl_module.loss_sum.tolist()
+        pl_module.loss_sum.zero_()
+        now = time.monotonic()
+        speed = (trainer.global_step - self._update) / (now - self._time)
+        self._time, self._update = now, trainer.global_step
+        values = {
+            "loss": loss_sum / count,
+            "learning_rate": float(trainer.optimizers[0].param_groups[0]["lr"]),
+            "updates_per_second": speed,
+            "scenes_per_second": speed * pl_module.training_config.batch_scenes * trainer.world_size,
+            "episodes": float(pl_module.cursor.episodes),
+            "epoch": float(pl_module.cursor.epoch),
+        }
+        if pl_module.device.type == "cuda":
+            values["gpu_memory_gb"] = torch.cuda.max_memory_allocated() / 1e9
+        log(trainer, self.run, values)
+        if self._bar is not None:
+            notes = f"loss {values['loss']:.3f}"
+            if "one_step_gain/validation" in self.monitor.last:
+                notes += f", {self.monitor.last['one_step_gain/validation']:.2f}x below trivial"
+            self._bar.set_postfix_str(f"{notes}, {self.published()}", refresh=False)
+            self._bar.update(trainer.global_step - self._bar.n)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+
+class Stopper(Callback):
+    """Ends the loop at an update boundary on every rank, once a checkpoint is written."""
+
+    AGREE_EVERY = 10  # updates between agreements of several ranks
+
+    def __init__(self, stop: StopRequest, checkpoints: Checkpoints) -> None:
+        self.stop, self.checkpoints = stop, checkpoints
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        if trainer.world_size > 1 and trainer.global_step % self.AGREE_EVERY:
+            return
+        if trainer.strategy.reduce_boolean_decision(self.stop.requested, all=False):
+            trainer.should_stop = True
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.checkpoints.save_last(trainer)
+
+
+def log(trainer: Trainer, run: Path, values: dict[str, float]) -> None:
+    """To TensorBoard and to metrics.jsonl, on rank 0 alone."""
+    if not trainer.is_global_zero:
+        return
+    for logger in trainer.loggers:
+        logger.log_metrics(values, trainer.global_step)
+    record = {"update": trainer.global_step, "time": time.time()} | values
+    with (run / "metrics.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")
+
+
+def _reduce(trainer: Trainer, device: torch.device, error: SquaredError, materials: tuple[str, ...]) -> SquaredError:
+    rows = [[error.total.get(name, 0.0), float(error.count.get(name, 0))] for name in materials]
+    summed = trainer.strategy.reduce(torch.tensor(rows, dtype=torch.float64, device=device), reduce_op="sum")
+    assert isinstance(summed, torch.Tensor)
+    return SquaredError(
+        {name: row[0] for name, row in zip(materials, summed.tolist(), strict=True)},
+        {name: int(row[1]) for name, row in zip(materials, summed.tolist(), strict=True)},
+    )

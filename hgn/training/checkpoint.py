@@ -1,0 +1,96 @@
+"""Checkpoints on disk: reading, checking against a configuration, and taking the network out.
+
+Nothing here needs Lightning: export and resume checks read plain containers and tensors.
+"""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hgn.config import NetworkConfig, TrainConfig
+from hgn.data.order import Cursor
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.schema import ConfigError, from_mapping, to_mapping
+
+SECTION = "hgn"  # the checkpoint's key for what is ours
+
+
+@dataclass(frozen=True)
+class DataInfo:
+    """What a network must remember of the data it was trained on."""
+
+    config_hash: str
+    frame_rate_hz: float
+    obstacle_cell_size: float
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint's content; only plain containers and tensors are ever loaded.
+
+    Raises: ConfigError when the file is missing, damaged, or no checkpoint of this project.
+    """
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise ConfigError(f"checkpoint must be an existing file, got {path}; hgn.train writes one") from None
+    except (RuntimeError, EOFError, ValueError, KeyError, OSError, pickle.UnpicklingError) as error:
+        reason = str(error).strip().split("\n")[0]
+        raise ConfigError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from None
+    if not isinstance(checkpoint, dict) or SECTION not in checkpoint:
+        raise ConfigError(f"checkpoint must be one of python -m hgn.train, got {path}")
+    return checkpoint
+
+
+def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_hash: str, path: Path) -> None:
+    """Refuses to resume a checkpoint of another configuration.
+
+    Raises: ConfigError naming the first key that differs.
+    """
+    remedy = "set it so, or choose another run=FOLDER"
+    stored, wanted = checkpoint[SECTION]["network"], to_mapping(config.network)
+    for key in sorted(stored.keys() | wanted.keys()):
+        if stored.get(key) != wanted.get(key):
+            raise ConfigError(
+                f"network.{key} must be {stored.get(key)!r} to go on with {path}, got {wanted.get(key)!r}; {remedy}"
+            )
+    if checkpoint[SECTION]["data"]["config_hash"] != config_hash:
+        raise ConfigError(
+            f"dataset.folder must hold the data set that {path} was trained on, got another one (config hash "
+            f"{config_hash[:12]} instead of {checkpoint[SECTION]['data']['config_hash'][:12]}); {remedy}"
+        )
+    if checkpoint[SECTION]["noise_std"] != config.training.noise_std:
+        # The normaliser was made with this noise.
+        raise ConfigError(
+            f"training.noise_std must be {checkpoint['hgn']['noise_std']} to go on with {path}, "
+            f"got {config.training.noise_std}; {remedy}"
+        )
+
+
+def network_of_checkpoint(checkpoint: dict[str, Any]) -> HierarchicalGraphNetwork:
+    """The network of a checkpoint, normaliser included, in evaluation mode."""
+    network = HierarchicalGraphNetwork(from_mapping(NetworkConfig, checkpoint[SECTION]["network"], "network"))
+    prefix = "network."
+    tensors = {k.removeprefix(prefix): v for k, v in checkpoint["state_dict"].items() if k.startswith(prefix)}
+    network.load_state_dict(tensors)
+    network.eval()
+    return network
+
+
+def cursor_of_checkpoint(checkpoint: dict[str, Any]) -> Cursor:
+    """Where in the order of samples the run stood."""
+    return from_mapping(Cursor, checkpoint[SECTION]["cursor"], "cursor")
+
+
+def data_of_checkpoint(checkpoint: dict[str, Any]) -> DataInfo:
+    """The data set that the network was trained on."""
+    return from_mapping(DataInfo, checkpoint[SECTION]["data"], "data")
+
+
+def updates_of_checkpoint(checkpoint: dict[str, Any]) -> int:
+    """Updates made when the checkpoint was written."""
+    return int(checkpoint[SECTION]["updates"])

@@ -1,0 +1,120 @@
+"""One-step and rollout errors, of the network and of predictors that have learned nothing.
+
+Conventions: squared errors sum over axes and average over particles, in frame units (domain units per frame
+squared for accelerations, domain units for positions).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from hgn.data.batch import Batch, make_batch
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.scene.episode import Episode
+
+REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
+Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
+
+
+@dataclass
+class SquaredError:
+    """Sums of squared errors and particle counts, by material; `mse` over all of them."""
+
+    total: dict[str, float] = field(default_factory=dict)
+    count: dict[str, int] = field(default_factory=dict)
+
+    def add(self, error_N: torch.Tensor, material_N: torch.Tensor, materials: Sequence[str]) -> None:
+        rows = len(materials)
+        totals = torch.zeros(rows, dtype=torch.float64, device=error_N.device)
+        totals.index_add_(0, material_N, error_N.double())
+        counts = torch.bincount(material_N, minlength=rows)
+        for name, total, count in zip(materials, totals.tolist(), counts.tolist(), strict=True):
+            self.total[name] = self.total.get(name, 0.0) + total
+            self.count[name] = self.count.get(name, 0) + count
+
+    @property
+    def mse(self) -> float:
+        count = sum(self.count.values())
+        return sum(self.total.values()) / count if count else float("nan")
+
+    def by_material(self) -> dict[str, float]:
+        return {name: self.total[name] / self.count[name] for name in self.total if self.count[name]}
+
+
+def constant_velocity(batch: Batch) -> torch.Tensor:
+    """Nothing accelerates."""
+    return torch.zeros_like(batch.window_WN3[0])
+
+
+def ballistic(batch: Batch) -> torch.Tensor:
+    """Everything falls freely."""
+    return batch.gravity_S3[batch.scene_N]
+
+
+def mean_acceleration(mean_3: torch.Tensor) -> Predictor:
+    """The training data's mean acceleration, for every particle."""
+    return lambda batch: mean_3.to(batch.window_WN3).expand_as(batch.window_WN3[0])
+
+
+def trivial_predictors(network: HierarchicalGraphNetwork) -> dict[str, Predictor]:
+    """What a network must beat to have learned anything."""
+    return {
+        "constant velocity": constant_velocity,
+        "ballistic motion": ballistic,
+        "mean acceleration": mean_acceleration(network.normaliser.acceleration_mean),
+    }
+
+
+def network_predictor(network: HierarchicalGraphNetwork) -> Predictor:
+    """The network without noise and jitter."""
+    return lambda batch: network(batch.state())
+
+
+def frame_batches(
+    episodes: Sequence[Episode],
+    network: HierarchicalGraphNetwork,
+    stride: int,
+    particles_per_batch: int,
+    rank: int = 0,
+    world_size: int = 1,
+) -> Iterator[Batch]:
+    """Every stride-th frame of every episode, several frames a batch; rank r takes each world_size-th frame."""
+    config = network.config
+    pairs = [(e, n) for e in episodes for n in range(0, len(e.position_TN3) - 1, stride)][rank::world_size]
+    while pairs:
+        taken, particles = 0, 0
+        while taken < len(pairs) and (taken == 0 or particles < particles_per_batch):
+            particles += len(pairs[taken][0].material_N)
+            taken += 1
+        yield make_batch(pairs[:taken], config.velocity_history, config.materials)
+        pairs = pairs[taken:]
+
+
+def one_step_errors(
+    predictors: dict[str, Predictor],
+    batches: Iterator[Batch],
+    device: torch.device,
+    materials: Sequence[str],
+    stop: Callable[[], bool] = lambda: False,
+) -> dict[str, SquaredError]:
+    """Squared errors of accelerations of each predictor over the batches."""
+    errors = {name: SquaredError() for name in predictors}
+    with torch.inference_mode():
+        for batch in batches:
+            if stop():
+                break
+            batch = batch.to(device)
+            target_N3 = batch.acceleration()
+            for name, predict in predictors.items():
+                error_N = (predict(batch) - target_N3).square().sum(-1)
+                errors[name].add(error_N, batch.material_N, materials)
+    return errors
+
+
+def position_mse(predicted_TN3: np.ndarray, reference_TN3: np.ndarray) -> np.ndarray:
+    """Mean squared distance of the particles at each frame, float64 [T]."""
+    return ((predicted_TN3.astype(np.float64) - reference_TN3) ** 2).sum(-1).mean(-1)

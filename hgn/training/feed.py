@@ -1,0 +1,69 @@
+"""Feeds batches to the trainer from a data set that may still grow."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from lightning.pytorch import LightningDataModule
+from torch.utils.data import DataLoader, IterableDataset
+
+from hgn.config import NetworkConfig, TrainingConfig
+from hgn.data.batch import Batch, make_batch
+from hgn.data.order import Cursor, SampleOrder
+from hgn.data.reader import EpisodeStore
+from hgn.schema import ConfigError
+
+SHARED_FOLDER_PATIENCE_S = 300.0
+
+
+class Feed(LightningDataModule):
+    """Endless batches in the deterministic order; each epoch sees what was published when it began."""
+
+    def __init__(self, store: EpisodeStore, network: NetworkConfig, training: TrainingConfig) -> None:
+        super().__init__()
+        self.store = store
+        self.network = network
+        self.training = training
+        self.cursor = Cursor()  # where to begin; set from the checkpoint on a resume
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        # The windows are memory-mapped and small: a worker process would cost more than it saves.
+        return DataLoader(_Stream(self), batch_size=None, num_workers=0)
+
+    def batches(self) -> Iterator[Batch]:
+        """This rank's batches, without end."""
+        rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        order = SampleOrder(
+            self.training.seed, self.training.batch_scenes, self._published, self.cursor, rank, world_size
+        )
+        history, materials = self.network.velocity_history, self.network.materials
+        while True:
+            samples = order.next_batch()
+            pairs = [(self.store.episodes[sample.episode], sample.frame) for sample in samples]
+            yield make_batch(pairs, history, materials, [sample.seed for sample in samples], order.cursor)
+
+    def _published(self, epoch: int) -> list[int]:
+        """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""
+        self.store.refresh()
+        count = len(self.store)
+        if self.trainer is not None and self.trainer.world_size > 1:
+            count = self.trainer.strategy.broadcast(count)
+            deadline = time.monotonic() + SHARED_FOLDER_PATIENCE_S
+            while len(self.store) < count:
+                if time.monotonic() > deadline:
+                    raise ConfigError(
+                        f"{self.store.folder} must show the same {count} episodes on every node, got "
+                        f"{len(self.store)} for {SHARED_FOLDER_PATIENCE_S:.0f} s; is it a shared folder?"
+                    )
+                time.sleep(1)
+                self.store.refresh()
+        return [entry.frames for entry in self.store.entries[:count]]
+
+
+class _Stream(IterableDataset[Batch]):
+    def __init__(self, feed: Feed) -> None:
+        self.feed = feed
+
+    def __iter__(self) -> Iterator[Batch]:
+        return self.feed.batches()

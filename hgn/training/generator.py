@@ -1,0 +1,98 @@
+"""The generator that a training starts itself where its data set is missing or incomplete."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+
+from hgn.config import DatagenConfig
+from hgn.schema import ConfigError, to_mapping
+
+PR_SET_PDEATHSIG = 1
+STOP_PATIENCE_S = 60.0
+
+
+class Generator:
+    """`python -m datagen` as a child process with its own log; it ends with its parent."""
+
+    def __init__(self, config: DatagenConfig, folder: Path) -> None:
+        """Writes the resolved configuration to `folder`/dataset.yaml and starts the process."""
+        folder.mkdir(parents=True, exist_ok=True)
+        mapping = to_mapping(config) | {
+            "name": folder.name,
+            "scenes": config.dataset.training_scenes,
+            "out": config.dataset.folder,
+            "progress": "json",
+            "hydra": {"run": {"dir": "."}, "output_subdir": None},
+        }
+        (folder / "dataset.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
+        self.log_path = folder / "datagen.log"
+        with self.log_path.open("wb") as log:
+            command = [
+                sys.executable,
+                "-m",
+                "datagen",
+                "--config-path",
+                str(folder.resolve()),
+                "--config-name",
+                "dataset",
+            ]
+            # Its own process group: Ctrl-C reaches the trainer, which then ends the generator in order.
+            self._process = subprocess.Popen(
+                command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, preexec_fn=_die_with_parent, process_group=0
+            )
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def check(self) -> None:
+        """Raises: ConfigError when the generator has failed; the message is its own."""
+        code = self._process.poll()
+        if code not in (None, 0):
+            raise ConfigError(f"the generator ended with exit code {code}: {self._last_error()} (log: {self.log_path})")
+
+    def progress(self) -> dict[str, object]:
+        """Its newest progress record, empty before the first."""
+        for line in reversed(self._tail()):
+            if line.startswith("{"):
+                try:
+                    record = json.loads(line)
+                except json.JSONDecodeError:
+                    continue  # the line is still being written
+                if isinstance(record, dict):
+                    return record
+        return {}
+
+    def stop(self) -> None:
+        """Ends the process as Ctrl-C does: it keeps what it has finished and can go on later."""
+        if self.running:
+            os.killpg(self._process.pid, signal.SIGINT)
+            try:
+                self._process.wait(STOP_PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                os.killpg(self._process.pid, signal.SIGKILL)
+                self._process.wait()
+
+    def _last_error(self) -> str:
+        lines = [line for line in self._tail() if line.strip() and not line.startswith("{")]
+        return lines[-1] if lines else "no message"
+
+    def _tail(self) -> list[str]:
+        with self.log_path.open("rb") as log:
+            log.seek(0, os.SEEK_END)
+            log.seek(max(log.tell() - 8192, 0))
+            return log.read().decode("utf-8", "replace").splitlines()
+
+
+def _die_with_parent() -> None:
+    """Runs in the child: Linux sends it SIGINT when the trainer is gone, however that ended."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)

@@ -1,0 +1,80 @@
+"""The Lightning module: loss, optimiser, learning-rate decay, and what a checkpoint holds.
+
+Shape legend: N particles of all scenes of a batch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningModule
+
+from hgn.config import TrainingConfig
+from hgn.data.batch import Batch
+from hgn.data.order import Cursor
+from hgn.data.statistics import Statistics
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.schema import to_mapping
+from hgn.training.checkpoint import SECTION, DataInfo, cursor_of_checkpoint
+from hgn.training.noise import jittered_origin, perturbed_window
+
+
+class TrainingModule(LightningModule):
+    """Trains a hierarchical graph network on one-step accelerations (paper sec. 3.3)."""
+
+    def __init__(self, network: HierarchicalGraphNetwork, training: TrainingConfig, data: DataInfo) -> None:
+        super().__init__()
+        self.network = network
+        self.training_config = training
+        self.data = data
+        self.cursor = Cursor()
+        # Sum of losses and number of updates since the last log line, kept on the device: no synchronisation.
+        self.loss_sum: torch.Tensor
+        self.register_buffer("loss_sum", torch.zeros(2), persistent=False)
+
+    def set_statistics(self, statistics: Statistics) -> None:
+        """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
+        noise = self.training_config.noise_std
+        for quantity in ("velocity", "acceleration"):
+            moments = getattr(statistics, quantity)
+            mean_3, std_3 = torch.tensor(moments.mean), torch.tensor(moments.std)
+            self.network.normaliser.set(quantity, mean_3, std_3, noise)
+
+    def loss(self, batch: Batch) -> torch.Tensor:
+        """Mean squared error of the normalised acceleration: over axes, over particles, over scenes."""
+        config = self.training_config
+        window_WN3 = perturbed_window(batch, config.noise_std)
+        origin_S3 = jittered_origin(batch, self.network.config.cell_size) if config.grid_jitter else None
+        target_N3 = self.network.normaliser.normalise_acceleration(batch.acceleration(window_WN3))
+        predicted_N3 = self.network.normalised_acceleration(batch.state(window_WN3), origin_S3)
+        return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
+
+    def training_step(self, batch: Batch, batch_index: int) -> torch.Tensor:
+        loss = self.loss(batch)
+        self.loss_sum += torch.stack([loss.detach(), torch.ones_like(loss)])
+        assert batch.cursor is not None
+        self.cursor = batch.cursor
+        return loss
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        return batch.to(device, non_blocking=True)
+
+    def configure_optimizers(self) -> Any:
+        config = self.training_config
+        optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
+        decay = (config.final_learning_rate / config.learning_rate) ** (1 / config.maximum_updates)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda update: decay**update)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint[SECTION] = {
+            "network": to_mapping(self.network.config),
+            "noise_std": self.training_config.noise_std,
+            "data": to_mapping(self.data),
+            "cursor": to_mapping(self.cursor),
+            "updates": self.global_step,
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.cursor = cursor_of_checkpoint(checkpoint)

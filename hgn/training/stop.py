@@ -1,0 +1,46 @@
+"""Stopping a training: Ctrl-C, SIGTERM, or the time that a start was given.
+
+A signal only raises a flag; the loop ends at the next update, after a checkpoint was written, and nothing is
+lost. A second Ctrl-C does not wait.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from types import FrameType
+
+
+class StopRequest:
+    """Whether, and why, this process should stop training."""
+
+    def __init__(self, maximum_minutes: float | None = None) -> None:
+        self.signal: int | None = None
+        self._deadline = None if maximum_minutes is None else time.monotonic() + 60 * maximum_minutes
+
+    def listen(self) -> None:
+        """Takes over SIGINT and SIGTERM; only the main thread may call this."""
+        signal.signal(signal.SIGINT, self._on_signal)
+        signal.signal(signal.SIGTERM, self._on_signal)
+
+    def restart_clock(self, maximum_minutes: float | None) -> None:
+        """Counts the time from now: waiting for data is not training."""
+        self._deadline = None if maximum_minutes is None else time.monotonic() + 60 * maximum_minutes
+
+    @property
+    def requested(self) -> bool:
+        return self.signal is not None or self.out_of_time
+
+    @property
+    def out_of_time(self) -> bool:
+        return self._deadline is not None and time.monotonic() > self._deadline
+
+    @property
+    def exit_code(self) -> int:
+        """128 + the signal's number, or 0."""
+        return 0 if self.signal is None else 128 + self.signal
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self.signal is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.signal = number

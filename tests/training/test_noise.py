@@ -1,0 +1,127 @@
+"""Noise injection and grid jitter."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from hgn.data.batch import make_batch
+from hgn.scene.episode import Episode
+from hgn.scene.material import MATERIALS
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.training.noise import jittered_origin, perturbed_window, random_walk
+
+STD = 0.000848528
+
+
+def episode(particles: int, frames: int = 12, seed: int = 0) -> Episode:
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(0, 1e-3, (frames, particles, 3))
+    return Episode(
+        key="train-000000",
+        position_TN3=(0.5 + steps.cumsum(0)).astype(np.float32),
+        initial_velocity_N3=rng.normal(0, 0.1, (particles, 3)).astype(np.float32),
+        material_N=rng.integers(0, 3, particles).astype(np.uint8),
+        obstacle_grid=ObstacleGrid(1 / 64, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32)),
+        domain_size=(1.0, 1.0, 1.0),
+        gravity=(0.0, -9.8, 0.0),
+        frame_rate_hz=60.0,
+        seed=0,
+        specification={},
+        solver={},
+    )
+
+
+def batch_of(*episodes: Episode, frame: int = 6, seeds: tuple[int, ...] | None = None):
+    pairs = [(e, frame) for e in episodes]
+    return make_batch(pairs, 5, MATERIALS, seeds or tuple(range(1, len(pairs) + 1)))
+
+
+def test_walk_has_the_papers_spread():
+    """Over 1e5 draws the last velocity's noise has standard deviation std within 2 %; earlier ones grow as a random
+    walk, sqrt(k / m) of it, with independent steps."""
+    walk_MN3 = random_walk((5, 100_000, 3), STD, torch.Generator().manual_seed(0))
+    for k in range(5):
+        expected = STD * math.sqrt((k + 1) / 5)
+        assert abs(float(walk_MN3[k].std()) / expected - 1) < 0.02
+    steps = torch.diff(walk_MN3, dim=0, prepend=torch.zeros(1, 100_000, 3)).flatten(1)
+    correlation = torch.corrcoef(steps)
+    assert float((correlation - torch.eye(5)).abs().max()) < 0.02
+
+
+def test_noise_in_the_window_is_that_walk():
+    """Positions are the sums of the velocity noise; the oldest position is exact; the next one moves with the last."""
+    batch = batch_of(episode(20_000))
+    noise_WN3 = perturbed_window(batch, STD).double() - batch.window_WN3.double()
+    assert not noise_WN3[0].any()
+    velocity_noise = noise_WN3[1:-1] - noise_WN3[:-2]
+    assert abs(float(velocity_noise[-1].std()) / STD - 1) < 0.02
+    torch.testing.assert_close(noise_WN3[-1], noise_WN3[-2], rtol=0, atol=2e-7)
+
+
+def test_target_undoes_the_velocity_error():
+    """The target is v_true^{n+1} - v_noisy^n."""
+    batch = batch_of(episode(500), episode(300, seed=1))
+    noisy = perturbed_window(batch, STD)
+    true_next = batch.window_WN3[-1] - batch.window_WN3[-2]
+    noisy_velocity = batch.state(noisy).velocity_NM3[:, 0]
+    torch.testing.assert_close(batch.acceleration(noisy), true_next - noisy_velocity, rtol=0, atol=3e-7)
+
+
+def test_noise_belongs_to_the_sample():
+    """A sample's noise depends on its seed alone, not on what shares its batch; other seeds give other noise."""
+    first, second = episode(50), episode(30, seed=1)
+    alone = perturbed_window(batch_of(first, seeds=(7,)), STD)
+    together = perturbed_window(batch_of(second, first, seeds=(9, 7)), STD)
+    assert torch.equal(together[:, 30:], alone)
+    assert not torch.equal(perturbed_window(batch_of(first, seeds=(8,)), STD), alone)
+
+
+def test_no_noise_is_no_copy():
+    """With noise off, the window is used as it is."""
+    batch = batch_of(episode(5))
+    assert perturbed_window(batch, 0.0) is batch.window_WN3
+
+
+def test_stored_episode_is_never_changed():
+    """Making, perturbing and moving batches leaves the episode's arrays bitwise as they were."""
+    stored = episode(40)
+    stored.position_TN3.setflags(write=False)
+    before = stored.position_TN3.tobytes()
+    for frame in range(11):
+        batch = batch_of(stored, frame=frame)
+        perturbed_window(batch, STD)
+        batch.window_WN3.add_(1.0)
+    assert stored.position_TN3.tobytes() == before
+
+
+def test_history_before_the_start_is_ballistic():
+    """Before frame 0 the particles flew freely into their initial state: constant acceleration g dt^2."""
+    stored = episode(30)
+    batch = batch_of(stored, frame=0)
+    velocity = batch.state().velocity_NM3.double()
+    expected = torch.from_numpy(stored.initial_velocity_N3).double() / 60
+    gravity = torch.tensor([0.0, -9.8 / 3600, 0.0], dtype=torch.float64)
+    for k in range(5):
+        torch.testing.assert_close(velocity[:, k], expected - (k + 0.5) * gravity, rtol=0, atol=3e-7)
+    torch.testing.assert_close(batch.gravity_S3[0].double(), gravity, rtol=1e-6, atol=0)
+
+
+def test_jitter_fills_a_cell():
+    """Grid origins are uniform in [-R, 0]^3, one for each scene, and belong to the sample."""
+    stored = episode(2)
+    origins = jittered_origin(batch_of(*[stored] * 2000, seeds=tuple(range(2000))), 0.035)
+    assert origins.shape == (2000, 3)
+    assert float(origins.max()) <= 0 and float(origins.min()) >= -0.035
+    torch.testing.assert_close(origins.mean(0), torch.full((3,), -0.0175), rtol=0.05, atol=0)
+    again = jittered_origin(batch_of(stored, seeds=(5,)), 0.035)
+    assert torch.equal(again[0], origins[5])
+
+
+def test_loss_weighs_scenes_alike():
+    """A scene with many particles counts as much as one with few."""
+    batch = batch_of(episode(10), episode(30, seed=1))
+    value = torch.cat([torch.full((10,), 2.0), torch.full((30,), 4.0)])
+    torch.testing.assert_close(batch.mean_over_scenes(value), torch.tensor(3.0))
