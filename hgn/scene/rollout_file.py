@@ -26,8 +26,12 @@ import h5py
 import numpy as np
 
 from hgn.files import sync_folder, temporary_path
+from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
+from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError
 
 FORMAT_NAME = "hgn rollout"
@@ -91,6 +95,60 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
     if len(velocity_TN3) > 1:
         velocity_TN3[0] = velocity_TN3[1]
     return velocity_TN3
+
+
+def episode_rollout(episode: Episode) -> Rollout:
+    """An episode of a data set as a rollout, to draw or to export as HDF5; its positions stay memory-mapped."""
+    return Rollout(
+        position_TN3=episode.position_TN3,
+        material_N=np.asarray(episode.material_N),
+        obstacles=obstacles_of_episode(episode),
+        domain_size=episode.domain_size,
+        frame_rate_hz=episode.frame_rate_hz,
+        gravity=episode.gravity,
+        cell_size=episode.obstacle_grid.cell_size,
+        source={"episode": episode.key, "seed": episode.seed, "specification": episode.specification},
+    )
+
+
+def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
+    """The meshes of an episode's obstacles, which shards do not hold.
+
+    A random scene's specification has the shape and place of each, so its meshes are built again. Of any other
+    scene (user meshes) only the obstacle cells are known: a square each.
+    """
+    if episode.specification.get("kind") != "random":
+        return cell_obstacles(episode.obstacle_grid)
+    return tuple(
+        shape_obstacle(
+            record["shape"],
+            record["size"],
+            tuple(record["position"]),
+            quaternion_rotation(tuple(record["quaternion"])),
+            f"obstacle_{index}_{record['shape']}",
+        )
+        for index, record in enumerate(episode.specification["obstacles"])
+    )
+
+
+def cell_obstacles(grid: ObstacleGrid) -> tuple[Obstacle, ...]:
+    """One square in each obstacle cell, across its normal: a stand-in where only the cells are known."""
+    if not len(grid.cell_K3):
+        return ()
+    center_K3 = (grid.cell_K3 + 0.5) * grid.cell_size
+    normal_K3 = grid.normal_K3.astype(np.float64)
+    least_K3 = np.eye(3)[np.abs(normal_K3).argmin(axis=1)]
+    side_K3 = np.cross(normal_K3, least_K3)
+    side_K3 /= np.maximum(np.linalg.norm(side_K3, axis=1, keepdims=True), 1e-12)
+    other_K3 = np.cross(normal_K3, side_K3)
+    half = 0.5 * grid.cell_size
+    corner_K43 = np.stack(
+        [center_K3 + half * (a * side_K3 + b * other_K3) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))],
+        axis=1,
+    )
+    first_K = 4 * np.arange(len(center_K3))
+    triangle_F3 = np.concatenate([np.stack((first_K, first_K + i, first_K + i + 1), axis=1) for i in (1, 2)])
+    return (Obstacle("cells", corner_K43.reshape(-1, 3), triangle_F3.astype(np.int32), closed=False),)
 
 
 def write_rollout(path: str | Path, rollout: Rollout) -> None:

@@ -9,7 +9,17 @@ import h5py
 import numpy as np
 import pytest
 
-from hgn.scene.rollout_file import Rollout, frame_velocity, read_rollout, write_rollout
+from hgn.scene.episode import Episode
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.rollout_file import (
+    Rollout,
+    cell_obstacles,
+    episode_rollout,
+    frame_velocity,
+    obstacles_of_episode,
+    read_rollout,
+    write_rollout,
+)
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
@@ -196,3 +206,52 @@ def test_inconsistent_rollouts_are_refused(change: dict, message: str) -> None:
     """Arrays that do not fit together never reach a file."""
     with pytest.raises(ConfigError, match=message):
         dataclasses.replace(make_rollout(), **change)
+
+
+def episode(specification: dict) -> Episode:
+    return Episode(
+        key="validation-000000",
+        position_TN3=np.zeros((4, PARTICLES, 3), np.float32),
+        initial_velocity_N3=np.zeros((PARTICLES, 3), np.float32),
+        material_N=np.zeros(PARTICLES, np.uint8),
+        obstacle_grid=ObstacleGrid(1 / 64, np.array([[30, 30, 30]], np.int32), np.array([[0, 1, 0]], np.float32)),
+        domain_size=(1.0, 1.0, 1.0),
+        gravity=(0.0, -9.8, 0.0),
+        frame_rate_hz=60.0,
+        seed=5,
+        specification=specification,
+        solver={},
+    )
+
+
+def test_cell_obstacles() -> None:
+    """Each cell becomes one square of the cell's size across the stored normal, around the cell's centre."""
+    normal = np.array([[0, 1, 0], [0.6, 0, 0.8]], np.float32)
+    grid = ObstacleGrid(0.25, np.array([[0, 1, 2], [3, 0, 1]], np.int32), normal)
+    (squares,) = cell_obstacles(grid)
+    corner = squares.vertex_V3[squares.triangle_F3]
+    np.testing.assert_allclose(squares.vertex_V3.reshape(2, 4, 3).mean(axis=1), (grid.cell_K3 + 0.5) * 0.25)
+    cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    np.testing.assert_allclose(np.linalg.norm(cross, axis=1), 0.25**2)
+    direction = cross / np.linalg.norm(cross, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.abs((direction * np.tile(normal, (2, 1))).sum(axis=1)), 1, rtol=1e-6)
+    assert cell_obstacles(ObstacleGrid(0.25, np.empty((0, 3), np.int32), np.empty((0, 3), np.float32))) == ()
+
+
+def test_obstacles_of_episodes() -> None:
+    """A random scene's obstacles are built again from its specification; others show their obstacle cells."""
+    record = {"shape": "cone", "size": 0.3, "position": [0.4, 0.3, 0.5], "quaternion": [0.5, 0.5, 0.5, 0.5]}
+    (cone,) = obstacles_of_episode(episode({"kind": "random", "obstacles": [record]}))
+    assert cone.name == "obstacle_0_cone" and cone.closed
+    np.testing.assert_allclose((cone.vertex_V3.min(axis=0) + cone.vertex_V3.max(axis=0)) / 2, (0.4, 0.3, 0.5))
+    np.testing.assert_allclose(np.ptp(cone.vertex_V3, axis=0).max(), 0.3, rtol=1e-6)
+    (cells,) = obstacles_of_episode(episode({"kind": "user"}))
+    assert len(cells.triangle_F3) == 2
+
+
+def test_episode_as_rollout(tmp_path: Path) -> None:
+    """An episode becomes a rollout without ground truth, and survives the file: HDF5 is the way out of a data set."""
+    rollout = episode_rollout(episode({"kind": "user"}))
+    assert rollout.reference_TN3 is None and rollout.source["episode"] == "validation-000000"
+    write_rollout(tmp_path / "episode.h5", rollout)
+    assert read_rollout(tmp_path / "episode.h5").source == rollout.source
