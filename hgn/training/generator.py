@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -30,10 +31,11 @@ class Generator:
             "scenes": config.dataset.training_scenes,
             "out": config.dataset.folder,
             "progress": "json",
-            "hydra": {"run": {"dir": "."}, "output_subdir": None},
         }
         (folder / "dataset.yaml").write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
         self.log_path = folder / "datagen.log"
+        self._read_to = self._finished = self._frames_per_episode = 0
+        self._running: dict[int, int] = {}  # frames of the launch that each worker is in
         with self.log_path.open("wb") as log:
             command = [
                 sys.executable,
@@ -59,17 +61,25 @@ class Generator:
         if code not in (None, 0):
             raise ConfigError(f"the generator ended with exit code {code}: {self._last_error()} (log: {self.log_path})")
 
-    def progress(self) -> dict[str, object]:
-        """Its newest progress record, empty before the first."""
-        for line in reversed(self._tail()):
-            if line.startswith("{"):
-                try:
-                    record = json.loads(line)
-                except json.JSONDecodeError:
-                    continue  # the line is still being written
-                if isinstance(record, dict):
-                    return record
-        return {}
+    def frames_done(self) -> int:
+        """Frames simulated since it started, those of running episodes included."""
+        with self.log_path.open("rb") as log:
+            log.seek(self._read_to)
+            for line in log:
+                if not line.endswith(b"\n"):
+                    break  # still being written
+                self._read_to += len(line)
+                if line.startswith(b"{"):
+                    self._note(json.loads(line))
+        return self._finished * self._frames_per_episode + sum(self._running.values())
+
+    def _note(self, record: dict[str, Any]) -> None:
+        if record["event"] == "start":
+            self._frames_per_episode = record["frames"]
+        elif record["event"] == "frame":
+            self._running[record["worker"]] = record["frame"] * record["scenes"]
+        elif record["event"] == "episode":
+            self._finished += 1
 
     def stop(self) -> None:
         """Ends the process as Ctrl-C does: it keeps what it has finished and can go on later."""
