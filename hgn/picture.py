@@ -18,8 +18,9 @@ from scipy.spatial import KDTree
 
 from hgn.files import write_atomically
 from hgn.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, Stage, to_bytes
+from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
-from hgn.scene.rollout_file import Rollout
+from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
@@ -210,6 +211,24 @@ def particle_spacing(position_N3: np.ndarray) -> float:
         return 1 / 128  # the usual eight particles in a cell of 1/64
     some = position_N3[:: max(1, len(position_N3) // 2000)]
     return max(float(np.median(KDTree(position_N3).query(some, k=4)[0][:, 3])), 1e-6)
+
+
+def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None) -> Rollout:
+    """An episode of a data set as a rollout: alone, or as the ground truth of a prediction float32 [T, N, 3].
+
+    The episode's positions stay memory-mapped.
+    """
+    return Rollout(
+        position_TN3=episode.position_TN3 if predicted_TN3 is None else predicted_TN3,
+        material_N=np.asarray(episode.material_N),
+        obstacles=obstacles_of_episode(episode),
+        domain_size=episode.domain_size,
+        frame_rate_hz=episode.frame_rate_hz,
+        gravity=episode.gravity,
+        cell_size=episode.obstacle_grid.cell_size,
+        source={"episode": episode.key, "seed": episode.seed, "specification": episode.specification},
+        reference_TN3=None if predicted_TN3 is None else episode.position_TN3,
+    )
 
 
 def check_frames(frames: Sequence[int], frame_count: int) -> None:

@@ -18,9 +18,12 @@ from hgn.picture import (
     error_curve,
     particle_spacing,
     position_error,
+    rollout_of_episode,
     write_picture,
 )
-from hgn.scene.rollout_file import Rollout
+from hgn.scene.episode import Episode
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
@@ -184,12 +187,32 @@ def test_particle_spacing() -> None:
     assert particle_spacing(np.zeros((50, 3))) > 0
 
 
-def test_data_are_not_called_a_prediction() -> None:
-    """A trajectory that no weights made is drawn without a row label."""
-    rollout = falling_blobs(4)
-    named = compare_picture(rollout, [0, 3], size=100)
-    plain = compare_picture(dataclasses.replace(rollout, source={"episode": "test-000000"}), [0, 3], size=100)
-    assert plain.width < named.width
+def test_episode_as_rollout(tmp_path: Path) -> None:
+    """An episode alone is no prediction and is not labelled as one; beside a prediction it is the ground truth."""
+    blobs = falling_blobs(4, 6)
+    assert blobs.reference_TN3 is not None
+    episode = Episode(
+        key="validation-000000",
+        position_TN3=blobs.reference_TN3,
+        initial_velocity_N3=np.zeros((blobs.particle_count, 3), np.float32),
+        material_N=blobs.material_N,
+        obstacle_grid=ObstacleGrid(1 / 64, np.full((1, 3), 30, np.int32), np.array([[0, 1, 0]], np.float32)),
+        domain_size=(1.0, 1.0, 1.0),
+        gravity=(0.0, -9.8, 0.0),
+        frame_rate_hz=60.0,
+        seed=5,
+        specification={"kind": "user"},
+        solver={},
+    )
+    alone = rollout_of_episode(episode)
+    assert alone.reference_TN3 is None and alone.source["episode"] == "validation-000000"
+    np.testing.assert_array_equal(alone.position_TN3, episode.position_TN3)
+    predicted = rollout_of_episode(episode, blobs.position_TN3)
+    np.testing.assert_array_equal(predicted.position_TN3, blobs.position_TN3)
+    np.testing.assert_array_equal(predicted.reference_TN3, episode.position_TN3)
+    write_rollout(tmp_path / "episode.h5", alone)
+    assert read_rollout(tmp_path / "episode.h5").source == alone.source
+    assert compare_picture(alone, [0, 3], 100).width < compare_picture(predicted, [0, 3], 100).width
 
 
 def test_png_keeps_its_source(tmp_path: Path) -> None:

@@ -97,20 +97,6 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
     return velocity_TN3
 
 
-def episode_rollout(episode: Episode) -> Rollout:
-    """An episode of a data set as a rollout, to draw or to export as HDF5; its positions stay memory-mapped."""
-    return Rollout(
-        position_TN3=episode.position_TN3,
-        material_N=np.asarray(episode.material_N),
-        obstacles=obstacles_of_episode(episode),
-        domain_size=episode.domain_size,
-        frame_rate_hz=episode.frame_rate_hz,
-        gravity=episode.gravity,
-        cell_size=episode.obstacle_grid.cell_size,
-        source={"episode": episode.key, "seed": episode.seed, "specification": episode.specification},
-    )
-
-
 def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
     """The meshes of an episode's obstacles, which shards do not hold.
 

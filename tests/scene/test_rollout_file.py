@@ -14,7 +14,6 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.rollout_file import (
     Rollout,
     cell_obstacles,
-    episode_rollout,
     frame_velocity,
     obstacles_of_episode,
     read_rollout,
@@ -247,11 +246,3 @@ def test_obstacles_of_episodes() -> None:
     np.testing.assert_allclose(np.ptp(cone.vertex_V3, axis=0).max(), 0.3, rtol=1e-6)
     (cells,) = obstacles_of_episode(episode({"kind": "user"}))
     assert len(cells.triangle_F3) == 2
-
-
-def test_episode_as_rollout(tmp_path: Path) -> None:
-    """An episode becomes a rollout without ground truth, and survives the file: HDF5 is the way out of a data set."""
-    rollout = episode_rollout(episode({"kind": "user"}))
-    assert rollout.reference_TN3 is None and rollout.source["episode"] == "validation-000000"
-    write_rollout(tmp_path / "episode.h5", rollout)
-    assert read_rollout(tmp_path / "episode.h5").source == rollout.source

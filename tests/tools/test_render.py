@@ -1,0 +1,113 @@
+"""python -m tools.render: which files it writes, and what it says of input that does not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hgn.config import DatagenConfig, RenderConfig
+from hgn.scene.rollout_file import Rollout, write_rollout
+from hgn.schema import ConfigError
+from tools.render import main
+
+FRAMES = 9
+
+
+def rollout_file(folder: Path, reference: bool) -> Path:
+    generator = np.random.default_rng(0)
+    start = 0.3 + 0.05 * generator.random((60, 3))
+    position = (start - np.linspace(0, 0.2, FRAMES)[:, None, None] * (0, 1, 0)).astype(np.float32)
+    rollout = Rollout(
+        position_TN3=position,
+        material_N=np.repeat(np.arange(3, dtype=np.uint8), 20),
+        obstacles=(),
+        domain_size=(1.0, 1.0, 1.0),
+        frame_rate_hz=60.0,
+        source={"weights": "model.safetensors"},
+        reference_TN3=position + np.float32(0.01) if reference else None,
+    )
+    write_rollout(folder / "fall.vtkhdf", rollout)
+    return folder / "fall.vtkhdf"
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str], reference: bool) -> None:
+    """A folder gets the grid, the animation and, with ground truth, the error; each path is printed."""
+    path = rollout_file(tmp_path, reference)
+    main({"rollout": str(path), "out": str(tmp_path / "pictures"), "size": 80})
+    wanted = ["fall.png", "fall.gif"] + ["fall_error.png"] * reference
+    assert [Path(line).name for line in capsys.readouterr().out.split()] == wanted
+    assert sorted(entry.name for entry in (tmp_path / "pictures").iterdir()) == sorted(wanted)
+    for name in wanted:
+        with Image.open(tmp_path / "pictures" / name) as picture:
+            picture.load()
+            assert getattr(picture, "n_frames", 1) == (3 if name.endswith("gif") else 1)
+
+
+@pytest.mark.parametrize("ending", ["png", "gif"])
+def test_single_file(tmp_path: Path, ending: str) -> None:
+    """A file name as `out` gets that picture alone, with the frames asked for."""
+    path = rollout_file(tmp_path, True)
+    out = tmp_path / f"one.{ending}"
+    main({"rollout": str(path), "out": str(out), "size": 80, "frames": [0, 8], "every": 4, "fps": 10})
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["fall.vtkhdf", f"one.{ending}"]
+    with Image.open(out) as picture:
+        assert picture.format == ending.upper()
+
+
+def test_no_gif(tmp_path: Path) -> None:
+    """gif=false leaves the animation out."""
+    main({"rollout": str(rollout_file(tmp_path, False)), "out": str(tmp_path / "p"), "size": 80, "gif": False})
+    assert [entry.name for entry in (tmp_path / "p").iterdir()] == ["fall.png"]
+
+
+def test_episode_of_a_data_set(
+    tmp_path: Path, make_dataset: Callable[[DatagenConfig], Path], make_config: Callable[..., DatagenConfig]
+) -> None:
+    """An episode is drawn without a rollout; a key that is not there is answered with those that are."""
+    folder = make_dataset(make_config(training_scenes=1, validation_scenes=2, test_scenes=1))
+    mapping = {"data": str(folder), "out": str(tmp_path / "out"), "size": 80}
+    main(mapping | {"episode": "validation-000001"})
+    assert sorted(entry.name for entry in (tmp_path / "out").iterdir()) == [
+        "validation-000001.gif",
+        "validation-000001.png",
+    ]
+    with pytest.raises(ConfigError, match="one of the 2 validation episodes"):
+        main(mapping | {"episode": "validation-000009"})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rollout": None}, "rollout must be a file, or else data and episode given"),
+        ({"data": "folder"}, "rollout must be left out where data and episode are given"),
+        ({"rollout": "nothing.h5"}, "rollout must be an existing file"),
+        ({"out": "picture.jpg"}, r"out must be a folder or end in \.png or \.gif, got 'picture\.jpg'"),
+        ({"frames": [0, 9]}, r"frames\[1\] must be in \[0, 9\)"),
+        ({"every": 0}, "every must be at least 1"),
+        ({"size": 10}, "size must be 64 to 4096 pixels"),
+        ({"fps": float("nan")}, "fps must be a finite number > 0"),
+        ({"colour": "red"}, "colour is not a known key"),
+        ({"rollout": None, "data": "d", "episode": "holiday-000000"}, "episode must begin with one of train"),
+        ({"rollout": None, "data": "missing", "episode": "test-000000"}, "missing"),
+    ],
+)
+def test_bad_input(tmp_path: Path, change: dict, message: str) -> None:
+    """Every wrong value is named with its rule, and nothing is written."""
+    mapping = {"rollout": str(rollout_file(tmp_path, False)), "out": str(tmp_path / "out"), "size": 80} | change
+    with pytest.raises(ConfigError, match=message):
+        main(mapping)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["fall.vtkhdf"]
+
+
+def test_config_file_has_the_fields_of_the_dataclass() -> None:
+    """conf/render.yaml and RenderConfig name the same keys, with the same defaults."""
+    import yaml
+
+    root = Path(__file__).resolve().parents[2]
+    keys = yaml.safe_load((root / "conf" / "render.yaml").read_text())
+    assert keys | {"rollout": "file"} == vars(RenderConfig(rollout="file", out="pictures"))
