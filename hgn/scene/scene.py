@@ -54,9 +54,7 @@ class Scene:
         for name in ("position_N3", "velocity_N3"):
             bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(axis=1))
             if len(bad):
-                raise ConfigError(
-                    f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}"
-                )
+                raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
         if count and int(self.material_N.max()) >= len(MATERIALS):
             raise ConfigError(f"material_N must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
 

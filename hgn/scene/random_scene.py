@@ -1,0 +1,244 @@
+"""Random scenes after the paper (sec. 3.3): disjoint obstacles, and groups of particles clear of them.
+
+A scene follows from (config, seed) alone, bitwise on every machine: all randomness is `PCG64` through
+`Generator.random()`, all geometry that reaches the scene is sums, products and square roots, and the only
+sines and cosines (in the unit shapes) are rounded to float32.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hgn.config import SceneConfig
+from hgn.scene.distance import contains
+from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, points_in_ball, region_of
+from hgn.scene.material import material_index
+from hgn.scene.rotation import quaternion_rotation, rotate
+from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.shapes import shape_obstacle, unit_shape
+from hgn.scene.surface import split_long_edges
+from hgn.schema import ConfigError, require
+
+LAYOUTS = 5  # whole scenes begun afresh before giving up
+SHAPES_PER_ITEM = 20  # sizes, shapes and orientations drawn for one obstacle or group
+PLACES_PER_SHAPE = 50
+SURFACE_DETAIL = 0.045  # longest edge, relative to the size, of the pieces that distances are taken between
+FEW = 32
+ROUNDING = 1e-6  # of a length; keeps float32 rounding on the right side of every bound
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """An obstacle with points of its surface; no surface point is farther than `gap` from one of them."""
+
+    obstacle: Obstacle
+    point_P3: np.ndarray
+    gap: float
+    tree: cKDTree
+    low: np.ndarray
+    high: np.ndarray
+    record: dict[str, Any]
+
+
+class _NoRoomError(Exception):
+    """One item found no place in this layout."""
+
+
+def generate_scene(config: SceneConfig, seed: int) -> Scene:
+    """A random scene with particles at rest, or with one velocity per group.
+
+    Obstacles lie completely inside the domain, `clearance_cells` solver cells from each other and none inside
+    another; groups keep the same distance to obstacles, to each other and to the solver's walls. Items are
+    placed by rejection: a new place, then a new size, shape and orientation, then a new layout.
+    `Scene.specification` records every choice in plain JSON types.
+
+    Raises: ConfigError when an item finds no room, with what to change.
+    """
+    require(isinstance(seed, int) and seed >= 0, "seed", "a whole number >= 0", seed)
+    rng = np.random.Generator(np.random.PCG64(seed))
+    failure = ""
+    for _ in range(LAYOUTS):
+        try:
+            obstacles = _place_obstacles(config, rng)
+            groups = _place_groups(config, obstacles, rng)
+        except _NoRoomError as error:
+            failure = str(error)
+            continue
+        return _assemble(config, seed, obstacles, groups, rng)
+    raise ConfigError(f"{failure} ({LAYOUTS} layouts, seed {seed})")
+
+
+def _place_obstacles(config: SceneConfig, rng: np.random.Generator) -> list[_Placed]:
+    placed: list[_Placed] = []
+    for index in range(config.obstacle_count):
+        placed.append(_place_obstacle(config, placed, index, rng))
+    return placed
+
+
+def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng: np.random.Generator) -> _Placed:
+    clearance = config.clearance_cells * config.cell_size
+    domain = np.array(config.domain_size)
+    smallest, largest = config.obstacle_size
+    for _ in range(SHAPES_PER_ITEM):
+        shape = _choice(config.obstacle_shapes, rng)
+        size = smallest + (largest - smallest) * rng.random()
+        quaternion = _random_quaternion(rng)
+        rotation = quaternion_rotation(quaternion)
+        turned = shape_obstacle(shape, size, rotation_33=rotation)
+        low, high = turned.vertex_V3.min(axis=0), turned.vertex_V3.max(axis=0)
+        first = -low + ROUNDING * domain
+        room = domain - ROUNDING * domain - high - first
+        if (room < 0).any():
+            continue
+        unit_surface, unit_gap = _unit_surface_points(shape)
+        surface, gap = rotate(size * unit_surface, rotation), size * unit_gap
+        for _ in range(PLACES_PER_SHAPE):
+            centre = first + room * rng.random(3)
+            position = _triple(centre)
+            obstacle = shape_obstacle(shape, size, position, rotation, f"obstacle_{index}_{shape}")
+            point = surface + centre
+            if any(_too_near(obstacle, point, gap, other, clearance) for other in placed):
+                continue
+            record = {"shape": shape, "size": size, "position": list(position), "quaternion": list(quaternion)}
+            return _Placed(obstacle, point, gap, cKDTree(point), low + centre, high + centre, record)
+    raise _NoRoomError(
+        f"obstacle_count must leave room for each obstacle, got no place for number {index + 1} of "
+        f"{config.obstacle_count}; lower obstacle_count, obstacle_size or clearance_cells, or raise domain_size"
+    )
+
+
+def _too_near(obstacle: Obstacle, point: np.ndarray, gap: float, other: _Placed, clearance: float) -> bool:
+    low, high = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
+    bound = clearance + gap + other.gap  # apart by this, the points prove the surfaces apart by the clearance
+    if (low > other.high + bound).any() or (high < other.low - bound).any():
+        return False
+    point = point[((point >= other.low - bound) & (point <= other.high + bound)).all(axis=1)]
+    for some in (point[::FEW], point):  # most overlaps show at a few points already
+        if np.isfinite(other.tree.query(some, distance_upper_bound=bound)[0]).any():
+            return True
+    # the surfaces do not meet, so one vertex tells whether one body holds the other
+    holds = contains(obstacle.vertex_V3[:1], other.obstacle) | contains(other.obstacle.vertex_V3[:1], obstacle)
+    return bool(holds.any())
+
+
+def _place_groups(config: SceneConfig, obstacles: list[_Placed], rng: np.random.Generator) -> list[tuple[str, Region]]:
+    placed: list[tuple[str, Region]] = []
+    for index in range(config.group_count):
+        placed.append(_place_group(config, obstacles, [region for _, region in placed], index, rng))
+    return placed
+
+
+def _place_group(
+    config: SceneConfig,
+    obstacles: list[_Placed],
+    groups: list[Region],
+    index: int,
+    rng: np.random.Generator,
+) -> tuple[str, Region]:
+    clearance = config.clearance_cells * config.cell_size + ROUNDING
+    margin = WALL_CELLS * config.cell_size + clearance + 0.5 * config.group_size
+    room = np.array(config.domain_size) - 2 * margin
+    size = (config.group_size,) * 3
+    for _ in range(SHAPES_PER_ITEM if (room >= 0).all() else 0):
+        shape = _choice(config.group_shapes, rng)
+        for _ in range(PLACES_PER_SHAPE):
+            region = region_of(shape, size, _triple(margin + room * rng.random(3)))
+            if any(region.distance(other) < clearance for other in groups):
+                continue
+            if any(_blocked(region, item, clearance) for item in obstacles):
+                continue
+            return shape, region
+    raise _NoRoomError(
+        f"group_count must leave room for each group, got no place for number {index + 1} of "
+        f"{config.group_count} with group_size {config.group_size:g}; lower group_count, group_size, "
+        "clearance_cells or obstacle_count, or raise domain_size"
+    )
+
+
+def _blocked(region: Region, item: _Placed, clearance: float) -> bool:
+    bound = clearance + item.gap
+    centre = np.array(region.centre)
+    if (centre - region.reach > item.high + bound).any() or (centre + region.reach < item.low - bound).any():
+        return False
+    if (region.distances(item.point_P3) < bound).any():
+        return True
+    return bool(contains(centre[None], item.obstacle)[0])
+
+
+def _assemble(
+    config: SceneConfig,
+    seed: int,
+    obstacles: list[_Placed],
+    groups: list[tuple[str, Region]],
+    rng: np.random.Generator,
+) -> Scene:
+    positions, velocities, materials = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)], []
+    records: list[dict[str, Any]] = []
+    for shape, region in groups:
+        material = _choice(config.materials, rng)
+        velocity = np.zeros(3)
+        if config.maximum_initial_speed > 0:
+            velocity = config.maximum_initial_speed * points_in_ball(1, 3, rng)[0]
+        count = particle_count(region, config.particles_per_cell, config.cell_size)
+        positions.append(fill(region, count, rng))
+        velocities.append(np.tile(velocity.astype(np.float32), (count, 1)))
+        materials.append(np.full(count, material_index(material), np.uint8))
+        records.append(
+            {
+                "shape": shape,
+                "size": config.group_size,
+                "position": list(region.centre),
+                "material": material,
+                "velocity": velocity.tolist(),
+                "particle_count": count,
+            }
+        )
+    return Scene(
+        position_N3=np.concatenate(positions),
+        velocity_N3=np.concatenate(velocities),
+        material_N=np.concatenate([np.zeros(0, np.uint8), *materials]),
+        obstacles=tuple(item.obstacle for item in obstacles),
+        domain_size=config.domain_size,
+        cell_size=config.cell_size,
+        gravity=config.gravity,
+        seed=seed,
+        specification={
+            "kind": "random",
+            "seed": seed,
+            "obstacles": [item.record for item in obstacles],
+            "groups": records,
+        },
+    )
+
+
+@functools.cache
+def _unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
+    """Points on the shape of size 1, and how far the rest of its surface is from them at most."""
+    vertex, triangle = unit_shape(shape)
+    pieces, _ = split_long_edges(vertex[triangle], SURFACE_DETAIL)
+    centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
+    offset = pieces - centroid[:, None]  # the farthest point of a triangle from its centroid is a corner
+    return centroid, float(np.sqrt((offset * offset).sum(axis=2).max())) + ROUNDING
+
+
+def _random_quaternion(rng: np.random.Generator) -> tuple[float, float, float, float]:
+    """A uniformly random unit quaternion, by rejection in the 4-ball."""
+    while True:
+        w, x, y, z = points_in_ball(1, 4, rng)[0].tolist()
+        length = float(np.sqrt(w * w + x * x + y * y + z * z))
+        if length > 0.1:  # dividing by less would magnify rounding
+            return w / length, x / length, y / length, z / length
+
+
+def _choice(options: tuple[str, ...], rng: np.random.Generator) -> str:
+    return options[int(rng.random() * len(options))]
+
+
+def _triple(point: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = point.tolist()
+    return x, y, z

@@ -1,0 +1,220 @@
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from hgn.config import SceneConfig
+from hgn.scene.distance import closest_points, contains
+from hgn.scene.group import WALL_CELLS, fill, particle_count, points_in_ball, region_of
+from hgn.scene.material import MATERIALS
+from hgn.scene.obstacle_grid import build_obstacle_grid
+from hgn.scene.random_scene import generate_scene
+from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.surface import split_long_edges
+from hgn.schema import ConfigError
+
+PAPER = SceneConfig()
+NO_OBSTACLES = SceneConfig(obstacle_count=0, group_shapes=("cube",))
+CELL = 1 / 64
+SEEDS = [0, 1, 2, 12345]
+
+
+def digest(scene: Scene) -> str:
+    """Eight digits each of: specification, positions and velocities, obstacle vertices."""
+    parts = (
+        json.dumps(scene.specification, sort_keys=True).encode(),
+        scene.position_N3.tobytes() + scene.velocity_N3.tobytes() + scene.material_N.tobytes(),
+        b"".join(item.vertex_V3.tobytes() + item.triangle_F3.tobytes() for item in scene.obstacles),
+    )
+    return " ".join(hashlib.sha256(part).hexdigest()[:8] for part in parts)
+
+
+def surface_distances(point: np.ndarray, obstacle: Obstacle) -> np.ndarray:
+    """Exact distance of each point to the surface, by brute force."""
+    corner = obstacle.vertex_V3[obstacle.triangle_F3]
+    best = np.full(len(point), np.inf)
+    for triangle in corner:
+        closest = closest_points(point, np.broadcast_to(triangle, (len(point), 3, 3)))
+        best = np.minimum(best, np.sqrt(((closest - point) ** 2).sum(axis=1)))
+    return best
+
+
+GOLDEN = {
+    0: "0b5df916 ac35166e dd382fe4",
+    1: "e8658f89 9dee6008 c5b19817",
+    2: "03f95146 85601d1c d86834ad",
+    12345: "1ad2f825 c6948d95 fb30c8ce",
+}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_scene_is_bitwise_the_same_everywhere(seed):
+    """Specification, particles and obstacles of a seed have these hashes on every machine, in every release."""
+    assert digest(generate_scene(PAPER, seed)) == GOLDEN[seed]
+    assert digest(generate_scene(PAPER, seed)) == GOLDEN[seed]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_obstacles_are_inside_the_domain_and_disjoint(seed):
+    """Five obstacles inside the domain, at least the clearance apart, none inside another; sizes in the range."""
+    scene = generate_scene(PAPER, seed)
+    assert len(scene.obstacles) == 5
+    for i, one in enumerate(scene.obstacles):
+        assert one.vertex_V3.min() >= 0
+        assert one.vertex_V3.max() <= 1
+        assert 0.1 <= scene.specification["obstacles"][i]["size"] <= 0.5
+        for other in scene.obstacles[:i]:
+            pieces, _ = split_long_edges(one.vertex_V3[one.triangle_F3], 0.02)
+            points = np.concatenate([pieces.mean(axis=1), one.vertex_V3])
+            assert surface_distances(points, other).min() >= 2 * CELL
+            assert not contains(points[:1], other).any()
+            assert not contains(other.vertex_V3[:1], one).any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("clearance", [0.0, 2.0])
+def test_particles_are_clear_of_obstacles_walls_and_other_groups(seed, clearance):
+    """Every particle keeps the clearance to surfaces, walls and other groups, and is inside no closed body."""
+    config = SceneConfig(clearance_cells=clearance)
+    scene = generate_scene(config, seed)
+    point = scene.position_N3.astype(np.float64)
+    inner = (WALL_CELLS + clearance) * CELL
+    assert point.min() > inner
+    assert point.max() < 1 - inner
+    for obstacle in scene.obstacles:
+        assert surface_distances(point, obstacle).min() > clearance * CELL
+        assert not contains(point, obstacle).any()
+    groups = scene.specification["groups"]
+    ends = np.cumsum([item["particle_count"] for item in groups])
+    parts = np.split(point, ends[:-1])
+    assert ends[-1] == len(point)
+    for i, one in enumerate(parts):
+        for other in parts[:i]:
+            nearest = np.sqrt(((one[:, None] - other[None, ::7]) ** 2).sum(axis=2)).min()
+            assert nearest > clearance * CELL
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_obstacle_free_scenes_have_the_papers_particle_count(seed):
+    """Four cubes of 0.08 at eight particles per cell are 4,296 particles (paper sec. 4)."""
+    scene = generate_scene(NO_OBSTACLES, seed)
+    assert scene.particle_count == 4296
+    assert scene.obstacles == ()
+    assert len(build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed).cell_K3) == 0
+
+
+def test_scene_agrees_with_its_specification():
+    """Counts, materials, velocities and places in the specification are those of the arrays; it is plain JSON."""
+    config = SceneConfig(maximum_initial_speed=3.0)
+    scene = generate_scene(config, 7)
+    assert json.loads(json.dumps(scene.specification)) == scene.specification
+    assert scene.specification["seed"] == scene.seed == 7
+    assert scene.position_N3.dtype == scene.velocity_N3.dtype == np.float32
+    assert scene.material_N.dtype == np.uint8
+    start = 0
+    for group in scene.specification["groups"]:
+        part = slice(start, start + group["particle_count"])
+        start = part.stop
+        assert set(scene.material_N[part]) == {MATERIALS.index(group["material"])}
+        velocity = np.array(group["velocity"], np.float32)
+        assert (scene.velocity_N3[part] == velocity).all()
+        assert 0 < np.linalg.norm(velocity) <= 3.0
+        offset = np.abs(scene.position_N3[part] - np.array(group["position"]))
+        assert offset.max() <= 0.04 + 1e-6
+        if group["shape"] == "sphere":
+            assert np.linalg.norm(offset, axis=1).max() <= 0.04 + 1e-6
+    assert start == scene.particle_count
+    for record, obstacle in zip(scene.specification["obstacles"], scene.obstacles, strict=True):
+        assert record["shape"] in obstacle.name
+        assert np.linalg.norm(record["quaternion"]) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_scenes_at_rest_have_no_velocity():
+    """With maximum_initial_speed 0 every velocity is exactly zero."""
+    assert not generate_scene(PAPER, 3).velocity_N3.any()
+
+
+def test_draws_cover_their_ranges():
+    """Over 60 scenes every shape and material appears, and sizes fill their range without a strong bias."""
+    scenes = [generate_scene(PAPER, seed) for seed in range(60)]
+    records = [record for scene in scenes for record in scene.specification["obstacles"]]
+    assert {record["shape"] for record in records} == set(PAPER.obstacle_shapes)
+    groups = [record for scene in scenes for record in scene.specification["groups"]]
+    assert {record["material"] for record in groups} == set(MATERIALS)
+    assert {record["shape"] for record in groups} == {"cube", "sphere"}
+    assert 0.27 < np.mean([record["size"] for record in records]) < 0.32
+    counts = [scene.particle_count for scene in scenes]
+    assert 2252 <= min(counts) < max(counts) <= 4296
+
+
+def test_wider_domains_and_more_items_work():
+    """A domain of 2 x 1 x 2 with 20 obstacles and 16 groups fills up as asked."""
+    config = SceneConfig(domain_size=(2.0, 1.0, 2.0), obstacle_count=20, group_count=16, obstacle_size=(0.1, 0.3))
+    scene = generate_scene(config, 0)
+    assert (len(scene.obstacles), len(scene.specification["groups"])) == (20, 16)
+    assert scene.position_N3[:, [0, 2]].max() > 1.2
+
+
+def test_no_groups_and_no_obstacles_is_an_empty_scene():
+    """Zero of everything is a scene of the right shapes."""
+    scene = generate_scene(SceneConfig(obstacle_count=0, group_count=0), 0)
+    assert scene.particle_count == 0
+    assert scene.material_N.dtype == np.uint8
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (SceneConfig(obstacle_count=3, obstacle_size=(0.9, 0.9)), "obstacle_count must leave room .* number"),
+        (SceneConfig(obstacle_count=1, obstacle_size=(3.0, 3.0)), "number 1 of 1; lower obstacle_count"),
+        (SceneConfig(obstacle_count=0, group_size=1.0), "group_size 1; lower group_count"),
+        (SceneConfig(obstacle_count=0, group_size=0.4, group_count=9), "group_count must leave room"),
+    ],
+)
+def test_what_does_not_fit_is_named(config, message):
+    """Too many or too large items end in an error that says which and what to change."""
+    with pytest.raises(ConfigError, match=message):
+        generate_scene(config, 0)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5])
+def test_bad_seeds_are_refused(seed):
+    """A seed is a whole number of at least zero."""
+    with pytest.raises(ConfigError, match="seed must be a whole number >= 0"):
+        generate_scene(PAPER, seed)
+
+
+def test_particle_counts():
+    """Cube and box int(n + 1), sphere ceil(n), with n eight per cell."""
+    centre = (0.5, 0.5, 0.5)
+    assert particle_count(region_of("cube", (0.08,) * 3, centre), 8.0, CELL) == 1074
+    assert particle_count(region_of("sphere", (0.08,) * 3, centre), 8.0, CELL) == 563
+    assert particle_count(region_of("box", (4 * CELL, 2 * CELL, CELL), centre), 8.0, CELL) == 65
+    assert particle_count(region_of("cube", (1e-9,) * 3, centre), 8.0, CELL) == 1
+
+
+def test_region_distances():
+    """Boxes and balls: face to face, corner to corner, ball to box, and negative or zero inside."""
+    box = region_of("box", (2.0, 2.0, 2.0), (0.0, 0.0, 0.0))
+    ball = region_of("sphere", (2.0, 2.0, 2.0), (3.0, 0.0, 0.0))
+    far = region_of("cube", (2.0, 2.0, 2.0), (3.0, 3.0, 3.0))
+    assert box.distance(ball) == ball.distance(box) == 1.0
+    assert box.distance(far) == pytest.approx(np.sqrt(3))
+    assert box.distance(box) <= 0
+    assert ball.distance(ball) < 0
+    assert box.distances(np.array([[0.0, 4.0, 5.0], [0.5, 0.0, 0.0]])).tolist() == [5.0, 0.0]
+    assert ball.distances(np.array([[3.0, 3.0, 0.0], [3.0, 0.0, 0.0]])).tolist() == [2.0, -1.0]
+
+
+def test_fill_is_uniform():
+    """Means and second moments of 20,000 points are those of the uniform ball and box, within five sigma."""
+    rng = np.random.Generator(np.random.PCG64(0))
+    ball = points_in_ball(20_000, 3, rng)
+    assert np.abs(ball.mean(axis=0)).max() < 5 * np.sqrt(0.2 / 20_000)
+    assert (ball**2).sum(axis=1).mean() == pytest.approx(0.6, abs=0.01)
+    assert np.abs(ball).max() <= 1
+    box = fill(region_of("box", (0.2, 0.4, 0.6), (1.0, 2.0, 3.0)), 20_000, rng)
+    assert box.dtype == np.float32
+    np.testing.assert_allclose(box.mean(axis=0), [1, 2, 3], atol=0.01)
+    np.testing.assert_allclose(box.std(axis=0), np.array([0.2, 0.4, 0.6]) / np.sqrt(12), rtol=0.02)
