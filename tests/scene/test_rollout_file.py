@@ -9,8 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
+from hgn.config import SceneConfig
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import (
     Rollout,
     cell_obstacles,
@@ -246,3 +248,14 @@ def test_obstacles_of_episodes() -> None:
     np.testing.assert_allclose(np.ptp(cone.vertex_V3, axis=0).max(), 0.3, rtol=1e-6)
     (cells,) = obstacles_of_episode(episode({"kind": "user"}))
     assert len(cells.triangle_F3) == 2
+
+
+def test_obstacles_of_random_scenes_are_exact() -> None:
+    """The rebuilt meshes of a random scene are those it was simulated with, bit for bit, in the same order."""
+    scene = generate_scene(SceneConfig(), 4)
+    rebuilt = obstacles_of_episode(episode(scene.specification))
+    assert [obstacle.name for obstacle in rebuilt] == [obstacle.name for obstacle in scene.obstacles]
+    for left, right in zip(rebuilt, scene.obstacles, strict=True):
+        np.testing.assert_array_equal(left.vertex_V3, right.vertex_V3)
+        np.testing.assert_array_equal(left.triangle_F3, right.triangle_F3)
+        assert left.closed == right.closed
