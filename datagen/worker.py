@@ -19,6 +19,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,7 @@ def start_solver(config: DatagenConfig, backend: Backend, threads: int | None, g
 
 def _run(target: Callable[..., None], connection: Connection, *arguments: Any) -> None:
     _die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     send = _Sender(connection)
     with _errors_sent(send):
         target(connection, send, *arguments)
@@ -248,7 +250,9 @@ def _die_with_parent() -> None:
 
 @contextlib.contextmanager
 def _terminal_signals_blocked() -> Iterator[None]:
-    # a child inherits the mask: Ctrl-C reaches the whole process group, and only the parent may act on it
+    # a child inherits the mask: Ctrl-C reaches the whole process group, and only the parent may act on it.
+    # Starting the resource tracker unblocks the signal, so it is started before.
+    resource_tracker.ensure_running()
     previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

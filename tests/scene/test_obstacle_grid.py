@@ -22,9 +22,7 @@ def rng(seed: int = 0) -> np.random.Generator:
 def sheet(*heights: float, flipped: bool = False) -> Obstacle:
     """Horizontal unit squares at the given heights."""
     vertex = [(x, y, z) for y in heights for x, z in ((0, 0), (0, 1), (1, 1), (1, 0))]
-    triangle = [
-        (4 * i + a, 4 * i + b, 4 * i + c) for i in range(len(heights)) for a, b, c in ((0, 1, 2), (0, 2, 3))
-    ]
+    triangle = [(4 * i + a, 4 * i + b, 4 * i + c) for i in range(len(heights)) for a, b, c in ((0, 1, 2), (0, 2, 3))]
     if flipped:
         triangle = [(a, c, b) for a, b, c in triangle]
     return Obstacle("sheet", np.array(vertex, float), np.array(triangle, np.int32), closed=False)

@@ -1,0 +1,123 @@
+"""What all commands share: Hydra composes the config, and faults a person can mend end in one line, no traceback.
+
+Exit codes: 0 done, 1 the machine is at fault (a full disk, no permission), 2 the input is at fault, 130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
+
+from hgn.config import config_directory
+from hgn.schema import ConfigError
+
+EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+
+# Hydra makes no folder and no log file of its own; the commands say where they write
+_QUIET = (
+    "hydra.run.dir=.",
+    "hydra.output_subdir=null",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+)
+_MACHINE_ERRORS = {
+    errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space",
+    errno.EACCES: "check the permissions",
+    errno.EPERM: "check the permissions",
+    errno.EROFS: "choose a folder that can be written to",
+}
+
+
+def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) -> NoReturn:
+    """Composes `conf/<config_name>.yaml` with the command line, calls `main` with the plain mapping, and exits.
+
+    Hydra's own options (--help, --cfg, --config-path, --config-name, --multirun) work as ever. `main` returns an exit
+    code or None for 0. ConfigError, an unknown key and a full disk are printed as one line, `error: ...`.
+    """
+    try:
+        code = 0
+        for mapping in _compose(config_name):
+            code = main(mapping) or 0
+            if code:
+                break
+    except ConfigError as error:
+        code = _fail(str(error), EXIT_INPUT)
+    except OSError as error:
+        if error.errno not in _MACHINE_ERRORS:
+            raise
+        place = f": {error.filename}" if error.filename else ""
+        remedy = _MACHINE_ERRORS[error.errno]
+        code = _fail(f"{error.strerror}{place}; {remedy} and run the same command again to go on", EXIT_MACHINE)
+    except KeyboardInterrupt:
+        code = _fail("interrupted", EXIT_INTERRUPTED)
+    sys.exit(code)
+
+
+def section(mapping: Mapping[str, Any], known: Mapping[str, str | None]) -> dict[str, Any]:
+    """Picks a command's own keys out of a composed config, which experiment files share with other commands.
+
+    `known` maps each key that may occur to the dotted name under which it is wanted; None leaves it out. Aliases
+    must come after the sections that they write into.
+    Raises: ConfigError for a key that is not known.
+    """
+    for key in mapping:
+        if key not in known:
+            raise ConfigError(f"{key} is not a known key; known keys: {', '.join(known)}")
+    picked: dict[str, Any] = {}
+    for key, name in known.items():
+        if name is None or key not in mapping:
+            continue
+        *folders, leaf = name.split(".")
+        place = picked
+        for folder in folders:
+            place = place.setdefault(folder, {})
+        value = mapping[key]
+        place[leaf] = dict(value) if isinstance(value, Mapping) else value
+    return picked
+
+
+def _compose(config_name: str) -> list[dict[str, Any]]:
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    composed: list[Any] = []  # one config, or several with --multirun
+    arguments, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = _with_quiet(arguments)
+    # Hydra would print and exit itself otherwise
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        hydra.main(version_base="1.3", config_path=str(config_directory()), config_name=config_name)(composed.append)()
+        plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=True) for config in composed]
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_one_line(str(error))) from error
+    finally:
+        sys.argv = arguments
+        if full_error is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = full_error
+    return [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
+
+
+def _with_quiet(arguments: list[str]) -> list[str]:
+    # before the person's own overrides, so that theirs win, and beside them, because argparse takes overrides in one
+    # run only
+    for place, argument in enumerate(arguments):
+        if place and "=" in argument and not argument.startswith("-") and not arguments[place - 1].startswith("--conf"):
+            return [*arguments[:place], *_QUIET, *arguments[place:]]
+    return [*arguments, *_QUIET]
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split("Config search path:")[0].split())
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"error: {message}", file=sys.stderr, flush=True)
+    return code

@@ -1,0 +1,257 @@
+"""The command: one line for each fault, exit codes, Ctrl-C, and progress for people and machines."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from datagen.__main__ import main
+from datagen.progress import BarProgress, JsonProgress
+from hgn.command import run_command
+from hgn.config import DatagenConfig, DatasetConfig, SceneConfig
+from hgn.data.manifest import Manifest
+from hgn.schema import ConfigError, to_mapping
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = ["scenes=3", "dataset.validation_scenes=1", "dataset.test_scenes=0", "dataset.frames=5", "dataset.workers=1"]
+
+
+def start(*arguments: str, ballistic: bool = True, **options: object) -> subprocess.Popen[str]:
+    module = "ballistic_command" if ballistic else "datagen"
+    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
+    return subprocess.Popen(
+        [sys.executable, "-m", module, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
+        start_new_session=True,
+        **options,  # type: ignore[call-overload]
+    )
+
+
+def run(*arguments: str, ballistic: bool = True, **options: object) -> tuple[int, str, str]:
+    process = start(*arguments, ballistic=ballistic, **options)
+    output, errors = process.communicate(timeout=60)
+    return process.returncode, output, errors
+
+
+BAD_INPUT = [
+    (["scenes=abc"], "error: dataset.training_scenes must be a whole number, got 'abc' (str)"),
+    (["dataset.frames=1"], "error: dataset.frames must be at least 2, got 1"),
+    (["colour=1"], "error: Could not override 'colour'. To append to your config use +colour=1"),
+    (["+colour=1"], "error: colour is not a known key; known keys: scene, mpm, dataset, scenes, out,"),
+    (["+dataset.colour=1"], "error: dataset.colour is not a known key; known keys: folder,"),
+    (["scene=moon"], "error: In 'datagen': Could not find 'scene/moon' Available options in 'scene':"),
+    (["progress=loud"], "error: progress must be one of bar, json, off, got 'loud'"),
+    (["out=${nowhere}"], "error: Interpolation key 'nowhere' not found"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_INPUT)
+def test_bad_input_is_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Whatever is wrong with the input, one line says field, rule and value; the exit code is 2; nothing is made."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["datagen", *arguments])
+    with pytest.raises(SystemExit) as exit_:
+        run_command(main, "datagen")
+    output, errors = capsys.readouterr()
+    assert exit_.value.code == 2 and output == ""
+    assert errors.startswith(message) and errors.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+    assert sys.argv == ["datagen", *arguments] and "HYDRA_FULL_ERROR" not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (ConfigError("frames must be 2"), 2, "error: frames must be 2\n"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "made/a.tar"),
+            1,
+            "error: No space left on device: made/a.tar;",
+        ),
+        (PermissionError(errno.EACCES, "Permission denied", "made"), 1, "error: Permission denied: made; check the"),
+        (KeyboardInterrupt(), 130, "error: interrupted\n"),
+    ],
+)
+def test_faults_end_in_one_line(
+    error: BaseException,
+    code: int,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Faults that a person can mend print one line and no traceback; the exit code tells whose fault it is."""
+
+    def fail(mapping: dict[str, object]) -> int:
+        raise error
+
+    monkeypatch.setattr(sys, "argv", ["datagen"])
+    with pytest.raises(SystemExit) as exit_:
+        run_command(fail, "datagen")
+    assert exit_.value.code == code
+    assert capsys.readouterr().err.startswith(message)
+
+
+def test_faults_of_ours_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What no person can mend is not dressed up as if they could."""
+
+    def fail(mapping: dict[str, object]) -> int:
+        raise FileNotFoundError(errno.ENOENT, "No such file", "x")
+
+    monkeypatch.setattr(sys, "argv", ["datagen"])
+    with pytest.raises(FileNotFoundError):
+        run_command(fail, "datagen")
+
+
+def test_help_and_config_print(tmp_path: Path) -> None:
+    """Hydra's own options work and start nothing."""
+    code, output, _ = run("--help", cwd=tmp_path, ballistic=False)
+    assert code == 0 and "Makes a data set, or completes one" in output
+    code, output, _ = run("--cfg", "job", *SMALL, cwd=tmp_path, ballistic=False)
+    assert code == 0 and "training_scenes: 800" in output and yaml.safe_load(output)["scenes"] == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_makes_completes_and_leaves_alone(backend: object, tmp_path: Path) -> None:
+    """The command makes a data set from any working folder, says when it is complete, and then changes nothing."""
+    code, output, errors = run(*SMALL, "out=made", cwd=tmp_path)
+    assert code == 0 and output == "", errors
+    assert errors.splitlines()[-1] == "made is complete: 3 train, 1 validation, 0 test episodes"
+    assert "published train-000000-000001.tar (1 episode)" in errors and "\r" not in errors
+    manifest = (tmp_path / "made" / "manifest.json").read_bytes()
+    code, _, errors = run(*SMALL, "out=made", cwd=tmp_path)
+    assert (code, errors) == (0, "made is complete: 3 train, 1 validation, 0 test episodes\n")
+    assert (tmp_path / "made" / "manifest.json").read_bytes() == manifest
+    assert [path.name for path in tmp_path.iterdir() if path.name != "control"] == ["made"]
+    code, _, errors = run(*SMALL, "out=made", "scene=no_obstacles", cwd=tmp_path)
+    assert code == 2 and errors.startswith("error: made holds another data set: scene.group_shapes is")
+
+
+def test_resolved_config_file(backend: object, tmp_path: Path) -> None:
+    """A resolved config in any folder, as the trainer writes one, serves instead of conf/."""
+    dataset = DatasetConfig(
+        folder=str(tmp_path / "made"), training_scenes=1, validation_scenes=0, test_scenes=0, frames=4, workers=1
+    )
+    config = DatagenConfig(scene=SceneConfig(obstacle_count=1), dataset=dataset)
+    (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(to_mapping(config)))
+    code, _, errors = run("--config-path", str(tmp_path), "--config-name", "dataset", cwd=tmp_path)
+    assert code == 0, errors
+    assert Manifest.load(dataset.folder).complete
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_json_progress(backend: object, tmp_path: Path) -> None:
+    """With progress=json standard output is one JSON object a line, and standard error is empty."""
+    code, output, errors = run(*SMALL, "out=made", "progress=json", cwd=tmp_path)
+    assert (code, errors) == (0, "")
+    events = [json.loads(line) for line in output.splitlines()]
+    assert events[0]["event"] == "start" and (events[0]["done"], events[0]["total"]) == (0, 4)
+    assert [event["done"] for event in events if event["event"] == "episode"] == [1, 2, 3, 4]
+    assert [event["revision"] for event in events if event["event"] == "shard"] == [1, 2, 3, 4]
+
+
+def processes_of_session(session: int) -> list[int]:
+    """The processes of a session that are still running (Linux)."""
+    running = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(fields[3]) == session and fields[0] != "Z":
+            running.append(int(path.parent.name))
+    return running
+
+
+def wait_until(condition: object, seconds: float = 30.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_stopping_leaves_a_resumable_folder(
+    backend: object, control: Path, tmp_path: Path, number: int, code: int
+) -> None:
+    """Ctrl-C, SIGTERM and even SIGKILL keep every staged episode and leave no process; the same command goes on."""
+    (control / "slow").touch()
+    process = start(*SMALL, "out=made", cwd=tmp_path)
+    manifest = tmp_path / "made" / "manifest.json"
+    wait_until(lambda: manifest.exists() and Manifest.load(manifest.parent).revision >= 1)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # a terminal signals the whole group
+    else:
+        os.kill(process.pid, number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == code
+    wait_until(lambda: processes_of_session(process.pid) == [])
+    if number != signal.SIGKILL:
+        assert "episodes are kept in made: run the same command to go on" in errors
+        assert "Traceback" not in errors
+        assert not list((tmp_path / "made").rglob("*.partial"))
+    (control / "slow").unlink()
+    code, _, errors = run(*SMALL, "out=made", cwd=tmp_path)
+    assert code == 0 and Manifest.load(tmp_path / "made").complete, errors
+    seeds = (control / "simulated.log").read_text().split()
+    assert len(set(seeds)) == 4 and len(seeds) <= 5  # at most the one in flight twice
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_bar_moves_within_an_episode() -> None:
+    """On a terminal the bar counts frames of running scenes, and a failed launch takes its frames back."""
+    stream = Terminal()
+    bar = BarProgress(stream)
+    bar.start(1, 3, 100)
+    bar.frame(0, 50, 1)
+    assert bar._bar is not None and bar._bar.n == 150
+    bar.frame(0, 0, 0)
+    assert bar._bar.n == 100
+    bar.episode("train-000001")
+    assert bar._bar.n == 200
+    bar.message("hello")
+    bar.close()
+    assert "hello\n" in stream.getvalue() and "episodes 2/3" in stream.getvalue()
+
+
+def test_lines_are_sparse_without_a_terminal() -> None:
+    """In a log file progress is a few plain lines, whatever the number of frames."""
+    stream = io.StringIO()
+    bar = BarProgress(stream)
+    bar.start(0, 2, 100)
+    for frame in range(100):
+        bar.frame(0, frame, 1)
+    bar.shard("train-000000-000001.tar", 1, 1)
+    bar.close()
+    assert stream.getvalue() == "episodes 0/2, frames 0/200\npublished train-000000-000001.tar (1 episode)\n"
+
+
+def test_json_lines_name_their_event() -> None:
+    """Each line is one object with its event and time."""
+    stream = io.StringIO()
+    JsonProgress(stream).message("hello")
+    line = json.loads(stream.getvalue())
+    assert line.pop("time_s") > 0 and line == {"event": "message", "text": "hello"}

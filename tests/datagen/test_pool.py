@@ -1,0 +1,202 @@
+"""The pool: whatever happens to its workers, the data set comes out whole, and no process is left behind."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datagen.plan import scene_seed
+from datagen.pool import Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
+from datagen.progress import Progress
+from datagen.worker import Backend
+from datagen.writer import DatasetWriter
+from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.schema import ConfigError
+
+MakeConfig = Callable[..., DatagenConfig]
+ONE = WorkerPlan(solvers=1, threads=1, makers=1, scenes_per_launch=1, first_launch=1)
+
+
+class Recorder(Progress):
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+        self.shards: list[str] = []
+        self.episodes: list[str] = []
+        self.launches: list[int] = []
+
+    def frame(self, worker: int, frame: int, scenes: int) -> None:
+        if scenes:
+            self.launches.append(scenes)
+
+    def episode(self, key: str) -> None:
+        self.episodes.append(key)
+
+    def shard(self, name: str, episodes: int, revision: int) -> None:
+        self.shards.append(name)
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+
+def generate(config: DatagenConfig, backend: Backend, plan: WorkerPlan = ONE, **options: Any) -> Recorder:
+    recorder = Recorder()
+    try:
+        with DatasetWriter(config, recorder.message) as writer:
+            Pool(config, writer, recorder, plan, backend, **options).run()
+    finally:
+        assert not multiprocessing.active_children()
+    return recorder
+
+
+def simulated(control: Path) -> list[int]:
+    return [int(line) for line in (control / "simulated.log").read_text().split()]
+
+
+def test_whole_dataset(
+    make_config: MakeConfig, make_dataset: Callable[[DatagenConfig], Path], backend: Backend, tmp_path: Path
+) -> None:
+    """Two solvers in processes of their own make the same shards, bitwise, as one loop in this process."""
+    config = make_config()
+    recorder = generate(config, backend, WorkerPlan(2, 1, 1, 1, 1))
+    here = make_dataset(make_config(folder=str(tmp_path / "here")))
+    for path in here.glob("*.tar"):
+        assert (Path(config.dataset.folder) / path.name).read_bytes() == path.read_bytes()
+    assert len(recorder.episodes) == 8 and len(recorder.shards) == 7
+    assert {path.suffix for path in Path(config.dataset.folder).iterdir()} == {".tar", ".json", ""}
+
+
+def test_batches(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """A solver that takes several scenes a launch starts with a small launch and fills the later ones."""
+    config = make_config(training_scenes=9, validation_scenes=0, test_scenes=0)
+    recorder = generate(config, backend, WorkerPlan(1, None, 2, 4, 2))
+    assert recorder.launches == [2, 4, 3]
+    assert sorted(simulated(control)) == sorted(scene_seed(0, "train", i, 0) for i in range(9))
+
+
+def test_killed_worker_is_replaced(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """A worker that is killed once costs a retry of the same seed, nothing else."""
+    config = make_config(training_scenes=3, validation_scenes=0, test_scenes=0)
+    seed = scene_seed(0, "train", 1, 0)
+    (control / f"kill-{seed}").write_text("1")
+    recorder = generate(config, backend)
+    assert recorder.messages == [
+        "a worker died (its process was ended by SIGKILL); it is replaced and its scenes are tried again"
+    ]
+    manifest = Manifest.load(config.dataset.folder)
+    assert manifest.complete and not manifest.quarantined
+    assert simulated(control).count(seed) == 2
+
+
+def test_scene_that_kills_its_worker_is_quarantined(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """In a batch only the guilty scene is quarantined, after maximum_attempts alone, and the next seed replaces it."""
+    config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0, maximum_attempts=2)
+    seed = scene_seed(0, "train", 2, 0)
+    (control / f"kill-{seed}").write_text("99")
+    generate(config, backend, WorkerPlan(1, None, 1, 4, 4))
+    manifest = Manifest.load(config.dataset.folder)
+    (failure,) = manifest.quarantined
+    assert (failure.key, failure.seed, failure.cause) == ("train-000002", seed, "its process was ended by SIGKILL")
+    assert manifest.complete
+    assert EpisodeStore(config.dataset.folder, "train").entries[2].attempt == 1
+    assert simulated(control).count(seed) == 3  # once with the others, twice alone
+
+
+@pytest.mark.parametrize(("sign", "cause"), [("fail", "diverged in frame 3"), ("refuse", "no room for the obstacles")])
+def test_scene_that_fails_is_quarantined(
+    make_config: MakeConfig, backend: Backend, control: Path, sign: str, cause: str
+) -> None:
+    """A scene that cannot be made or simulated is replaced at once: trying the same seed again would not help."""
+    config = make_config(training_scenes=2, validation_scenes=0, test_scenes=0)
+    seed = scene_seed(0, "train", 0, 0)
+    (control / f"{sign}-{seed}").touch()
+    recorder = generate(config, backend)
+    manifest = Manifest.load(config.dataset.folder)
+    (failure,) = manifest.quarantined
+    assert (failure.seed, failure.attempt, failure.cause) == (seed, 0, cause)
+    assert manifest.complete and manifest.shards[0].episodes[0].seed == scene_seed(0, "train", 0, 1)
+    assert recorder.messages == [f"train-000000 (seed {seed}) could not be simulated: {cause}; trying another seed"]
+
+
+def test_stop_keeps_what_is_staged(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """A run that is asked to stop ends, and the next one simulates only what is left."""
+    config = make_config()
+    recorder = Recorder()
+    with pytest.raises(Stopped), DatasetWriter(config) as writer:
+        Pool(config, writer, recorder, ONE, backend, lambda: len(recorder.episodes) >= 3).run()
+    assert not multiprocessing.active_children()
+    # the episode in flight may or may not have been staged when its worker ended
+    done = len(recorder.episodes)
+    again = generate(config, backend)
+    assert Manifest.load(config.dataset.folder).complete
+    assert 8 - done - 1 <= len(again.episodes) <= 8 - done
+    assert len(simulated(control)) <= 9
+
+
+def test_fault_in_the_solver_ends_the_run(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """An exception that no scene is to blame for is not retried: it ends the run with the worker's traceback."""
+    (control / "raise").touch()
+    with pytest.raises(RuntimeError, match=r"(?s)a worker failed:\nTraceback .*a fault in the solver"):
+        generate(make_config(), backend)
+
+
+def test_missing_solver_ends_the_run(make_config: MakeConfig, backend: Backend) -> None:
+    """A solver that cannot be imported ends the run."""
+    with pytest.raises(RuntimeError, match="ModuleNotFoundError"):
+        generate(make_config(), Backend(backend.generate_scene, backend.build_obstacle_grid, "no_such_module:simulate"))
+
+
+def test_full_disk_in_a_worker_reaches_the_parent(make_config: MakeConfig, backend: Backend, tmp_path: Path) -> None:
+    """An OSError while staging ends the run as that OSError."""
+    config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
+    with DatasetWriter(config) as writer:
+        staging = writer.folder / ".staging"
+        staging.rmdir()
+        staging.write_text("in the way")
+        with pytest.raises(NotADirectoryError):
+            Pool(config, writer, Recorder(), ONE, backend).run()
+        staging.unlink()
+        staging.mkdir()
+
+
+def test_every_scene_fails(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """When no seed works the run ends with the cause and what to change."""
+    for attempt in range(20):
+        (control / f"refuse-{scene_seed(0, 'train', 0, attempt)}").touch()
+    with pytest.raises(ConfigError, match=r"train-000000 could not be simulated with 20 seeds, .* no room"):
+        generate(make_config(training_scenes=1, validation_scenes=0, test_scenes=0), backend)
+
+
+def test_worker_plans() -> None:
+    """One solver for two cores; on a GPU one solver with full launches and makers in front; settings win."""
+    default = DatagenConfig()
+    assert plan_workers(default, (), 8) == WorkerPlan(4, 2, 1, 1, 1)
+    assert plan_workers(default, (), 1) == WorkerPlan(1, 1, 1, 1, 1)
+    assert plan_workers(default, ("0",), 8) == WorkerPlan(1, None, 7, 64, 8, ("0",))
+    assert plan_workers(DatagenConfig(mpm=MpmConfig(device="cpu")), ("0",), 4).threads == 2
+    many = DatagenConfig(dataset=DatasetConfig(workers=3), mpm=MpmConfig(scenes_per_launch=2))
+    assert plan_workers(many, (), 8) == WorkerPlan(3, 2, 1, 2, 2)
+    assert plan_workers(many, ("4", "5"), 8) == WorkerPlan(3, None, 7, 2, 2, ("4", "5"))
+
+
+def test_hidden_gpus_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CUDA_VISIBLE_DEVICES takes GPUs away, as everywhere else."""
+    for value in ("", "-1"):
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", value)
+        assert visible_gpus() == ()
+
+
+def test_positions_start_at_the_scene(make_config: MakeConfig, backend: Backend) -> None:
+    """Episodes hold what the solver returned, with seed, counters and physics beside."""
+    config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
+    generate(config, backend)
+    (episode,) = EpisodeStore(config.dataset.folder, "train").episodes
+    assert episode.solver["counters"] == {"substeps": 6}
+    assert episode.solver["settings"]["youngs_modulus_pa"] == 1e6 and "device" not in episode.solver["settings"]
+    assert np.isfinite(episode.position_TN3).all() and episode.frame_count == 6
