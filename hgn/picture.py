@@ -24,7 +24,7 @@ from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
-RADIUS_IN_SPACINGS = 0.64  # spheres that overlap a little look like a body, not like a cloud
+RADIUS_IN_SPACINGS = 0.72  # spheres that overlap a little look like a body, not like a cloud
 TEXT_COLOR = (45, 50, 60)
 FAINT_COLOR = (130, 136, 146)
 PALETTE_SAMPLES = 40_000
