@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hgn.command import run_command
 from hgn.config import RenderConfig
 from hgn.data.select import find_episode
 from hgn.picture import (
@@ -78,6 +79,4 @@ def _write_gif(config: RenderConfig, rollout: Rollout, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    from hgn.command import run_command
-
     run_command(main, "render")
