@@ -1,0 +1,194 @@
+"""Scenes that users write: a YAML file of obstacles (built-in shapes or meshes) and groups of particles.
+
+See conf/scenes/ for examples. Lengths are in domain units, angles in degrees, y points up.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from hgn.config import OBSTACLE_SHAPES
+from hgn.scene.distance import contains
+from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
+from hgn.scene.material import MATERIALS, material_index
+from hgn.scene.mesh import load_mesh
+from hgn.scene.rotation import euler_rotation
+from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.shapes import shape_obstacle
+from hgn.schema import ConfigError, from_mapping, require, require_positive, to_mapping
+
+GROUP_SHAPES = ("cube", "sphere", "box")
+MAXIMUM_PARTICLES = 50_000_000
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ObstacleEntry:
+    """Either `mesh` (a file, with `scale`) or `shape` (a built-in one, with `size`)."""
+
+    mesh: str | None = None  # path relative to the scene file
+    scale: float | None = None  # of the mesh; 1 if absent
+    shape: str | None = None
+    size: float | None = None  # side, diameter, or base width and height
+    position: Vector | None = None  # moves a mesh (origin if absent); the centre of a shape
+    rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
+
+    def __post_init__(self) -> None:
+        if (self.mesh is None) == (self.shape is None):
+            seen = "neither" if self.mesh is None else "both"
+            raise ConfigError(f"mesh or shape must be given, one of the two, got {seen}")
+        if self.mesh is not None:
+            require(self.size is None, "size", "left out beside mesh", self.size, "meshes take scale")
+            if self.scale is not None:
+                require_positive(self, "scale")
+        else:
+            require(self.shape in OBSTACLE_SHAPES, "shape", f"one of {', '.join(OBSTACLE_SHAPES)}", self.shape)
+            require(self.scale is None, "scale", "left out beside shape", self.scale, "shapes take size")
+            require(self.size is not None, "size", "given beside shape", self.size)
+            require_positive(self, "size")
+            require(self.position is not None, "position", "given beside shape", self.position)
+        _require_finite("position", self.position or (0.0, 0.0, 0.0))
+        _require_finite("rotation", self.rotation)
+
+
+@dataclass(frozen=True)
+class GroupEntry:
+    """A solid of one material, filled with random particles."""
+
+    shape: str  # cube, sphere or box
+    size: float | Vector  # side, diameter, or the three edges of a box
+    position: Vector  # of the centre
+    material: str
+    velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
+
+    def __post_init__(self) -> None:
+        require(self.shape in GROUP_SHAPES, "shape", f"one of {', '.join(GROUP_SHAPES)}", self.shape)
+        if isinstance(self.size, tuple) != (self.shape == "box"):
+            rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
+            require(False, "size", rule, self.size)
+        for edge in self.edges:
+            require(0 < edge < math.inf, "size", "finite and > 0", self.size)
+        material_index(self.material)
+        _require_finite("position", self.position)
+        _require_finite("velocity", self.velocity)
+
+    @property
+    def edges(self) -> Vector:
+        """The three edges, or three times the side or diameter."""
+        return self.size if isinstance(self.size, tuple) else (self.size, self.size, self.size)
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """What a scene file may say; the defaults are the paper's."""
+
+    groups: tuple[GroupEntry, ...]
+    obstacles: tuple[ObstacleEntry, ...] = ()
+    domain_size: Vector = (1.0, 1.0, 1.0)
+    cell_size: float = 1 / 64  # of the solver's grid and of the obstacle cells
+    gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
+    particles_per_cell: float = 8.0
+    seed: int = 0  # of the particles and of the obstacle samples
+
+    def __post_init__(self) -> None:
+        require(len(self.groups) > 0, "groups", "a list with at least one group", [])
+        require_positive(self, "cell_size", "particles_per_cell")
+        for axis, length in zip("xyz", self.domain_size, strict=True):
+            require(0 < length < math.inf, f"domain_size ({axis})", "a finite number > 0", length)
+        _require_finite("gravity", self.gravity)
+        require(self.seed >= 0, "seed", "a whole number >= 0", self.seed)
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Reads a scene file.
+
+    Each group has its own random stream, so that editing one leaves the others' particles in place.
+
+    Raises: ConfigError, beginning with the file's path, for whatever is wrong in it or in a mesh it names:
+    unknown keys, bad values, groups that reach into the solver's walls (3 cells) or into closed obstacles.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigError(f"scene must be an existing YAML file, got {path}")
+    try:
+        mapping = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} must be a YAML file: {error}") from error
+    try:
+        return _build(from_mapping(SceneFile, mapping), path.parent)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _build(file: SceneFile, folder: Path) -> Scene:
+    obstacles = tuple(_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles))
+    regions = [region_of(entry.shape, entry.edges, entry.position) for entry in file.groups]
+    counts = [particle_count(region, file.particles_per_cell, file.cell_size) for region in regions]
+    require(
+        sum(counts) <= MAXIMUM_PARTICLES,
+        "groups",
+        f"at most {MAXIMUM_PARTICLES} particles together",
+        sum(counts),
+        "lower size or particles_per_cell",
+    )
+    positions = []
+    for index, (entry, region, count) in enumerate(zip(file.groups, regions, counts, strict=True)):
+        name = f"groups[{index}] ({entry.shape} of {entry.material})"
+        position_N3 = fill(region, count, np.random.Generator(np.random.PCG64([file.seed, index])))
+        _require_inside_walls(name, region, position_N3, file)
+        for obstacle in obstacles:
+            inside = int(contains(position_N3, obstacle).sum())
+            if inside:
+                raise ConfigError(
+                    f"{name} must be clear of closed obstacles, got {inside} of {count} particles inside "
+                    f"{obstacle.name}; move or shrink the group or the obstacle"
+                )
+        positions.append(position_N3)
+    return Scene(
+        position_N3=np.concatenate(positions),
+        velocity_N3=np.repeat(np.array([entry.velocity for entry in file.groups], np.float32), counts, axis=0),
+        material_N=np.repeat(np.array([MATERIALS.index(e.material) for e in file.groups], np.uint8), counts),
+        obstacles=obstacles,
+        domain_size=file.domain_size,
+        cell_size=file.cell_size,
+        gravity=file.gravity,
+        seed=file.seed,
+        specification={"kind": "file", **to_mapping(file), "particle_counts": counts},
+    )
+
+
+def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:
+    if entry.mesh is None:
+        assert entry.shape is not None and entry.size is not None and entry.position is not None
+        name = f"obstacle_{index}_{entry.shape}"
+        return shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name)
+    return load_mesh(
+        folder / entry.mesh,
+        f"obstacles[{index}].mesh",
+        scale=1.0 if entry.scale is None else entry.scale,
+        translation=entry.position or (0.0, 0.0, 0.0),
+        rotation=entry.rotation,
+    )
+
+
+def _require_inside_walls(name: str, region: Region, position_N3: np.ndarray, file: SceneFile) -> None:
+    wall = WALL_CELLS * file.cell_size
+    high = np.array(file.domain_size) - wall
+    centre = np.array(region.centre)
+    if (centre - region.reach >= wall - 1e-9).all() and (centre + region.reach <= high + 1e-9).all():
+        return
+    outside = int(((position_N3 < wall) | (position_N3 > high)).any(axis=1).sum())
+    raise ConfigError(
+        f"{name} must lie between the walls, which are {WALL_CELLS} cells ({wall:g}) thick, got {outside} of "
+        f"{len(position_N3)} particles outside; move or shrink the group, or raise domain_size"
+    )
+
+
+def _require_finite(field: str, value: Vector) -> None:
+    require(all(math.isfinite(item) for item in value), field, "three finite numbers", value)

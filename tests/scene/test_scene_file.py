@@ -1,0 +1,181 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hgn.scene.material import SAND, SNOW, WATER
+from hgn.scene.scene_file import load_scene
+from hgn.schema import ConfigError
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "conf" / "scenes"
+CUBE = {"shape": "cube", "size": 0.08, "position": [0.5, 0.5, 0.5], "material": "water"}
+CONE = {"shape": "cone", "size": 0.2, "position": [0.5, 0.2, 0.5]}
+
+
+def write(folder: Path, mapping: object) -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(yaml.safe_dump(mapping), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("name", ["funnel.yaml", "own_mesh.yaml"])
+def test_examples_load_and_are_deterministic(name):
+    """The example scenes load, twice the same, with a JSON-able specification."""
+    scene, again = load_scene(EXAMPLES / name), load_scene(EXAMPLES / name)
+    assert scene.particle_count > 2000
+    assert len(scene.obstacles) >= 2
+    assert scene.position_N3.tobytes() == again.position_N3.tobytes()
+    assert json.loads(json.dumps(scene.specification)) == scene.specification
+    assert sum(scene.specification["particle_counts"]) == scene.particle_count
+
+
+def test_example_mesh_is_closed_and_found_beside_the_scene_file(tmp_path):
+    """Mesh paths are relative to the scene file, wherever that is."""
+    for name in ("own_mesh.yaml", "ramp.obj"):
+        shutil.copy(EXAMPLES / name, tmp_path / name)
+    ramp = load_scene(tmp_path / "own_mesh.yaml").obstacles[0]
+    assert ramp.closed
+    np.testing.assert_allclose(ramp.vertex_V3.min(axis=0), [0.3, 0.05, 0.3], atol=1e-6)
+    np.testing.assert_allclose(ramp.vertex_V3.max(axis=0), [0.7, 0.45, 0.7], atol=1e-6)
+
+
+def test_groups_become_particles(tmp_path):
+    """Counts, places, materials, velocities and the scene's numbers are those of the file."""
+    mapping = {
+        "domain_size": [2, 1, 1],
+        "cell_size": 0.03125,
+        "gravity": [0, -1.5, 0],
+        "particles_per_cell": 4,
+        "seed": 9,
+        "groups": [
+            {**CUBE, "size": 0.25, "velocity": [1, 2, 3]},
+            {"shape": "sphere", "size": 0.2, "position": [1.5, 0.5, 0.5], "material": "sand"},
+            {"shape": "box", "size": [0.5, 0.125, 0.25], "position": [1.0, 0.8, 0.5], "material": "snow"},
+        ],
+    }
+    scene = load_scene(write(tmp_path, mapping))
+    assert (scene.domain_size, scene.cell_size, scene.gravity) == ((2.0, 1.0, 1.0), 0.03125, (0.0, -1.5, 0.0))
+    assert scene.seed == 9
+    counts = [4 * 512 + 1, int(np.ceil(4 * np.pi / 6 * 0.2**3 * 32**3)), 4 * 512 + 1]
+    assert scene.specification["particle_counts"] == counts
+    assert np.bincount(scene.material_N).tolist() == [counts[WATER], counts[SAND], counts[SNOW]]
+    assert (scene.velocity_N3[: counts[0]] == [1, 2, 3]).all()
+    assert not scene.velocity_N3[counts[0] :].any()
+    parts = np.split(scene.position_N3.astype(float), np.cumsum(counts)[:-1])
+    assert np.abs(parts[0] - 0.5).max() <= 0.125 + 1e-6
+    assert np.linalg.norm(parts[1] - [1.5, 0.5, 0.5], axis=1).max() <= 0.1 + 1e-6
+    assert (np.abs(parts[2] - [1.0, 0.8, 0.5]).max(axis=0) <= np.array([0.25, 0.0625, 0.125]) + 1e-6).all()
+
+
+def test_editing_one_group_leaves_the_others(tmp_path):
+    """Each group has a random stream of its own."""
+    other = {**CUBE, "position": [0.2, 0.5, 0.5]}
+    before = load_scene(write(tmp_path, {"groups": [CUBE, other]}))
+    after = load_scene(write(tmp_path, {"groups": [{**CUBE, "size": 0.1}, other]}))
+    assert before.position_N3[-1074:].tobytes() == after.position_N3[-1074:].tobytes()
+    assert before.position_N3[:1074].tobytes() != before.position_N3[1074:].tobytes()
+
+
+def test_shapes_are_placed_and_turned(tmp_path):
+    """A square turned by 90 degrees about x stands upright at its position."""
+    square = {"shape": "square", "size": 0.2, "position": [0.5, 0.3, 0.6], "rotation": [90, 0, 0]}
+    (obstacle,) = load_scene(write(tmp_path, {"groups": [CUBE], "obstacles": [square]})).obstacles
+    np.testing.assert_allclose(obstacle.vertex_V3.min(axis=0), [0.4, 0.2, 0.6], atol=1e-6)
+    np.testing.assert_allclose(obstacle.vertex_V3.max(axis=0), [0.6, 0.4, 0.6], atol=1e-6)
+
+
+def test_groups_may_touch_the_walls_but_not_enter_them(tmp_path):
+    """The solver's walls are 3 cells thick: a cube on the inner face is accepted, a cell further it is not."""
+    wall, half = 3 / 64, 0.04
+    load_scene(write(tmp_path, {"groups": [{**CUBE, "position": [wall + half, 1 - wall - half, 0.5]}]}))
+    with pytest.raises(ConfigError, match=r"groups\[0\] \(cube of water\) must lie between the walls"):
+        load_scene(write(tmp_path, {"groups": [{**CUBE, "position": [wall + half - 1 / 64, 0.5, 0.5]}]}))
+
+
+def test_particles_inside_a_closed_obstacle_are_refused_with_their_count(tmp_path):
+    """The message names group, obstacle and count; inside a bowl or above a sheet is no offence."""
+    path = write(tmp_path, {"groups": [CUBE, {**CUBE, "position": [0.5, 0.25, 0.5]}], "obstacles": [CONE]})
+    with pytest.raises(
+        ConfigError, match=r"groups\[1\] \(cube of water\) must be clear of closed .*obstacle_0_cone"
+    ) as seen:
+        load_scene(path)
+    assert "1074 of 1074" not in str(seen.value)
+    assert " of 1074 particles inside" in str(seen.value)
+    bowl = {"shape": "half_sphere", "size": 0.4, "position": [0.5, 0.5, 0.5]}
+    assert load_scene(write(tmp_path, {"groups": [CUBE], "obstacles": [bowl]})).particle_count == 1074
+
+
+def scene_with(**changes: object) -> dict[str, object]:
+    return {"groups": [CUBE], **changes}
+
+
+def group_with(**changes: object) -> dict[str, object]:
+    return {"groups": [{**CUBE, **changes}]}
+
+
+def obstacle_with(**changes: object) -> dict[str, object]:
+    entry = {key: value for key, value in {**CONE, **changes}.items() if value is not None}
+    return {"groups": [CUBE], "obstacles": [entry]}
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        (None, "SceneFile must be a mapping"),
+        ({}, "groups is missing"),
+        ({"groups": []}, "groups must be a list with at least one group"),
+        (scene_with(gruops=1), "gruops is not a known key; did you mean groups"),
+        (scene_with(cell_size=0), "cell_size must be a finite number > 0"),
+        (scene_with(cell_size=float("nan")), "cell_size must be a finite number > 0, got nan"),
+        (scene_with(particles_per_cell=-1), "particles_per_cell must be a finite number > 0"),
+        (scene_with(particles_per_cell=1e9), "groups must be at most 50000000 particles"),
+        (scene_with(domain_size=[1, -1, 1]), r"domain_size \(y\) must be a finite number > 0"),
+        (scene_with(domain_size=[1, 1]), "domain_size must be a list of 3 values"),
+        (scene_with(domain_size=[0.05, 1, 1]), r"groups\[0\] \(cube of water\) must lie between the walls"),
+        (scene_with(gravity=[0, float("inf"), 0]), "gravity must be three finite numbers"),
+        (scene_with(seed=-1), "seed must be a whole number >= 0"),
+        (scene_with(seed=0.5), "seed must be a whole number"),
+        (group_with(material="lava"), r"groups\[0\]\.material must be one of water, sand, snow, got 'lava'"),
+        (group_with(shape="torus"), r"groups\[0\]\.shape must be one of cube, sphere, box"),
+        (group_with(size=0), r"groups\[0\]\.size must be finite and > 0"),
+        (group_with(size=float("nan")), r"groups\[0\]\.size must be finite and > 0"),
+        (group_with(size=[0.1, 0.1, 0.1]), r"groups\[0\]\.size must be one number for a cube"),
+        (group_with(shape="box"), r"groups\[0\]\.size must be a list of three edges for a box"),
+        (group_with(shape="box", size=[0.1, -0.1, 0.1]), r"groups\[0\]\.size must be finite and > 0"),
+        (group_with(position=[0.5, float("nan"), 0.5]), r"groups\[0\]\.position must be three finite numbers"),
+        (group_with(velocity=[0, float("inf"), 0]), r"groups\[0\]\.velocity must be three finite numbers"),
+        (group_with(position=[5, 0.5, 0.5]), "got 1074 of 1074 particles outside; move or shrink"),
+        (obstacle_with(shape="sphere"), r"obstacles\[0\]\.shape must be one of half_box"),
+        (obstacle_with(shape=None), r"obstacles\[0\]\.mesh or shape must be given, .* got neither"),
+        (obstacle_with(mesh="a.obj"), r"obstacles\[0\]\.mesh or shape must be given, .* got both"),
+        (obstacle_with(size=None), r"obstacles\[0\]\.size must be given beside shape"),
+        (obstacle_with(size=-1), r"obstacles\[0\]\.size must be a finite number > 0"),
+        (obstacle_with(position=None), r"obstacles\[0\]\.position must be given beside shape"),
+        (obstacle_with(position=[0, 0, float("nan")]), r"obstacles\[0\]\.position must be three finite numbers"),
+        (obstacle_with(rotation=[0, 0, float("nan")]), r"obstacles\[0\]\.rotation must be three finite numbers"),
+        (obstacle_with(scale=2), r"obstacles\[0\]\.scale must be left out beside shape"),
+        (obstacle_with(shape=None, mesh="a.obj"), r"obstacles\[0\]\.size must be left out beside mesh"),
+        (obstacle_with(shape=None, size=None, mesh="a.obj", scale=0), r"obstacles\[0\]\.scale must be a finite"),
+        (obstacle_with(shape=None, size=None, mesh="a.obj"), r"obstacles\[0\]\.mesh must be an existing file"),
+    ],
+)
+def test_every_mistake_is_named(tmp_path, mapping, message):
+    """Each mistake in a scene file ends in one error: the file, the field, the rule and the value."""
+    with pytest.raises(ConfigError, match=rf"scene\.yaml: {message}|scene\.yaml: .*{message}"):
+        load_scene(write(tmp_path, mapping))
+
+
+def test_missing_and_broken_files(tmp_path):
+    """A missing file and broken YAML are named."""
+    with pytest.raises(ConfigError, match=r"scene must be an existing YAML file, got .*nothing\.yaml"):
+        load_scene(tmp_path / "nothing.yaml")
+    path = tmp_path / "scene.yaml"
+    path.write_text("groups: [", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"scene\.yaml must be a YAML file"):
+        load_scene(path)
+    path.write_bytes(b"\xff\xfe\xfa")
+    with pytest.raises(ConfigError, match=r"scene\.yaml must be a YAML file"):
+        load_scene(path)
