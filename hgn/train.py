@@ -20,7 +20,7 @@ import yaml
 
 from hgn.command import run_command
 from hgn.config import TrainConfig
-from hgn.data.identity import dataset_identity, identity_hash
+from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
 from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.order import Cursor
 from hgn.data.reader import EpisodeStore
@@ -39,6 +39,8 @@ def main(mapping: dict[str, Any]) -> int:
     mapping.pop("name", None)
     config = from_mapping(TrainConfig, mapping)
     run = Path(config.run)
+    if EpisodeStore.available(config.dataset.folder):
+        require_same_dataset(Manifest.load(config.dataset.folder).config, config.datagen, config.dataset.folder)
     last = run / "checkpoints" / "last.ckpt"
     checkpoint = _checkpoint_to_resume(config, last) if last.exists() else None
     stop = StopRequest()

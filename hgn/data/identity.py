@@ -13,7 +13,7 @@ from typing import Any
 
 from hgn.config import DatagenConfig
 from hgn.scene.episode import SCHEMA_VERSION
-from hgn.schema import to_mapping
+from hgn.schema import ConfigError, to_mapping
 
 # of the solver's settings: where and how many at once, which no trajectory depends on beyond rounding
 _NOT_PHYSICS = ("device", "scenes_per_launch")
@@ -53,3 +53,17 @@ def identity_differences(found: Mapping[str, Any], asked: Mapping[str, Any], pat
         elif left != right:
             lines.append(f"{name} is {left} there, {right} is asked for")
     return lines
+
+
+def require_same_dataset(found: Mapping[str, Any], config: DatagenConfig, folder: object) -> None:
+    """A folder's data set (its manifest's `config`) is the one that a configuration asks for.
+
+    Raises: ConfigError naming the first keys that differ, and the remedy.
+    """
+    differences = identity_differences(found, dataset_identity(config))
+    if differences:
+        shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
+        raise ConfigError(
+            f"{folder} holds another data set: {shown}; choose another folder (out=... or dataset.folder=...) or the "
+            "same settings"
+        )

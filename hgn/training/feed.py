@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
+import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, IterableDataset
 
@@ -30,6 +31,9 @@ class Feed(LightningDataModule):
     def train_dataloader(self) -> DataLoader[Batch]:
         # The windows are memory-mapped and small: a worker process would cost more than it saves.
         return DataLoader(_Stream(self), batch_size=None, num_workers=0)
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        return batch.to(device, non_blocking=True)
 
     def batches(self) -> Iterator[Batch]:
         """This rank's batches, without end."""

@@ -57,9 +57,6 @@ class TrainingModule(LightningModule):
         self.cursor = batch.cursor
         return loss
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        return batch.to(device, non_blocking=True)
-
     def configure_optimizers(self) -> Any:
         config = self.training_config
         optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)

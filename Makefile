@@ -1,0 +1,54 @@
+# make demo: from nothing to a trained, exported and simulated network, in minutes on two CPU cores
+# make test: the tests        make check: all that CI runs
+PYTHON ?= $(shell command -v python3.12 >/dev/null 2>&1 && python3.12 --version >/dev/null 2>&1 && echo python3.12 \
+	|| (command -v python3.11 >/dev/null 2>&1 && python3.11 --version >/dev/null 2>&1 && echo python3.11) || echo python3)
+VENV := .venv
+RUN := $(VENV)/bin/python
+DEMO := demo
+
+.PHONY: setup demo test check format lint types layers clean
+
+setup: $(VENV)/.installed
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 13) and "Python 3.11 or 3.12 is needed (Taichi), got " + sys.version.split()[0] + "; name one with make PYTHON=...")'
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off -c constraints.txt torch
+	$(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: setup
+	@echo "== 1 of 5: generating MPM episodes"
+	$(RUN) -m datagen +experiment=demo
+	@echo "== 2 of 5: training"
+	$(RUN) -m hgn.train +experiment=demo
+	@echo "== 3 of 5: exporting inference weights"
+	$(RUN) -m hgn.export checkpoint=$(DEMO)/run/checkpoints/best.ckpt out=$(DEMO)/weights.safetensors
+	@echo "== 4 of 5: simulating a validation scene beside its ground truth"
+	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=$(DEMO)/data episode=validation-000000 out=$(DEMO)/rollout.vtkhdf
+	$(RUN) -m tools.render rollout=$(DEMO)/rollout.vtkhdf out=$(DEMO)/pictures every=2
+	@echo "== 5 of 5: errors"
+	$(RUN) -m hgn.evaluate weights=$(DEMO)/weights.safetensors data=$(DEMO)/data json=$(DEMO)/errors.json
+	@echo "weights: $(DEMO)/weights.safetensors"
+	@echo "rollout: $(DEMO)/rollout.vtkhdf (HDF5; ParaView opens it)"
+	@echo "picture: $$(ls $(DEMO)/pictures/*.png $(DEMO)/pictures/*.gif | tr '\n' ' ')"
+
+test: setup
+	$(RUN) -m pytest
+
+check: setup format lint types layers test
+
+format:
+	$(RUN) -m ruff format --check
+
+lint:
+	$(RUN) -m ruff check
+
+types:
+	$(RUN) -m mypy
+
+layers:
+	$(VENV)/bin/lint-imports
+
+clean:
+	rm -rf $(VENV) $(DEMO) build dist

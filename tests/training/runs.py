@@ -1,0 +1,40 @@
+"""Small trainings for the tests."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from hgn.config import DatagenConfig
+from hgn.schema import to_mapping
+
+NETWORK = {"width": 8, "levels": 2, "message_passing_steps": 1, "material_embedding": 2}
+TRAINING = {
+    "maximum_updates": 12,
+    "batch_scenes": 2,
+    "learning_rate": 1e-3,
+    "final_learning_rate": 1e-4,
+    "accelerator": "cpu",
+    "log_every": 4,
+    "checkpoint_every": 5,
+    "monitor_every": 6,
+    "monitor_scenes": 2,
+    "monitor_rollout_frames": 4,
+    "generate": False,
+}
+
+
+def train_mapping(config: DatagenConfig, run: Path, **training: Any) -> dict[str, Any]:
+    """What Hydra would hand to the command."""
+    return to_mapping(config) | {
+        "network": dict(NETWORK),
+        "training": TRAINING | training,
+        "run": str(run),
+        "name": "test",
+    }
+
+
+def metrics(run: Path) -> list[dict[str, float]]:
+    """All logged records of a run."""
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
