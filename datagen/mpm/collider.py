@@ -1,0 +1,219 @@
+"""Mesh obstacles as the grid sees them: nodes near or inside a mesh, each with the direction that is free.
+
+The paper's cell normals leak when used as a collider, so the solver builds its own from the triangles.
+Shape legend: K contact nodes, P points, F triangles, V vertices.
+
+Sheets (open meshes): nodes within `band_cells` of the surface, on both sides, with the normal toward the node's
+own side. A node on the sheet (closer than 0.05 cells) stops motion both ways. Closed bodies: nodes inside, and
+nodes outside nearer than half a cell, with the normal outward; where the body is so thin that no node may lie
+inside, the sheet's band holds on its outside too. Where two obstacles claim a node, the closest surface wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from hgn.scene.distance import closest_points, contains
+from hgn.scene.scene import Obstacle, Scene
+from hgn.schema import ConfigError
+
+ONE_SIDED, BOTH_SIDES = 1, 2
+ON_SURFACE_CELLS = 0.05
+CLOSED_BAND_CELLS = 0.5
+PAIRS_PER_CHUNK = 1_000_000  # (node, triangle) pairs held at once
+# squared area over fourth power of the longest edge, below which a triangle has no direction
+FLAT_TRIANGLE = 1e-20
+
+
+@dataclass(frozen=True, eq=False)
+class Collider:
+    """A scene's contact nodes, and which of its bodies are closed."""
+
+    node_K3: np.ndarray  # int32, unique
+    normal_K3: np.ndarray  # float32, unit length
+    kind_K: np.ndarray  # uint8: ONE_SIDED or BOTH_SIDES
+    closed: tuple[Obstacle, ...]
+
+    def count_inside(self, position_N3: np.ndarray) -> int:
+        """How many of the particles lie inside a closed obstacle."""
+        inside = np.zeros(len(position_N3), bool)
+        for obstacle in self.closed:
+            inside |= contains(position_N3, obstacle)
+        return int(inside.sum())
+
+
+def build_collider(scene: Scene, band_cells: float) -> Collider:
+    """The contact nodes of all obstacles of a scene; nodes lie at multiples of scene.cell_size.
+
+    Any number and size of triangles takes bounded memory. Triangles without area and parts outside the domain
+    are left out. Raises: ConfigError when an obstacle has vertices that are not finite, or triangles whose
+    indices are out of range.
+    """
+    shape = tuple(round(length / scene.cell_size) for length in scene.domain_size)
+    surface = _Surface(shape)
+    for index, obstacle in enumerate(scene.obstacles):
+        triangle_F33 = _triangles(obstacle, index) / scene.cell_size
+        if len(triangle_F33):
+            own = _closed_contacts if obstacle.closed else _sheet_contacts
+            surface.merge(own(obstacle, triangle_F33, band_cells, shape, scene.cell_size))
+    node = np.flatnonzero(np.isfinite(surface.distance))
+    return Collider(
+        np.stack(np.unravel_index(node, shape), axis=1).astype(np.int32),
+        surface.normal[node],
+        surface.kind[node],
+        tuple(obstacle for obstacle in scene.obstacles if obstacle.closed and len(obstacle.triangle_F3)),
+    )
+
+
+class _Surface:
+    """Per node the closest surface: distance in cells, free direction, kind; infinity where there is none."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        count = int(np.prod(shape))
+        self.shape = shape
+        self.distance = np.full(count, np.inf)
+        self.normal = np.zeros((count, 3), np.float32)
+        self.kind = np.zeros(count, np.uint8)
+
+    def merge(self, contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]) -> None:
+        node, distance, normal, kind = contacts
+        nearer = distance < self.distance[node]
+        node = node[nearer]
+        self.distance[node], self.normal[node], self.kind[node] = distance[nearer], normal[nearer], kind[nearer]
+
+
+def _triangles(obstacle: Obstacle, index: int) -> np.ndarray:
+    """Corners of the triangles that have an area, float64 [F, 3, 3]."""
+    vertex = np.asarray(obstacle.vertex_V3, np.float64)
+    triangle = np.asarray(obstacle.triangle_F3)
+    if not np.isfinite(vertex).all():
+        raise ConfigError(f"vertex_V3 of obstacle {index} ({obstacle.name}) must be finite; repair the mesh")
+    if len(triangle) and not (triangle.min() >= 0 and triangle.max() < len(vertex)):
+        raise ConfigError(
+            f"triangle_F3 of obstacle {index} ({obstacle.name}) must index its {len(vertex)} vertices, got "
+            f"{triangle.min()} to {triangle.max()}; repair the mesh"
+        )
+    corner = vertex[triangle].reshape(-1, 3, 3)
+    edge = corner - np.roll(corner, 1, axis=1)
+    longest_square = (edge**2).sum(axis=2).max(axis=1)
+    area_square = (np.cross(edge[:, 0], edge[:, 1]) ** 2).sum(axis=1)
+    return corner[area_square > FLAT_TRIANGLE * longest_square**2]
+
+
+def _near_pairs(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, ...]]:
+    """Chunks of (node, triangle index): the nodes in each triangle's box widened by `band` cells."""
+    low = np.clip(np.ceil(triangle_F33.min(axis=1) - band), 0, np.array(shape)).astype(np.int64)
+    high = np.clip(np.floor(triangle_F33.max(axis=1) + band) + 1, 0, np.array(shape)).astype(np.int64)
+    size = np.maximum(high - low, 0)
+    count = size.prod(axis=1)
+    end = np.cumsum(count)
+    total = int(end[-1]) if len(end) else 0
+    for start in range(0, total, PAIRS_PER_CHUNK):
+        pair = np.arange(start, min(start + PAIRS_PER_CHUNK, total))
+        owner = np.searchsorted(end, pair, side="right")
+        place = pair - (end[owner] - count[owner])
+        size_y, size_z = size[owner, 1], size[owner, 2]
+        offset = np.stack([place // (size_y * size_z), place // size_z % size_y, place % size_z], axis=1)
+        yield low[owner] + offset, owner
+
+
+def _rasterise(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """Nodes within `band` cells of the triangles: flat index [P], distance [P], closest point [P, 3], triangle [P].
+
+    All in cells. Of triangles equally close the first counts.
+    """
+    count = int(np.prod(shape))
+    best = np.full(count, np.inf)
+    closest = np.zeros((count, 3))
+    owner = np.full(count, -1, np.int64)
+    normal = _face_normals(triangle_F33)
+    for node, triangle in _near_pairs(triangle_F33, band, shape):
+        height = ((node - triangle_F33[triangle, 0]) * normal[triangle]).sum(axis=1)
+        keep = np.abs(height) <= band
+        node, triangle = node[keep], triangle[keep]
+        foot = closest_points(node, triangle_F33[triangle])
+        distance = np.linalg.norm(node - foot, axis=1)
+        flat = np.ravel_multi_index(node.T, shape)
+        nearer = (distance <= band) & (distance < best[flat])
+        flat, distance, foot, triangle = flat[nearer], distance[nearer], foot[nearer], triangle[nearer]
+        order = np.lexsort((triangle, distance, flat))
+        first = order[np.unique(flat[order], return_index=True)[1]]
+        node_first = flat[first]
+        best[node_first], closest[node_first], owner[node_first] = distance[first], foot[first], triangle[first]
+    near = np.flatnonzero(owner >= 0)
+    return near, best[near], closest[near], owner[near]
+
+
+def _face_normals(triangle_F33: np.ndarray) -> np.ndarray:
+    normal = np.cross(triangle_F33[:, 1] - triangle_F33[:, 0], triangle_F33[:, 2] - triangle_F33[:, 0])
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _points(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return np.stack(np.unravel_index(flat, shape), axis=1).astype(np.float64)
+
+
+def _sheet_contacts(
+    obstacle: Obstacle, triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], cell_size: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    node, distance, foot, owner = _rasterise(triangle_F33, band, shape)
+    on_surface = distance < ON_SURFACE_CELLS
+    away = (_points(node, shape) - foot) / np.where(on_surface, 1.0, distance)[:, None]
+    normal = np.where(on_surface[:, None], _face_normals(triangle_F33)[owner], away)
+    kind = np.where(on_surface, BOTH_SIDES, ONE_SIDED)
+    return node, distance, normal, kind
+
+
+def _closed_contacts(
+    obstacle: Obstacle, triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], cell_size: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    # one cell at least: a line of nodes that crosses the surface then meets a node of the band
+    node, distance, foot, owner = _rasterise(triangle_F33, max(band, 1.0), shape)
+    within = contains(_points(node, shape) * cell_size, obstacle)
+    inside = np.zeros(shape, bool)
+    inside.ravel()[node[within]] = True
+    near = np.zeros(shape, bool)
+    near.ravel()[node] = True
+    _fill_inside(inside, near, obstacle, cell_size)
+
+    point = _points(node, shape)
+    sign = np.where(within, -1.0, 1.0)
+    on_surface = distance < ON_SURFACE_CELLS
+    away = (point - foot) * (sign / np.where(on_surface, 1.0, distance))[:, None]
+    face = _face_normals(triangle_F33)[owner]
+    # face normals may point inwards: the side that lies inside decides
+    half_cell = contains((foot + 0.1 * face) * cell_size, obstacle) if on_surface.any() else np.zeros(len(node), bool)
+    face = np.where(half_cell[:, None], -face, face)
+    normal = np.where(on_surface[:, None], face, away)
+
+    beyond = np.clip(np.rint(foot - 1.5 * normal), 0, np.array(shape) - 1).astype(np.int64)
+    thin = ~inside[tuple(beyond.T)]
+    chosen = within | (distance < CLOSED_BAND_CELLS) | (thin & (distance <= band))
+    node, distance, normal = node[chosen], distance[chosen], normal[chosen]
+
+    deep = np.flatnonzero(inside.ravel() & ~near.ravel())
+    if len(deep):  # the way out leads to the surface that is nearest to the nearest node of the band
+        feet = np.zeros((int(np.prod(shape)), 3))
+        feet[np.flatnonzero(near.ravel())] = foot
+        nearest = ndimage.distance_transform_edt(~near, return_distances=False, return_indices=True)
+        source = np.ravel_multi_index([axis.ravel()[deep] for axis in nearest], shape)
+        out = feet[source] - _points(deep, shape)
+        depth = np.linalg.norm(out, axis=1)
+        node, distance = np.concatenate([node, deep]), np.concatenate([distance, depth])
+        normal = np.concatenate([normal, out / depth[:, None]])
+    return node, distance, normal, np.full(len(node), ONE_SIDED)
+
+
+def _fill_inside(inside: np.ndarray, near: np.ndarray, obstacle: Obstacle, cell_size: float) -> None:
+    """Marks the nodes inside that are not near the surface: one test for each connected region of them."""
+    region, count = ndimage.label(~near)
+    if count == 0:
+        return
+    index = np.arange(1, count + 1)
+    sample = np.array(ndimage.maximum_position(~near, region, index)).reshape(-1, 3)
+    holds = contains(sample * cell_size, obstacle)
+    inside |= np.concatenate([[False], holds])[region]

@@ -1,0 +1,144 @@
+"""The constitutive laws of one particle, for Taichi kernels: water, sand, snow (Taichi Elements' materials).
+
+Every law maps the trial deformation of a step to the new state and the Kirchhoff stress (stress times J, per
+initial volume, in pascals). State per particle: F (sand, snow), and one scalar, `volume`: J for water, the
+volume correction v_c for sand (Tampubolon et al. 2017), the plastic volume ratio Jp for snow (Stomakhin et al.
+2013).
+"""
+
+import taichi as ti
+
+from datagen.mpm.layout import CONSTANT, COUNT
+from datagen.mpm.svd import svd3
+from hgn.scene.material import SAND, SNOW
+
+# Jp beyond these is rounding: hardening is capped, or nothing is left of it
+SMALLEST_PLASTIC_VOLUME, LARGEST_PLASTIC_VOLUME = 1e-3, 1e3
+
+
+@ti.func
+def count_event(counter: ti.template(), scene: ti.i32, event: ti.template(), times: ti.i32):
+    if times > 0:
+        ti.atomic_add(counter[scene, event], ti.cast(times, ti.i64))
+
+
+@ti.func
+def hardening(plastic_volume: ti.f32, constant: ti.template()) -> ti.f32:
+    """exp(xi (1 - Jp)), capped."""
+    cap = constant[CONSTANT.maximum_hardening]
+    exponent = constant[CONSTANT.hardening] * (1.0 - plastic_volume)
+    return ti.min(ti.exp(ti.min(exponent, 80.0)), cap)
+
+
+@ti.func
+def water(volume: ti.f32, expansion: ti.f32, constant: ti.template(), counter: ti.template(), scene: ti.i32):
+    """J (1 + dt tr C), floored; Kirchhoff pressure term lambda J (J - 1); present stiffness, Pa."""
+    bulk = constant[CONSTANT.bulk]
+    smallest = constant[CONSTANT.water_smallest_volume]
+    J = volume * (1.0 + expansion)
+    if J < smallest:
+        J = smallest
+        count_event(counter, scene, COUNT.water_volume_floors, 1)
+    # d(tau) / d(log J) is lambda J (2 J - 1): stretched water is stiffer than water at rest
+    return J, bulk * J * (J - 1.0), 3.0 * bulk * ti.max(1.0, J * (2.0 * J - 1.0))
+
+
+@ti.func
+def _project_sand(log_strain, volume: ti.f32, constant: ti.template(), taichi_elements_sand: ti.template()):
+    """Drucker-Prager return mapping of the principal log strains: new ones, and the new volume correction.
+
+    Tampubolon et al. 2017: v_c / 3 joins each log strain first, and v_c += log det F_trial - log det F_new.
+    `taichi_elements_sand` is Taichi Elements' form, where v_c enters the trace but not the strains.
+    """
+    strain = log_strain
+    trace = log_strain.sum() + volume
+    if ti.static(not taichi_elements_sand):
+        strain = log_strain + volume / 3.0
+    deviator = strain - trace / 3.0
+    new_volume = 0.0
+    new_strain = ti.Vector([0.0, 0.0, 0.0])
+    if trace >= 0.0:
+        new_volume = trace
+    else:
+        shear = constant[CONSTANT.shear]
+        bulk = constant[CONSTANT.bulk]
+        size = deviator.norm() + 1e-20
+        excess = size + (3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * constant[CONSTANT.sand_alpha]
+        # the mapping keeps the trace, so log det F takes up all of v_c, which ends at 0
+        new_strain = strain - deviator * (ti.max(excess, 0.0) / size)
+    return new_strain, new_volume
+
+
+@ti.func
+def solid(
+    F,
+    volume: ti.f32,
+    material: ti.i32,
+    constant: ti.template(),
+    counter: ti.template(),
+    scene: ti.i32,
+    sand: ti.template(),
+    snow: ti.template(),
+    taichi_elements_sand: ti.template(),
+):
+    """Sand and snow from the trial F: new F, new volume, Kirchhoff stress, present stiffness 3 lambda + 2 mu."""
+    shear = constant[CONSTANT.shear]
+    bulk = constant[CONSTANT.bulk]
+    smallest = constant[CONSTANT.smallest_singular_value]
+    U, sigma, V = svd3(F)
+    floors = 0
+    for i in ti.static(range(3)):
+        if sigma[i] < smallest:
+            sigma[i] = smallest
+            floors += 1
+    count_event(counter, scene, COUNT.singular_value_floors, floors)
+    new_sigma = sigma
+    new_volume = volume
+    plastic = floors
+    stiffness = 3.0 * bulk + 2.0 * shear
+    stress = ti.Vector([0.0, 0.0, 0.0])
+    if ti.static(sand):
+        if ti.static(not snow) or material == SAND:
+            log_strain = ti.log(sigma)
+            strain, new_volume_ = _project_sand(log_strain, volume, constant, taichi_elements_sand)
+            new_volume = new_volume_
+            for i in ti.static(range(3)):
+                if strain[i] != log_strain[i]:
+                    new_sigma[i] = ti.exp(strain[i])
+                    plastic += 1
+            stress = 2.0 * shear * strain + bulk * strain.sum()
+    if ti.static(snow):
+        if ti.static(not sand) or material == SNOW:
+            h = hardening(volume, constant)
+            ratio = 1.0
+            for i in ti.static(range(3)):
+                low = constant[CONSTANT.snow_smallest]
+                high = constant[CONSTANT.snow_largest]
+                bounded = ti.min(ti.max(sigma[i], low), high)
+                if bounded != sigma[i]:
+                    ratio *= sigma[i] / bounded
+                    new_sigma[i] = bounded
+                    plastic += 1
+            new_volume = volume * ratio
+            if new_volume < SMALLEST_PLASTIC_VOLUME or new_volume > LARGEST_PLASTIC_VOLUME:
+                new_volume = ti.min(ti.max(new_volume, SMALLEST_PLASTIC_VOLUME), LARGEST_PLASTIC_VOLUME)
+                count_event(counter, scene, COUNT.plastic_volume_bounds, 1)
+            new_h = hardening(new_volume, constant)
+            if new_h >= constant[CONSTANT.maximum_hardening]:
+                count_event(counter, scene, COUNT.hardening_caps, 1)
+            stiffness *= new_h
+            J = new_sigma[0] * new_sigma[1] * new_sigma[2]
+            stress = 2.0 * shear * h * (new_sigma - 1.0) * new_sigma + bulk * h * J * (J - 1.0)
+    new_F = F
+    if plastic > 0:  # recomposed only then: each decomposition costs a rounding of det F
+        new_F = _compose(U, new_sigma, V)
+    return new_F, new_volume, _compose(U, stress, U), stiffness
+
+
+@ti.func
+def _compose(U, diagonal, V):
+    """U diag(diagonal) Vᵀ."""
+    out = ti.Matrix.zero(ti.f32, 3, 3)
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        out[i, j] = U[i, 0] * diagonal[0] * V[j, 0] + U[i, 1] * diagonal[1] * V[j, 1] + U[i, 2] * diagonal[2] * V[j, 2]
+    return out

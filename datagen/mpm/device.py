@@ -1,0 +1,75 @@
+"""Starts Taichi once a process, on the device that the solver's config asks for."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from dataclasses import dataclass
+
+from hgn.schema import ConfigError, require, require_one_of
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # stdout belongs to the command
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # a simulation makes no network calls
+
+import taichi as ti
+
+
+@dataclass(frozen=True)
+class Device:
+    """What this process simulates on."""
+
+    kind: str  # cpu or gpu
+    threads: int  # of the CPU; 1 on a GPU
+
+
+_started: Device | None = None
+
+
+def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
+    """Starts Taichi, or returns what an earlier call of this process started.
+
+    `device` is auto (CUDA if this machine has it, else the CPU), cpu or gpu. `cpu_threads` is the number of
+    threads on a CPU; none takes all cores that this process may use. Compiled kernels are kept in Taichi's
+    cache on disk, so that the next process starts fast.
+
+    Raises: ConfigError when gpu is asked for and there is none, or when the process already runs on another
+    device or number of threads (Taichi has one runtime a process).
+    """
+    global _started
+    require_one_of(_Request(device), "device", ("auto", "cpu", "gpu"))
+    if cpu_threads is not None:
+        require(cpu_threads >= 1, "cpu_threads", "at least 1", cpu_threads)
+    if _started is not None:
+        if device not in ("auto", _started.kind):
+            raise ConfigError(
+                f"device must stay {_started.kind} in a process that began with it, got {device!r}; use another process"
+            )
+        if _started.kind == "cpu" and cpu_threads not in (None, _started.threads):
+            raise ConfigError(
+                f"cpu_threads must stay {_started.threads} in a process that began with it, got {cpu_threads}; "
+                "use another process"
+            )
+        return _started
+    ti.set_logging_level(ti.ERROR)  # the search for CUDA warns where there is none
+    has_gpu = device != "cpu" and ti.lang.misc.is_arch_supported(ti.cuda)
+    if device == "gpu" and not has_gpu:
+        raise ConfigError("device must be cpu or auto where CUDA finds no device, got 'gpu'")
+    threads = cpu_threads or len(os.sched_getaffinity(0))
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(
+            arch=ti.cuda if has_gpu else ti.cpu,
+            cpu_max_num_threads=threads,
+            offline_cache=True,
+            default_fp=ti.f32,
+            default_ip=ti.i32,
+            fast_math=False,  # it reorders sums by what stands beside them, and drops tests for NaN
+            log_level=ti.ERROR,
+        )
+    _started = Device("gpu", 1) if has_gpu else Device("cpu", threads)
+    return _started
+
+
+@dataclass(frozen=True)
+class _Request:
+    device: str
