@@ -4,9 +4,10 @@ The paper's cell normals leak when used as a collider, so the solver builds its 
 Shape legend: K contact nodes, P points, F triangles, V vertices.
 
 Sheets (open meshes): nodes within `band_cells` of the surface, on both sides, with the normal toward the node's
-own side. A node on the sheet (closer than 0.05 cells) stops motion both ways. Closed bodies: nodes inside, and
-nodes outside nearer than half a cell, with the normal outward; where the body is so thin that no node may lie
-inside, the sheet's band holds on its outside too. Where two obstacles claim a node, the closest surface wins.
+own side. The nodes nearest to the sheet (within half a cell) stop motion both ways: one that lies just behind the
+sheet would else pass on what comes from the front. Closed bodies: nodes inside, and nodes outside nearer than half
+a cell, with the normal outward; where the body is thinner than a cell, so that no node may lie inside, the sheet's
+band holds on its outside too. Where two obstacles claim a node, the closest surface wins.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
 ONE_SIDED, BOTH_SIDES = 1, 2
-ON_SURFACE_CELLS = 0.05
+ON_SURFACE_CELLS = 0.05  # nearer than this, the direction to the surface is rounding
+BOTH_SIDES_CELLS = 0.5 + 1e-6
 CLOSED_BAND_CELLS = 0.5
 PAIRS_PER_CHUNK = 1_000_000  # (node, triangle) pairs held at once
 # squared area over fourth power of the longest edge, below which a triangle has no direction
@@ -164,7 +166,7 @@ def _sheet_contacts(
     on_surface = distance < ON_SURFACE_CELLS
     away = (_points(node, shape) - foot) / np.where(on_surface, 1.0, distance)[:, None]
     normal = np.where(on_surface[:, None], _face_normals(triangle_F33)[owner], away)
-    kind = np.where(on_surface, BOTH_SIDES, ONE_SIDED)
+    kind = np.where(distance <= BOTH_SIDES_CELLS, BOTH_SIDES, ONE_SIDED)
     return node, distance, normal, kind
 
 
@@ -190,9 +192,11 @@ def _closed_contacts(
     face = np.where(half_cell[:, None], -face, face)
     normal = np.where(on_surface[:, None], face, away)
 
-    beyond = np.clip(np.rint(foot - 1.5 * normal), 0, np.array(shape) - 1).astype(np.int64)
-    thin = ~inside[tuple(beyond.T)]
-    chosen = within | (distance < CLOSED_BAND_CELLS) | (thin & (distance <= band))
+    # thin: a cell further on, past the surface, lies outside again
+    thin = np.zeros(len(node), bool)
+    between = np.flatnonzero(~within & (distance > CLOSED_BAND_CELLS) & (distance <= band))
+    thin[between] = ~contains((foot[between] - normal[between]) * cell_size, obstacle)
+    chosen = within | (distance < CLOSED_BAND_CELLS) | thin
     node, distance, normal = node[chosen], distance[chosen], normal[chosen]
 
     deep = np.flatnonzero(inside.ravel() & ~near.ravel())

@@ -240,6 +240,8 @@ def substep(
     nodes_x: ti.i32,
     nodes_y: ti.i32,
     nodes_z: ti.i32,
+    wall_cells: ti.i32,
+    sticky_walls: ti.i32,
     maximum_substeps: ti.i32,
     dx: ti.f32,
     inverse_dx: ti.f32,
@@ -263,13 +265,11 @@ def substep(
     contact: Integers,
     contact_normal: Vectors,
     contact_kind: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    wall_cells: ti.template(),
     has_water: ti.template(),
     has_sand: ti.template(),
     has_snow: ti.template(),
     has_contact: ti.template(),
     taichi_elements_sand: ti.template(),
-    sticky_walls: ti.template(),
     parts: ti.template(),
     atomic: ti.template(),
 ):
@@ -368,9 +368,8 @@ def substep(
                 if index[axis] >= nodes[axis] - wall_cells:
                     v[axis] = ti.min(v[axis], 0.0)
                     stuck = 1
-            if ti.static(sticky_walls):
-                if stuck:
-                    v = ti.Vector([0.0, 0.0, 0.0])
+            if stuck and sticky_walls:
+                v = ti.Vector([0.0, 0.0, 0.0])
         node[place] = ti.Vector([v[0], v[1], v[2], total[3]])
 
     for p in range(particles):

@@ -91,7 +91,7 @@ def simulate(
     node_counts = _shared_grid(scenes, config)
     low, high = particle_bounds(scenes[0], config)
     for index, scene in enumerate(scenes):
-        _require_inside(scene, index, low, high)
+        _require_sound(scene, index, low, high)
     colliders = [build_collider(scene, config.collider_band_cells) for scene in scenes]
 
     device = initialise(config.device, cpu_threads)
@@ -129,6 +129,7 @@ def fixed_substeps(config: MpmConfig, frame_rate_hz: float) -> int:
 
 def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, int]:
     first = scenes[0]
+    require(first.cell_size > 0 and math.isfinite(first.cell_size), "cell_size", "a finite number > 0", first.cell_size)
     for index, scene in enumerate(scenes):
         for name in ("domain_size", "cell_size"):
             if getattr(scene, name) != getattr(first, name):
@@ -156,7 +157,10 @@ def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, 
     return counts[0], counts[1], counts[2]
 
 
-def _require_inside(scene: Scene, index: int, low: np.ndarray, high: np.ndarray) -> None:
+def _require_sound(scene: Scene, index: int, low: np.ndarray, high: np.ndarray) -> None:
+    for name in ("gravity", "velocity_N3"):
+        if not np.isfinite(getattr(scene, name)).all():
+            raise ConfigError(f"{name} of scene {index} must be finite")
     position = np.asarray(scene.position_N3, np.float32)
     outside = np.flatnonzero(~((position >= low) & (position <= high)).all(axis=1))
     if len(outside):
@@ -325,13 +329,13 @@ class _Launch:
         while pending:
             for _ in range(min(pending, SUBSTEPS_PER_CHECK)):
                 kernels.substep(
-                    len(self.scenes), self.particles, nodes_x, nodes_y, nodes_z, config.maximum_substeps_per_frame,
-                    cell_size, 1 / cell_size, self.position, self.velocity, self.affine, self.deformation,
-                    self.volume, self.material, self.scene_of, self.part_begin, self.scene_value, self.scene_state,
-                    self.counter, self.constant, setting, self.node, self.flag, self.touched, self.touched_count,
-                    self.contact, self.contact_normal, self.contact_kind, config.wall_cells, *self.has,
-                    self.has_contact, config.sand_volume_correction == "taichi_elements",
-                    config.wall_contact == "stick", self.parts, self.atomic,
+                    len(self.scenes), self.particles, nodes_x, nodes_y, nodes_z, config.wall_cells,
+                    config.wall_contact == "stick", config.maximum_substeps_per_frame, cell_size, 1 / cell_size,
+                    self.position, self.velocity, self.affine, self.deformation, self.volume, self.material,
+                    self.scene_of, self.part_begin, self.scene_value, self.scene_state, self.counter, self.constant,
+                    setting, self.node, self.flag, self.touched, self.touched_count, self.contact,
+                    self.contact_normal, self.contact_kind, *self.has, self.has_contact,
+                    config.sand_volume_correction == "taichi_elements", self.parts, self.atomic,
                 )  # fmt: skip
             value = self.scene_value.to_numpy()
             busy = value[:, VALUE.remaining] > 0

@@ -70,7 +70,7 @@ def _perpendicular(u: ti.template()) -> ti.math.vec3:
 
 @ti.func
 def svd3(A: ti.template()):
-    """U, sigma (a vector, descending in size, only the last may be negative), V of a finite 3 x 3 matrix."""
+    """U, sigma, V of a finite matrix; sigma descends in size, and only its last is negative beyond rounding."""
     scale = 0.0
     for i, j in ti.static(ti.ndrange(3, 3)):
         scale = ti.max(scale, ti.abs(A[i, j]))

@@ -1,0 +1,10 @@
+"""Taichi on two CPU threads for all tests of this folder."""
+
+import pytest
+
+from datagen.mpm.device import initialise
+
+
+@pytest.fixture(scope="session", autouse=True)
+def taichi_on_cpu() -> None:
+    initialise("cpu", 2)

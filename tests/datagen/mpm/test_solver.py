@@ -1,0 +1,297 @@
+"""The solver against closed forms, conservation laws and its own promises about batches and failures."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from datagen.mpm.device import initialise
+from datagen.mpm.solver import SceneFailure, Simulated, fixed_substeps, particle_bounds, simulate
+from hgn.config import MpmConfig
+from hgn.scene.material import MATERIALS, SAND, SNOW, WATER
+from hgn.scene.scene import Obstacle, Scene
+from hgn.schema import ConfigError
+
+CELL = 1 / 16
+ADAPTIVE = MpmConfig(device="cpu")
+FIXED = MpmConfig(device="cpu", time_step="fixed")
+
+
+def block(
+    material: int, low: tuple, high: tuple, velocity: tuple = (0, 0, 0), seed: int = 0, count: int = 0, **scene
+) -> Scene:
+    """A box of particles at random places, eight a cell unless `count` is given."""
+    low, high = np.array(low), np.array(high)
+    count = count or int(8 * np.prod((high - low) / CELL))
+    position = np.random.default_rng(seed).uniform(low, high, (count, 3)).astype(np.float32)
+    return Scene(
+        position, np.tile(np.float32(velocity), (count, 1)), np.full(count, material, np.uint8),
+        cell_size=CELL, **scene,
+    )  # fmt: skip
+
+
+def joined(*scenes: Scene) -> Scene:
+    return Scene(
+        np.concatenate([s.position_N3 for s in scenes]), np.concatenate([s.velocity_N3 for s in scenes]),
+        np.concatenate([s.material_N for s in scenes]), scenes[0].obstacles, cell_size=CELL,
+        gravity=scenes[0].gravity,
+    )  # fmt: skip
+
+
+# a particle of each material: with it beside, every test shares one compiled kernel
+BESIDE = Scene(
+    np.float32([[0.3, 0.5, 0.5], [0.5, 0.5, 0.5], [0.7, 0.5, 0.5]]), np.zeros((3, 3), np.float32),
+    np.arange(3).astype(np.uint8), cell_size=CELL,
+)  # fmt: skip
+
+
+def beside(scene: Scene) -> Scene:
+    return Scene(BESIDE.position_N3, BESIDE.velocity_N3, BESIDE.material_N, (), scene.domain_size, CELL)
+
+
+def run(scene: Scene, config: MpmConfig, frames: int) -> Simulated:
+    outcome = simulate([scene, beside(scene)], config, frames, 60.0)[0]
+    assert isinstance(outcome, Simulated), outcome
+    return outcome
+
+
+@pytest.mark.parametrize("material", range(3))
+def test_free_fall(material: int) -> None:
+    """With a fixed step a falling body follows y = -g dt² n (n + 1) / 2 to 1e-4 of the fall."""
+    scene = block(material, (0.4, 0.7, 0.4), (0.5, 0.8, 0.5))
+    position = run(scene, FIXED, 13).position_TN3.astype(float)
+    n = fixed_substeps(FIXED, 60.0) * np.arange(13)
+    fall = -9.8 * FIXED.fixed_time_step_s**2 * n * (n + 1) / 2
+    assert np.abs(position[:, :, 1].mean(axis=1) - position[0, :, 1].mean() - fall).max() < 1e-4 * abs(fall[-1])
+
+
+def test_taichi_elements_substeps() -> None:
+    """A fixed step of 3.125e-4 s at 60 Hz takes 54 substeps a frame, Taichi Elements' count."""
+    outcome = run(block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=20), FIXED, 3)
+    assert outcome.counters["substeps"] == 2 * 54
+    assert outcome.counters["smallest_time_step_s"] == pytest.approx(3.125e-4)
+
+
+def test_adaptive_steps_fill_the_frame() -> None:
+    """Adaptive steps add up to the frame: free fall over ten frames ends within one step's error of g t² / 2."""
+    outcome = run(block(SNOW, (0.4, 0.7, 0.4), (0.5, 0.8, 0.5), count=200), ADAPTIVE, 11)
+    time = 10 / 60
+    fall = (outcome.position_TN3[-1] - outcome.position_TN3[0])[:, 1].mean()
+    step = outcome.counters["smallest_time_step_s"]
+    # the symplectic scheme is ahead by g t dt / 2, with dt at most twice the smallest
+    assert -9.8 * time * (time / 2 + step) < fall < -9.8 * time * time / 2
+    assert outcome.counters["substeps"] >= time / (0.5 * CELL * (1000 / 1_666_667) ** 0.5)
+
+
+@pytest.mark.parametrize("config", [ADAPTIVE, FIXED], ids=["adaptive", "fixed"])
+def test_momentum_is_conserved(config: MpmConfig) -> None:
+    """Without gravity two colliding blocks keep their total momentum to 1e-5 of what each brings in."""
+    scene = joined(
+        block(WATER, (0.3, 0.4, 0.4), (0.42, 0.55, 0.55), (2, 0.3, 0), gravity=(0.0, 0.0, 0.0)),
+        block(SNOW, (0.5, 0.42, 0.4), (0.6, 0.57, 0.55), (-2, 0, 0.1), seed=1),
+        block(SAND, (0.38, 0.62, 0.4), (0.5, 0.7, 0.5), (0, -2, 0), seed=2),
+    )
+    moved = np.diff(run(scene, config, 7).position_TN3.astype(float), axis=0).sum(axis=1)
+    expected = moved[0]
+    assert np.abs(moved - expected).max() < 1e-5 * np.abs(scene.velocity_N3).sum() / 60
+
+
+def test_water_comes_to_rest() -> None:
+    """Water between walls carries its own weight: it comes to rest, and keeps its level but for half a cell."""
+    scene = block(WATER, (2.6 * CELL, 2.6 * CELL, 2.6 * CELL), (13.2 * CELL, 7 * CELL, 13.2 * CELL))
+    outcome = run(scene, ADAPTIVE, 91)
+    level = outcome.position_TN3[:, :, 1].mean(axis=1)
+    assert np.abs(level - level[0]).max() < 0.5 * CELL
+    assert np.abs(level[-30:] / level[-1] - 1).max() < 0.02
+    speed = np.linalg.norm(np.diff(outcome.position_TN3[-10:], axis=0), axis=2) * 60
+    assert np.sqrt((speed**2).mean()) < 0.1
+    assert outcome.counters["water_volume_floors"] == 0
+
+
+@pytest.mark.parametrize("material", range(3), ids=MATERIALS)
+@pytest.mark.parametrize("count", [1, 0], ids=["particle", "block"])
+def test_impact_at_ten_metres_per_second(material: int, count: int) -> None:
+    """The adaptive step bears an impact on the floor at 10 m/s, of a block and of a single particle."""
+    scene = block(material, (0.4, 0.3, 0.4), (0.6, 0.45, 0.6), (0, -10, 0), count=count)
+    outcome = run(scene, ADAPTIVE, 13)
+    low, high = particle_bounds(scene, ADAPTIVE)
+    assert np.isfinite(outcome.position_TN3).all()
+    assert (outcome.position_TN3 >= low).all()
+    assert (outcome.position_TN3 <= high).all()
+    assert outcome.counters["position_clamps"] == 0
+    assert outcome.counters["largest_speed"] < 15
+
+
+def test_snow_impact_is_converged() -> None:
+    """Halving the step changes the height of a snow block that fell at 4.5 m/s by less than 3 %."""
+    scene = block(SNOW, (0.35, 0.25, 0.35), (0.6, 0.5, 0.6), (0, -4.5, 0))
+    half = MpmConfig(device="cpu", stability_fraction=0.25, speed_fraction=0.15)
+    heights = [
+        np.quantile(run(scene, config, 25).position_TN3[-1, :, 1], 0.95) - 3 * CELL for config in (ADAPTIVE, half)
+    ]
+    assert abs(heights[1] / heights[0] - 1) < 0.03
+
+
+def test_walls() -> None:
+    """Slipping walls keep tangential motion, sticking walls brake it, and neither lets anything through."""
+    scene = block(SNOW, (0.2, 2.6 * CELL, 0.3), (0.4, 4.6 * CELL, 0.5), (2, 0, 0))
+    moved = []
+    for contact in ("slip", "stick"):
+        config = MpmConfig(device="cpu", wall_contact=contact)
+        position = run(scene, config, 10).position_TN3
+        moved.append((position[-1] - position[0])[:, 0].mean())
+        low, high = particle_bounds(scene, config)
+        assert ((position >= low) & (position <= high)).all()
+    assert moved[0] == pytest.approx(2 * 9 / 60, rel=0.02)
+    assert moved[1] < 0.7 * moved[0]
+
+
+def test_scenes_of_a_batch_equal_scenes_alone() -> None:
+    """A scene's trajectory is bitwise the same alone and beside scenes of other size, material and obstacles."""
+    sheet = Obstacle(
+        "sheet", np.array([[0.0, 0.3, 0], [1, 0.3, 0], [1, 0.3, 1], [0, 0.3, 1]]),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32), False,
+    )  # fmt: skip
+    scenes = [
+        block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (1, -3, 0)),
+        block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet,)),
+        joined(block(SAND, (0.3, 0.2, 0.3), (0.4, 0.3, 0.4)), block(WATER, (0.5, 0.2, 0.3), (0.6, 0.3, 0.4))),
+    ]
+    together = simulate(scenes, ADAPTIVE, 7, 60.0)
+    for scene, outcome in zip(scenes, together, strict=True):
+        (alone,) = simulate([scene], ADAPTIVE, 7, 60.0)
+        assert np.array_equal(alone.position_TN3, outcome.position_TN3)
+        assert alone.counters == outcome.counters
+
+
+@pytest.mark.parametrize(
+    ("config", "velocity", "cause"),
+    [
+        (FIXED, (0, 1e25, 0), "frame 1: a particle's position, velocity or velocity gradient is no longer finite"),
+        (FIXED, (0, 3000, 0), "frame 1: a particle left the domain"),
+        (MpmConfig(device="cpu", maximum_substeps_per_frame=20), (0, 20, 0), "maximum_substeps_per_frame = 20"),
+    ],
+    ids=["not finite", "left", "substeps"],
+)
+def test_a_bad_scene_leaves_its_batch_alone(config: MpmConfig, velocity: tuple, cause: str) -> None:
+    """A scene that blows up is reported with frame and rule; its batch mates keep every bit."""
+    good = block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (1, -1, 0))
+    bad = block(SNOW, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), velocity)
+    first, failed, last, _ = simulate([good, bad, good, BESIDE], config, 5, 60.0)
+    assert isinstance(failed, SceneFailure)
+    assert cause in failed.cause
+    alone = run(good, config, 5)
+    for outcome in (first, last):
+        assert np.array_equal(outcome.position_TN3, alone.position_TN3)
+        assert outcome.counters == alone.counters
+
+
+@pytest.mark.parametrize("material", range(3), ids=MATERIALS)
+def test_few_particles(material: int) -> None:
+    """One particle, two on one spot, particles on cell faces and corners: finite, and frame 0 is the input."""
+    spots = [
+        [[0.5, 0.5, 0.5]],
+        [[0.4, 0.3, 0.4]] * 2,
+        [[4 * CELL, 5 * CELL, 6 * CELL], [4.5 * CELL, 5 * CELL, 6.5 * CELL], [4.5 * CELL, 4.5 * CELL, 4.5 * CELL]],
+        [np.full(3, 3 * CELL), np.full(3, 13 * CELL)],
+    ]
+    scenes = [
+        Scene(
+            np.array(spot, np.float32), np.zeros((len(spot), 3), np.float32), np.full(len(spot), material, np.uint8),
+            cell_size=CELL,
+        )
+        for spot in spots
+    ]  # fmt: skip
+    for scene, outcome in zip(scenes, simulate([*scenes, BESIDE], ADAPTIVE, 20, 60.0), strict=False):
+        assert isinstance(outcome, Simulated), outcome
+        assert outcome.position_TN3.dtype == np.float32
+        assert np.array_equal(outcome.position_TN3[0], scene.position_N3)
+        assert np.isfinite(outcome.position_TN3).all()
+
+
+def test_bounds_themselves_are_inside() -> None:
+    """Particles exactly on the bounds start, and stay within them."""
+    for wall_cells in (2, 3, 5):
+        config = MpmConfig(device="cpu", wall_cells=wall_cells)
+        low, high = particle_bounds(block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=1), config)
+        position = np.array([low, high, [low[0], high[1], low[2]]], np.float32)
+        scene = Scene(position, np.full((3, 3), 2, np.float32), np.zeros(3, np.uint8), cell_size=CELL)
+        outcome = run(scene, config, 5)
+        assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+
+
+def test_a_domain_that_is_no_cube() -> None:
+    """Sides of 1, 0.75 and 1.375 with nodes that are no multiple of the block size: material spreads to each wall."""
+    scene = block(WATER, (0.3, 0.2, 0.3), (0.6, 0.5, 0.6), (3, 0, 4), domain_size=(1.0, 0.75, 1.375))
+    position = run(scene, ADAPTIVE, 25).position_TN3
+    low, high = particle_bounds(scene, ADAPTIVE)
+    assert ((position >= low) & (position <= high)).all()
+    assert (position.max(axis=(0, 1))[[0, 2]] > high[[0, 2]] - 2 * CELL).all()
+
+
+def test_empty() -> None:
+    """No scenes give no results; scenes without particles give empty trajectories, also beside others."""
+    nothing = Scene(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.uint8), cell_size=CELL)
+    frames: list[int] = []
+    assert simulate([], ADAPTIVE, 4, 60.0) == []
+    (alone,) = simulate([nothing], ADAPTIVE, 4, 60.0, frames.append)
+    assert alone.position_TN3.shape == (4, 0, 3)
+    assert alone.counters["substeps"] == 0
+    assert frames == [0, 1, 2, 3]
+    _, other, _ = simulate([nothing, BESIDE, nothing], ADAPTIVE, 2, 60.0)
+    assert len(other.position_TN3) == 2
+
+
+def test_one_frame_is_the_initial_state() -> None:
+    """frames=1 returns the initial positions without a step; on_frame sees each frame once."""
+    frames: list[int] = []
+    (outcome,) = simulate([BESIDE], ADAPTIVE, 1, 60.0, frames.append)
+    assert np.array_equal(outcome.position_TN3, BESIDE.position_N3[None])
+    simulate([BESIDE], ADAPTIVE, 3, 60.0, frames.append)
+    assert frames == [0, 0, 1, 2]
+
+
+def test_bad_input_is_refused() -> None:
+    """Scenes outside the walls, of other grids, not finite, or no frames: an error that names the field."""
+    good = block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=4)
+    other = Scene(good.position_N3, good.velocity_N3, good.material_N)
+    outside = Scene(good.position_N3 + 0.8, good.velocity_N3, good.material_N, cell_size=CELL)
+    drifting = Scene(good.position_N3, good.velocity_N3, good.material_N, cell_size=CELL, gravity=(0, np.nan, 0))
+    uneven = Scene(good.position_N3, good.velocity_N3, good.material_N, cell_size=0.06)
+    small = Scene(good.position_N3, good.velocity_N3, good.material_N, cell_size=0.25)
+    late = Scene(good.position_N3, good.velocity_N3.copy(), good.material_N, cell_size=CELL)
+    late.velocity_N3[0] = np.nan
+    for scenes, field in (
+        ([good, other], "cell_size"), ([good, outside], "position_N3 of scene 1"), ([drifting], "gravity"),
+        ([uneven], "domain_size"), ([small], "domain_size"), ([late], "velocity_N3"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=field):
+            simulate(scenes, ADAPTIVE, 2, 60.0)
+    with pytest.raises(ConfigError, match="frames"):
+        simulate([good], ADAPTIVE, 0, 60.0)
+    with pytest.raises(ConfigError, match="frame_rate_hz"):
+        simulate([good], ADAPTIVE, 2, float("nan"))
+
+
+def test_one_runtime_a_process() -> None:
+    """A second start with other threads or device is refused; the same, or auto, is not."""
+    assert initialise("auto").kind == "cpu"
+    assert initialise("cpu", 2).threads == 2
+    with pytest.raises(ConfigError, match="cpu_threads"):
+        initialise("cpu", 1)
+    with pytest.raises(ConfigError, match="device"):
+        initialise("gpu")
+
+
+def test_one_thread_repeats_itself_in_silence() -> None:
+    """In a process of one thread two runs agree bitwise, and Taichi writes nothing to stdout or stderr."""
+    program = (
+        "import numpy as np; from datagen.mpm.solver import simulate; from hgn.config import MpmConfig;"
+        "from hgn.scene.scene import Scene; x = np.random.default_rng(0).uniform(.3, .5, (300, 3)).astype('f4');"
+        "s = Scene(x, x - 2, np.arange(300).astype('u1') % 3, cell_size=1 / 16);"
+        "a, b = (simulate([s], MpmConfig(), 4, 60., cpu_threads=1)[0].position_TN3 for _ in range(2));"
+        "raise SystemExit(0 if np.array_equal(a, b) else 1)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
