@@ -15,7 +15,17 @@ Everything is per scene: time step, remaining time, state, counters. A scene tha
 import taichi as ti
 
 from datagen.mpm.constitutive import count_event, hardening, solid, water
-from datagen.mpm.layout import BLOCK, BLOCK_NODES, CONSTANT, COUNT, SETTING, STATE, STATUS, VALUE
+from datagen.mpm.layout import (
+    BLOCK,
+    BLOCK_NODES,
+    CONSTANT,
+    COUNT,
+    SETTING,
+    SHAPE,
+    STATUS,
+    VALUE,
+    VARIANT,
+)
 from hgn.scene.material import SNOW, WATER
 
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
@@ -64,16 +74,14 @@ def _raise_maximum(values: ti.template(), scene: ti.i32, entry: ti.template(), v
 def _choose_time_step(
     scene: ti.i32,
     scene_value: ti.template(),
-    scene_state: ti.template(),
     counter: ti.template(),
-    constant: ti.template(),
     setting: ti.template(),
-    dx: ti.f32,
     maximum_substeps: ti.i32,
 ):
     step = 0.0
+    dx = setting[SETTING.cell_size]
     remaining = scene_value[scene, VALUE.remaining]
-    if remaining > 0.0 and scene_state[scene, STATE.status] == STATUS.running:
+    if remaining > 0.0 and counter[scene, COUNT.status] == STATUS.running:
         stiffness = ti.max(
             scene_value[scene, VALUE.stiffness],
             scene_value[scene, VALUE.least_stiffness],
@@ -84,17 +92,17 @@ def _choose_time_step(
         fixed = setting[SETTING.fixed_time_step]
         limit = fixed
         if fixed == 0.0:
-            limit = setting[SETTING.stability_fraction] * dx * ti.sqrt(constant[CONSTANT.density] / stiffness)
+            limit = setting[SETTING.stability_fraction] * dx * ti.sqrt(setting[CONSTANT.density] / stiffness)
             # the fall within the step counts too
             speed = ti.sqrt(speed_square) + gravity.norm() * ti.min(limit, remaining)
             limit = ti.min(limit, setting[SETTING.speed_fraction] * dx / ti.max(speed, 1e-20))
         # equal steps to the end of the frame: no sliver at its end
         ahead = ti.max(ti.ceil(ti.min(remaining / limit, 1e9) - 1e-4), 1.0)
-        done = scene_state[scene, STATE.frame_substeps]
+        done = ti.cast(counter[scene, COUNT.frame_substeps], ti.i32)
         if fixed > 0.0:
             ahead = setting[SETTING.fixed_substeps] - ti.cast(done, ti.f32)
         if not ahead <= ti.cast(maximum_substeps - done, ti.f32):
-            scene_state[scene, STATE.status] = STATUS.too_many_substeps
+            counter[scene, COUNT.status] = ti.cast(STATUS.too_many_substeps, ti.i64)
             scene_value[scene, VALUE.remaining] = 0.0
         else:
             step = remaining / ahead
@@ -106,7 +114,7 @@ def _choose_time_step(
             scene_value[scene, VALUE.remaining] = remaining
             scene_value[scene, VALUE.substeps_ahead] = ahead - 1.0
             scene_value[scene, VALUE.smallest_time_step] = ti.min(scene_value[scene, VALUE.smallest_time_step], step)
-            scene_state[scene, STATE.frame_substeps] = done + 1
+            counter[scene, COUNT.frame_substeps] = ti.cast(done + 1, ti.i64)
             counter[scene, COUNT.substeps] += ti.cast(1, ti.i64)
             # maxima are gathered anew while the step runs
             scene_value[scene, VALUE.stiffness] = 0.0
@@ -115,18 +123,12 @@ def _choose_time_step(
 
 
 @ti.func
-def _mark(
-    x,
-    scene: ti.i32,
-    inverse_dx: ti.f32,
-    blocks_y: ti.i32,
-    blocks_z: ti.i32,
-    scene_blocks: ti.i32,
-    flag: ti.template(),
-    touched: ti.template(),
-    touched_count: ti.template(),
-):
-    """Adds the blocks that the particle's nodes lie in, up to eight, to the list."""
+def _mark(x, scene: ti.i32, inverse_dx: ti.f32, shape: ti.template(), block: ti.template()):
+    """Adds the blocks that the particle's nodes lie in, up to eight, to the list.
+
+    `block` holds a flag for each block of all scenes, then the list of touched ones, then its length.
+    """
+    blocks = shape[SHAPE.all_blocks]
     base = _base(x, inverse_dx)
     first = base >> 2
     last = (base + 2) >> 2
@@ -138,55 +140,76 @@ def _mark(
                 if first[axis] == last[axis]:
                     fresh = 0
         if fresh:
-            block = scene * scene_blocks + (corner[0] * blocks_y + corner[1]) * blocks_z + corner[2]
-            if flag[block] == 0:
-                if ti.atomic_max(flag[block], 1) == 0:
-                    touched[ti.atomic_add(touched_count[0], 1)] = block
+            index = scene * shape[SHAPE.scene_blocks]
+            index += (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
+            if block[index] == 0:
+                if ti.atomic_max(block[index], 1) == 0:
+                    block[blocks + ti.atomic_add(block[2 * blocks], 1)] = index
+
+
+@ti.func
+def _node_places(base, first_node: ti.i32, shape: ti.template()):
+    """Shares of x, y, z in the place of nodes base .. base + 2; the place is the sum of one of each."""
+    stride_y = shape[SHAPE.blocks + 2] * BLOCK_NODES
+    stride_x = shape[SHAPE.blocks + 1] * stride_y
+    offset = ti.Vector([0, 1, 2])
+    return (
+        first_node + _node_of_axis(base[0] + offset, stride_x, BLOCK * BLOCK),
+        _node_of_axis(base[1] + offset, stride_y, BLOCK),
+        _node_of_axis(base[2] + offset, BLOCK_NODES, 1),
+    )
 
 
 @ti.func
 def _particle_to_grid(
     p: ti.i32,
-    first_node: ti.i32,
-    step: ti.f32,
+    copy: ti.i32,
     scene: ti.i32,
-    dx: ti.f32,
-    inverse_dx: ti.f32,
-    stride_x: ti.i32,
-    stride_y: ti.i32,
+    step: ti.f32,
     position: ti.template(),
     velocity: ti.template(),
     affine: ti.template(),
     deformation: ti.template(),
     volume: ti.template(),
-    material: ti.template(),
+    label: ti.template(),
     node: ti.template(),
     scene_value: ti.template(),
     counter: ti.template(),
-    constant: ti.template(),
-    has_water: ti.template(),
-    has_sand: ti.template(),
-    has_snow: ti.template(),
-    taichi_elements_sand: ti.template(),
-    atomic: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    variant: ti.template(),
 ):
+    """Updates the particle's deformation and adds its mass and momentum to its nodes in one copy of the grid."""
+    has_water = ti.static(bool(variant & VARIANT.water))
+    has_solid = ti.static(bool(variant & (VARIANT.sand | VARIANT.snow)))
+    dx = setting[SETTING.cell_size]
+    inverse_dx = setting[SETTING.inverse_cell_size]
+    material = label[p] & 3
     C = affine[p]
     # -dt V0 (4 / dx^2) stress / mass, with V0 / mass = 1 / density
-    scale = -step * 4.0 * inverse_dx * inverse_dx / constant[CONSTANT.density]
+    scale = -step * 4.0 * inverse_dx * inverse_dx / setting[CONSTANT.density]
     A = C
     if ti.static(has_water):
-        if ti.static(not (has_sand or has_snow)) or material[p] == WATER:
-            J, pressure, stiffness = water(volume[p], step * C.trace(), constant, counter, scene)
+        if ti.static(not has_solid) or material == WATER:
+            J, pressure, stiffness = water(volume[p], step * C.trace(), setting, counter, scene)
             volume[p] = J
             for i in ti.static(range(3)):
                 A[i, i] += scale * pressure
             _raise_maximum(scene_value, scene, VALUE.stiffness, stiffness)
-    if ti.static(has_sand or has_snow):
-        if ti.static(not has_water) or material[p] != WATER:
+    if ti.static(has_solid):
+        if ti.static(not has_water) or material != WATER:
             F = deformation[p]
             F += step * (C @ F)
             new_F, new_volume, stress, stiffness = solid(
-                F, volume[p], material[p], constant, counter, scene, has_sand, has_snow, taichi_elements_sand
+                F,
+                volume[p],
+                material,
+                setting,
+                counter,
+                scene,
+                ti.static(bool(variant & VARIANT.sand)),
+                ti.static(bool(variant & VARIANT.snow)),
+                ti.static(bool(variant & VARIANT.taichi_elements_sand)),
             )
             deformation[p] = new_F
             volume[p] = new_volume
@@ -197,9 +220,8 @@ def _particle_to_grid(
     base = ti.floor(x - 0.5, ti.i32)
     fx = x - ti.cast(base, ti.f32)
     w0, w1, w2 = _weights(fx)
-    index_x = [first_node + _node_of_axis(base[0] + i, stride_x, 16) for i in ti.static(range(3))]
-    index_y = [_node_of_axis(base[1] + i, stride_y, 4) for i in ti.static(range(3))]
-    index_z = [_node_of_axis(base[2] + i, 64, 1) for i in ti.static(range(3))]
+    first_node = (copy + scene * shape[SHAPE.scene_blocks]) * BLOCK_NODES
+    index_x, index_y, index_z = _node_places(base, first_node, shape)
     w = ti.static((w0, w1, w2))
     A *= dx
     v = velocity[p] - A @ fx
@@ -211,7 +233,7 @@ def _particle_to_grid(
             vxyz = ti.Vector([vxy[a] + A[a, 2] * k for a in range(3)])
             share = ti.Vector([weight * vxyz[0], weight * vxyz[1], weight * vxyz[2], weight])
             target = index_x[i] + index_y[j] + index_z[k]
-            if ti.static(atomic):
+            if ti.static(bool(variant & VARIANT.atomic)):
                 ti.atomic_add(node[target], share)
             else:
                 old = node[target]
@@ -219,11 +241,11 @@ def _particle_to_grid(
 
 
 @ti.func
-def _meet_collider(v, normal, kind: ti.i32, friction: ti.f32):
+def _meet_collider(v, normal, both_sides: ti.i32, friction: ti.f32):
     """Contact of a node: separation is free, approach keeps the tangential part less Coulomb friction."""
     out = v
     along = v.dot(normal)
-    if kind == 2 or along < 0.0:  # kind 2: on a sheet, which stops motion both ways
+    if both_sides or along < 0.0:
         tangential = v - along * normal
         speed = tangential.norm()
         keep = 1.0
@@ -233,246 +255,239 @@ def _meet_collider(v, normal, kind: ti.i32, friction: ti.f32):
     return out
 
 
+@ti.func
+def _update_node(
+    place: ti.i32,
+    global_block: ti.i32,
+    scene_value: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    node: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    variant: ti.template(),
+):
+    """Momentum to velocity; gravity, colliders and walls. What copies hold is summed in order."""
+    total = node[place]
+    for part in ti.static(range(1, variant // VARIANT.parts)):
+        total += node[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
+    v = ti.Vector([0.0, 0.0, 0.0])
+    if total[3] > SMALLEST_MASS:
+        blocks_y = shape[SHAPE.blocks + 1]
+        blocks_z = shape[SHAPE.blocks + 2]
+        scene = global_block // shape[SHAPE.scene_blocks]
+        block = global_block - scene * shape[SHAPE.scene_blocks]
+        gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
+        v = ti.Vector([total[0], total[1], total[2]]) / total[3] + scene_value[scene, VALUE.time_step] * gravity
+        if ti.static(bool(variant & VARIANT.contact)):
+            entry = contact[place]
+            if entry >= 0:
+                v = _meet_collider(v, contact_normal[entry >> 1], entry & 1, setting[SETTING.friction])
+        # walls last: whatever a collider leaves, nothing leaves the domain
+        local = place & (BLOCK_NODES - 1)
+        index = ti.Vector(
+            [
+                block // (blocks_y * blocks_z) * BLOCK + local // 16,
+                block // blocks_z % blocks_y * BLOCK + local // 4 % 4,
+                block % blocks_z * BLOCK + local % 4,
+            ]
+        )
+        wall_cells = shape[SHAPE.wall_cells]
+        stuck = 0
+        for axis in ti.static(range(3)):
+            if index[axis] < wall_cells:
+                v[axis] = ti.max(v[axis], 0.0)
+                stuck = 1
+            if index[axis] >= shape[SHAPE.nodes + axis] - wall_cells:
+                v[axis] = ti.min(v[axis], 0.0)
+                stuck = 1
+        if stuck and shape[SHAPE.sticky_walls]:
+            v = ti.Vector([0.0, 0.0, 0.0])
+    node[place] = ti.Vector([v[0], v[1], v[2], total[3]])
+
+
+@ti.func
+def _grid_to_particle(
+    p: ti.i32,
+    scene: ti.i32,
+    step: ti.f32,
+    position: ti.template(),
+    velocity: ti.template(),
+    affine: ti.template(),
+    node: ti.template(),
+    scene_value: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+):
+    """New velocity and its gradient, then advection; stops a scene that is not finite or leaves the domain."""
+    inverse_dx = setting[SETTING.inverse_cell_size]
+    x = position[p]
+    scaled = x * inverse_dx
+    base = ti.floor(scaled - 0.5, ti.i32)
+    fx = scaled - ti.cast(base, ti.f32)
+    w0, w1, w2 = _weights(fx)
+    w = ti.static((w0, w1, w2))
+    index_x, index_y, index_z = _node_places(base, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape)
+    v = ti.Vector([0.0, 0.0, 0.0])
+    gradient_x = ti.Vector([0.0, 0.0, 0.0])
+    gradient_y = ti.Vector([0.0, 0.0, 0.0])
+    gradient_z = ti.Vector([0.0, 0.0, 0.0])
+    for i in ti.static(range(3)):
+        plane = ti.Vector([0.0, 0.0, 0.0])
+        plane_y = ti.Vector([0.0, 0.0, 0.0])
+        plane_z = ti.Vector([0.0, 0.0, 0.0])
+        for j in ti.static(range(3)):
+            line = ti.Vector([0.0, 0.0, 0.0])
+            line_z = ti.Vector([0.0, 0.0, 0.0])
+            for k in ti.static(range(3)):
+                value = node[index_x[i] + index_y[j] + index_z[k]]
+                share = w[k][2] * ti.Vector([value[0], value[1], value[2]])
+                line += share
+                line_z += (k - fx[2]) * share
+            plane += w[j][1] * line
+            plane_y += w[j][1] * (j - fx[1]) * line
+            plane_z += w[j][1] * line_z
+        v += w[i][0] * plane
+        gradient_x += w[i][0] * (i - fx[0]) * plane
+        gradient_y += w[i][0] * plane_y
+        gradient_z += w[i][0] * plane_z
+    C = ti.Matrix.cols([gradient_x, gradient_y, gradient_z]) * (4.0 * inverse_dx)
+    x += step * v
+    speed_square = v.dot(v)
+    bad = _not_finite(speed_square) | _not_finite(x.sum()) | _not_finite(C.sum())
+    outside = 0
+    clamps = 0
+    for axis in ti.static(range(3)):
+        low = setting[SETTING.low + axis]
+        high = setting[SETTING.high + axis]
+        if not (x[axis] >= 0.0 and x[axis] <= setting[SETTING.size + axis]):
+            outside = 1
+        if not x[axis] >= low:
+            x[axis] = low
+            clamps = 1
+        if not x[axis] <= high:
+            x[axis] = high
+            clamps = 1
+    if bad:
+        counter[scene, COUNT.status] = ti.cast(STATUS.not_finite, ti.i64)
+        scene_value[scene, VALUE.remaining] = 0.0
+    elif outside:
+        # a value that is not finite is the better cause to report
+        if counter[scene, COUNT.status] != STATUS.not_finite:
+            counter[scene, COUNT.status] = ti.cast(STATUS.left_domain, ti.i64)
+        scene_value[scene, VALUE.remaining] = 0.0
+    else:
+        count_event(counter, scene, COUNT.position_clamps, clamps)
+        _raise_maximum(scene_value, scene, VALUE.speed_square, speed_square)
+        _raise_maximum(scene_value, scene, VALUE.largest_speed_square, speed_square)
+    position[p] = x
+    velocity[p] = v
+    affine[p] = C
+
+
 @ti.kernel
 def substep(
-    scenes: ti.i32,
-    particles: ti.i32,
-    nodes_x: ti.i32,
-    nodes_y: ti.i32,
-    nodes_z: ti.i32,
-    wall_cells: ti.i32,
-    sticky_walls: ti.i32,
-    maximum_substeps: ti.i32,
-    dx: ti.f32,
-    inverse_dx: ti.f32,
     position: Vectors,
     velocity: Vectors,
     affine: Matrices,
     deformation: Matrices,
     volume: Scalars,
-    material: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    scene_of: Integers,
-    part_begin: Integers,
+    label: Integers,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    scene_state: ti.types.ndarray(dtype=ti.i32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    constant: Scalars,
     setting: Scalars,
+    shape: Integers,
     node: Nodes,
-    flag: Integers,
-    touched: Integers,
-    touched_count: Integers,
+    block: Integers,
     contact: Integers,
     contact_normal: Vectors,
-    contact_kind: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    has_water: ti.template(),
-    has_sand: ti.template(),
-    has_snow: ti.template(),
-    has_contact: ti.template(),
-    taichi_elements_sand: ti.template(),
-    parts: ti.template(),
-    atomic: ti.template(),
+    variant: ti.template(),
 ):
     """Advances every scene that has time left by one substep of its own length.
 
     Order: time step, mark and clear blocks, particles to grid (deformation, plasticity, stress), gravity,
-    colliders, walls, grid to particles, advection. `node` [parts * scenes * blocks * 64] holds `parts` copies.
+    colliders, walls, grid to particles, advection. `label` holds scene * 4 + material of each particle, `node`
+    [parts * scenes * blocks * 64] holds a copy of the grid for each part, `contact` twice the index of each
+    node's normal plus 1 where motion is stopped both ways, or -1.
     """
-    for scene in range(scenes):
-        _choose_time_step(scene, scene_value, scene_state, counter, constant, setting, dx, maximum_substeps)
+    for scene in range(scene_value.shape[0]):
+        _choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
         if scene == 0:
-            touched_count[0] = 0
+            block[2 * shape[SHAPE.all_blocks]] = 0
 
-    for p in range(particles):
-        scene = scene_of[p]
+    for p in range(position.shape[0]):
+        scene = label[p] >> 2
         if scene_value[scene, VALUE.time_step] > 0.0:
-            blocks_y = (nodes_y + 3) // 4
-            blocks_z = (nodes_z + 3) // 4
-            scene_blocks = (nodes_x + 3) // 4 * blocks_y * blocks_z
-            _mark(position[p], scene, inverse_dx, blocks_y, blocks_z, scene_blocks, flag, touched, touched_count)
+            _mark(position[p], scene, setting[SETTING.inverse_cell_size], shape, block)
 
-    for n in range(touched_count[0] * BLOCK_NODES):
-        blocks = scenes * ((nodes_x + 3) // 4) * ((nodes_y + 3) // 4) * ((nodes_z + 3) // 4)
-        place = touched[n >> 6] * BLOCK_NODES + (n & 63)
-        for part in ti.static(range(parts)):
+    for n in range(block[2 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
+        blocks = shape[SHAPE.all_blocks]
+        place = block[blocks + (n >> 6)] * BLOCK_NODES + (n & 63)
+        for part in ti.static(range(variant // VARIANT.parts)):
             node[place + part * blocks * BLOCK_NODES] = ti.Vector([0.0, 0.0, 0.0, 0.0])
 
-    if ti.static(atomic):
-        for p in range(particles):
-            scene = scene_of[p]
+    if ti.static(bool(variant & VARIANT.atomic)):
+        for p in range(position.shape[0]):
+            scene = label[p] >> 2
             step = scene_value[scene, VALUE.time_step]
             if step > 0.0:
-                blocks_y = (nodes_y + 3) // 4
-                blocks_z = (nodes_z + 3) // 4
-                scene_nodes = (nodes_x + 3) // 4 * blocks_y * blocks_z * BLOCK_NODES
                 _particle_to_grid(
-                    p, scene * scene_nodes, step, scene, dx, inverse_dx, blocks_y * blocks_z * 64, blocks_z * 64,
-                    position, velocity, affine, deformation, volume, material, node, scene_value, counter,
-                    constant, has_water, has_sand, has_snow, taichi_elements_sand, atomic,
+                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, node, scene_value,
+                    counter, setting, shape, variant,
                 )  # fmt: skip
     else:
-        for task in range(scenes * parts):
+        for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
+            parts = ti.static(variant // VARIANT.parts)
             scene = task // parts
             step = scene_value[scene, VALUE.time_step]
             if step > 0.0:
-                blocks_y = (nodes_y + 3) // 4
-                blocks_z = (nodes_z + 3) // 4
-                scene_nodes = (nodes_x + 3) // 4 * blocks_y * blocks_z * BLOCK_NODES
-                copy = (task - scene * parts) * scenes
-                for p in range(part_begin[task], part_begin[task + 1]):
+                copy = (task - scene * parts) * shape[SHAPE.all_blocks]
+                for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
                     _particle_to_grid(
-                        p, (copy + scene) * scene_nodes, step, scene, dx, inverse_dx, blocks_y * blocks_z * 64,
-                        blocks_z * 64, position, velocity, affine, deformation, volume, material, node,
-                        scene_value, counter, constant, has_water, has_sand, has_snow, taichi_elements_sand,
-                        atomic,
+                        p, copy, scene, step, position, velocity, affine, deformation, volume, label, node,
+                        scene_value, counter, setting, shape, variant,
                     )  # fmt: skip
 
-    for n in range(touched_count[0] * BLOCK_NODES):
-        blocks_y = (nodes_y + 3) // 4
-        blocks_z = (nodes_z + 3) // 4
-        scene_blocks = (nodes_x + 3) // 4 * blocks_y * blocks_z
-        global_block = touched[n >> 6]
-        local = n & 63
-        if local == 0:
-            flag[global_block] = 0
-        place = global_block * BLOCK_NODES + local
-        total = node[place]
-        for part in ti.static(range(1, parts)):
-            total += node[place + part * scenes * scene_blocks * BLOCK_NODES]
-        v = ti.Vector([0.0, 0.0, 0.0])
-        if total[3] > SMALLEST_MASS:
-            scene = global_block // scene_blocks
-            block = global_block - scene * scene_blocks
-            step = scene_value[scene, VALUE.time_step]
-            gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
-            v = ti.Vector([total[0], total[1], total[2]]) / total[3] + step * gravity
-            if ti.static(has_contact):
-                entry = contact[place]
-                if entry >= 0:
-                    friction = setting[SETTING.friction]
-                    v = _meet_collider(v, contact_normal[entry], ti.cast(contact_kind[entry], ti.i32), friction)
-            # walls last: whatever a collider leaves, nothing leaves the domain
-            index = ti.Vector(
-                [
-                    block // (blocks_y * blocks_z) * BLOCK + local // 16,
-                    block // blocks_z % blocks_y * BLOCK + local // 4 % 4,
-                    block % blocks_z * BLOCK + local % 4,
-                ]
-            )
-            nodes = ti.Vector([nodes_x, nodes_y, nodes_z])
-            stuck = 0
-            for axis in ti.static(range(3)):
-                if index[axis] < wall_cells:
-                    v[axis] = ti.max(v[axis], 0.0)
-                    stuck = 1
-                if index[axis] >= nodes[axis] - wall_cells:
-                    v[axis] = ti.min(v[axis], 0.0)
-                    stuck = 1
-            if stuck and sticky_walls:
-                v = ti.Vector([0.0, 0.0, 0.0])
-        node[place] = ti.Vector([v[0], v[1], v[2], total[3]])
+    for n in range(block[2 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
+        global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
+        if n & 63 == 0:
+            block[global_block] = 0
+        _update_node(
+            global_block * BLOCK_NODES + (n & 63), global_block, scene_value, setting, shape, node, contact,
+            contact_normal, variant,
+        )  # fmt: skip
 
-    for p in range(particles):
-        scene = scene_of[p]
+    for p in range(position.shape[0]):
+        scene = label[p] >> 2
         step = scene_value[scene, VALUE.time_step]
         if step > 0.0:
-            blocks_y = (nodes_y + 3) // 4
-            blocks_z = (nodes_z + 3) // 4
-            scene_nodes = (nodes_x + 3) // 4 * blocks_y * blocks_z * BLOCK_NODES
-            x = position[p]
-            scaled = x * inverse_dx
-            base = ti.floor(scaled - 0.5, ti.i32)
-            fx = scaled - ti.cast(base, ti.f32)
-            w0, w1, w2 = _weights(fx)
-            w = ti.static((w0, w1, w2))
-            index_x = [
-                scene * scene_nodes + _node_of_axis(base[0] + i, blocks_y * blocks_z * 64, 16)
-                for i in ti.static(range(3))
-            ]
-            index_y = [_node_of_axis(base[1] + i, blocks_z * 64, 4) for i in ti.static(range(3))]
-            index_z = [_node_of_axis(base[2] + i, 64, 1) for i in ti.static(range(3))]
-            v = ti.Vector([0.0, 0.0, 0.0])
-            gradient_x = ti.Vector([0.0, 0.0, 0.0])
-            gradient_y = ti.Vector([0.0, 0.0, 0.0])
-            gradient_z = ti.Vector([0.0, 0.0, 0.0])
-            for i in ti.static(range(3)):
-                plane = ti.Vector([0.0, 0.0, 0.0])
-                plane_y = ti.Vector([0.0, 0.0, 0.0])
-                plane_z = ti.Vector([0.0, 0.0, 0.0])
-                for j in ti.static(range(3)):
-                    line = ti.Vector([0.0, 0.0, 0.0])
-                    line_z = ti.Vector([0.0, 0.0, 0.0])
-                    for k in ti.static(range(3)):
-                        value = node[index_x[i] + index_y[j] + index_z[k]]
-                        share = w[k][2] * ti.Vector([value[0], value[1], value[2]])
-                        line += share
-                        line_z += (k - fx[2]) * share
-                    plane += w[j][1] * line
-                    plane_y += w[j][1] * (j - fx[1]) * line
-                    plane_z += w[j][1] * line_z
-                v += w[i][0] * plane
-                gradient_x += w[i][0] * (i - fx[0]) * plane
-                gradient_y += w[i][0] * plane_y
-                gradient_z += w[i][0] * plane_z
-            C = ti.Matrix.cols([gradient_x, gradient_y, gradient_z]) * (4.0 * inverse_dx)
-            x += step * v
-            speed_square = v.dot(v)
-            bad = _not_finite(speed_square) | _not_finite(x.sum()) | _not_finite(C.sum())
-            outside = 0
-            clamps = 0
-            for axis in ti.static(range(3)):
-                low = setting[SETTING.low + axis]
-                high = setting[SETTING.high + axis]
-                if not (x[axis] >= 0.0 and x[axis] <= setting[SETTING.size + axis]):
-                    outside = 1
-                if not x[axis] >= low:
-                    x[axis] = low
-                    clamps = 1
-                if not x[axis] <= high:
-                    x[axis] = high
-                    clamps = 1
-            if bad:
-                scene_state[scene, STATE.status] = STATUS.not_finite
-                scene_value[scene, VALUE.remaining] = 0.0
-            elif outside:
-                # a value that is not finite is the better cause to report
-                if scene_state[scene, STATE.status] != STATUS.not_finite:
-                    scene_state[scene, STATE.status] = STATUS.left_domain
-                scene_value[scene, VALUE.remaining] = 0.0
-            else:
-                count_event(counter, scene, COUNT.position_clamps, clamps)
-                _raise_maximum(scene_value, scene, VALUE.speed_square, speed_square)
-                _raise_maximum(scene_value, scene, VALUE.largest_speed_square, speed_square)
-            position[p] = x
-            velocity[p] = v
-            affine[p] = C
+            _grid_to_particle(p, scene, step, position, velocity, affine, node, scene_value, counter, setting, shape)
 
 
 @ti.kernel
 def start(
-    particles: ti.i32,
     velocity: Vectors,
     affine: Matrices,
     deformation: Matrices,
     volume: Scalars,
-    material: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    scene_of: Integers,
+    label: Integers,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    constant: Scalars,
-    has_solid: ti.template(),
+    setting: Scalars,
 ):
     """Particles at rest shape, and the maxima that the first time step needs."""
-    for p in range(particles):
-        scene = scene_of[p]
+    for p in range(velocity.shape[0]):
+        scene = label[p] >> 2
+        material = label[p] & 3
         affine[p] = ti.Matrix.zero(ti.f32, 3, 3)
-        if ti.static(has_solid):
+        if p < deformation.shape[0]:
             deformation[p] = ti.Matrix.identity(ti.f32, 3)
         volume[p] = 1.0
-        stiffness = 3.0 * constant[CONSTANT.bulk]
-        if material[p] != WATER:
-            stiffness += 2.0 * constant[CONSTANT.shear]
-            if material[p] == SNOW:
-                stiffness *= hardening(1.0, constant)
+        stiffness = 3.0 * setting[CONSTANT.bulk]
+        if material != WATER:
+            stiffness += 2.0 * setting[CONSTANT.shear]
+            if material == SNOW:
+                stiffness *= hardening(1.0, setting)
             else:
                 volume[p] = 0.0
         _raise_maximum(scene_value, scene, VALUE.stiffness, stiffness)
@@ -483,13 +498,12 @@ def start(
 
 @ti.kernel
 def begin_frame(
-    scenes: ti.i32,
     frame_s: ti.f32,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    scene_state: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
 ):
     """Gives every running scene a frame's time."""
-    for scene in range(scenes):
-        scene_state[scene, STATE.frame_substeps] = 0
-        if scene_state[scene, STATE.status] == STATUS.running:
+    for scene in range(scene_value.shape[0]):
+        counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
+        if counter[scene, COUNT.status] == STATUS.running:
             scene_value[scene, VALUE.remaining] = frame_s

@@ -32,7 +32,7 @@ class Constant(NamedTuple):
 
 
 class Count(NamedTuple):
-    """Positions of the events that are counted per scene."""
+    """Positions in the int64 state of each scene: what is counted and reported, then what runs the scene."""
 
     substeps: int = 0
     water_volume_floors: int = 1
@@ -40,7 +40,12 @@ class Count(NamedTuple):
     hardening_caps: int = 3
     plastic_volume_bounds: int = 4
     position_clamps: int = 5
-    length: int = 6
+    status: int = 6
+    frame_substeps: int = 7  # taken in the present frame
+    length: int = 8
+
+
+REPORTED = Count._fields[:6]
 
 
 class SceneValue(NamedTuple):
@@ -58,14 +63,6 @@ class SceneValue(NamedTuple):
     length: int = 11
 
 
-class SceneState(NamedTuple):
-    """Positions in the int32 state of each scene."""
-
-    status: int = 0
-    frame_substeps: int = 1
-    length: int = 2
-
-
 class Status(NamedTuple):
     running: int = 0
     not_finite: int = 1
@@ -74,21 +71,48 @@ class Status(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Positions in the float32 settings of a launch."""
+    """Positions in the float32 settings of a launch, after those of Constant."""
 
-    fixed_time_step: int = 0  # s; 0 for the adaptive rule
-    stability_fraction: int = 1
-    speed_fraction: int = 2
-    friction: int = 3
-    low: int = 4  # 4, 5, 6: smallest coordinates of a particle
-    high: int = 7  # 7, 8, 9: largest
-    size: int = 10  # 10, 11, 12: of the domain
+    cell_size: int = 10
+    inverse_cell_size: int = 11
+    fixed_time_step: int = 12  # s; 0 for the adaptive rule
     fixed_substeps: int = 13  # a frame, where the time step is fixed
-    length: int = 14
+    stability_fraction: int = 14
+    speed_fraction: int = 15
+    friction: int = 16
+    low: int = 17  # 17, 18, 19: smallest coordinates of a particle
+    high: int = 20  # 20, 21, 22: largest
+    size: int = 23  # 23, 24, 25: of the domain
+    length: int = 26
 
 
-CONSTANT, COUNT = Constant(), Count()
-VALUE, STATE, STATUS, SETTING = SceneValue(), SceneState(), Status(), Setting()
+class Shape(NamedTuple):
+    """Positions in the int32 shape of a launch."""
+
+    nodes: int = 0  # 0, 1, 2: along each axis
+    blocks: int = 3  # 3, 4, 5: along each axis
+    scene_blocks: int = 6
+    all_blocks: int = 7  # of all scenes
+    wall_cells: int = 8
+    sticky_walls: int = 9
+    maximum_substeps: int = 10
+    part_begin: int = 11  # from here on: first particle of each (scene, part), and the end
+
+
+class Variant(NamedTuple):
+    """Bits of the number that a kernel is compiled for, so that a launch does only what its scenes need."""
+
+    water: int = 1
+    sand: int = 2
+    snow: int = 4
+    contact: int = 8
+    taichi_elements_sand: int = 16
+    atomic: int = 32  # a GPU's way to add up; else in parts, one after another
+    parts: int = 64  # times the number of parts
+
+
+CONSTANT, COUNT, VALUE, STATUS = Constant(), Count(), SceneValue(), Status()
+SETTING, SHAPE, VARIANT = Setting(), Shape(), Variant()
 
 
 def lame_parameters(config: MpmConfig) -> tuple[float, float]:

@@ -13,16 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from datagen.mpm.collider import Collider, build_collider
+from datagen.mpm.collider import BOTH_SIDES, Collider, build_collider
 from datagen.mpm.device import Device, initialise
 from datagen.mpm.layout import (
     BLOCK,
     BLOCK_NODES,
+    CONSTANT,
     COUNT,
+    REPORTED,
     SETTING,
-    STATE,
+    SHAPE,
     STATUS,
     VALUE,
+    VARIANT,
     constants,
     lame_parameters,
 )
@@ -172,7 +175,7 @@ def _require_sound(scene: Scene, index: int, low: np.ndarray, high: np.ndarray) 
 
 
 def _no_counters() -> dict[str, Any]:
-    counters: dict[str, Any] = {name: 0 for name in COUNT._fields if name != "length"}
+    counters: dict[str, Any] = dict.fromkeys(REPORTED, 0)
     counters["smallest_time_step_s"] = None
     counters["largest_speed"] = 0.0
     counters["particles_inside_obstacles_at_start"] = 0
@@ -192,90 +195,103 @@ class _Launch:
         device: Device,
     ) -> None:
         self.scenes, self.colliders, self.config, self.node_counts = scenes, colliders, config, node_counts
-        self.atomic = device.kind == "gpu"
-        self.parts = 1 if self.atomic else min(device.threads, MAXIMUM_PARTS)
-        counts = [scene.particle_count for scene in scenes]
-        self.particle_begin = np.concatenate([[0], np.cumsum(counts)])
-        self.particles = int(self.particle_begin[-1])
-        blocks = len(scenes) * math.prod(-(-nodes // BLOCK) for nodes in node_counts)
-        nodes = blocks * BLOCK_NODES * self.parts
-        if nodes >= 2**31 or self.particles >= 2**31:
+        atomic = device.kind == "gpu"
+        self.parts = 1 if atomic else min(device.threads, MAXIMUM_PARTS)
+        self.particle_begin = np.concatenate([[0], np.cumsum([scene.particle_count for scene in scenes])])
+        self.blocks = tuple(-(-count // BLOCK) for count in node_counts)
+        all_blocks = len(scenes) * math.prod(self.blocks)
+        nodes, particles = all_blocks * BLOCK_NODES * self.parts, int(self.particle_begin[-1])
+        if max(nodes, particles) >= 2**31:
             raise ConfigError(
                 f"a batch must hold less than 2^31 nodes and particles, got {nodes} nodes of {len(scenes)} scenes and "
-                f"{self.particles} particles; lower scenes_per_launch"
+                f"{particles} particles; lower scenes_per_launch"
             )
-        material = np.concatenate([np.asarray(scene.material_N, np.uint8) for scene in scenes])
-        self.has = tuple(bool((material == kind).any()) for kind in (WATER, SAND, SNOW))
-        self._make_arrays(material, blocks, nodes)
-        self._make_contacts(blocks)
+        label = np.concatenate(
+            [4 * index + np.asarray(scene.material_N, np.int32) for index, scene in enumerate(scenes)]
+        )
+        present = [bool((label % 4 == kind).any()) for kind in (WATER, SAND, SNOW)]
+        has_contact = any(len(collider.node_K3) for collider in colliders)
+        self.variant = (
+            VARIANT.water * present[WATER]
+            + VARIANT.sand * present[SAND]
+            + VARIANT.snow * present[SNOW]
+            + VARIANT.contact * has_contact
+            + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
+            + VARIANT.atomic * atomic
+            + VARIANT.parts * self.parts
+        )
+        self.position = _vectors(np.concatenate([scene.position_N3 for scene in scenes]))
+        self.velocity = _vectors(np.concatenate([scene.velocity_N3 for scene in scenes]))
+        self.affine = ti.Matrix.ndarray(3, 3, ti.f32, particles)
+        self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, particles if present[SAND] or present[SNOW] else 1)
+        self.volume = ti.ndarray(ti.f32, particles)
+        self.label = _array(label.astype(np.int32))
+        self.scene_value = _array(self._scene_values())
+        self.counter = _array(np.zeros((len(scenes), COUNT.length), np.int64))
+        self.shape = _array(self._shape())
+        self.node = ti.Vector.ndarray(4, ti.f32, nodes)
+        self.block = _array(np.zeros(2 * all_blocks + 1, np.int32))
+        contact, normal = self._contacts() if has_contact else (np.full(1, -1, np.int32), np.zeros((1, 3), np.float32))
+        self.contact, self.contact_normal = _array(contact), _vectors(normal)
 
-    def _make_arrays(self, material: np.ndarray, blocks: int, nodes: int) -> None:
-        scenes, count = self.scenes, self.particles
-        position = np.concatenate([np.asarray(scene.position_N3, np.float32) for scene in scenes])
-        velocity = np.concatenate([np.asarray(scene.velocity_N3, np.float32) for scene in scenes])
-        self.position = _vectors(position)
-        self.velocity = _vectors(velocity)
-        self.affine = ti.Matrix.ndarray(3, 3, ti.f32, count)
-        self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, count if any(self.has[1:]) else 1)
-        self.volume = ti.ndarray(ti.f32, count)
-        self.material = _array(material)
-        self.scene_of = _array(np.repeat(np.arange(len(scenes), dtype=np.int32), np.diff(self.particle_begin)))
+    def _scene_values(self) -> np.ndarray:
+        value = np.zeros((len(self.scenes), VALUE.length), np.float32)
+        value[:, VALUE.smallest_time_step] = np.inf
+        shear, bulk = lame_parameters(self.config)
+        for row, scene in zip(value, self.scenes, strict=True):
+            row[VALUE.gravity : VALUE.gravity + 3] = scene.gravity
+            constant = {WATER: 3 * bulk, SAND: 3 * bulk + 2 * shear, SNOW: 0.0}
+            row[VALUE.least_stiffness] = max(constant[kind] for kind in np.unique(scene.material_N).tolist())
+        return value
+
+    def _shape(self) -> np.ndarray:
+        """The int32 shape that kernels read, with the bounds of the parts that each scene's particles fall into."""
         begin = [
             start + (stop - start) * part // self.parts
             for start, stop in zip(self.particle_begin[:-1], self.particle_begin[1:], strict=True)
             for part in range(self.parts)
         ]
-        self.part_begin = _array(np.array([*begin, count], np.int32))
+        shape = np.zeros(SHAPE.part_begin, np.int32)
+        shape[SHAPE.nodes : SHAPE.nodes + 3] = self.node_counts
+        shape[SHAPE.blocks : SHAPE.blocks + 3] = self.blocks
+        shape[SHAPE.scene_blocks] = math.prod(self.blocks)
+        shape[SHAPE.all_blocks] = len(self.scenes) * math.prod(self.blocks)
+        shape[SHAPE.wall_cells] = self.config.wall_cells
+        shape[SHAPE.sticky_walls] = self.config.wall_contact == "stick"
+        shape[SHAPE.maximum_substeps] = self.config.maximum_substeps_per_frame
+        return np.concatenate([shape, np.array([*begin, self.particle_begin[-1]], np.int32)])
 
-        config = self.config
-        self.constant = _array(constants(config))
-        low, high = particle_bounds(scenes[0], config)
+    def _settings(self, frame_rate_hz: float) -> np.ndarray:
+        config, cell_size = self.config, self.scenes[0].cell_size
+        low, high = particle_bounds(self.scenes[0], config)
         setting = np.zeros(SETTING.length, np.float32)
+        setting[: CONSTANT.length] = constants(config)
+        setting[SETTING.cell_size] = cell_size
+        setting[SETTING.inverse_cell_size] = 1 / cell_size
+        if config.time_step == "fixed":
+            setting[SETTING.fixed_time_step] = config.fixed_time_step_s
+            setting[SETTING.fixed_substeps] = fixed_substeps(config, frame_rate_hz)
         setting[SETTING.stability_fraction] = config.stability_fraction
         setting[SETTING.speed_fraction] = config.speed_fraction
         setting[SETTING.friction] = config.collider_friction
         setting[SETTING.low : SETTING.low + 3] = low
         setting[SETTING.high : SETTING.high + 3] = high
-        setting[SETTING.size : SETTING.size + 3] = scenes[0].domain_size
-        self.setting = setting
+        setting[SETTING.size : SETTING.size + 3] = self.scenes[0].domain_size
+        return setting
 
-        value = np.zeros((len(scenes), VALUE.length), np.float32)
-        value[:, VALUE.smallest_time_step] = np.inf
-        shear, bulk = lame_parameters(config)
-        for row, scene in zip(value, scenes, strict=True):
-            row[VALUE.gravity : VALUE.gravity + 3] = scene.gravity
-            kinds = set(np.unique(scene.material_N).tolist())
-            row[VALUE.least_stiffness] = max(
-                3 * bulk if WATER in kinds else 0.0, 3 * bulk + 2 * shear if SAND in kinds else 0.0
-            )
-        self.scene_value = _array(value)
-        self.scene_state = _array(np.zeros((len(scenes), STATE.length), np.int32))
-        self.counter = _array(np.zeros((len(scenes), COUNT.length), np.int64))
-
-        self.node = ti.Vector.ndarray(4, ti.f32, nodes)
-        self.flag = _array(np.zeros(blocks, np.int32))
-        self.touched = ti.ndarray(ti.i32, blocks)
-        self.touched_count = _array(np.zeros(1, np.int32))
-
-    def _make_contacts(self, blocks: int) -> None:
-        """Per node the entry in the packed list of contacts, or -1."""
-        self.has_contact = any(len(collider.node_K3) for collider in self.colliders)
-        contact = np.full(blocks * BLOCK_NODES if self.has_contact else 1, -1, np.int32)
-        if self.has_contact:
-            across = [-(-nodes // BLOCK) for nodes in self.node_counts]
-            scene_nodes = math.prod(across) * BLOCK_NODES
-            first = 0
-            for index, collider in enumerate(self.colliders):
-                block, local = np.divmod(collider.node_K3.astype(np.int64), BLOCK)
-                place = (block[:, 0] * across[1] + block[:, 1]) * across[2] + block[:, 2]
-                place = place * BLOCK_NODES + (local[:, 0] * 16 + local[:, 1] * 4 + local[:, 2])
-                contact[index * scene_nodes + place] = np.arange(first, first + len(place))
-                first += len(place)
-        normal = np.concatenate([collider.normal_K3 for collider in self.colliders]) if self.has_contact else None
-        kind = np.concatenate([collider.kind_K for collider in self.colliders]) if self.has_contact else None
-        self.contact = _array(contact)
-        self.contact_normal = _vectors(np.zeros((1, 3), np.float32) if normal is None else normal)
-        self.contact_kind = _array(np.zeros(1, np.uint8) if kind is None else kind)
+    def _contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Per node twice the index of its normal, plus 1 where motion is stopped both ways, or -1; the normals."""
+        scene_nodes = math.prod(self.blocks) * BLOCK_NODES
+        contact = np.full(len(self.scenes) * scene_nodes, -1, np.int32)
+        first = 0
+        for index, collider in enumerate(self.colliders):
+            block, local = np.divmod(collider.node_K3.astype(np.int64), BLOCK)
+            place = (block[:, 0] * self.blocks[1] + block[:, 1]) * self.blocks[2] + block[:, 2]
+            place = place * BLOCK_NODES + (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
+            both_sides = collider.kind_K == BOTH_SIDES
+            contact[index * scene_nodes + place] = 2 * np.arange(first, first + len(place)) + both_sides
+            first += len(place)
+        return contact, np.concatenate([collider.normal_K3 for collider in self.colliders])
 
     def run(
         self, frames: int, frame_rate_hz: float, on_frame: Callable[[int], None] | None
@@ -283,15 +299,9 @@ class _Launch:
         scenes, config = self.scenes, self.config
         frame_s = 1 / frame_rate_hz
         if config.time_step == "fixed":
-            substeps = fixed_substeps(config, frame_rate_hz)
-            self.setting[SETTING.fixed_time_step] = config.fixed_time_step_s
-            self.setting[SETTING.fixed_substeps] = substeps
-            frame_s = substeps * config.fixed_time_step_s
-        setting = _array(self.setting)
-        kernels.start(
-            self.particles, self.velocity, self.affine, self.deformation, self.volume, self.material, self.scene_of,
-            self.scene_value, self.constant, any(self.has[1:]),
-        )  # fmt: skip
+            frame_s = fixed_substeps(config, frame_rate_hz) * config.fixed_time_step_s
+        setting = _array(self._settings(frame_rate_hz))
+        kernels.start(self.velocity, self.affine, self.deformation, self.volume, self.label, self.scene_value, setting)
         trajectory = [np.empty((frames, scene.particle_count, 3), np.float32) for scene in scenes]
         for rows, scene in zip(trajectory, scenes, strict=True):
             rows[0] = scene.position_N3
@@ -299,10 +309,10 @@ class _Launch:
             on_frame(0)
         cause: dict[int, str] = {}
         for frame in range(1, frames):
-            kernels.begin_frame(len(scenes), frame_s, self.scene_value, self.scene_state)
+            kernels.begin_frame(frame_s, self.scene_value, self.counter)
             self._run_frame(setting)
             position = self.position.to_numpy()
-            status = self.scene_state.to_numpy()[:, STATE.status]
+            status = self.counter.to_numpy()[:, COUNT.status]
             for index, begin in enumerate(self.particle_begin[:-1]):
                 if index in cause:
                     continue
@@ -322,20 +332,13 @@ class _Launch:
 
     def _run_frame(self, setting: ti.ScalarNdarray) -> None:
         """Substeps until no scene has time left; the host looks only when the last estimate has run out."""
-        config = self.config
-        nodes_x, nodes_y, nodes_z = self.node_counts
-        cell_size = self.scenes[0].cell_size
         pending = 1
         while pending:
             for _ in range(min(pending, SUBSTEPS_PER_CHECK)):
                 kernels.substep(
-                    len(self.scenes), self.particles, nodes_x, nodes_y, nodes_z, config.wall_cells,
-                    config.wall_contact == "stick", config.maximum_substeps_per_frame, cell_size, 1 / cell_size,
-                    self.position, self.velocity, self.affine, self.deformation, self.volume, self.material,
-                    self.scene_of, self.part_begin, self.scene_value, self.scene_state, self.counter, self.constant,
-                    setting, self.node, self.flag, self.touched, self.touched_count, self.contact,
-                    self.contact_normal, self.contact_kind, *self.has, self.has_contact,
-                    config.sand_volume_correction == "taichi_elements", self.parts, self.atomic,
+                    self.position, self.velocity, self.affine, self.deformation, self.volume, self.label,
+                    self.scene_value, self.counter, setting, self.shape, self.node, self.block, self.contact,
+                    self.contact_normal, self.variant,
                 )  # fmt: skip
             value = self.scene_value.to_numpy()
             busy = value[:, VALUE.remaining] > 0
@@ -358,9 +361,8 @@ class _Launch:
         out = []
         for index, collider in enumerate(self.colliders):
             counters = _no_counters()
-            for name in COUNT._fields:
-                if name != "length":
-                    counters[name] = int(counter[index, getattr(COUNT, name)])
+            for name in REPORTED:
+                counters[name] = int(counter[index, getattr(COUNT, name)])
             smallest = float(value[index, VALUE.smallest_time_step])
             counters["smallest_time_step_s"] = smallest if math.isfinite(smallest) else None
             counters["largest_speed"] = float(math.sqrt(value[index, VALUE.largest_speed_square]))
