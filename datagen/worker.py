@@ -35,7 +35,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
-_FRAME_REPORT_SECONDS = 0.25
+_FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 

@@ -32,11 +32,11 @@ from datagen.plan import (
     shard_ranges,
 )
 from hgn.config import DatagenConfig
-from hgn.data.identity import dataset_identity, identity_differences, identity_hash
+from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, QuarantinedScene, ShardEntry
 from hgn.data.reader import file_sha256, read_episode
 from hgn.data.statistics import episode_statistics, merge_statistics
-from hgn.files import TEMPORARY_SUFFIX, sync_folder, temporary_path
+from hgn.files import TEMPORARY_SUFFIX, sync_folder, temporary_file
 from hgn.scene.episode import Episode, encode_episode
 from hgn.schema import ConfigError
 
@@ -53,15 +53,11 @@ def stage_episode(folder: Path, episode: Episode) -> None:
     Raises: OSError (a full disk), ConfigError (positions that are not finite).
     """
     target = folder / STAGING_NAME / f"{episode.key}.tar"
-    temporary = temporary_path(target)
     members = encode_episode(episode)
-    try:
+    with temporary_file(target) as temporary:
         with temporary.open("wb") as file:
             write_tar(file, ((f"{episode.key}.{name}", len(data), io.BytesIO(data)) for name, data in members.items()))
         temporary.replace(target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
     sync_folder(target.parent)
 
 
@@ -81,9 +77,9 @@ def write_tar(file: BinaryIO, members: Iterable[tuple[str, int, Any]]) -> None:
 class DatasetWriter:
     """The one writer of a data set folder; a context manager that holds the folder's lock.
 
-    Entering recovers whatever an earlier run left: adopts shards that are not yet in the manifest, removes partial
-    files, publishes ranges that are staged whole. Raises: ConfigError when the folder is in use, holds another data
-    set, or holds a file that was altered.
+    Entering recovers what an earlier run left: partial files are removed, shards that are not yet in the manifest
+    are checked and listed, staged episodes are checked and kept. Raises: ConfigError when the folder is in use, holds
+    another data set, or holds a file that was altered.
     """
 
     def __init__(self, config: DatagenConfig, report: Callable[[str], None] = lambda message: None) -> None:
@@ -203,7 +199,7 @@ class DatasetWriter:
     def _recover(self) -> None:
         if (self.folder / MANIFEST_NAME).exists():
             self.manifest = Manifest.load(self.folder)
-            self._require_same_dataset()
+            require_same_dataset(self.manifest.config, self.config, self.folder)
         self._remove_partial_files()
         shards = [shard for shard in self.manifest.shards if self._is_present(shard)]
         listed = {shard.name for shard in shards}
@@ -227,13 +223,6 @@ class DatasetWriter:
             self.manifest = dataclasses.replace(self.manifest, requested=self.requested)
             self.manifest.save(self.folder)
         self._find_staged({(shard.split, index) for shard in present for index in shard.indices})
-
-    def _require_same_dataset(self) -> None:
-        if self.manifest.config_hash == self.config_hash:
-            return
-        differences = identity_differences(self.manifest.config, self.identity)
-        shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
-        raise ConfigError(f"{self.folder} holds another data set: {shown}; give another out=... or the same settings")
 
     def _is_present(self, shard: ShardEntry) -> bool:
         path = self.folder / shard.name
@@ -278,14 +267,11 @@ class DatasetWriter:
 
     def _assemble(self, shard: ShardRange) -> ShardEntry:
         target = self.folder / shard.name
-        temporary = temporary_path(target)
-        try:
+        with temporary_file(target) as temporary:
             with temporary.open("wb") as file:
                 write_tar(file, self._staged_members(shard))
             entry = self._inspect(temporary, shard)
             _link(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
         sync_folder(self.folder)
         return entry
 

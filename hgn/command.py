@@ -35,6 +35,9 @@ _MACHINE_ERRORS = {
 def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) -> NoReturn:
     """Composes `conf/<config_name>.yaml` with the command line, calls `main` with the plain mapping, and exits.
 
+    A command without config groups has its file in `conf/command/`: beside the groups Hydra would take its keys
+    (`scene=my_scene.yaml`) for choices of a group.
+
     Hydra's own options (--help, --cfg, --config-path, --config-name, --multirun) work as ever. `main` returns an exit
     code or None for 0. ConfigError, an unknown key and a full disk are printed as one line, `error: ...`.
     """
@@ -86,15 +89,18 @@ def _compose(config_name: str) -> list[dict[str, Any]]:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    folder = config_directory()
+    if (folder / "command" / f"{config_name}.yaml").is_file():
+        folder = folder / "command"
     composed: list[Any] = []  # one config, or several with --multirun
     arguments, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = _with_quiet(arguments)
     # Hydra would print and exit itself otherwise
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        hydra.main(version_base="1.3", config_path=str(config_directory()), config_name=config_name)(composed.append)()
+        hydra.main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=True) for config in composed]
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra raises plain ValueErrors too
         raise ConfigError(_one_line(str(error))) from error
     finally:
         sys.argv = arguments

@@ -316,7 +316,7 @@ class RolloutConfig:
             "scene",
             "given, or data and episode instead",
             self.scene,
-            "for example scene=conf/scenes/funnel.yaml, or data=data/obstacles episode=validation-000000",
+            "for example scene=conf/example/funnel.yaml, or data=data/obstacles episode=validation-000000",
         )
 
 

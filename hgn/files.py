@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 TEMPORARY_SUFFIX = ".partial"
@@ -13,21 +15,31 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
 
 
+@contextlib.contextmanager
+def temporary_file(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path` for writing it. It is gone at the end unless the caller gave it its final name.
+
+    An OSError on the way that names no file (a full disk) is made to name `path`.
+    """
+    temporary = temporary_path(path)
+    try:
+        with _errors_name(path):
+            yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def write_atomically(path: Path, data: bytes) -> None:
     """Writes `data` to a temporary name in the same folder, syncs it and renames it to `path`.
 
     Raises: OSError (a full disk, no permission); nothing is left behind then and an existing `path` is unchanged.
     """
-    temporary = temporary_path(path)
-    try:
+    with temporary_file(path) as temporary:
         with temporary.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
     sync_folder(path.parent)
 
 
@@ -35,6 +47,17 @@ def sync_folder(folder: Path) -> None:
     """Makes renames inside `folder` survive a loss of power."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        with _errors_name(folder):
+            os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _errors_name(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise

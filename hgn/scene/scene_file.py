@@ -1,6 +1,6 @@
 """Scenes that users write: a YAML file of obstacles (built-in shapes or meshes) and groups of particles.
 
-See conf/scenes/ for examples. Lengths are in domain units, angles in degrees, y points up.
+See conf/example/ for examples. Lengths are in domain units, angles in degrees, y points up.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ import yaml
 from datagen.__main__ import main
 from datagen.progress import BarProgress, JsonProgress
 from hgn.command import run_command
-from hgn.config import DatagenConfig, DatasetConfig, SceneConfig
+from hgn.config import DatagenConfig, DatasetConfig, SceneConfig, config_directory
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError, to_mapping
 
@@ -53,6 +53,7 @@ BAD_INPUT = [
     (["+colour=1"], "error: colour is not a known key; known keys: scene, mpm, dataset, scenes, out,"),
     (["+dataset.colour=1"], "error: dataset.colour is not a known key; known keys: folder,"),
     (["scene=moon"], "error: In 'datagen': Could not find 'scene/moon' Available options in 'scene':"),
+    (["scene=3"], "error: Config group override must be a string or a list. Got int"),
     (["progress=loud"], "error: progress must be one of bar, json, off, got 'loud'"),
     (["out=${nowhere}"], "error: Interpolation key 'nowhere' not found"),
 ]
@@ -76,6 +77,16 @@ def test_bad_input_is_one_line(
     assert errors.startswith(message) and errors.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
     assert sys.argv == ["datagen", *arguments] and "HYDRA_FULL_ERROR" not in os.environ
+
+
+def test_no_key_is_taken_for_a_config_group() -> None:
+    """A key with the name of a folder beside its file could not be set; `scene=file` and `scenes=3` can."""
+    conf = config_directory()
+    for path in (*conf.glob("*.yaml"), *conf.glob("command/*.yaml")):
+        mapping = yaml.safe_load(path.read_text())
+        plain = {key for key, value in mapping.items() if not isinstance(value, dict) and key != "defaults"}
+        groups = {folder.name for folder in path.parent.iterdir() if folder.is_dir()}
+        assert not plain & groups, path
 
 
 @pytest.mark.parametrize(

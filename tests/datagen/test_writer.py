@@ -231,7 +231,7 @@ def test_other_settings_are_refused(
     folder = make_dataset(config)
     before = snapshot(folder)
     with (
-        pytest.raises(ConfigError, match=f"holds another data set: {message}; give another out="),
+        pytest.raises(ConfigError, match=f"holds another data set: {message}; choose another folder"),
         DatasetWriter(dataclasses.replace(config, **changes)),
     ):
         pass
@@ -400,7 +400,10 @@ def test_full_disk_leaves_nothing_half_written(
         stage(writer, "train", 0)
         writer.publish_next()
         before = hashes(writer.folder)
-    with pytest.raises(OSError, match="No space left"), DatasetWriter(make_config()) as writer:
+    with (
+        pytest.raises(OSError, match=r"No space left on device: .*data"),
+        DatasetWriter(make_config()) as writer,
+    ):
         full_disk(after)
         for index in (1, 2):
             stage(writer, "train", index)

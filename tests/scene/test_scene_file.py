@@ -10,7 +10,7 @@ from hgn.scene.material import SAND, SNOW, WATER
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "conf" / "scenes"
+EXAMPLES = Path(__file__).resolve().parents[2] / "conf" / "example"
 CUBE = {"shape": "cube", "size": 0.08, "position": [0.5, 0.5, 0.5], "material": "water"}
 CONE = {"shape": "cone", "size": 0.2, "position": [0.5, 0.2, 0.5]}
 

@@ -105,9 +105,9 @@ def test_bad_input(tmp_path: Path, change: dict, message: str) -> None:
 
 
 def test_config_file_has_the_fields_of_the_dataclass() -> None:
-    """conf/render.yaml and RenderConfig name the same keys, with the same defaults."""
+    """conf/command/render.yaml and RenderConfig name the same keys, with the same defaults."""
     import yaml
 
     root = Path(__file__).resolve().parents[2]
-    keys = yaml.safe_load((root / "conf" / "render.yaml").read_text())
+    keys = yaml.safe_load((root / "conf" / "command" / "render.yaml").read_text())
     assert keys | {"rollout": "file"} == vars(RenderConfig(rollout="file", out="pictures"))
