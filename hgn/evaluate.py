@@ -18,9 +18,8 @@ from hgn.files import write_atomically
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
-from hgn.rollout import require_frame_rate
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
-from hgn.runtime.weights import load_weights
+from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping
 from hgn.training.errors import (

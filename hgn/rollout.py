@@ -12,7 +12,7 @@ from hgn.data.select import find_episode
 from hgn.device import choose_device
 from hgn.progress import bar
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.weights import WeightsInfo, load_weights
+from hgn.runtime.weights import WeightsInfo, load_weights, require_frame_rate
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
 from hgn.scene.scene_file import load_scene
 from hgn.schema import from_mapping, require
@@ -68,17 +68,6 @@ def rollout(config: RolloutConfig) -> Path:
         ),
     )
     return path
-
-
-def require_frame_rate(info: WeightsInfo, frame_rate_hz: float) -> None:
-    """One step of a network is one frame of the data it was trained on."""
-    require(
-        frame_rate_hz == info.frame_rate_hz,
-        "data frame_rate_hz",
-        f"the weights' {info.frame_rate_hz}",
-        frame_rate_hz,
-        "take a data set or weights of the same frame rate",
-    )
 
 
 def _require_cell_size(info: WeightsInfo, cell_size: float) -> None:

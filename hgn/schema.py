@@ -56,9 +56,7 @@ def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
 def to_mapping(value: Any) -> Any:
     """The inverse of `from_mapping`: plain dicts, lists and scalars, ready for JSON or YAML."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {
-            field.name: to_mapping(getattr(value, field.name)) for field in dataclasses.fields(value) if field.init
-        }
+        return {field.name: to_mapping(getattr(value, field.name)) for field in dataclasses.fields(value) if field.init}
     if isinstance(value, Mapping):
         return {key: to_mapping(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

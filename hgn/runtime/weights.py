@@ -5,7 +5,6 @@ Nothing in it is ever unpickled or executed. The structure travels as JSON in th
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ from safetensors.torch import save
 from hgn.config import NetworkConfig
 from hgn.files import write_atomically
 from hgn.network.network import HierarchicalGraphNetwork
-from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.schema import ConfigError, from_mapping, require, to_mapping
 
 FORMAT_VERSION = 1
 
@@ -83,13 +82,18 @@ def load_weights(path: Path, device: torch.device | str = "cpu") -> tuple[Hierar
     return network.to(device).eval(), info
 
 
-def describe_difference(expected: NetworkConfig, found: NetworkConfig) -> str:
-    """The first key in which two structures differ, or an empty text."""
-    for key in dataclasses.fields(NetworkConfig):
-        ours, theirs = getattr(expected, key.name), getattr(found, key.name)
-        if ours != theirs:
-            return f"network.{key.name} must be {theirs!r}, got {ours!r}"
-    return ""
+def require_frame_rate(info: WeightsInfo, frame_rate_hz: float) -> None:
+    """One step of a network is one frame of the data it was trained on.
+
+    Raises: ConfigError when the data has another frame rate than the weights.
+    """
+    require(
+        frame_rate_hz == info.frame_rate_hz,
+        "data frame_rate_hz",
+        f"the weights' {info.frame_rate_hz}",
+        frame_rate_hz,
+        "take a data set or weights of the same frame rate",
+    )
 
 
 def _shape(shape: torch.Size | None) -> str:
