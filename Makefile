@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.12 >/dev/null 2>&1 && python3.12 --version 
 	|| (command -v python3.11 >/dev/null 2>&1 && python3.11 --version >/dev/null 2>&1 && echo python3.11) || echo python3)
 VENV := .venv
 RUN := $(VENV)/bin/python
-DEMO := demo
+DEMO := runs/demo
 
 .PHONY: setup demo test check format lint types layers clean
 
@@ -23,12 +23,12 @@ demo: setup
 	@echo "== 2 of 5: training"
 	$(RUN) -m hgn.train +experiment=demo
 	@echo "== 3 of 5: exporting inference weights"
-	$(RUN) -m hgn.export checkpoint=$(DEMO)/run/checkpoints/best.ckpt out=$(DEMO)/weights.safetensors
+	$(RUN) -m hgn.export checkpoint=$(DEMO)/checkpoints/best.ckpt out=$(DEMO)/weights.safetensors
 	@echo "== 4 of 5: simulating a validation scene beside its ground truth"
-	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=$(DEMO)/data episode=validation-000000 out=$(DEMO)/rollout.vtkhdf
+	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=data/demo episode=validation-000000 out=$(DEMO)/rollout.vtkhdf
 	$(RUN) -m tools.render rollout=$(DEMO)/rollout.vtkhdf out=$(DEMO)/pictures every=2
 	@echo "== 5 of 5: errors"
-	$(RUN) -m hgn.evaluate weights=$(DEMO)/weights.safetensors data=$(DEMO)/data json=$(DEMO)/errors.json
+	$(RUN) -m hgn.evaluate weights=$(DEMO)/weights.safetensors data=data/demo json=$(DEMO)/errors.json
 	@echo "weights: $(DEMO)/weights.safetensors"
 	@echo "rollout: $(DEMO)/rollout.vtkhdf (HDF5; ParaView opens it)"
 	@echo "picture: $$(ls $(DEMO)/pictures/*.png $(DEMO)/pictures/*.gif | tr '\n' ' ')"
@@ -51,4 +51,4 @@ layers:
 	$(VENV)/bin/lint-imports
 
 clean:
-	rm -rf $(VENV) $(DEMO) build dist
+	rm -rf $(VENV) build dist

@@ -375,3 +375,11 @@ class RenderConfig:
         require(64 <= self.size <= 4096, "size", "64 to 4096 pixels", self.size)
         if self.fps is not None:
             require_positive(self, "fps")
+
+
+@dataclass(frozen=True)
+class CurvesConfig:
+    """`python -m tools.curves`: learning curves of a run."""
+
+    run: str
+    out: str
