@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import importlib.metadata
+import os
 import platform
 import subprocess
 import sys
@@ -16,7 +17,12 @@ PACKAGES = ("torch", "lightning", "taichi", "numpy")
 
 
 def commit() -> str:
-    """The checkout's commit, with `+changes` where files differ from it; `unknown` outside a checkout."""
+    """The checkout's commit, with `+changes` where files differ from it; HGN_COMMIT where it is set, for copies
+    without their history; else `unknown`.
+    """
+    given = os.environ.get("HGN_COMMIT")
+    if given:
+        return given
     folder = Path(__file__).resolve().parent.parent
     if not (folder / ".git").exists():
         return "unknown"
