@@ -188,8 +188,9 @@ def _closed_contacts(
     away = (point - foot) * (sign / np.where(on_surface, 1.0, distance))[:, None]
     face = _face_normals(triangle_F33)[owner]
     # face normals may point inwards: the side that lies inside decides
-    half_cell = contains((foot + 0.1 * face) * cell_size, obstacle) if on_surface.any() else np.zeros(len(node), bool)
-    face = np.where(half_cell[:, None], -face, face)
+    on = np.flatnonzero(on_surface)
+    inward = contains((foot[on] + 0.1 * face[on]) * cell_size, obstacle)
+    face[on[inward]] *= -1
     normal = np.where(on_surface[:, None], face, away)
 
     # thin: a cell further on, past the surface, lies outside again

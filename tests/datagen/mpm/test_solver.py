@@ -1,7 +1,9 @@
 """The solver against closed forms, conservation laws and its own promises about batches and failures."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -272,6 +274,21 @@ def test_bad_input_is_refused() -> None:
         simulate([good], ADAPTIVE, 0, 60.0)
     with pytest.raises(ConfigError, match="frame_rate_hz"):
         simulate([good], ADAPTIVE, 2, float("nan"))
+
+
+def test_memory_is_given_back() -> None:
+    """Fifty simulations leave the process within 20 MB of its size; each holds a grid of 2 MB and more."""
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    scenes = [beside(BESIDE)] * 16
+    for _ in range(5):
+        simulate(scenes, ADAPTIVE, 1, 60.0)
+    before = resident()
+    for _ in range(50):
+        simulate(scenes, ADAPTIVE, 1, 60.0)
+    assert resident() - before < 20e6
 
 
 def test_one_runtime_a_process() -> None:
