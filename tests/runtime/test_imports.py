@@ -1,0 +1,64 @@
+"""What the runtime loads."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+from network.states import network_of
+
+from hgn.runtime.weights import WeightsInfo, save_weights
+
+ROOT = Path(__file__).resolve().parents[2]
+TRAINING_STACK = (
+    "lightning",
+    "pytorch_lightning",
+    "hydra",
+    "omegaconf",
+    "taichi",
+    "webdataset",
+    "tensorboard",
+    "matplotlib",
+    "hgn.training",
+    "hgn.data",
+    "datagen",
+)
+PROGRAM = """
+import json, sys
+from pathlib import Path
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.weights import load_weights
+from hgn.scene.scene_file import load_scene
+
+network, info = load_weights(Path(sys.argv[1]))
+(path,) = Simulator(network, info.frame_rate_hz).rollout([InitialState.of_scene(load_scene(sys.argv[2]))], 3)
+print(json.dumps({"shape": path.shape, "modules": sorted(sys.modules)}))
+"""
+
+
+def test_simulating_loads_no_training_stack(tmp_path: Path) -> None:
+    """Loading weights and simulating a scene file imports none of Lightning, Hydra, Taichi, WebDataset, TensorBoard,
+    nor the project's own training, data and generator."""
+    network = network_of(torch.float32)
+    weights = tmp_path / "weights.safetensors"
+    save_weights(weights, network, WeightsInfo(network.config, 60.0, 1 / 64))
+    scene = tmp_path / "scene.yaml"
+    scene.write_text("groups:\n  - {shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: water}\n")
+    process = subprocess.run(
+        [sys.executable, "-W", "error", "-c", PROGRAM, str(weights), str(scene)],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert process.returncode == 0, process.stderr
+    report = json.loads(process.stdout)
+    assert report["shape"][0] == 3 and report["shape"][1] > 100
+    loaded = set(report["modules"])
+    assert "hgn.runtime.simulator" in loaded
+    assert [name for name in TRAINING_STACK if name in loaded] == []

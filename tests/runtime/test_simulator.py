@@ -1,0 +1,172 @@
+"""The simulation loop: scenes in a batch, the start, and what happens when a network is not good enough."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from network.states import network_of, random_grid
+
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.scene import Scene
+from hgn.scene.scene_file import load_scene
+from hgn.schema import ConfigError
+
+EMPTY_GRID = ObstacleGrid(1 / 64, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+GRAVITY = (0.0, -9.8, 0.0)
+
+
+def initial(
+    particles: int, seed: int = 0, obstacles: bool = True, domain_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> InitialState:
+    """A random scene; some of its particles lie in obstacle cells."""
+    rng = np.random.default_rng(seed)
+    return InitialState(
+        position_N3=(0.05 + 0.3 * rng.random((particles, 3))).astype(np.float32),
+        velocity_N3=rng.normal(0, 0.1, (particles, 3)).astype(np.float32),
+        material_N=rng.integers(0, 3, particles).astype(np.uint8),
+        obstacle_grid=random_grid(seed, 4_000) if obstacles else EMPTY_GRID,
+        domain_size=domain_size,
+        gravity=GRAVITY,
+    )
+
+
+def constant(acceleration: tuple[float, float, float], **changes: object) -> HierarchicalGraphNetwork:
+    """A network that predicts the same acceleration everywhere, in frame units."""
+    network = network_of(torch.float32, **changes)
+    network.normaliser.set("acceleration", torch.tensor(acceleration), torch.ones(3), 0.0)
+    with torch.no_grad():
+        for parameter in network.decode.parameters():
+            parameter.zero_()
+    return network
+
+
+@pytest.mark.parametrize("obstacles", [(True, True, True), (True, False, True), (False, False, False)])
+def test_batch_equals_each_alone(obstacles: tuple[bool, ...]) -> None:
+    """Scenes of different sizes, with and without obstacles, in one batch move as each does alone."""
+    simulator = Simulator(network_of(torch.float32), 60.0)
+    scenes = [initial(n, seed, wanted) for seed, (n, wanted) in enumerate(zip((40, 1, 90), obstacles, strict=True))]
+    together = simulator.rollout(scenes, 6)
+    for scene, path_TN3 in zip(scenes, together, strict=True):
+        assert path_TN3.shape == (6, len(scene.position_N3), 3) and path_TN3.dtype == np.float32
+        (alone_TN3,) = simulator.rollout([scene], 6)
+        np.testing.assert_allclose(path_TN3, alone_TN3, rtol=0, atol=2e-6)
+
+
+def test_obstacles_are_felt() -> None:
+    """The same particles move differently beside obstacles: the normals reach the network."""
+    simulator = Simulator(network_of(torch.float32), 60.0)
+    (with_TN3,), (without_TN3,) = (simulator.rollout([initial(60, obstacles=wanted)], 4) for wanted in (True, False))
+    assert np.abs(with_TN3[-1] - without_TN3[-1]).max() > 1e-5
+
+
+def test_history_at_the_start_is_ballistic() -> None:
+    """Before frame 0 particles flew freely into the initial state: v^{-k} = v0 dt - (k + 1/2) g dt^2, newest first."""
+    simulator = Simulator(network_of(torch.float32), 60.0)
+    scenes = [initial(20), initial(15, 1)]
+    state = simulator.start(scenes)
+    assert state.velocity_NM3.shape == (35, 5, 3)
+    velocity_N3 = np.concatenate([scene.velocity_N3 for scene in scenes]).astype(np.float64) / 60
+    for k in range(5):
+        expected_N3 = velocity_N3 - (k + 0.5) * np.array(GRAVITY) / 3600
+        np.testing.assert_allclose(state.velocity_NM3[:, k].numpy(), expected_N3, rtol=0, atol=3e-7)
+
+
+def test_perfect_network_falls_as_the_closed_form() -> None:
+    """With the true acceleration predicted, free flight follows x0 + v0 t + g t^2 / 2."""
+    simulator = Simulator(constant((0.0, -9.8 / 3600, 0.0)), 60.0)
+    scene = initial(25)
+    (path_TN3,) = simulator.rollout([scene], 9)
+    time_T11 = (np.arange(9) / 60)[:, None, None]
+    expected_TN3 = scene.position_N3 + scene.velocity_N3 * time_T11 + 0.5 * np.array(GRAVITY) * time_T11**2
+    np.testing.assert_allclose(path_TN3, expected_TN3, rtol=0, atol=2e-6)
+
+
+def test_frames_are_reported_and_scenes_untouched() -> None:
+    """Each simulated frame is reported once, frame 0 is the initial state, and the caller's arrays stay as they are."""
+    simulator = Simulator(network_of(torch.float32), 60.0)
+    scene = initial(30)
+    before = scene.position_N3.copy()
+    seen: list[int] = []
+    (path_TN3,) = simulator.rollout([scene], 5, seen.append)
+    assert seen == [1, 2, 3, 4]
+    assert np.array_equal(path_TN3[0], before) and np.array_equal(scene.position_N3, before)
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "frame", "cause"),
+    [
+        ((0.5, 0.0, 0.0), 3, "farther from the domain than its own size"),
+        ((float("nan"), 0.0, 0.0), 1, "40 of 40 particles are not finite"),
+        ((float("inf"), 0.0, 0.0), 1, "40 of 40 particles are not finite"),
+    ],
+)
+def test_divergence_names_the_frame(acceleration: tuple[float, float, float], frame: int, cause: str) -> None:
+    """A network that throws particles out of reach, or makes them NaN, is stopped at that frame: x > 2 after
+    0.5 (1 + 2 + 3) domain units, at frame 3."""
+    scene = initial(40)
+    scene.velocity_N3[:] = 0
+    simulator = Simulator(constant(acceleration), 60.0)
+    with pytest.raises(DivergenceError, match=f"diverged at frame {frame}: .*{cause}") as raised:
+        simulator.rollout([scene], 10)
+    assert raised.value.frame == frame
+
+
+def test_range_of_a_domain_is_its_own() -> None:
+    """What leaves a small domain is still inside a larger one."""
+    simulator = Simulator(constant((0.5, 0.0, 0.0)), 60.0)
+    scene = initial(10, domain_size=(4.0, 1.0, 1.0))
+    scene.velocity_N3[:] = 0
+    simulator.rollout([scene], 4)
+
+
+def test_initial_state_out_of_range_is_named() -> None:
+    """A scene whose particles lie beyond what grid coordinates can express ends as divergence at frame 1."""
+    scene = initial(3)
+    scene.position_N3[0, 0] = 1e6
+    with pytest.raises(DivergenceError, match="diverged at frame 1: positions must be finite and within"):
+        Simulator(network_of(torch.float32), 60.0).rollout([scene], 3)
+
+
+def test_unknown_material() -> None:
+    """A material that the network was not trained with is refused before anything moves."""
+    scene = initial(10)
+    scene.material_N[:] = 0
+    scene.material_N[4] = 2
+    simulator = Simulator(network_of(torch.float32, materials=("water", "sand")), 60.0)
+    with pytest.raises(ConfigError, match=r"material must be one of the network's \(water, sand\), got snow"):
+        simulator.rollout([scene], 3)
+
+
+def test_materials_are_found_by_name() -> None:
+    """A network with another list of materials looks them up by name, not by index."""
+    simulator = Simulator(network_of(torch.float32, materials=("snow", "water")), 60.0)
+    scene = initial(4)
+    scene.material_N[:] = [0, 2, 2, 0]
+    assert simulator.start([scene]).material_N.tolist() == [1, 0, 0, 1]
+
+
+def test_network_without_obstacle_features() -> None:
+    """A network without normals ignores the obstacles of a scene."""
+    simulator = Simulator(network_of(torch.float32, obstacle_features=False), 60.0)
+    (with_TN3,), (without_TN3,) = (simulator.rollout([initial(60, obstacles=wanted)], 4) for wanted in (True, False))
+    assert np.array_equal(with_TN3, without_TN3)
+
+
+def test_scene_file_to_rollout(tmp_path: Path) -> None:
+    """A scene file, obstacles and all, starts with its own particles and with normals where obstacles are."""
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        "obstacles:\n  - {shape: half_box, size: 0.3, position: [0.5, 0.2, 0.5]}\n"
+        "groups:\n  - {shape: cube, size: 0.06, position: [0.5, 0.5, 0.5], material: sand, velocity: [0, -1, 0]}\n"
+    )
+    scene: Scene = load_scene(path)
+    state = Simulator(network_of(torch.float32), 60.0).start([InitialState.of_scene(scene)])
+    assert state.obstacles is not None and len(state.obstacles.key_K) > 100
+    assert np.array_equal(state.position_N3.numpy(), scene.position_N3)
+    assert state.material_N.unique().tolist() == [1]
+    assert state.velocity_NM3[:, 0, 1].numpy() == pytest.approx(-1 / 60 + 0.5 * 9.8 / 3600, abs=1e-6)

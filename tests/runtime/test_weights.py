@@ -1,0 +1,220 @@
+"""Inference weights: what comes out is what went in, and every file that is not ours is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from network.states import network_of, random_state
+from safetensors import safe_open
+from safetensors.torch import save_file
+from training.runs import train_mapping
+
+from hgn import train
+from hgn.config import DatagenConfig
+from hgn.export import export
+from hgn.runtime.weights import WeightsInfo, load_weights, require_frame_rate, save_weights
+from hgn.schema import ConfigError
+from hgn.training.checkpoint import network_of_checkpoint, read_checkpoint
+
+STATE = random_state((70, 30), dtype=torch.float32)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """The weights file of a small network."""
+    network = network_of(torch.float32)
+    path = tmp_path / "weights.safetensors"
+    save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64, updates=7))
+    return path
+
+
+def content(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """The tensors and the declared structure of a weights file."""
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        return tensors, json.loads(file.metadata()["hgn"])
+
+
+def rewrite(
+    path: Path, change: Callable[[dict[str, torch.Tensor], dict[str, Any]], None], structure: str | None = None
+) -> None:
+    """Changes a weights file; `structure` replaces the declared one."""
+    tensors, mapping = content(path)
+    change(tensors, mapping)
+    save_file(tensors, path, metadata={"hgn": json.dumps(mapping) if structure is None else structure})
+
+
+def test_exported_checkpoint_is_the_trained_network(
+    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path], tmp_path: Path
+) -> None:
+    """A checkpoint of the trainer, exported and loaded, predicts what the checkpoint's network does (to 1e-6) and
+    remembers what it was trained on."""
+    config = make_config()
+    make_dataset(config)
+    changes = {"maximum_updates": 3, "monitor_every": 3, "monitor_rollout_frames": 0}
+    assert train.main(train_mapping(config, tmp_path / "run", **changes)) == 0
+    checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    path = tmp_path / "shipped" / "weights.safetensors"
+    export(checkpoint, path)
+    loaded, info = load_weights(path)
+    expected = network_of_checkpoint(read_checkpoint(checkpoint))
+    assert expected.normaliser.velocity_std.min() > 0.001  # the data's, no longer the identity
+    with torch.no_grad():
+        torch.testing.assert_close(loaded(STATE), expected(STATE), rtol=1e-6, atol=1e-6)
+    assert (info.updates, info.frame_rate_hz, info.obstacle_cell_size) == (3, 60.0, 1 / 64)
+    assert info.network == expected.config and info.provenance["checkpoint"] == "last.ckpt"
+    assert [file.name for file in path.parent.iterdir()] == ["weights.safetensors"]
+
+
+def test_roundtrip_keeps_every_bit(weights: Path) -> None:
+    """Saved and loaded, every tensor is bitwise the same, normaliser included; the network is ready to predict."""
+    expected = network_of(torch.float32)
+    loaded, info = load_weights(weights)
+    assert not loaded.training and info == WeightsInfo(expected.config, 60.0, 1 / 64, updates=7)
+    found = loaded.state_dict()
+    assert found.keys() == expected.state_dict().keys()
+    for name, tensor in expected.state_dict().items():
+        assert torch.equal(found[name], tensor), name
+
+
+def test_same_network_same_bytes(weights: Path, tmp_path: Path) -> None:
+    """A file depends on nothing but the network and what is said of it."""
+    network, info = load_weights(weights)
+    save_weights(tmp_path / "again.safetensors", network, info)
+    assert (tmp_path / "again.safetensors").read_bytes() == weights.read_bytes()
+
+
+def test_half_precision(weights: Path, tmp_path: Path) -> None:
+    """`half` rounds each learned tensor to float16 and halves the file; the normaliser keeps its float32 values, and
+    the network computes in float32 again."""
+    network, info = load_weights(weights)
+    path = tmp_path / "half.safetensors"
+    save_weights(path, network, info, half=True)
+    tensors, _ = content(path)
+    for name, tensor in network.state_dict().items():
+        kept = name.startswith("normaliser.")
+        assert tensors[name].dtype == (torch.float32 if kept else torch.float16)
+        assert torch.equal(tensors[name], tensor if kept else tensor.half()), name
+    assert path.stat().st_size < 0.6 * weights.stat().st_size
+    loaded, _ = load_weights(path)
+    assert all(tensor.dtype == torch.float32 for tensor in loaded.state_dict().values())
+    with torch.no_grad():
+        difference, size = loaded(STATE) - network(STATE), network(STATE)
+    assert 0 < float(difference.abs().max()) < 0.02 * float(size.abs().max())
+
+
+def test_missing(tmp_path: Path) -> None:
+    """A file that is not there is named, with the command that writes one."""
+    with pytest.raises(ConfigError, match=r"weights must be an existing file, got .*none\.safetensors; write one with"):
+        load_weights(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize("data", [b"", b"no weights at all", b"PK\x03\x04" + bytes(64)], ids=["empty", "text", "zip"])
+def test_not_safetensors(tmp_path: Path, data: bytes) -> None:
+    """Another format is refused, and the file stays as it was."""
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(data)
+    with pytest.raises(ConfigError, match="weights must be a safetensors file, got"):
+        load_weights(path)
+    assert path.read_bytes() == data
+
+
+@pytest.mark.parametrize("kept", [0.01, 0.5, 0.999])
+def test_truncated(weights: Path, kept: float) -> None:
+    """A file cut anywhere is refused as such."""
+    data = weights.read_bytes()
+    weights.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(ConfigError, match="weights must be a safetensors file, got"):
+        load_weights(weights)
+
+
+def test_without_structure(weights: Path) -> None:
+    """Tensors alone are no weights file: nothing says which network they belong to."""
+    save_file(content(weights)[0], weights)
+    with pytest.raises(ConfigError, match=r"weights must be a file of python -m hgn\.export, got .* without its"):
+        load_weights(weights)
+
+
+@pytest.mark.parametrize(
+    ("structure", "message"),
+    [
+        ("{not json", "weights must declare their structure as JSON"),
+        ("[1, 2]", "weights format_version must be 1, got None"),
+        ('{"format_version": 1}', r"weights\.network is missing"),
+    ],
+)
+def test_garbled_structure(weights: Path, structure: str, message: str) -> None:
+    """A structure that cannot be understood is refused with what is wrong in it."""
+    rewrite(weights, lambda tensors, mapping: None, structure)
+    with pytest.raises(ConfigError, match=message):
+        load_weights(weights)
+
+
+def test_other_format_version(weights: Path) -> None:
+    """A file of another version is refused before anything else in it is looked at."""
+    rewrite(weights, lambda tensors, mapping: mapping.update(format_version=2, invented_later=True))
+    with pytest.raises(ConfigError, match="weights format_version must be 1, got 2 in .*; export again"):
+        load_weights(weights)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, r"weights\.network\.width must be a finite number > 0, got 0"),
+        ({"width": "wide"}, r"weights\.network\.width must be a whole number, got 'wide'"),
+        ({"wdith": 16}, r"weights\.network\.wdith is not a known key; did you mean width"),
+        ({"materials": ["water", "lava", "snow"]}, r"weights\.network\.materials\[1\] must be one of .*'lava'"),
+        ({"width": 8}, r"weights tensor .* must have shape .* got .*; these are the weights of another network"),
+        ({"levels": 4}, r"weights tensor .* must have shape .* got none in"),
+        ({"levels": 2}, r"weights tensor .* must have shape none for the declared network, got"),
+    ],
+)
+def test_tensors_of_another_network(weights: Path, change: dict[str, Any], message: str) -> None:
+    """A structure that is invalid, or that the tensors do not fit, is refused with the key or the tensor."""
+    rewrite(weights, lambda tensors, mapping: mapping["network"].update(change))
+    with pytest.raises(ConfigError, match=message):
+        load_weights(weights)
+
+
+@pytest.mark.parametrize("extra", [True, False])
+def test_tensor_names(weights: Path, extra: bool) -> None:
+    """One tensor too many or too few is named."""
+
+    def change(tensors: dict[str, torch.Tensor], mapping: dict[str, Any]) -> None:
+        if extra:
+            tensors["surplus.weight"] = torch.zeros(3)
+        else:
+            del tensors["embedding.weight"]
+
+    rewrite(weights, change)
+    name = "surplus.weight" if extra else "embedding.weight"
+    with pytest.raises(ConfigError, match=f"weights tensor {name} must have shape"):
+        load_weights(weights)
+
+
+def test_frame_rate(weights: Path) -> None:
+    """Data of another frame rate is refused: one step of a network is one frame."""
+    _, info = load_weights(weights)
+    require_frame_rate(info, 60.0)
+    with pytest.raises(ConfigError, match=r"frame_rate_hz must be the weights' 60\.0, got 30\.0"):
+        require_frame_rate(info, 30.0)
+
+
+def test_failed_save_leaves_the_old_file(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk while writing leaves the earlier file, whole, and nothing beside it."""
+    network, info = load_weights(weights)
+    before = weights.read_bytes()
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("hgn.files.os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_weights(weights, network, info, half=True)
+    assert weights.read_bytes() == before
+    assert [file.name for file in weights.parent.iterdir()] == [weights.name]
