@@ -133,13 +133,20 @@ def _rasterise(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) ->
     closest = np.zeros((count, 3))
     owner = np.full(count, -1, np.int64)
     normal = _face_normals(triangle_F33)
+    centre = triangle_F33.mean(axis=1)
+    radius = np.linalg.norm(triangle_F33 - centre[:, None], axis=2).max(axis=1)
+    # a triangle counts at a node only if its sphere comes nearer than the nearest centre of all
+    bound = np.full(count, band)
     for node, triangle in _near_pairs(triangle_F33, band, shape):
+        np.minimum.at(bound, np.ravel_multi_index(node.T, shape), np.linalg.norm(node - centre[triangle], axis=1))
+    for node, triangle in _near_pairs(triangle_F33, band, shape):
+        flat = np.ravel_multi_index(node.T, shape)
         height = ((node - triangle_F33[triangle, 0]) * normal[triangle]).sum(axis=1)
-        keep = np.abs(height) <= band
-        node, triangle = node[keep], triangle[keep]
+        reach = np.linalg.norm(node - centre[triangle], axis=1) - radius[triangle]
+        keep = np.maximum(np.abs(height), reach) <= bound[flat] + 1e-9
+        node, triangle, flat = node[keep], triangle[keep], flat[keep]
         foot = closest_points(node, triangle_F33[triangle])
         distance = np.linalg.norm(node - foot, axis=1)
-        flat = np.ravel_multi_index(node.T, shape)
         nearer = (distance <= band) & (distance < best[flat])
         flat, distance, foot, triangle = flat[nearer], distance[nearer], foot[nearer], triangle[nearer]
         order = np.lexsort((triangle, distance, flat))

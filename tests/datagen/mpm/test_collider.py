@@ -6,6 +6,7 @@ import pytest
 from datagen.mpm.collider import BOTH_SIDES, build_collider
 from datagen.mpm.solver import Simulated, simulate
 from hgn.config import MpmConfig
+from hgn.scene.distance import closest_points
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
@@ -77,6 +78,22 @@ def test_body_nodes(flip: bool) -> None:
     centre = (low + high) / 2
     assert ((node - centre) * collider.normal_K3).sum(axis=1).min() > 0
     assert collider.count_inside(np.array([[0.5, 0.5, 0.5], [0.1, 0.5, 0.5]], np.float32)) == 1
+
+
+def test_sheet_nodes_of_a_crumpled_mesh() -> None:
+    """Over 120 random triangles of mixed size the contact nodes are exactly those that a search over all finds."""
+    corner = np.random.default_rng(0).uniform(0, 1, (120, 1, 3))
+    corner = (
+        corner + np.random.default_rng(1).uniform(-1, 1, (120, 3, 3)) * np.geomspace(0.005, 0.2, 120)[:, None, None]
+    )
+    mesh = Obstacle("crumpled", corner.reshape(-1, 3), np.arange(360).reshape(-1, 3).astype(np.int32), False)
+    collider = build_collider(scene_of(mesh), 1.5)
+    node = np.stack(np.unravel_index(np.arange(16**3), (16,) * 3), axis=1)
+    distance = np.full(len(node), np.inf)
+    for triangle in corner:
+        foot = closest_points(node * CELL, np.broadcast_to(triangle, (len(node), 3, 3)))
+        distance = np.minimum(distance, np.linalg.norm(node * CELL - foot, axis=1))
+    assert np.array_equal(collider.node_K3, node[distance <= 1.5 * CELL])
 
 
 def test_closest_obstacle_wins() -> None:
