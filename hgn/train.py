@@ -1,12 +1,11 @@
 """python -m hgn.train +experiment=obstacles: trains a network, and makes the data it needs.
 
-A run is a folder; the same command again goes on where it stopped. Ctrl-C and SIGTERM end the run at the next
-update, after a checkpoint.
+A run is a folder; the same command again goes on where it stopped. Ctrl-C, SIGTERM and SIGUSR1 end the run at the
+next update, after a checkpoint.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 import warnings
@@ -31,6 +30,7 @@ from hgn.provenance import provenance
 from hgn.schema import ConfigError, from_mapping, to_mapping
 from hgn.training.checkpoint import DataInfo, check_checkpoint, cursor_of_checkpoint, read_checkpoint
 from hgn.training.generator import Generator
+from hgn.training.launch import check_processes, device_count, first_rank
 from hgn.training.stop import StopRequest
 
 
@@ -38,6 +38,7 @@ def main(mapping: dict[str, Any]) -> int:
     """Trains as the resolved configuration says; returns the exit code."""
     mapping.pop("name", None)
     config = from_mapping(TrainConfig, mapping)
+    check_processes(config.training)
     run = Path(config.run)
     if EpisodeStore.available(config.dataset.folder):
         require_same_dataset(Manifest.load(config.dataset.folder).config, config.datagen, config.dataset.folder)
@@ -47,7 +48,7 @@ def main(mapping: dict[str, Any]) -> int:
     stop.listen()
     with ExitStack() as stack:
         generator = None
-        if _first_rank() and config.training.generate and not _complete(config):
+        if first_rank() and config.training.generate and not _complete(config):
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)
         store = _wait_for_episodes(config, generator, stop)
@@ -91,7 +92,7 @@ def _fit(
     lines = LogLines(run, monitor, training.log_every, training.maximum_updates, _published_text(config, generator))
     trainer = Trainer(
         accelerator=training.accelerator,
-        devices=training.devices or ("auto" if training.accelerator != "cpu" and torch.cuda.is_available() else 1),
+        devices=device_count(training),
         num_nodes=training.nodes,
         max_steps=training.maximum_updates,
         max_epochs=-1,
@@ -129,7 +130,7 @@ def _wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: S
     """Waits until enough training episodes are published, showing what is awaited; none when asked to stop."""
     folder, needed = Path(config.dataset.folder), config.training.minimum_episodes
     needed = min(needed, config.dataset.training_scenes)
-    if generator is None and _first_rank() and not EpisodeStore.available(folder):
+    if generator is None and first_rank() and not EpisodeStore.available(folder):
         raise ConfigError(
             f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
             f"out={folder}, or set training.generate=true"
@@ -148,12 +149,12 @@ def _wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: S
                     f"training.minimum_episodes must be reachable, got {needed} where the data set has "
                     f"{len(store) if store else 0}; ask for more scenes"
                 )
-        elif _first_rank():
+        elif first_rank():
             raise ConfigError(
                 f"dataset.folder must hold {needed} training episodes, got {len(store) if store else 0} in {folder}; "
                 "generate them, or set training.generate=true"
             )
-        if progress is None and _first_rank():
+        if progress is None and first_rank():
             print(f"waiting for training episode {needed} in {folder}", file=sys.stderr)
             progress = bar("generating", total=needed * config.dataset.frames, unit="frame")
         if progress is not None and generator is not None:
@@ -176,7 +177,7 @@ def _published_text(config: TrainConfig, generator: Generator | None) -> Callabl
 
 def _write_run_files(config: TrainConfig, run: Path) -> None:
     run.mkdir(parents=True, exist_ok=True)
-    if not _first_rank():
+    if not first_rank():
         return
     manifest = Manifest.load(config.dataset.folder)
     record = to_mapping(config)
@@ -196,12 +197,6 @@ def _report(config: TrainConfig, run: Path, updates: int, last: dict[str, float]
         )
     if stop.requested:
         print("stopped; the same command goes on from here")
-
-
-def _first_rank() -> bool:
-    """Whether this process leads: launchers set RANK, SLURM_PROCID or LOCAL_RANK for the others."""
-    ranks = [os.environ.get(name, "0") for name in ("RANK", "SLURM_PROCID", "LOCAL_RANK")]
-    return all(rank == "0" for rank in ranks)
 
 
 def _quieten_lightning() -> None:

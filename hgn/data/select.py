@@ -10,9 +10,10 @@ from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 
 
-def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
-    """The episodes of lowest index, whatever order they were published in: a fixed choice."""
-    ranked = sorted(range(len(store)), key=lambda i: store.entries[i].index)
+def first_episodes(store: EpisodeStore, count: int, known: int | None = None) -> list[Episode]:
+    """The episodes of lowest index among the first `known` published (all of them if absent)."""
+    entries = store.entries[:known]
+    ranked = sorted(range(len(entries)), key=lambda i: entries[i].index)
     return [store.episodes[i] for i in ranked[:count]]
 
 

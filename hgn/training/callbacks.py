@@ -34,6 +34,7 @@ from hgn.training.errors import (
     position_mse,
     trivial_predictors,
 )
+from hgn.training.feed import agreed_count
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
@@ -98,7 +99,7 @@ class Monitor(Callback):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
-        if self.stop.signal is None:
+        if not self._interrupted(trainer):
             self.measure(trainer, pl_module)
 
     def measure(self, trainer: Trainer, module: TrainingModule) -> None:
@@ -109,9 +110,10 @@ class Monitor(Callback):
         config, network = module.training_config, module.network
         network.eval()
         started = time.monotonic()
+        stores = {"training": self.training_store, "validation": EpisodeStore(self.data_folder, "validation")}
         scenes = {
-            "training": first_episodes(self.training_store, config.monitor_scenes),
-            "validation": first_episodes(EpisodeStore(self.data_folder, "validation"), config.monitor_scenes),
+            split: first_episodes(store, config.monitor_scenes, agreed_count(store, trainer))
+            for split, store in stores.items()
         }
         values: dict[str, float] = {}
         for split, episodes in scenes.items():
@@ -244,11 +246,20 @@ class Stopper(Callback):
     def __init__(self, stop: StopRequest, checkpoints: Checkpoints) -> None:
         self.stop, self.checkpoints = stop, checkpoints
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # Lightning has just put a handler of its own before ours: on SIGTERM it talks to the other ranks from within
+        # the handler, and leaves the loop by an exception, past the checkpoint.
+        self.stop.listen()
+
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if trainer.world_size > 1 and trainer.global_step % self.AGREE_EVERY:
             return
         if trainer.strategy.reduce_boolean_decision(self.stop.requested, all=False):
             trainer.should_stop = True
+            # A signal may have reached one rank alone; all end with its exit code.
+            signal = torch.tensor(self.stop.signal or 0, device=pl_module.device)
+            reduced = trainer.strategy.reduce(signal, reduce_op="max")
+            self.stop.signal = int(reduced) or None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.checkpoints.save_last(trainer)

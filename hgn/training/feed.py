@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 
 import torch
-from lightning.pytorch import LightningDataModule
+from lightning.pytorch import LightningDataModule, Trainer
 from torch.utils.data import DataLoader, IterableDataset
 
 from hgn.config import NetworkConfig, TrainingConfig
@@ -50,19 +50,29 @@ class Feed(LightningDataModule):
     def _published(self, epoch: int) -> list[int]:
         """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""
         self.store.refresh()
-        count = len(self.store)
-        if self.trainer is not None and self.trainer.world_size > 1:
-            count = self.trainer.strategy.broadcast(count)
-            deadline = time.monotonic() + SHARED_FOLDER_PATIENCE_S
-            while len(self.store) < count:
-                if time.monotonic() > deadline:
-                    raise ConfigError(
-                        f"{self.store.folder} must show the same {count} episodes on every node, got "
-                        f"{len(self.store)} for {SHARED_FOLDER_PATIENCE_S:.0f} s; is it a shared folder?"
-                    )
-                time.sleep(1)
-                self.store.refresh()
+        count = agreed_count(self.store, self.trainer) if self.trainer is not None else len(self.store)
         return [entry.frames for entry in self.store.entries[:count]]
+
+
+def agreed_count(store: EpisodeStore, trainer: Trainer) -> int:
+    """How many episodes rank 0 knows; the other ranks wait until they see as many. All ranks call this.
+
+    Episodes come in publication order, so that the first `count` are then the same everywhere.
+    Raises: ConfigError when a node does not see them for SHARED_FOLDER_PATIENCE_S.
+    """
+    if trainer.world_size == 1:
+        return len(store)
+    count = int(trainer.strategy.broadcast(len(store)))
+    deadline = time.monotonic() + SHARED_FOLDER_PATIENCE_S
+    while len(store) < count:
+        if time.monotonic() > deadline:
+            raise ConfigError(
+                f"{store.folder} must show the same {count} episodes on every node, got {len(store)} for "
+                f"{SHARED_FOLDER_PATIENCE_S:.0f} s; is it a shared folder?"
+            )
+        time.sleep(1)
+        store.refresh()
+    return count
 
 
 class _Stream(IterableDataset[Batch]):

@@ -1,4 +1,4 @@
-"""Stopping a training: Ctrl-C, SIGTERM, or the time that a start was given.
+"""Stopping a training: Ctrl-C, SIGTERM, SIGUSR1 (what schedulers send before the end), or the time a start was given.
 
 A signal only raises a flag; the loop ends at the next update, after a checkpoint was written, and nothing is
 lost. A second Ctrl-C does not wait.
@@ -19,9 +19,9 @@ class StopRequest:
         self._deadline = None if maximum_minutes is None else time.monotonic() + 60 * maximum_minutes
 
     def listen(self) -> None:
-        """Takes over SIGINT and SIGTERM; only the main thread may call this."""
-        signal.signal(signal.SIGINT, self._on_signal)
-        signal.signal(signal.SIGTERM, self._on_signal)
+        """Takes over SIGINT, SIGTERM and SIGUSR1; only the main thread may call this."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
+            signal.signal(number, self._on_signal)
 
     def restart_clock(self, maximum_minutes: float | None) -> None:
         """Counts the time from now: waiting for data is not training."""

@@ -158,7 +158,7 @@ def test_garbled_structure(weights: Path, structure: str, message: str) -> None:
 def test_other_format_version(weights: Path) -> None:
     """A file of another version is refused before anything else in it is looked at."""
     rewrite(weights, lambda tensors, mapping: mapping.update(format_version=2, invented_later=True))
-    with pytest.raises(ConfigError, match="weights format_version must be 1, got 2 in .*; export again"):
+    with pytest.raises(ConfigError, match=r"weights format_version must be 1, got 2 in .*; export again"):
         load_weights(weights)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from hgn import train
 from hgn.config import DatagenConfig
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
+from hgn.training.module import TrainingModule
 
 MakeConfig = Callable[..., DatagenConfig]
 MakeDataset = Callable[[DatagenConfig], Path]
@@ -23,7 +25,7 @@ MakeDataset = Callable[[DatagenConfig], Path]
 
 @pytest.fixture(autouse=True)
 def keep_signal_handlers():
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
     yield
     for number, handler in handlers.items():
         signal.signal(number, handler)
@@ -81,6 +83,22 @@ def test_resume_equals_no_interruption(data, tmp_path):
     states = [c["optimizer_states"][0]["state"] for c in (expected, found)]
     for index in states[0]:
         assert torch.equal(states[0][index]["exp_avg_sq"], states[1][index]["exp_avg_sq"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGINT])
+def test_signals_end_the_run_after_a_checkpoint(data, tmp_path, monkeypatch, number):
+    """A real signal in the middle of an update ends the run at that update, with a checkpoint and 128 + its number."""
+    original = TrainingModule.on_before_optimizer_step
+
+    def signalled(module, optimizer):
+        if module.global_step == 2:
+            os.kill(os.getpid(), number)
+        return original(module, optimizer)
+
+    monkeypatch.setattr(TrainingModule, "on_before_optimizer_step", signalled)
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run)) == 128 + number
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 3
 
 
 def test_a_finished_run_stays_finished(data, tmp_path):
