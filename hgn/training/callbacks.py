@@ -78,6 +78,7 @@ class Checkpoints(Callback):
             if trainer.is_global_zero:
                 temporary.replace(path)
                 sync_folder(self.folder)
+            trainer.strategy.barrier()  # a rank that ends before this may take the others with it
         finally:
             if trainer.is_global_zero:
                 temporary.unlink(missing_ok=True)
