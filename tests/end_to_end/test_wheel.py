@@ -1,0 +1,84 @@
+"""The wheel: installed without the checkout, every command runs from any folder."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from the checkout with what is installed, without a network."""
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    built = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert built.returncode == 0, built.stdout + built.stderr
+    (path,) = folder.glob("hgn-*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of a fresh environment with the wheel, which sees the present dependencies but no checkout."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False)
+    interpreter = folder / "bin" / "python"
+    install = ["install", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-index", str(wheel)]
+    pip = [sys.executable, "-m", "pip", "--python", str(interpreter), *install]
+    installed = subprocess.run(pip, capture_output=True, text=True, timeout=120)
+    assert installed.returncode == 0, installed.stderr
+    (packages,) = folder.glob("lib/python*/site-packages")
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return interpreter
+
+
+def run(python: Path, folder: Path, *arguments: str) -> str:
+    """Standard output of a command that must succeed and leave the folder empty."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = subprocess.run(
+        [str(python), *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert list(folder.iterdir()) == []
+    return done.stdout
+
+
+def test_configs_travel_inside(wheel: Path) -> None:
+    """All of conf/ is inside the package, byte for byte; tests, job files and caches are not."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        for path in (ROOT / "conf").rglob("*"):
+            if path.is_file():
+                assert archive.read(f"hgn/conf/{path.relative_to(ROOT / 'conf')}") == path.read_bytes()
+    assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"hgn", "datagen", "tools"}
+    assert not [name for name in names if "__pycache__" in name or "test" in name]
+
+
+def test_package_is_the_installed_one(python: Path, tmp_path: Path) -> None:
+    """The configs are found inside the installed package."""
+    code = "import hgn.config; print(hgn.config.config_directory())"
+    directory = Path(run(python, tmp_path, "-c", code).strip())
+    assert directory.is_relative_to(python.parents[1]) and directory.parts[-2:] == ("hgn", "conf")
+
+
+@pytest.mark.parametrize(("module", "key"), [("hgn.train", "training"), ("datagen", "mpm")])
+def test_commands_compose_their_config(python: Path, tmp_path: Path, module: str, key: str) -> None:
+    """`--cfg job` with an experiment prints the composed configuration, from an empty folder."""
+    composed = yaml.safe_load(run(python, tmp_path, "-m", module, "+experiment=small", "--cfg", "job"))
+    assert composed["name"] == "small" and key in composed
+
+
+@pytest.mark.parametrize(("module", "key"), [("hgn.rollout", "weights: ???"), ("tools.render", "rollout: null")])
+def test_commands_help(python: Path, tmp_path: Path, module: str, key: str) -> None:
+    """`--help` shows the keys of a command, from an empty folder."""
+    assert key in run(python, tmp_path, "-m", module, "--help")
