@@ -93,7 +93,7 @@ def build_hierarchy(
 
 
 def _edges(key_C: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    stride_6 = DIRECTION_63.to(key_C.device) @ torch.tensor(AXIS_STRIDE, device=key_C.device)
+    stride_6 = (DIRECTION_63 * torch.tensor(AXIS_STRIDE)).sum(-1).to(key_C.device)
     neighbour_C6, found_C6 = find(key_C, key_C[:, None] + stride_6)
     receiver_E, direction_E = torch.nonzero(found_C6, as_tuple=True)
     return neighbour_C6[receiver_E, direction_E], receiver_E, direction_E
