@@ -1,6 +1,7 @@
 """What all commands share: Hydra composes the config, and faults a person can mend end in one line, no traceback.
 
-Exit codes: 0 done, 1 the machine is at fault (a full disk, no permission), 2 the input is at fault, 130 Ctrl-C.
+Exit codes: 0 done, 1 the machine is at fault (a full disk, no permission, a path that is taken), 2 the input is at
+fault, 130 Ctrl-C.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ _MACHINE_ERRORS = {
     errno.EACCES: "check the permissions",
     errno.EPERM: "check the permissions",
     errno.EROFS: "choose a folder that can be written to",
+    # a path the person gave leads through a file, or ends at a thing of the wrong kind
+    errno.EEXIST: "choose another path",
+    errno.ENOTDIR: "choose another path",
+    errno.EISDIR: "choose another path",
 }
 
 
@@ -125,5 +130,5 @@ def _one_line(text: str) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"error: {message}", file=sys.stderr, flush=True)
+    print(f"error: {' '.join(message.split())}", file=sys.stderr, flush=True)
     return code

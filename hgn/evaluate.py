@@ -48,7 +48,9 @@ def main(mapping: dict[str, Any]) -> int:
     print(table(rows, config, len(episodes)))
     if config.json is not None:
         report = {"meta": provenance(device) | {"weights": config.weights, "updates": info.updates}, "rows": rows}
-        write_atomically(Path(config.json), json.dumps(report, indent=1).encode())
+        path = Path(config.json)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, json.dumps(report, indent=1).encode())
     return 0
 
 

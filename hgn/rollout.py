@@ -11,11 +11,11 @@ from hgn.config import RolloutConfig
 from hgn.data.select import find_episode
 from hgn.device import choose_device
 from hgn.progress import bar
-from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, load_weights, require_frame_rate
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
 from hgn.scene.scene_file import load_scene
-from hgn.schema import from_mapping, require
+from hgn.schema import ConfigError, from_mapping, require
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -27,7 +27,10 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def rollout(config: RolloutConfig) -> Path:
-    """Simulates a scene file, or an episode beside its truth, and writes HDF5; returns its path."""
+    """Simulates a scene file, or an episode beside its truth, and writes HDF5; returns its path.
+
+    Raises: ConfigError for bad input, weights that let the simulation diverge among them; nothing is written then.
+    """
     device = choose_device(config.device)
     weights = Path(config.weights)
     network, info = load_weights(weights, device)
@@ -51,7 +54,10 @@ def rollout(config: RolloutConfig) -> Path:
     _require_cell_size(info, cell_size)
     simulator = Simulator(network, info.frame_rate_hz)
     with bar("simulating", total=frames - 1, unit="frame") as progress:
-        (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
+        try:
+            (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
+        except DivergenceError as error:
+            raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
     path = Path(config.out)
     write_rollout(
         path,

@@ -107,7 +107,9 @@ def draw(records: list[dict[str, float]], settings: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def _plot(axes: Any, records: list[dict[str, float]], key: str, label: str, color: str | None, marker: str = "") -> None:
+def _plot(
+    axes: Any, records: list[dict[str, float]], key: str, label: str, color: str | None, marker: str = ""
+) -> None:
     points = [(record["update"], record[key]) for record in records if key in record]
     if points:
         axes.plot(*zip(*points, strict=True), label=label, color=color, marker=marker, markersize=3, linewidth=1)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from training.runs import NETWORK, metrics
+from training.runs import metrics, train_arguments
 
 from hgn.config import DatagenConfig
 from hgn.training.checkpoint import read_checkpoint
@@ -21,16 +21,7 @@ from hgn.training.checkpoint import read_checkpoint
 ROOT = Path(__file__).resolve().parents[2]
 JOBS = ROOT / "jobs"
 SCRIPTS = sorted([*JOBS.rglob("*.sh"), *JOBS.rglob("*.sbatch")])
-SMALL_TRAINING = [
-    *(f"network.{key}={value}" for key, value in NETWORK.items()),
-    "training.accelerator=cpu",
-    "training.generate=false",
-    "training.maximum_updates=4",
-    "training.log_every=2",
-    "training.monitor_every=4",
-    "training.monitor_scenes=2",
-    "training.monitor_rollout_frames=0",
-]
+SHORT = {"maximum_updates": 4, "batch_scenes": 1, "log_every": 2, "monitor_every": 4, "monitor_rollout_frames": 0}
 
 # starts one process for each task of one node, as srun does, and returns the highest exit code
 SRUN = """#!/usr/bin/env bash
@@ -85,14 +76,6 @@ def slurm(tmp_path: Path) -> dict[str, str]:
     }
 
 
-def small_training(config: DatagenConfig, run_folder: Path) -> list[str]:
-    """The overrides that train on a test's data set into `run_folder`."""
-    dataset = config.dataset
-    values = {"folder": dataset.folder, "training_scenes": dataset.training_scenes, "frames": dataset.frames}
-    counts = {"validation_scenes": dataset.validation_scenes, "test_scenes": dataset.test_scenes}
-    return [*SMALL_TRAINING, f"run={run_folder}", *(f"dataset.{k}={v}" for k, v in (values | counts).items())]
-
-
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
 def test_scripts_are_valid(script: Path) -> None:
     """Bash parses each launch file, shellcheck (where installed) finds nothing, and each may be executed."""
@@ -129,7 +112,7 @@ def test_torchrun_trains(
     """jobs/torchrun.sh starts one training on two processes, which writes one run folder."""
     config = make_config()
     make_dataset(config)
-    done = run("torchrun.sh", *small_training(config, tmp_path / "run"), cwd=tmp_path, GPUS="2")
+    done = run("torchrun.sh", *train_arguments(config, tmp_path / "run", **SHORT), cwd=tmp_path, GPUS="2")
     assert done.returncode == 0, done.stderr[-4000:]
     assert done.stdout.count("trained 4 of 4 updates") == 1
     stored = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
@@ -172,7 +155,7 @@ def test_slurm_trains(
     """jobs/slurm/train.sbatch starts one training of two tasks that know their ranks from Slurm's variables."""
     config = make_config()
     make_dataset(config)
-    done = run("slurm/train.sbatch", *small_training(config, tmp_path / "run"), cwd=tmp_path, **slurm)
+    done = run("slurm/train.sbatch", *train_arguments(config, tmp_path / "run", **SHORT), cwd=tmp_path, **slurm)
     assert done.returncode == 0, done.stderr[-4000:]
     assert done.stdout.count("trained 4 of 4 updates") == 1
     checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")

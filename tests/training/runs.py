@@ -35,6 +35,15 @@ def train_mapping(config: DatagenConfig, run: Path, **training: Any) -> dict[str
     }
 
 
+def train_arguments(config: DatagenConfig, run: Path, **training: Any) -> list[str]:
+    """The same as overrides on the command line."""
+    names = ("folder", "frames", "training_scenes", "validation_scenes", "test_scenes")
+    dataset = {name: getattr(config.dataset, name) for name in names}
+    sections = {"network": NETWORK, "training": TRAINING | training, "dataset": dataset}
+    values = [f"{section}.{key}={value}" for section, keys in sections.items() for key, value in keys.items()]
+    return [*values, f"run={run}"]
+
+
 def metrics(run: Path) -> list[dict[str, float]]:
     """All logged records of a run."""
     return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]

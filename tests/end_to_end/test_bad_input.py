@@ -1,0 +1,417 @@
+"""Bad input to the commands: one line that says what is wrong, a non-zero exit code, and nothing touched."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from network.states import network_of
+from training.runs import train_arguments, train_mapping
+
+import datagen.__main__
+from hgn import evaluate, export, rollout, train
+from hgn.command import EXIT_INPUT, EXIT_MACHINE, run_command
+from hgn.config import DatagenConfig
+from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
+from tools import render
+
+ROOT = Path(__file__).resolve().parents[2]
+COMMANDS: dict[str, Callable[[dict[str, Any]], int]] = {
+    "datagen": datagen.__main__.main,
+    "train": train.main,
+    "export": export.main,
+    "rollout": rollout.main,
+    "evaluate": evaluate.main,
+    "render": render.main,
+}
+SCENE = """
+obstacles:
+  - {shape: cone, size: 0.3, position: [0.5, 0.4, 0.5]}
+groups:
+  - {shape: cube, size: 0.05, position: [0.5, 0.8, 0.5], material: water}
+"""
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@dataclass
+class Place:
+    """A folder with a data set, a finished run, its weights and a scene file; all paths are relative to it."""
+
+    folder: Path
+    config: DatagenConfig
+
+    def path(self, name: str) -> Path:
+        return self.folder / name
+
+    def shard(self, split: str) -> Path:
+        return sorted(self.path("data").glob(f"{split}-*.tar"))[0]
+
+    def edit(self, name: str, old: str, new: str) -> None:
+        text = self.path(name).read_text()
+        assert old in text
+        self.path(name).write_text(text.replace(old, new))
+
+    def edit_manifest(self, **values: object) -> None:
+        path = self.path("data/manifest.json")
+        path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+    def scene(self, text: str) -> None:
+        self.path("scene.yaml").write_text(text)
+
+    def train(self, *arguments: str, run: str = "run") -> list[str]:
+        return ["+experiment=obstacles", *train_arguments(self.config, self.path(run)), *arguments]
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the first test keeps what all begin with."""
+    return tmp_path_factory.mktemp("original") / "place"
+
+
+@pytest.fixture
+def place(
+    original: Path,
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Place]:
+    config = make_config()
+    made = Place(tmp_path, config)
+    if original.exists():
+        shutil.copytree(original, tmp_path, dirs_exist_ok=True)
+    else:
+        make_dataset(config)
+        assert train.main(train_mapping(config, tmp_path / "run", maximum_updates=2, monitor_rollout_frames=0)) == 0
+        export.export(tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path / "weights.safetensors")
+        shutil.copytree(tmp_path, original)
+    made.scene(SCENE)
+    monkeypatch.chdir(tmp_path)
+    yield made
+
+
+@pytest.fixture(autouse=True)
+def keep_signal_handlers() -> Iterator[None]:
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+Capture = pytest.CaptureFixture[str]
+
+
+def refused(command: str, arguments: list[str], capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
+    """Runs a command as its module would; returns the exit code and the one error line."""
+    monkeypatch.setattr(sys, "argv", [command, *arguments])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as raised:
+        run_command(COMMANDS[command], command)
+    lines = capsys.readouterr().err.splitlines()
+    errors = [line for line in lines if line.startswith("error: ")]
+    # a progress bar may have begun; after the error there is nothing
+    assert errors == lines[-1:] and "Traceback" not in "".join(lines), lines
+    return int(str(raised.value.code)), errors[0]
+
+
+def check(place: Place, command: str, arguments: list[str], message: str, capsys: Capture, patch: Any) -> None:
+    """The command is refused with that message and leaves every file as it was; no half-written one is left."""
+    before = content(place.folder)
+    code, line = refused(command, arguments, capsys, patch)
+    assert code == EXIT_INPUT and message in line, line
+    after = content(place.folder)
+    assert {name: after.get(name) for name in before} == before
+    assert not [name for name in after if name.endswith(".partial")]
+
+
+ROLLOUT = ["weights=weights.safetensors", "scene=scene.yaml", "out=made/rollout.vtkhdf", "frames=3"]
+EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "json=made/errors.json"]
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        ("datagen", ["dataset.frames=-3"], "dataset.frames must be at least 2, got -3"),
+        ("datagen", ["scene.group_size=nan"], "scene.group_size must be a finite number > 0, got nan"),
+        (
+            "datagen",
+            ["scene.materials=[water,lava]"],
+            "scene.materials[1] must be one of water, sand, snow, got 'lava'",
+        ),
+        ("train", ["+training.batchsize=2"], "training.batchsize is not a known key; did you mean batch_scenes?"),
+        ("train", ["training.batchsize=2"], "Could not override 'training.batchsize'"),
+        ("train", ["training.maximum_updates=many"], "training.maximum_updates must be a whole number, got 'many'"),
+        ("train", ["training.learning_rate=-1"], "training.learning_rate must be a finite number > 0, got -1.0"),
+        ("train", ["training.noise_std=nan"], "training.noise_std must be a finite number >= 0, got nan"),
+        ("train", ["network.materials=[lava]"], "network.materials[0] must be one of water, sand, snow, got 'lava'"),
+        ("train", ["+experiment=moon"], "Could not find 'experiment/moon'"),
+        ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
+        ("export", ["out=x"], "Missing mandatory value: checkpoint"),
+        ("rollout", [*ROLLOUT, "frames=1"], "frames must be at least 2, got 1"),
+        ("rollout", [*ROLLOUT, "scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
+        ("rollout", [*ROLLOUT, "scene=null"], "scene must be given, or data and episode instead, got None; for"),
+        ("rollout", [*ROLLOUT, "device=abacus"], "device must be auto, cpu or cuda[:index], got 'abacus'"),
+        ("rollout", [*ROLLOUT, "device=cuda:77"], "device must exist, got 'cuda:77' with"),
+        ("rollout", [*ROLLOUT, "weights=none"], "weights must be an existing file, got none; write one with python -m"),
+        ("evaluate", [*EVALUATE, "scenes=0"], "scenes must be a finite number > 0, got 0"),
+        ("evaluate", [*EVALUATE, "split=moon"], "split must be one of train, validation, test, got 'moon'"),
+        (
+            "evaluate",
+            [*EVALUATE, "data=nowhere"],
+            "manifest.json must be the manifest of a data set, got no such file;",
+        ),
+        ("render", ["rollout=none.vtkhdf"], "rollout must be an existing file, got none.vtkhdf"),
+        ("render", ["rollout=scene.yaml"], "got scene.yaml"),
+    ],
+)
+def test_values(
+    place: Place, command: str, arguments: list[str], message: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unknown keys, wrong types, negative and NaN numbers, unknown materials and missing files are named."""
+    check(place, command, arguments, message, capsys, monkeypatch)
+    assert not place.path("made").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (SCENE.replace("[0.5, 0.8, 0.5]", "[0.5, 0.45, 0.5]"), "particles inside obstacle_0_cone; move or shrink the"),
+        (SCENE.replace("[0.5, 0.8, 0.5]", "[0.5, 0.02, 0.5]"), "must lie between the walls, which are 3 cells"),
+        (SCENE.replace("water", "lava"), "groups[0].material must be one of water, sand, snow, got 'lava'"),
+        (SCENE.replace("size: 0.05", "size: -0.05"), "groups[0].size must be finite and > 0, got -0.05"),
+        (SCENE.replace("size: 0.05", "size: .nan"), "groups[0].size must be finite and > 0, got nan"),
+        (SCENE.replace("size: 0.05", "size: large"), "groups[0].size must be"),
+        (SCENE.replace("material: water", "materials: water"), "groups[0].materials is not a known key; did you mean"),
+        (SCENE.replace("cone", "torus"), "obstacles[0].shape must be one of half_box, square, half_sphere, cone, "),
+        (SCENE.replace("groups:", "groups: ["), "scene.yaml must be a YAML file"),
+        ("", "must be a mapping of keys to values, got None"),
+        (SCENE.replace("shape: cone, size: 0.3", "mesh: none.obj"), "obstacles[0].mesh must be an existing file, got"),
+        (SCENE.replace("shape: cone, size: 0.3", "mesh: empty.obj"), "obstacles[0].mesh must"),
+        (SCENE.replace("shape: cone, size: 0.3", "mesh: points.obj"), "obstacles[0].mesh must"),
+        (SCENE.replace("shape: cone, size: 0.3", "mesh: scene.yaml"), "obstacles[0].mesh must end in one of .stl, "),
+        (
+            SCENE.replace("shape: cone, size: 0.3", "mesh: solid.obj").replace("[0.5, 0.4, 0.5]", "[0.4, 0.7, 0.4]"),
+            "particles inside solid; move or shrink the group or the obstacle",
+        ),
+    ],
+)
+def test_scenes(place: Place, text: str, message: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scene file that cannot be simulated is refused with the entry that is wrong in it, meshes included."""
+    place.path("empty.obj").write_text("")
+    place.path("points.obj").write_text("v 0 0 0\nv 1 0 0\n")
+    place.path("solid.obj").write_text(TETRAHEDRON)
+    place.scene(text)
+    check(place, "rollout", ROLLOUT, message, capsys, monkeypatch)
+    assert not place.path("made").exists()
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-700])
+
+
+def alter(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[700] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (truncate, " bytes, got "),
+        (alter, ": it was altered; delete it and run the generator again"),
+        (Path.unlink, " is listed in the manifest but missing; run the generator again"),
+    ],
+    ids=["truncated", "altered", "missing"],
+)
+def test_damaged_shards(
+    place: Place,
+    command: str,
+    damage: Callable[[Path], None],
+    message: str,
+    capsys: Capture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Training and evaluation stop at a damaged shard and name it; a cut tar is never read as fewer episodes."""
+    split = "train" if command == "train" else "validation"
+    for shard in place.path("data").glob(f"{split}-*.tar"):
+        damage(shard)
+    arguments = place.train(run="other") if command == "train" else EVALUATE
+    check(place, command, arguments, message, capsys, monkeypatch)
+    assert not place.path("other/checkpoints").exists() and not place.path("made").exists()
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"schema_version": 99}, "schema_version must be 1, got 99"),
+        ({"shards": "none"}, "shards must be a list, got 'none'"),
+        ({"invented": 1}, "invented is not a known key"),
+    ],
+)
+def test_data_of_another_schema(
+    place: Place,
+    command: str,
+    change: dict[str, object],
+    message: str,
+    capsys: Capture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A manifest of another version, or one that makes no sense, is refused before any shard is opened."""
+    place.edit_manifest(**change)
+    arguments = place.train(run="other") if command == "train" else EVALUATE
+    check(place, command, arguments, message, capsys, monkeypatch)
+    assert not place.path("other").exists() and not place.path("made").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["network.width=16"], "network.width must be 8 to go on with"),
+        (["network.materials=[snow,sand,water]"], "network.materials must be ['water', 'sand', 'snow'] to go on with"),
+        (["training.noise_std=0.01"], "training.noise_std must be 0.000848528 to go on with"),
+        (["dataset.frames=7"], "holds another data set: frames is 6 there, 7 is asked for"),
+    ],
+)
+def test_checkpoint_of_another_configuration(
+    place: Place, arguments: list[str], message: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run is not gone on with under another network, noise or data set."""
+    check(place, "train", place.train(*arguments), message, capsys, monkeypatch)
+
+
+@pytest.mark.parametrize("command", ["train", "export"])
+def test_damaged_checkpoint(place: Place, command: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cut checkpoint is named; weights that were exported earlier stay."""
+    truncate(place.path("run/checkpoints/last.ckpt"))
+    arguments = (
+        place.train() if command == "train" else ["checkpoint=run/checkpoints/last.ckpt", "out=weights.safetensors"]
+    )
+    check(place, command, arguments, "checkpoint must be a whole checkpoint file, got", capsys, monkeypatch)
+
+
+def test_checkpoint_of_another_project(place: Place, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of torch.save that is no checkpoint of ours is refused."""
+    torch.save({"state_dict": {}}, place.path("foreign.ckpt"))
+    message = "checkpoint must be one of python -m hgn.train, got foreign.ckpt"
+    check(place, "export", ["checkpoint=foreign.ckpt", "out=weights.safetensors"], message, capsys, monkeypatch)
+
+
+@pytest.mark.parametrize(("command", "arguments"), [("rollout", ROLLOUT), ("evaluate", EVALUATE)])
+@pytest.mark.parametrize("case", ["another network", "truncated", "frame rate", "material"])
+def test_weights(
+    place: Place, command: str, arguments: list[str], case: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Weights that are cut, or of another network, frame rate or materials than what they are used on, are refused."""
+    path = place.path("weights.safetensors")
+    if case == "truncated":
+        truncate(path)
+        message = "weights must be a safetensors file, got weights.safetensors"
+    elif case == "another network":
+        network, _ = load_weights(path)
+        save_weights(path, network, WeightsInfo(network_of(torch.float32).config, 60.0, 1 / 64))
+        message = "these are the weights of another network"
+    elif case == "frame rate":
+        network, info = load_weights(path)
+        save_weights(path, network, WeightsInfo(info.network, 30.0, 1 / 64))
+        message = "data frame_rate_hz must be the weights' 30.0, got 60.0; take a data set or weights of the same"
+        if command == "rollout":
+            arguments = [*ROLLOUT, "scene=null", "data=data", "episode=validation-000000"]
+    else:
+        network = network_of(torch.float32, materials=("snow",))
+        save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64))
+        message = "material must be one of the network's (snow), got "
+    check(place, command, arguments, message, capsys, monkeypatch)
+    assert not place.path("made").exists()
+
+
+def test_diverging_weights(place: Place, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rollout that flies apart says at which frame, and leaves an earlier rollout as it was."""
+    network = network_of(torch.float32)
+    network.normaliser.set("acceleration", torch.full((3,), 5.0), torch.ones(3), 0.0)
+    save_weights(place.path("weights.safetensors"), network, WeightsInfo(network.config, 60.0, 1 / 64))
+    place.path("made").mkdir()
+    place.path("made/rollout.vtkhdf").write_bytes(b"an earlier one")
+    message = "weights must keep the simulation together, got weights.safetensors: the simulation diverged at frame 1:"
+    check(place, "rollout", ROLLOUT, message, capsys, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("rollout", [*ROLLOUT, "out=scene.yaml/rollout.vtkhdf"]),
+        ("rollout", [*ROLLOUT, "out=data"]),
+        ("evaluate", [*EVALUATE, "json=scene.yaml/errors.json"]),
+        ("export", ["checkpoint=run/checkpoints/last.ckpt", "out=data"]),
+        ("train", ["run=scene.yaml"]),
+    ],
+)
+def test_output_that_is_in_the_way(
+    place: Place, command: str, arguments: list[str], capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An output path that leads through a file, or is a folder where a file is to be, is named."""
+    before = content(place.folder)
+    if command == "train":
+        arguments = place.train(*arguments)
+    code, line = refused(command, arguments, capsys, monkeypatch)
+    assert code in (EXIT_INPUT, EXIT_MACHINE) and ("scene.yaml" in line or "data" in line)
+    assert content(place.folder) == before
+
+
+def test_errors_file_makes_its_folder(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder of json=… is made, as those of the other outputs are: an evaluation is not lost at its end."""
+    monkeypatch.setattr(sys, "argv", ["evaluate", *EVALUATE])
+    with pytest.raises(SystemExit) as raised:
+        run_command(evaluate.main, "evaluate")
+    assert raised.value.code == 0 and json.loads(place.path("made/errors.json").read_text())["rows"]
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "message"),
+    [
+        (
+            "hgn.train",
+            ["+training.colour=red"],
+            "error: training.colour is not a known key; known keys: maximum_updates,",
+        ),
+        (
+            "hgn.rollout",
+            ROLLOUT,
+            "error: scene.yaml: groups[0] (cube of water) must be clear of closed obstacles, got ",
+        ),
+        ("hgn.evaluate", EVALUATE, "error: data/validation-000000-000001.tar must have "),
+    ],
+)
+def test_as_processes(place: Place, module: str, arguments: list[str], message: str) -> None:
+    """Started as a person would, each command ends with exit code 2 and that one line on standard error alone."""
+    place.scene(SCENE.replace("[0.5, 0.8, 0.5]", "[0.5, 0.45, 0.5]"))
+    for shard in place.path("data").glob("validation-*.tar"):
+        truncate(shard)
+    before = content(place.folder)
+    done = subprocess.run(
+        [sys.executable, "-m", module, *arguments],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == EXIT_INPUT and done.stdout == "", done.stderr
+    assert done.stderr.startswith(message) and done.stderr.count("\n") == 1
+    assert content(place.folder) == before
