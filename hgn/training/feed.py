@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
 from lightning.pytorch import LightningDataModule, Trainer
@@ -11,11 +13,12 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch, make_batch
-from hgn.data.order import Cursor, SampleOrder
+from hgn.data.order import Cursor, Sample, SampleOrder
 from hgn.data.reader import EpisodeStore
 from hgn.schema import ConfigError
 
 SHARED_FOLDER_PATIENCE_S = 300.0
+BATCHES_AHEAD = 2
 
 
 class Feed(LightningDataModule):
@@ -42,10 +45,18 @@ class Feed(LightningDataModule):
             self.training.seed, self.training.batch_scenes, self._published, self.cursor, rank, world_size
         )
         history, materials = self.network.velocity_history, self.network.materials
-        while True:
-            samples = order.next_batch()
+
+        def read(samples: Sequence[Sample], cursor: Cursor) -> Batch:
             pairs = [(self.store.episodes[sample.episode], sample.frame) for sample in samples]
-            yield make_batch(pairs, history, materials, [sample.seed for sample in samples], order.cursor)
+            return make_batch(pairs, history, materials, [sample.seed for sample in samples], cursor)
+
+        # The order may have to ask other ranks, so it stays in this thread; reading runs ahead in another.
+        with ThreadPoolExecutor(1) as executor:
+            waiting: deque[Future[Batch]] = deque()
+            while True:
+                while len(waiting) < BATCHES_AHEAD:
+                    waiting.append(executor.submit(read, order.next_batch(), order.cursor))
+                yield waiting.popleft().result()
 
     def _published(self, epoch: int) -> list[int]:
         """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""
