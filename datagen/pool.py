@@ -22,7 +22,8 @@ from hgn.schema import ConfigError
 
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
 _GPU_SCENES_PER_LAUNCH = 64
-_GPU_FIRST_LAUNCH = 8  # small, so that training can start early
+_GPU_FIRST_LAUNCH = 2  # small, so that training can start early
+_LAUNCH_GROWTH = 8  # from one launch to the next, up to the full size
 _MAXIMUM_MAKERS = 8
 
 
@@ -83,7 +84,7 @@ class Pool:
     ) -> None:
         self._config, self._writer, self._progress = config, writer, progress
         self._plan, self._backend, self._should_stop = plan, backend or Backend(), should_stop
-        self._launched = False
+        self._launch_size = plan.first_launch
         self._deaths_in_a_row = 0
         self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
 
@@ -150,11 +151,11 @@ class Pool:
             if made.task.key in self._alone:
                 self._ready.remove(made)
                 return [made]
-        size = self._plan.scenes_per_launch if self._launched else self._plan.first_launch
+        size = self._launch_size
         more = self._todo or any(maker.tasks for maker in self._makers)
         if not self._ready or (more and len(self._ready) < size):
             return []
-        self._launched = True
+        self._launch_size = min(_LAUNCH_GROWTH * size, self._plan.scenes_per_launch)
         batch, self._ready = self._ready[:size], self._ready[size:]
         return batch
 
@@ -165,6 +166,8 @@ class Pool:
             try:
                 message = worker.connection.recv()
             except (EOFError, ConnectionResetError):
+                if self._should_stop():  # a signal to the whole process group ends workers too
+                    raise Stopped from None
                 self._replace(worker)
             else:
                 self._handle(worker, *message)

@@ -143,7 +143,7 @@ def _make_scenes(connection: Connection, send: _Sender, config: SceneConfig, bac
     for task in _received(connection):
         try:
             scene = generate_scene(config, task.seed)
-            grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed)
+            grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size)
         except ConfigError as error:  # no room for the obstacles, say: another seed may do
             send("failed", task.key, str(error))
         else:

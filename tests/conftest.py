@@ -61,7 +61,7 @@ def stage(backend: Backend) -> Callable[[DatasetWriter, str, int], None]:
     def run(writer: DatasetWriter, split: str, index: int) -> None:
         config, task = writer.config, writer.task(split, index)
         scene = ballistic_solver.generate_scene(config.scene, task.seed)
-        grid = ballistic_solver.build_obstacle_grid((), scene.cell_size, 0)
+        grid = ballistic_solver.build_obstacle_grid((), scene.cell_size, 0, scene.domain_size)
         (result,) = ballistic_solver.simulate([scene], config.mpm, config.dataset.frames, 60.0)
         episode = make_episode(MadeScene(task, scene, grid), result, config, writer.config_hash)
         stage_episode(writer.folder, episode)

@@ -60,7 +60,7 @@ class InitialState:
             scene.position_N3,
             scene.velocity_N3,
             scene.material_N,
-            build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed),
+            build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size),
             scene.domain_size,
             scene.gravity,
         )

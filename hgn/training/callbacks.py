@@ -177,13 +177,11 @@ class Monitor(Callback):
         return values
 
     def _picture(self, trainer: Trainer, predicted_TN3: np.ndarray, episode: Episode, frames: int) -> None:
-        from hgn.picture import compare_picture, rollout_of_episode
+        from hgn.picture import compare_picture, rollout_of_episode, write_picture
 
         rollout = rollout_of_episode(episode, predicted_TN3)
         image = compare_picture(rollout, np.linspace(0, frames - 1, 4).astype(int).tolist())
-        folder = self.run / "pictures"
-        folder.mkdir(parents=True, exist_ok=True)
-        image.save(folder / f"rollout_{trainer.global_step:09d}.png")
+        write_picture(self.run / "pictures" / f"rollout_{trainer.global_step:09d}.png", image)
         logger = trainer.logger
         if isinstance(logger, TensorBoardLogger):
             pixels = np.asarray(image.convert("RGB"))

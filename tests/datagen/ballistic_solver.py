@@ -54,7 +54,9 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     )
 
 
-def build_obstacle_grid(obstacles: Sequence[Obstacle], cell_size: float, seed: int) -> ObstacleGrid:
+def build_obstacle_grid(
+    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: tuple[float, float, float]
+) -> ObstacleGrid:
     return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
 

@@ -140,6 +140,16 @@ def test_stop_keeps_what_is_staged(make_config: MakeConfig, backend: Backend, co
     assert len(simulated(control)) <= 9
 
 
+def test_workers_that_die_while_stopping(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """A signal to the whole process group ends workers as well: then none is replaced, and nothing is said of it."""
+    config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
+    (control / f"kill-{scene_seed(0, 'train', 0, 0)}").write_text("1")
+    recorder = Recorder()
+    with pytest.raises(Stopped), DatasetWriter(config) as writer:
+        Pool(config, writer, recorder, ONE, backend, lambda: (control / "simulated.log").exists()).run()
+    assert recorder.messages == [] and len(simulated(control)) == 1
+
+
 def test_fault_in_the_solver_ends_the_run(make_config: MakeConfig, backend: Backend, control: Path) -> None:
     """An exception that no scene is to blame for is not retried: it ends the run with the worker's traceback."""
     (control / "raise").touch()
@@ -179,7 +189,7 @@ def test_worker_plans() -> None:
     default = DatagenConfig()
     assert plan_workers(default, (), 8) == WorkerPlan(4, 2, 1, 1, 1)
     assert plan_workers(default, (), 1) == WorkerPlan(1, 1, 1, 1, 1)
-    assert plan_workers(default, ("0",), 8) == WorkerPlan(1, None, 7, 64, 8, ("0",))
+    assert plan_workers(default, ("0",), 8) == WorkerPlan(1, None, 7, 64, 2, ("0",))
     assert plan_workers(DatagenConfig(mpm=MpmConfig(device="cpu")), ("0",), 4).threads == 2
     many = DatagenConfig(dataset=DatasetConfig(workers=3), mpm=MpmConfig(scenes_per_launch=2))
     assert plan_workers(many, (), 8) == WorkerPlan(3, 2, 1, 2, 2)
