@@ -216,11 +216,12 @@ class TrainingConfig:
     grid_jitter: bool = True
     seed: int = 0
     accelerator: str = "auto"  # or cpu, gpu
-    devices: int | None = None  # none: one on a CPU, all GPUs of the machine
-    nodes: int = 1
+    devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
+    nodes: int | None = None  # machines; none: as launched, without a launcher one
     precision: str = "high"  # float32 matrix products: highest (float32), high (TF32 where there is one)
     minimum_episodes: int = 1  # training starts once that many training episodes are published
     generate: bool = True  # start the generator where the data set is missing or incomplete
+    maximum_skipped_updates: int = 100  # in a row, for gradients that are not finite; then training ends
     log_every: int = 50  # updates
     checkpoint_every: int = 1_000  # updates
     monitor_every: int = 100_000  # updates between measurements of one-step and rollout errors
@@ -236,8 +237,8 @@ class TrainingConfig:
             "batch_scenes",
             "learning_rate",
             "final_learning_rate",
-            "nodes",
             "minimum_episodes",
+            "maximum_skipped_updates",
             "log_every",
             "checkpoint_every",
             "monitor_every",
@@ -256,8 +257,9 @@ class TrainingConfig:
         )
         if self.maximum_minutes is not None:
             require_positive(self, "maximum_minutes")
-        if self.devices is not None:
-            require(self.devices >= 1, "devices", "at least 1", self.devices)
+        for name in ("devices", "nodes"):
+            if getattr(self, name) is not None:
+                require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
 
 
 @dataclass(frozen=True)

@@ -30,15 +30,17 @@ from hgn.provenance import provenance
 from hgn.schema import ConfigError, from_mapping, to_mapping
 from hgn.training.checkpoint import DataInfo, check_checkpoint, cursor_of_checkpoint, read_checkpoint
 from hgn.training.generator import Generator
-from hgn.training.launch import check_processes, device_count, first_rank
+from hgn.training.launch import default_run, first_rank, layout
 from hgn.training.stop import StopRequest
 
 
 def main(mapping: dict[str, Any]) -> int:
     """Trains as the resolved configuration says; returns the exit code."""
-    mapping.pop("name", None)
+    name = mapping.pop("name", "unnamed")
+    if mapping.get("run") is None:
+        mapping["run"] = str(default_run(name))
     config = from_mapping(TrainConfig, mapping)
-    check_processes(config.training)
+    layout(config.training)
     run = Path(config.run)
     if EpisodeStore.available(config.dataset.folder):
         require_same_dataset(Manifest.load(config.dataset.folder).config, config.datagen, config.dataset.folder)
@@ -73,7 +75,10 @@ def _fit(
 
     from hgn.training.callbacks import Checkpoints, LogLines, Monitor, Stopper
     from hgn.training.feed import Feed
+    from hgn.training.gradients import GradientGuard
     from hgn.training.module import TrainingModule
+    from hgn.training.ranks import SameStart, gradient_averaging
+    from hgn.training.tensorboard import FinalMetrics
 
     training = config.training
     data = DataInfo(store.manifest.config_hash, config.dataset.frame_rate_hz, config.scene.cell_size)
@@ -89,14 +94,18 @@ def _fit(
 
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every)
     monitor = Monitor(run, store, Path(config.dataset.folder), stop, checkpoints)
-    lines = LogLines(run, monitor, training.log_every, training.maximum_updates, _published_text(config, generator))
+    guard = GradientGuard(training.maximum_skipped_updates)
+    lines = LogLines(run, monitor, guard, feed, _published_text(config, generator))
+    final = FinalMetrics(to_mapping(config), monitor.last, stop)
+    devices, nodes = layout(training)
     trainer = Trainer(
         accelerator=training.accelerator,
-        devices=device_count(training),
-        num_nodes=training.nodes,
+        devices=devices,
+        num_nodes=nodes,
+        strategy=gradient_averaging() if devices * nodes > 1 else "auto",
         max_steps=training.maximum_updates,
         max_epochs=-1,
-        callbacks=[lines, monitor, checkpoints, Stopper(stop, checkpoints)],
+        callbacks=[SameStart(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
         logger=TensorBoardLogger(run, name="", version="tensorboard"),
         default_root_dir=run,
         enable_checkpointing=False,
@@ -108,7 +117,8 @@ def _fit(
     trainer.fit(module, feed, ckpt_path=checkpoint[0] if checkpoint else None, weights_only=True)
     if trainer.is_global_zero:
         _report(config, run, trainer.global_step, monitor.last, stop)
-    return stop.exit_code
+    # a signal that came after the last update changed nothing
+    return 0 if trainer.global_step >= training.maximum_updates else stop.exit_code
 
 
 def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Cursor]:

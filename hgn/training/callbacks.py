@@ -13,15 +13,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm import tqdm
 
 from hgn.data.reader import EpisodeStore
 from hgn.data.select import first_episodes
 from hgn.files import sync_folder, temporary_path
+from hgn.picture import rollout_of_episode
 from hgn.progress import bar
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.scene.episode import Episode
@@ -31,12 +30,14 @@ from hgn.training.errors import (
     frame_batches,
     network_predictor,
     one_step_errors,
-    position_mse,
+    rollout_errors,
     trivial_predictors,
 )
-from hgn.training.feed import agreed_count
+from hgn.training.feed import Feed, agreed_count
+from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
+from hgn.training.tensorboard import show_rollout
 
 
 class Checkpoints(Callback):
@@ -168,65 +169,61 @@ class Monitor(Callback):
             predicted = simulator.rollout([InitialState.of_episode(episode) for episode in episodes], frames)
         except DivergenceError as error:
             return {"rollout/finished": 0.0, "rollout/frames": float(error.frame)}
-        mse_T = np.mean(
-            [position_mse(p, e.position_TN3[:frames]) for p, e in zip(predicted, episodes, strict=True)], axis=0
-        )
-        values = {f"rollout/mse_frame_{n}": float(mse_T[n]) for n in REPORTED_FRAMES if n < frames}
-        values |= {"rollout/finished": 1.0, "rollout/frames": float(frames), "rollout/mse": float(mse_T.mean())}
-        self._picture(trainer, predicted[0], episodes[0], frames)
+        error_T = rollout_errors(predicted, episodes)
+        values = {f"rollout/mse_frame_{n}": float(error_T["all"][n]) for n in REPORTED_FRAMES if n < frames}
+        values |= {"rollout/finished": 1.0, "rollout/frames": float(frames)}
+        for name, mse_T in error_T.items():
+            values["rollout/mse" if name == "all" else f"rollout/mse_{name}"] = float(mse_T.mean())
+        show_rollout(trainer, self.run / "pictures", rollout_of_episode(episodes[0], predicted[0]), error_T)
         return values
-
-    def _picture(self, trainer: Trainer, predicted_TN3: np.ndarray, episode: Episode, frames: int) -> None:
-        from hgn.picture import compare_picture, rollout_of_episode, write_picture
-
-        rollout = rollout_of_episode(episode, predicted_TN3)
-        image = compare_picture(rollout, np.linspace(0, frames - 1, 4).astype(int).tolist())
-        write_picture(self.run / "pictures" / f"rollout_{trainer.global_step:09d}.png", image)
-        logger = trainer.logger
-        if isinstance(logger, TensorBoardLogger):
-            pixels = np.asarray(image.convert("RGB"))
-            logger.experiment.add_image("rollout", pixels, trainer.global_step, dataformats="HWC")
 
     def _interrupted(self, trainer: Trainer) -> bool:
         return bool(trainer.strategy.reduce_boolean_decision(self.stop.signal is not None, all=False))
 
 
 class LogLines(Callback):
-    """Loss, learning rate and speed, to TensorBoard, metrics.jsonl and a progress bar."""
+    """Loss, learning rate and speed, to TensorBoard, metrics.jsonl and a progress bar.
 
-    def __init__(self, run: Path, monitor: Monitor, every: int, maximum_updates: int, published: Callable[[], str]):
-        self.run, self.monitor, self.every, self.maximum_updates = run, monitor, every, maximum_updates
-        self.published = published
+    The loss is the mean over all ranks; speed, waiting for data and GPU memory are those of rank 0.
+    """
+
+    def __init__(self, run: Path, monitor: Monitor, guard: GradientGuard, feed: Feed, published: Callable[[], str]):
+        self.run, self.monitor, self.guard, self.feed, self.published = run, monitor, guard, feed, published
         self._bar: tqdm[Any] | None = None
-        self._time, self._update = time.monotonic(), 0
+        self._time, self._update, self._waited_s = time.monotonic(), 0, 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._time, self._update = time.monotonic(), trainer.global_step
+        self._time, self._update, self._waited_s = time.monotonic(), trainer.global_step, self.feed.waited_s
         if trainer.is_global_zero:
-            self._bar = bar("training", total=self.maximum_updates, initial=trainer.global_step, unit="update")
+            total = self.feed.training.maximum_updates
+            self._bar = bar("training", total=total, initial=trainer.global_step, unit="update")
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         assert isinstance(pl_module, TrainingModule)
-        if trainer.global_step % self.every:
+        if trainer.global_step % pl_module.training_config.log_every:
             return
-        loss_sum, count = pl_module.loss_sum.tolist()
+        loss_sum, count = trainer.strategy.reduce(pl_module.loss_sum.clone(), reduce_op="sum").tolist()
         pl_module.loss_sum.zero_()
-        now = time.monotonic()
-        speed = (trainer.global_step - self._update) / (now - self._time)
-        self._time, self._update = now, trainer.global_step
-        values = {
-            "loss": loss_sum / count,
+        gradients = self.guard.take(trainer.global_step)
+        now, waited_s = time.monotonic(), self.feed.waited_s
+        seconds = now - self._time
+        speed = (trainer.global_step - self._update) / seconds
+        values = {"loss": loss_sum / count} if count else {}
+        values |= gradients | {
             "learning_rate": float(trainer.optimizers[0].param_groups[0]["lr"]),
             "updates_per_second": speed,
             "scenes_per_second": speed * pl_module.training_config.batch_scenes * trainer.world_size,
+            "data_wait_share": (waited_s - self._waited_s) / seconds,
+            "shards": float(len(self.feed.store.manifest.shards_of("train"))),
             "episodes": float(pl_module.cursor.episodes),
             "epoch": float(pl_module.cursor.epoch),
         }
+        self._time, self._update, self._waited_s = now, trainer.global_step, waited_s
         if pl_module.device.type == "cuda":
             values["gpu_memory_gb"] = torch.cuda.max_memory_allocated() / 1e9
         log(trainer, self.run, values)
         if self._bar is not None:
-            notes = f"loss {values['loss']:.3f}"
+            notes = f"loss {values.get('loss', math.nan):.3f}"
             if "one_step_gain/validation" in self.monitor.last:
                 notes += f", {self.monitor.last['one_step_gain/validation']:.2f}x below trivial"
             self._bar.set_postfix_str(f"{notes}, {self.published()}", refresh=False)

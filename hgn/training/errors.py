@@ -15,6 +15,7 @@ import torch
 from hgn.data.batch import Batch, make_batch
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.scene.episode import Episode
+from hgn.scene.material import MATERIALS
 
 REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
 Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
@@ -118,3 +119,19 @@ def one_step_errors(
 def position_mse(predicted_TN3: np.ndarray, reference_TN3: np.ndarray) -> np.ndarray:
     """Mean squared distance of the particles at each frame, float64 [T]."""
     return ((predicted_TN3.astype(np.float64) - reference_TN3) ** 2).sum(-1).mean(-1)
+
+
+def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
+    """Position MSE at each frame, mean over scenes, float64 [T]: `all`, and each material over the scenes that have it.
+
+    predicted: positions [T, N, 3] of each episode, all of T frames.
+    """
+    curves: dict[str, list[np.ndarray]] = {"all": []}
+    for path_TN3, episode in zip(predicted, episodes, strict=True):
+        reference_TN3 = episode.position_TN3[: len(path_TN3)]
+        curves["all"].append(position_mse(path_TN3, reference_TN3))
+        for index in np.unique(episode.material_N):
+            of_material_N = episode.material_N == index
+            mse_T = position_mse(path_TN3[:, of_material_N], reference_TN3[:, of_material_N])
+            curves.setdefault(MATERIALS[index], []).append(mse_T)
+    return {name: np.mean(mse, axis=0) for name, mse in curves.items()}

@@ -24,12 +24,21 @@ BATCHES_AHEAD = 2
 class Feed(LightningDataModule):
     """Endless batches in the deterministic order; each epoch sees what was published when it began."""
 
-    def __init__(self, store: EpisodeStore, network: NetworkConfig, training: TrainingConfig) -> None:
+    def __init__(
+        self,
+        store: EpisodeStore,
+        network: NetworkConfig,
+        training: TrainingConfig,
+        batches_ahead: int = BATCHES_AHEAD,
+    ) -> None:
         super().__init__()
+        assert batches_ahead >= 0
         self.store = store
         self.network = network
         self.training = training
+        self.batches_ahead = batches_ahead  # read while another is trained on; 0: read when asked for
         self.cursor = Cursor()  # where to begin; set from the checkpoint on a resume
+        self.waited_s = 0.0  # time that the training has waited for a batch
 
     def train_dataloader(self) -> DataLoader[Batch]:
         # The windows are memory-mapped and small: a worker process would cost more than it saves.
@@ -54,9 +63,12 @@ class Feed(LightningDataModule):
         with ThreadPoolExecutor(1) as executor:
             waiting: deque[Future[Batch]] = deque()
             while True:
-                while len(waiting) < BATCHES_AHEAD:
+                started = time.monotonic()
+                while len(waiting) <= self.batches_ahead:
                     waiting.append(executor.submit(read, order.next_batch(), order.cursor))
-                yield waiting.popleft().result()
+                batch = waiting.popleft().result()
+                self.waited_s += time.monotonic() - started
+                yield batch
 
     def _published(self, epoch: int) -> list[int]:
         """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""

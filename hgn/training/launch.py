@@ -1,17 +1,22 @@
-"""How many processes train, and which of them this is: launchers say so in environment variables.
+"""How many processes train, which of them this is, and the run's folder: launchers say so in environment variables.
 
-torchrun sets RANK and WORLD_SIZE, srun sets SLURM_PROCID and SLURM_NTASKS, Lightning's own launcher, which starts
-the other processes of a machine itself, sets LOCAL_RANK and NODE_RANK in them.
+torchrun sets RANK, WORLD_SIZE and LOCAL_WORLD_SIZE, srun sets SLURM_PROCID, SLURM_NTASKS and SLURM_NNODES,
+Lightning's own launcher, which starts the other processes of a machine itself, sets LOCAL_RANK and NODE_RANK in them.
 """
 
 from __future__ import annotations
 
 import os
+import re
+from pathlib import Path
 
 import torch
 
 from hgn.config import TrainingConfig
 from hgn.schema import ConfigError, require
+
+RUN_VARIABLE = "HGN_RUN"
+_RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
 def first_rank() -> bool:
@@ -22,40 +27,67 @@ def first_rank() -> bool:
     return all(os.environ.get(name, "0") == "0" for name in ("SLURM_PROCID", "NODE_RANK", "LOCAL_RANK"))
 
 
-def device_count(training: TrainingConfig) -> int:
-    """Processes on each machine, one for each device.
+def default_run(name: str) -> Path:
+    """The run's folder where the configuration names none; the same in all processes and after every restart.
 
-    Raises: ConfigError when there are not as many GPUs as asked for.
+    In runs/, the first of these that there is: HGN_RUN (a path may be given too), torchrun's run id (--rdzv-id),
+    `name` with Slurm's job id (which a requeued job keeps), `name`. So two jobs do not meet in one folder by accident.
     """
+    torchrun_id = os.environ.get("TORCHELASTIC_RUN_ID", "none")  # none: no id was given
+    if _RANDOM_ID.fullmatch(torchrun_id):
+        torchrun_id = "none"  # torchrun --standalone makes a new one at each start: nothing could go on from there
+    if os.environ.get(RUN_VARIABLE):
+        return Path("runs", os.environ[RUN_VARIABLE])
+    if torchrun_id != "none":
+        return Path("runs", re.sub(r"[^\w.-]+", "-", torchrun_id))
+    if "RANK" not in os.environ and _inside_slurm_step() and "SLURM_JOB_ID" in os.environ:
+        return Path("runs", f"{name}-{os.environ['SLURM_JOB_ID']}")
+    return Path("runs", name)
+
+
+def layout(training: TrainingConfig) -> tuple[int, int]:
+    """(processes on each machine, machines): as configured, else as launched, else all GPUs of one machine.
+
+    Raises: ConfigError when there are not as many GPUs, or the launcher started another number of processes.
+    """
+    launched = _launched()
+    devices, nodes = training.devices, training.nodes
+    if launched is not None:
+        devices, nodes = devices or launched[0], nodes or launched[1]
+    devices, nodes = _devices(training.accelerator, devices), nodes or 1
+    if launched is not None and devices * nodes != launched[0] * launched[1]:
+        # each process would train alone and write over the others' checkpoints, or wait for ever
+        raise ConfigError(
+            f"training.devices x training.nodes must be the {launched[0] * launched[1]} processes that the launcher "
+            f"started, got {devices} x {nodes}; leave both out, or set training.devices to the processes of one "
+            "machine and training.nodes to the number of machines, and under Slurm start one task for each device "
+            "with srun"
+        )
+    return devices, nodes
+
+
+def _devices(accelerator: str, wanted: int | None) -> int:
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    require(training.accelerator != "gpu" or gpus > 0, "training.accelerator", "auto or cpu without a GPU", "gpu")
-    if training.accelerator == "cpu" or gpus == 0:
-        return training.devices or 1
-    wanted = training.devices or gpus
+    require(accelerator != "gpu" or gpus > 0, "training.accelerator", "auto or cpu without a GPU", "gpu")
+    if accelerator == "cpu" or gpus == 0:
+        return wanted or 1
+    wanted = wanted or gpus
     require(wanted <= gpus, "training.devices", f"at most the {gpus} GPUs of this machine", wanted)
     return wanted
 
 
-def check_processes(training: TrainingConfig) -> None:
-    """The launcher started as many processes as the configuration counts on.
-
-    Otherwise each of them would train alone and write over the others' checkpoints, or wait for ever.
-    Raises: ConfigError.
-    """
-    started = _started_processes()
-    devices = device_count(training)
-    if started is not None and started != devices * training.nodes:
-        raise ConfigError(
-            f"training.devices x training.nodes must be the {started} processes that the launcher started, got "
-            f"{devices} x {training.nodes}; set training.devices to the processes of one machine and training.nodes "
-            "to the number of machines, and under Slurm start one task for each device with srun"
-        )
-
-
-def _started_processes() -> int | None:
+def _launched() -> tuple[int, int] | None:
+    """(processes on each machine, machines) that a launcher started."""
     if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
-        return int(os.environ["WORLD_SIZE"])
-    interactive = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # Lightning's rule: a shell, no job
-    if "SLURM_PROCID" in os.environ and "SLURM_NTASKS" in os.environ and not interactive:
-        return int(os.environ["SLURM_NTASKS"])
+        processes = int(os.environ["WORLD_SIZE"])
+        here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
+        return here, processes // here
+    if _inside_slurm_step():
+        processes, nodes = int(os.environ["SLURM_NTASKS"]), int(os.environ.get("SLURM_NNODES", "1"))
+        return processes // nodes, nodes
     return None
+
+
+def _inside_slurm_step() -> bool:
+    interactive = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # Lightning's rule: a shell, no job
+    return "SLURM_PROCID" in os.environ and "SLURM_NTASKS" in os.environ and not interactive

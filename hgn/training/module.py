@@ -29,7 +29,7 @@ class TrainingModule(LightningModule):
         self.training_config = training
         self.data = data
         self.cursor = Cursor()
-        # Sum of losses and number of updates since the last log line, kept on the device: no synchronisation.
+        # Sum of finite losses and their number since the last log line, kept on the device: no synchronisation.
         self.loss_sum: torch.Tensor
         self.register_buffer("loss_sum", torch.zeros(2), persistent=False)
 
@@ -52,16 +52,16 @@ class TrainingModule(LightningModule):
 
     def training_step(self, batch: Batch, batch_index: int) -> torch.Tensor:
         loss = self.loss(batch)
-        self.loss_sum += torch.stack([loss.detach(), torch.ones_like(loss)])
+        known = loss.detach()
+        self.loss_sum += torch.where(known.isfinite(), torch.stack([known, torch.ones_like(known)]), 0)
         assert batch.cursor is not None
         self.cursor = batch.cursor
         return loss
 
     def configure_optimizers(self) -> Any:
         config = self.training_config
-        # One launch instead of several for each group of tensors, where there is a GPU.
-        fused = self.device.type == "cuda"
-        optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=fused)
+        # One launch instead of several for each group of tensors; and only the fused kind can skip a step by itself.
+        optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=True)
         decay = (config.final_learning_rate / config.learning_rate) ** (1 / config.maximum_updates)
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda update: decay**update)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

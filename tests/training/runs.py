@@ -20,7 +20,7 @@ TRAINING = {
     "checkpoint_every": 5,
     "monitor_every": 6,
     "monitor_scenes": 2,
-    "monitor_rollout_frames": 4,
+    "monitor_rollout_frames": 0,
     "generate": False,
 }
 

@@ -20,12 +20,15 @@ from hgn import train
 from hgn.config import DatagenConfig, TrainingConfig
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.launch import check_processes, device_count, first_rank
+from hgn.training.launch import default_run, first_rank, layout
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = Path(__file__).with_name("ddp_program.py")
 ADAM_BETA_1 = 0.9
-LAUNCHER_VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "SLURM_NTASKS", "SLURM_JOB_NAME")
+LAUNCHER_VARIABLES = (
+    *("HGN_RUN", "RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "NODE_RANK", "TORCHELASTIC_RUN_ID"),
+    *("SLURM_PROCID", "SLURM_NTASKS", "SLURM_NNODES", "SLURM_JOB_NAME", "SLURM_JOB_ID"),
+)
 
 
 def free_port() -> int:
@@ -151,24 +154,66 @@ def test_launcher_and_configuration_agree(
         no_launcher.setenv(name, value)
     training = TrainingConfig(accelerator="cpu", devices=2, nodes=2)
     if accepted:
-        check_processes(training)
+        assert layout(training) == (2, 2)
     else:
         with pytest.raises(
             ConfigError, match=r"training\.devices x training\.nodes must be the \d processes .* 2 x 2;"
         ):
-            check_processes(training)
+            layout(training)
 
 
-def test_devices_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("variables", "expected"),
+    [
+        ({}, (1, 1)),
+        ({"RANK": "5", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "2"}, (2, 3)),
+        ({"RANK": "0", "WORLD_SIZE": "4"}, (4, 1)),
+        ({"SLURM_PROCID": "7", "SLURM_NTASKS": "8", "SLURM_NNODES": "2"}, (4, 2)),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8", "SLURM_NNODES": "2", "SLURM_JOB_NAME": "interactive"}, (1, 1)),
+        ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, (2, 2)),
+    ],
+)
+def test_layout_follows_the_launcher(
+    no_launcher: pytest.MonkeyPatch, variables: dict[str, str], expected: tuple[int, int]
+) -> None:
+    """Where the configuration leaves them open, devices and nodes are those that the launcher started."""
+    for name, value in variables.items():
+        no_launcher.setenv(name, value)
+    assert layout(TrainingConfig(accelerator="cpu")) == expected
+
+
+@pytest.mark.parametrize(
+    ("variables", "folder"),
+    [
+        ({}, "runs/small"),
+        ({"SLURM_JOB_ID": "4711"}, "runs/small"),  # a shell or a script inside a job, without srun
+        ({"SLURM_JOB_ID": "4711", "SLURM_PROCID": "3", "SLURM_NTASKS": "8"}, "runs/small-4711"),
+        ({"RANK": "1", "WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "none"}, "runs/small"),
+        ({"RANK": "1", "WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "night/one two"}, "runs/night-one-two"),
+        ({"RANK": "1", "TORCHELASTIC_RUN_ID": "5bd6a8f0-93a5-4c5b-9b8c-0a52b6cf3d11"}, "runs/small"),
+        ({"RANK": "0", "TORCHELASTIC_RUN_ID": "a", "SLURM_JOB_ID": "1", "SLURM_PROCID": "0"}, "runs/a"),
+        ({"HGN_RUN": "mine", "TORCHELASTIC_RUN_ID": "a", "SLURM_JOB_ID": "1", "SLURM_PROCID": "0"}, "runs/mine"),
+        ({"HGN_RUN": "/shared/mine"}, "/shared/mine"),
+    ],
+)
+def test_one_folder_a_run(no_launcher: pytest.MonkeyPatch, variables: dict[str, str], folder: str) -> None:
+    """All processes of a job, and its restarts, agree on the folder; two jobs get two. Our own variable comes first,
+    then torchrun's id (unless it is random, as --standalone makes it), then Slurm's."""
+    for name, value in variables.items():
+        no_launcher.setenv(name, value)
+    assert str(default_run("small")) == folder
+
+
+def test_devices_that_are_not_there(no_launcher: pytest.MonkeyPatch) -> None:
     """All GPUs are taken unless fewer are asked for; more than there are, or a GPU where there is none, is refused."""
     for gpus in (0, 4):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda gpus=gpus: gpus > 0)
-        monkeypatch.setattr(torch.cuda, "device_count", lambda gpus=gpus: gpus)
-        assert device_count(TrainingConfig()) == max(gpus, 1)
-        assert device_count(TrainingConfig(devices=3)) == 3
-        assert device_count(TrainingConfig(accelerator="cpu")) == 1
+        no_launcher.setattr(torch.cuda, "is_available", lambda gpus=gpus: gpus > 0)
+        no_launcher.setattr(torch.cuda, "device_count", lambda gpus=gpus: gpus)
+        assert layout(TrainingConfig()) == (max(gpus, 1), 1)
+        assert layout(TrainingConfig(devices=3)) == (3, 1)
+        assert layout(TrainingConfig(accelerator="cpu")) == (1, 1)
     with pytest.raises(ConfigError, match=r"training\.devices must be at most the 4 GPUs of this machine, got 5"):
-        device_count(TrainingConfig(devices=5))
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        layout(TrainingConfig(devices=5))
+    no_launcher.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match=r"training\.accelerator must be auto or cpu without a GPU, got 'gpu'"):
-        device_count(TrainingConfig(accelerator="gpu"))
+        layout(TrainingConfig(accelerator="gpu"))

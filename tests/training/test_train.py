@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from training.runs import metrics, train_mapping
 
-import hgn.training.stop
 from hgn import train
 from hgn.config import DatagenConfig
 from hgn.schema import ConfigError
@@ -43,46 +45,90 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
 
 
 def test_a_run_leaves_what_it_promises(data, tmp_path):
-    """Checkpoints, metrics with one-step and rollout errors of both splits, a picture, events, the resolved config."""
+    """Checkpoints, metrics with one-step and rollout errors of both splits, pictures, the resolved config; and in
+    TensorBoard loss, errors by material, rate, gradient norm, speed, waiting, shards, pictures, hyper-parameters."""
     run = tmp_path / "run"
-    assert train.main(train_mapping(data, run)) == 0
+    assert train.main(train_mapping(data, run, monitor_rollout_frames=4)) == 0
     checkpoint = read_checkpoint(run / "checkpoints" / "last.ckpt")
     assert checkpoint["hgn"]["updates"] == 12 and (run / "checkpoints" / "best.ckpt").is_file()
     records = metrics(run)
     keys = set().union(*records)
+    materials = [key.removeprefix("one_step/validation_") for key in keys if key.startswith("one_step/validation_")]
+    assert materials and set(materials) <= {"water", "sand", "snow"}
     for split in ("training", "validation"):
         assert {f"one_step/{split}", f"trivial/{split}_ballistic_motion", f"one_step_gain/{split}"} <= keys
-    assert {"loss", "learning_rate", "rollout/finished", "updates_per_second"} <= keys
-    rates = [record["learning_rate"] for record in records if "learning_rate" in record]
-    assert rates == pytest.approx([1e-3 * 0.1 ** (n / 12) for n in (4, 8, 12)])
-    assert list((run / "tensorboard").glob("events.*"))
+    scalars = {"loss", "learning_rate", "gradient_norm", "skipped_updates", "scenes_per_second", "data_wait_share"}
+    scalars |= {"shards", "episodes", "updates_per_second", "rollout/finished", "rollout/mse"}
+    scalars |= {f"rollout/mse_{name}" for name in materials}
+    assert scalars <= keys
+    lines = [record for record in records if "loss" in record]
+    assert [line["learning_rate"] for line in lines] == pytest.approx([1e-3 * 0.1 ** (n / 12) for n in (4, 8, 12)])
+    assert all(0 < line["gradient_norm"] < 1e3 and 0 <= line["data_wait_share"] <= 1 for line in lines)
+    assert all(line["shards"] == 4 and line["skipped_updates"] == 0 for line in lines)
     stored = yaml.safe_load((run / "config.yaml").read_text())
     assert stored["training"]["maximum_updates"] == 12 and stored["provenance"]["data_schema_version"] == 1
 
+    shown = EventAccumulator(str(run / "tensorboard"), size_guidance={"images": 0})
+    shown.Reload()
+    assert scalars | {f"one_step/validation_{name}" for name in materials} <= set(shown.Tags()["scalars"])
+    assert "final/one_step/validation" in shown.Tags()["scalars"]
+    assert set(shown.Tags()["images"]) == {"rollout/picture", "rollout/animation", "rollout/error_over_time"}
+    (_, animation) = shown.Images("rollout/animation")
+    assert animation.step == 12 and animation.encoded_image_string.startswith(b"GIF89a")
+    kinds = (("error", "png"), ("rollout", "gif"), ("rollout", "png"))
+    expected = {f"{kind}_{step:09d}.{ending}" for kind, ending in kinds for step in (6, 12)}
+    assert {path.name for path in (run / "pictures").iterdir()} == expected
+    content = shown.PluginTagToContent("hparams")
+    session = HParamsPluginData.FromString(content["_hparams_/session_start_info"]).session_start_info
+    assert session.hparams["training/learning_rate"].number_value == 1e-3
+    assert session.hparams["network/width"].number_value == 8
 
-def test_resume_equals_no_interruption(data, tmp_path):
-    """Stopped after 7 of 12 updates and started again, a run ends bitwise where an uninterrupted one does: weights,
-    optimiser, order, noise and jitter."""
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert train.main(train_mapping(data, whole)) == 0
 
-    original = hgn.training.stop.StopRequest.requested
-    calls = iter(range(100))
-    try:
-        hgn.training.stop.StopRequest.requested = property(lambda self: next(calls) >= 7)
-        train.main(train_mapping(data, cut))
-    finally:
-        hgn.training.stop.StopRequest.requested = original
-    stopped = read_checkpoint(cut / "checkpoints" / "last.ckpt")["hgn"]["updates"]
-    assert 0 < stopped < 12
-    assert train.main(train_mapping(data, cut)) == 0
-    expected, found = (read_checkpoint(run / "checkpoints" / "last.ckpt") for run in (whole, cut))
-    assert found["hgn"] == expected["hgn"]
-    for name, tensor in expected["state_dict"].items():
-        assert torch.equal(found["state_dict"][name], tensor), name
-    states = [c["optimizer_states"][0]["state"] for c in (expected, found)]
-    for index in states[0]:
-        assert torch.equal(states[0][index]["exp_avg_sq"], states[1][index]["exp_avg_sq"])
+def gradients_with_faults(monkeypatch: pytest.MonkeyPatch, faulty: Collection[int]) -> None:
+    """Puts one NaN into the gradient of some updates, before the callbacks see it."""
+    original = TrainingModule.on_after_backward
+
+    def on_after_backward(module):
+        original(module)
+        if module.global_step in faulty:
+            next(iter(module.network.parameters())).grad.view(-1)[0] = float("nan")
+
+    monkeypatch.setattr(TrainingModule, "on_after_backward", on_after_backward)
+
+
+def test_updates_without_a_finite_gradient_are_skipped(data, tmp_path, monkeypatch):
+    """One NaN in a gradient leaves weights and moments bitwise as they were, is counted, and the training goes on."""
+    before: dict[int, dict[str, torch.Tensor]] = {}
+    original = TrainingModule.on_train_batch_start
+
+    def remember(module, batch, index):
+        before[module.global_step] = {name: tensor.clone() for name, tensor in module.network.state_dict().items()}
+        return original(module, batch, index)
+
+    monkeypatch.setattr(TrainingModule, "on_train_batch_start", remember)
+    gradients_with_faults(monkeypatch, {2, 3, 9})
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run, maximum_skipped_updates=3)) == 0
+    changed = [
+        any(not torch.equal(before[n][name], before[n + 1][name]) for name in before[n]) for n in range(len(before) - 1)
+    ]
+    assert [n for n, moved in enumerate(changed) if not moved] == [2, 3, 9]
+    lines = [record for record in metrics(run) if "loss" in record]
+    assert [line["skipped_updates"] for line in lines] == [2, 2, 3]
+    assert all(np.isfinite(line["gradient_norm"]) and np.isfinite(line["loss"]) for line in lines)
+    state = read_checkpoint(run / "checkpoints" / "last.ckpt")["optimizer_states"][0]["state"]
+    assert {int(entry["step"]) for entry in state.values()} == {9}  # twelve updates, three of them skipped
+
+
+def test_training_ends_when_no_gradient_is_finite(data, tmp_path, monkeypatch):
+    """At the limit of updates skipped in a row the training ends with a message; the stored weights are finite."""
+    gradients_with_faults(monkeypatch, range(3, 100))
+    run = tmp_path / "run"
+    with pytest.raises(ConfigError, match="gradients must be finite, got 5 updates in a row without, up to update 8"):
+        train.main(train_mapping(data, run, maximum_skipped_updates=5))
+    stored = read_checkpoint(run / "checkpoints" / "last.ckpt")
+    assert stored["hgn"]["updates"] == 5
+    assert all(tensor.isfinite().all() for tensor in stored["state_dict"].values())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGINT])

@@ -1,0 +1,202 @@
+"""Order and resume: each sample once an epoch, and an interruption anywhere changes nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from training.runs import NETWORK, TRAINING, train_mapping
+
+from hgn import train
+from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
+from hgn.data.batch import Batch
+from hgn.data.order import Cursor, SampleOrder
+from hgn.data.reader import EpisodeStore
+from hgn.training.checkpoint import read_checkpoint
+from hgn.training.feed import Feed
+from hgn.training.module import TrainingModule
+from hgn.training.stop import StopRequest
+
+UPDATES = 16  # of 2 samples, where an epoch has 25
+FRAMES = st.lists(st.integers(2, 9), min_size=1, max_size=6)
+
+
+class Samples:
+    """The samples of an epoch as (episode, frame), in the order in which they were trained on."""
+
+    def __init__(self) -> None:
+        self.epochs: dict[int, list[tuple[int, int]]] = {}
+
+    def take(self, orders: Sequence[SampleOrder]) -> None:
+        """One global batch: the ranks' shares follow each other, and may run over the end of an epoch."""
+        cursor = orders[0].cursor
+        left = len(orders[0]._order) - cursor.position
+        for number, sample in enumerate(sample for order in orders for sample in order.next_batch()):
+            self.epochs.setdefault(cursor.epoch + (number >= left), []).append((sample.episode, sample.frame))
+        assert all(order.cursor == orders[0].cursor for order in orders)
+
+
+def ranks_of(
+    world_size: int, batch: int, published: Callable[[int], Sequence[int]], cursor: Cursor | None = None
+) -> list[SampleOrder]:
+    return [SampleOrder(5, batch, published, cursor, rank, world_size) for rank in range(world_size)]
+
+
+@settings(max_examples=80, deadline=None)
+@given(FRAMES, st.lists(st.tuples(st.integers(1, 8), st.integers(1, 3), st.integers(0, 7)), min_size=1, max_size=6))
+def test_each_sample_once_an_epoch_through_any_interruptions(
+    frames: list[int], starts: list[tuple[int, int, int]]
+) -> None:
+    """However often a training is interrupted, and on whatever number of ranks and batch size it goes on, each epoch
+    has every sample exactly once."""
+    total, seen, cursor = sum(frames) - len(frames), Samples(), Cursor()
+    for world_size, batch, batches in starts:
+        orders = ranks_of(world_size, min(batch, max(1, total // world_size)), lambda _: frames, cursor)
+        if world_size * orders[0].batch_scenes > total:
+            continue  # a batch of more than an epoch has its own test
+        for _ in range(batches):
+            seen.take(orders)
+        cursor = orders[0].cursor
+    expected = [(e, n) for e, count in enumerate(frames) for n in range(count - 1)]
+    for epoch, samples in seen.epochs.items():
+        if epoch < cursor.epoch:
+            assert sorted(samples) == expected
+        else:
+            assert len(set(samples)) == len(samples) and set(samples) <= set(expected)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.lists(st.integers(1, 3), min_size=1, max_size=6),
+    st.integers(1, 4),
+    st.lists(st.tuples(st.integers(1, 6), st.integers(0, 2)), min_size=1, max_size=8),
+)
+def test_an_epoch_keeps_the_revision_it_began_with(
+    growth: list[int], world_size: int, starts: list[tuple[int, int]]
+) -> None:
+    """While a data set grows at every look, and the training is interrupted at any batch, each epoch has exactly the
+    episodes that were published when it began, each sample once."""
+    published: list[int] = [4, 3, 5]
+    begun: dict[int, int] = {}
+    looks = iter(growth * 1000)
+
+    def look(epoch: int) -> list[int]:
+        if epoch not in begun:
+            published.extend([3] * next(looks))
+            begun[epoch] = len(published)
+        return list(published)
+
+    seen, cursor = Samples(), Cursor()
+    for batches, grown_meanwhile in starts:
+        published.extend([2] * grown_meanwhile)
+        orders = ranks_of(world_size, 1, look, cursor)
+        for _ in range(batches):
+            seen.take(orders)
+            published.extend([2] * grown_meanwhile)
+        cursor = orders[0].cursor
+    assert cursor.episodes == begun[cursor.epoch]
+    for epoch, samples in seen.epochs.items():
+        expected = [(e, n) for e, count in enumerate(published[: begun[epoch]]) for n in range(count - 1)]
+        if epoch < cursor.epoch:
+            assert sorted(samples) == expected
+        else:
+            assert len(set(samples)) == len(samples) and set(samples) <= set(expected)
+
+
+@pytest.fixture
+def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
+    config = make_config()
+    make_dataset(config)
+    return config
+
+
+def test_reading_ahead_changes_nothing(data: DatagenConfig) -> None:
+    """With 0 to 3 batches read ahead the batches are the same, bit by bit, and each carries the cursor after it, from
+    which a feed goes on with the next one."""
+    network, training = NetworkConfig(**NETWORK), TrainingConfig(**TRAINING)
+    store = EpisodeStore(data.dataset.folder, "train")
+
+    def batches(ahead: int, count: int, cursor: Cursor | None = None) -> list[Batch]:
+        feed = Feed(store, network, training, batches_ahead=ahead)
+        feed.cursor = cursor or Cursor()
+        return list(islice(feed.batches(), count))
+
+    expected = batches(0, 30)
+    for ahead in (1, 2, 3):
+        for batch, other in zip(expected, batches(ahead, 30), strict=True):
+            assert torch.equal(batch.window_WN3, other.window_WN3)
+            assert (batch.seeds_S, batch.cursor) == (other.seeds_S, other.cursor)
+    for ahead in range(4):
+        again = batches(ahead, 5, expected[16].cursor)
+        for batch, other in zip(expected[17:22], again, strict=True):
+            assert torch.equal(batch.window_WN3, other.window_WN3) and batch.seeds_S == other.seeds_S
+
+
+@pytest.fixture
+def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
+    """Makes the next start of a training stop once it has made that many updates in all."""
+    place: dict[str, Any] = {"update": None, "module": None}
+    original = TrainingModule.on_train_batch_start
+
+    def on_train_batch_start(module: TrainingModule, *arguments: Any) -> Any:
+        place["module"] = module
+        return original(module, *arguments)
+
+    def requested(_: StopRequest) -> bool:
+        module = place["module"]
+        return place["update"] is not None and module is not None and module.global_step >= place["update"]
+
+    monkeypatch.setattr(TrainingModule, "on_train_batch_start", on_train_batch_start)
+    monkeypatch.setattr(StopRequest, "requested", property(requested))
+    return lambda update: place.update(update=update, module=None)
+
+
+def assert_same(found: Any, expected: Any, where: str = "") -> None:
+    """Equal bit by bit, tensors inside containers included."""
+    if isinstance(expected, torch.Tensor):
+        assert torch.equal(found, expected), where
+    elif isinstance(expected, dict):
+        assert found.keys() == expected.keys(), where
+        for key, value in expected.items():
+            assert_same(found[key], value, f"{where}.{key}")
+    elif isinstance(expected, (list, tuple)):
+        assert len(found) == len(expected), where
+        for index, value in enumerate(expected):
+            assert_same(found[index], value, f"{where}[{index}]")
+    else:
+        assert found == expected, where
+
+
+def test_resume_equals_no_interruption(data: DatagenConfig, stop_at: Callable[[int | None], None]) -> None:
+    """Interrupted at any updates, once or several times, a training ends where an uninterrupted one does, bit by bit:
+    weights, both moments, learning rate and order; noise and jitter come from the samples' seeds, so they agree too."""
+
+    def trained(run: Path, stops: Sequence[int]) -> dict[str, Any]:
+        for stop in (*stops, None):
+            stop_at(stop)
+            assert train.main(train_mapping(data, run, maximum_updates=UPDATES, monitor_every=1000)) == 0
+            updates = read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"]
+            assert updates == (UPDATES if stop is None else stop)
+        return read_checkpoint(run / "checkpoints" / "last.ckpt")
+
+    with tempfile.TemporaryDirectory() as folder:
+        whole = trained(Path(folder) / "whole", [])
+    assert dataclasses.asdict(Cursor(1, 7, 5)) == whole["hgn"]["cursor"]
+
+    @settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+    @given(st.lists(st.integers(1, UPDATES - 1), min_size=1, max_size=2, unique=True).map(sorted))
+    def interrupted(stops: list[int]) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            found = trained(Path(folder) / "cut", stops)
+        for part in ("state_dict", "optimizer_states", "lr_schedulers", "hgn"):
+            assert_same(found[part], whole[part], part)
+
+    interrupted()
