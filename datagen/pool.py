@@ -152,8 +152,12 @@ class Pool:
                 self._ready.remove(made)
                 return [made]
         size = self._launch_size
-        more = self._todo or any(maker.tasks for maker in self._makers)
-        if not self._ready or (more and len(self._ready) < size):
+        unmade = [*self._todo, *(task for maker in self._makers for task in maker.tasks.values())]
+        if not self._ready or (unmade and len(self._ready) < size):
+            return []
+        # training waits for the first shards in order, so small launches must not overtake a scene still being made
+        growing = size < self._plan.scenes_per_launch
+        if growing and any(self._place(_task(item)) < self._place(self._ready[size - 1].task) for item in unmade):
             return []
         self._launch_size = min(_LAUNCH_GROWTH * size, self._plan.scenes_per_launch)
         batch, self._ready = self._ready[:size], self._ready[size:]

@@ -1,7 +1,8 @@
 """A deterministic stand-in for scenes and solver, quick enough to make whole data sets in tests.
 
 Loaded by name inside spawned workers. A file `simulated.log` in the working folder of a test records each key that
-was simulated; files named `kill-<seed>` and `fail-<seed>` there make the solver die or fail at that seed.
+was simulated; files named `kill-<seed>`, `fail-<seed>` and `late-<seed>` there make the solver die or fail at that
+seed, or its scene come late.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ def control(name: str) -> Path:
 def generate_scene(config: SceneConfig, seed: int) -> Scene:
     if control(f"refuse-{seed}").exists():
         raise ConfigError("no room for the obstacles")
+    if control(f"late-{seed}").exists():
+        time.sleep(0.5)
     generator = np.random.default_rng(seed)
     count = 3 + seed % 4
     return Scene(

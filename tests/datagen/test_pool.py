@@ -80,6 +80,15 @@ def test_batches(make_config: MakeConfig, backend: Backend, control: Path) -> No
     assert sorted(simulated(control)) == sorted(scene_seed(0, "train", i, 0) for i in range(9))
 
 
+def test_first_launch_waits_for_the_first_scenes(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """A scene that is quick to make does not overtake the first ones: training waits for the first shard."""
+    config = make_config(training_scenes=7, validation_scenes=0, test_scenes=0)
+    first, second = (scene_seed(0, "train", i, 0) for i in range(2))
+    (control / f"late-{first}").touch()
+    generate(config, backend, WorkerPlan(1, None, 3, 4, 2))
+    assert simulated(control)[:2] == [first, second]
+
+
 def test_killed_worker_is_replaced(make_config: MakeConfig, backend: Backend, control: Path) -> None:
     """A worker that is killed once costs a retry of the same seed, nothing else."""
     config = make_config(training_scenes=3, validation_scenes=0, test_scenes=0)
