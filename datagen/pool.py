@@ -133,7 +133,7 @@ class Pool:
 
     def _hand_out(self) -> None:
         for solver in self._solvers:
-            if solver.idle and (batch := self._next_batch()):
+            if solver.idle and (batch := self._next_batch(solver)):
                 solver.tasks.update((made.task.key, made) for made in batch)
                 solver.give(batch)
         ahead = 2 * self._plan.scenes_per_launch * self._plan.solvers
@@ -144,11 +144,13 @@ class Pool:
                 maker.tasks[task.key] = task
                 maker.give(task)
 
-    def _next_batch(self) -> list[MadeScene]:
+    def _next_batch(self, solver: Worker) -> list[MadeScene]:
         """The next scenes to simulate; empty when it is better to wait for more of them."""
         self._ready.sort(key=lambda made: self._place(made.task))
         for made in self._ready:
             if made.task.key in self._alone:
+                if solver.tasks:  # still being staged: alone means that no other can be to blame
+                    return []
                 self._ready.remove(made)
                 return [made]
         size = self._launch_size
