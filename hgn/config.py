@@ -14,6 +14,7 @@ from hgn.schema import ConfigError, require, require_non_negative, require_one_o
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 GROUP_SHAPES = ("cube", "sphere")
+NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 
 
 def config_directory() -> Path:
@@ -170,10 +171,11 @@ class DatagenConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The hierarchical graph network (paper sec. 3.1, 3.2). Lengths in domain units."""
+    """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
 
-    cell_size: float = 0.035  # R, the finest level
-    levels: int = 4  # L
+    kind: str = "hgn"  # or gns; or gns_particles, which sees obstacles as static particles
+    cell_size: float = 0.035  # R: the finest level; the connectivity radius of GNS
+    levels: int = 4  # L; GNS has one, the particles
     message_passing_steps: int = 4  # M, in each of the 2 L - 1 blocks
     width: int = 128  # latent and hidden
     velocity_history: int = 5  # m
@@ -181,8 +183,10 @@ class NetworkConfig:
     wall_distance_cells: float = 8.0  # d_max / R
     obstacle_features: bool = True
     materials: tuple[str, ...] = MATERIALS
+    maximum_neighbours: int | None = None  # of a particle of GNS, the nearest; none: all within R
 
     def __post_init__(self) -> None:
+        require_one_of(self, "kind", NETWORK_KINDS)
         require_positive(
             self,
             "cell_size",
@@ -196,6 +200,28 @@ class NetworkConfig:
         for i, name in enumerate(self.materials):
             material_index(name, f"materials[{i}]")
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
+        if self.kind == "hgn":
+            require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
+        else:
+            require(self.levels == 1, "levels", f"1 for {self.kind}: the particles themselves", self.levels)
+        if self.maximum_neighbours is not None:
+            require(self.maximum_neighbours >= 1, "maximum_neighbours", "at least 1", self.maximum_neighbours)
+        require(
+            not (self.obstacle_particles and self.obstacle_features),
+            "obstacle_features",
+            "false for gns_particles: its obstacles are particles",
+            True,
+        )
+
+    @property
+    def obstacle_particles(self) -> bool:
+        """Whether obstacles are static particles."""
+        return self.kind == "gns_particles"
+
+    @property
+    def sees_obstacles(self) -> bool:
+        """Whether obstacles are among its input."""
+        return self.obstacle_features or self.obstacle_particles
 
     @property
     def feature_width(self) -> int:
@@ -276,7 +302,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         require(self.run != "", "run", "a folder name", self.run)
         require(
-            self.network.obstacle_features or self.scene.obstacle_count == 0,
+            self.network.sees_obstacles or self.scene.obstacle_count == 0,
             "network.obstacle_features",
             "true for scenes with obstacles",
             False,

@@ -15,7 +15,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.select import first_episodes
 from hgn.device import choose_device
 from hgn.files import write_atomically
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.base import ParticleNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
@@ -54,9 +54,7 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def one_step_rows(
-    network: HierarchicalGraphNetwork, episodes: list[Episode], config: EvaluateConfig
-) -> list[dict[str, Any]]:
+def one_step_rows(network: ParticleNetwork, episodes: list[Episode], config: EvaluateConfig) -> list[dict[str, Any]]:
     """One row a predictor: {"system", "one_step_mse", "by_material"}."""
     predictors = {"network": network_predictor(network)} | trivial_predictors(network)
     device = next(network.parameters()).device
@@ -75,9 +73,7 @@ def one_step_rows(
     ]
 
 
-def rollout_row(
-    network: HierarchicalGraphNetwork, frame_rate_hz: float, episodes: list[Episode], frames: int
-) -> dict[str, Any]:
+def rollout_row(network: ParticleNetwork, frame_rate_hz: float, episodes: list[Episode], frames: int) -> dict[str, Any]:
     """{"system", "position_mse": {frame: value}, "mean_position_mse"}, or where the rollout diverged."""
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     with bar("rollouts", total=frames - 1, unit="frame") as progress:

@@ -78,9 +78,9 @@ def rollout(config: RolloutConfig) -> Path:
 
 def _require_cell_size(info: WeightsInfo, cell_size: float) -> None:
     require(
-        cell_size == info.obstacle_cell_size or not info.network.obstacle_features,
+        cell_size == info.obstacle_cell_size or not info.network.sees_obstacles,
         "cell_size",
-        f"the weights' {info.obstacle_cell_size}, the size of the cells its obstacle normals were taken from",
+        f"the weights' {info.obstacle_cell_size}, the size of the cells that it knows obstacles by",
         cell_size,
     )
 

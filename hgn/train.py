@@ -24,7 +24,7 @@ from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.order import Cursor
 from hgn.data.reader import EpisodeStore
 from hgn.files import write_atomically
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.build import build_network
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.schema import ConfigError, from_mapping, to_mapping
@@ -85,7 +85,7 @@ def _fit(
     _quieten_lightning()
     torch.set_float32_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
-    module = TrainingModule(HierarchicalGraphNetwork(config.network), training, data)
+    module = TrainingModule(build_network(config.network), training, data)
     module.set_statistics(store.statistics())
     feed = Feed(store, config.network, training)
     if checkpoint is not None:

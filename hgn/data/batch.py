@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from hgn.config import NetworkConfig
 from hgn.data.order import Cursor
 from hgn.network.features import ParticleState, material_rows
-from hgn.network.obstacles import ObstacleCells
+from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
+from hgn.scene.rollout_file import episode_surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,7 @@ class Batch:
     domain_S3: torch.Tensor
     gravity_S3: torch.Tensor  # domain units per frame squared
     obstacles: ObstacleCells | None
+    surface: SurfaceParticles | None  # where the network sees obstacles as particles
     seeds_S: tuple[int, ...]  # of noise and jitter
     cursor: Cursor | None = None  # the order's state once this batch is trained on
 
@@ -36,7 +39,8 @@ class Batch:
         names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
         moved = {name: getattr(self, name).to(device, non_blocking=non_blocking) for name in names}
         obstacles = self.obstacles and self.obstacles.to(device, non_blocking)
-        return replace(self, obstacles=obstacles, **moved)
+        surface = self.surface and self.surface.to(device, non_blocking)
+        return replace(self, obstacles=obstacles, surface=surface, **moved)
 
     def state(self, window_WN3: torch.Tensor | None = None) -> ParticleState:
         """The network's input at frame n, from this window or a perturbed copy of it."""
@@ -50,6 +54,7 @@ class Batch:
             scene_N=self.scene_N,
             domain_S3=self.domain_S3,
             obstacles=self.obstacles,
+            surface=self.surface,
         )
 
     def acceleration(self, window_WN3: torch.Tensor | None = None) -> torch.Tensor:
@@ -66,24 +71,24 @@ class Batch:
 
 def make_batch(
     samples: Sequence[tuple[Episode, int]],
-    history: int,
-    materials: Sequence[str],
+    network: NetworkConfig,
     seeds: Sequence[int] | None = None,
     cursor: Cursor | None = None,
 ) -> Batch:
-    """Reads the windows of (episode, frame) pairs and joins them."""
-    windows = [window(episode, frame, history) for episode, frame in samples]
+    """Reads the windows of (episode, frame) pairs and joins them, with what the network sees of the obstacles."""
+    windows = [window(episode, frame, network.velocity_history) for episode, frame in samples]
     episodes = [episode for episode, _ in samples]
     particles = tuple(len(episode.material_N) for episode in episodes)
     gravity_S3 = np.array([np.asarray(e.gravity) / e.frame_rate_hz**2 for e in episodes], np.float32)
     return Batch(
         window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
-        material_N=material_rows(np.concatenate([episode.material_N for episode in episodes]), materials),
+        material_N=material_rows(np.concatenate([episode.material_N for episode in episodes]), network.materials),
         scene_N=torch.from_numpy(np.repeat(np.arange(len(episodes)), particles)),
         particles_S=particles,
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
         gravity_S3=torch.from_numpy(gravity_S3),
-        obstacles=ObstacleCells.of([episode.obstacle_grid for episode in episodes]),
+        obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
+        surface=SurfaceParticles.of([episode_surface(e) for e in episodes]) if network.obstacle_particles else None,
         seeds_S=tuple(seeds) if seeds is not None else (0,) * len(episodes),
         cursor=cursor,
     )

@@ -31,8 +31,11 @@ def linear(value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None 
 class FCN(nn.Module):
     """A fully connected network on the concatenation of `parts`."""
 
-    def __init__(self, parts: Sequence[int], hidden: int, out: int, layer_norm: bool = True) -> None:
+    def __init__(
+        self, parts: Sequence[int], hidden: int, out: int, layer_norm: bool = True, slope: float = LEAKY_SLOPE
+    ) -> None:
         super().__init__()
+        self.slope = slope  # of the activation below zero
         self.parts = tuple(parts)
         self.first = nn.Linear(sum(parts), hidden)
         self.second = nn.Linear(hidden, out)
@@ -45,7 +48,7 @@ class FCN(nn.Module):
 
     def finish(self, hidden: torch.Tensor) -> torch.Tensor:
         """From the sum of all projections, bias included, to the output [..., out]."""
-        out = linear(functional.leaky_relu(hidden, LEAKY_SLOPE), self.second.weight, self.second.bias)
+        out = linear(functional.leaky_relu(hidden, self.slope), self.second.weight, self.second.bias)
         return out if self.norm is None else self.norm(out)
 
     def forward(self, *values: torch.Tensor) -> torch.Tensor:

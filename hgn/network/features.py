@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from hgn.network.obstacles import ObstacleCells
+from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
 
@@ -29,6 +29,7 @@ class ParticleState:
     scene_N: torch.Tensor  # int64, index of the particle's scene
     domain_S3: torch.Tensor  # domain size of each scene
     obstacles: ObstacleCells | None
+    surface: SurfaceParticles | None = None  # where the network sees obstacles as particles
 
     @property
     def scene_count(self) -> int:

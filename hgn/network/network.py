@@ -12,8 +12,9 @@ import torch
 from torch import nn
 
 from hgn.config import NetworkConfig
+from hgn.network.base import ParticleNetwork
 from hgn.network.fcn import FCN
-from hgn.network.features import Normaliser, ParticleState, wall_distances
+from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 
 
@@ -45,7 +46,7 @@ class MessagePassing(nn.Module):
         return cell_CW
 
 
-class HierarchicalGraphNetwork(nn.Module):
+class HierarchicalGraphNetwork(ParticleNetwork):
     """Predicts the acceleration of every particle, in frame units.
 
     Without obstacle features the input lacks the normals (the paper's second data set); with them, a scene
@@ -53,13 +54,8 @@ class HierarchicalGraphNetwork(nn.Module):
     """
 
     def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        self.config = config
+        super().__init__(config)
         width = config.width
-        self.normaliser = Normaliser()
-        self.embedding = nn.Embedding(len(config.materials), config.material_embedding)
-        normal_width = 3 if config.obstacle_features else 0
-        self.encode = FCN((3 * config.velocity_history, normal_width, 6, config.material_embedding), width, width)
         self.particle_to_cell = FCN((width, 3), width, width)
         self.passing_down = nn.ModuleList(
             MessagePassing(config.message_passing_steps, width) for _ in range(config.levels)
@@ -72,34 +68,16 @@ class HierarchicalGraphNetwork(nn.Module):
         self.cell_to_particle = FCN((width, width, 3), width, width)
         self.decode = FCN((width,), width, 3, layer_norm=False)
 
-    @property
-    def parameter_count(self) -> int:
-        return sum(parameter.numel() for parameter in self.parameters())
-
-    def forward(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        """Accelerations in frame units [N, 3]; the finest grid's origin in each scene is 0 unless given."""
-        return self.normaliser.restore_acceleration(self.normalised_acceleration(state, origin_S3))
-
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
-        """The network's raw output [N, 3], which the loss compares with the normalised target."""
+        """The network's raw output [N, 3], which the loss compares with the normalised target.
+
+        The finest grid's origin in each scene is 0 unless given.
+        """
         if origin_S3 is None:
             origin_S3 = torch.zeros_like(state.domain_S3)
         config = self.config
         grid = build_hierarchy(state.position_N3, state.scene_N, origin_S3, config.cell_size, config.levels)
         return self.propagate(self.encode_particles(state), grid)
-
-    def encode_particles(self, state: ParticleState) -> torch.Tensor:
-        """Step 0: particle features to latent vectors [N, W]. Zero normals are not multiplied."""
-        velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
-        maximum = self.config.wall_distance_cells * self.config.cell_size
-        wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)
-        hidden_NH = self.encode.project(0, velocity_NV) + self.encode.project(2, wall_N6)
-        material_MH = self.encode.project(3, self.embedding.weight) + self.encode.first.bias
-        hidden_NH = hidden_NH + material_MH[state.material_N]
-        if self.config.obstacle_features and state.obstacles is not None:
-            normal_N3 = state.obstacles.normals(state.position_N3, state.scene_N)
-            hidden_NH = hidden_NH + self.encode.project(1, normal_N3)
-        return self.encode.finish(hidden_NH)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
         """Steps 1 to 12: latent particles and their grids to normalised accelerations [N, 3]."""

@@ -12,14 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.grid import GridRangeError
-from hgn.network.network import HierarchicalGraphNetwork
-from hgn.network.obstacles import ObstacleCells
+from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_positions
-from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
-from hgn.scene.scene import Scene
+from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
+from hgn.scene.rollout_file import cell_obstacles, obstacles_of_episode
+from hgn.scene.scene import Obstacle, Scene
 
 
 class DivergenceError(RuntimeError):
@@ -40,6 +41,8 @@ class InitialState:
     obstacle_grid: ObstacleGrid
     domain_size: tuple[float, float, float]
     gravity: tuple[float, float, float]
+    # The obstacles' meshes, for networks that see them as particles; none: only the cells are known, a square each.
+    obstacles: Callable[[], Sequence[Obstacle]] | None = None
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -51,6 +54,7 @@ class InitialState:
             episode.obstacle_grid,
             episode.domain_size,
             episode.gravity,
+            lambda: obstacles_of_episode(episode),
         )
 
     @staticmethod
@@ -63,13 +67,20 @@ class InitialState:
             build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size),
             scene.domain_size,
             scene.gravity,
+            lambda: scene.obstacles,
         )
+
+    def surface(self) -> np.ndarray:
+        """Points on the obstacles, no closer than a quarter of a cell, float32 [P, 3]."""
+        grid = self.obstacle_grid
+        obstacles = cell_obstacles(grid) if self.obstacles is None else self.obstacles()
+        return surface_points(obstacles, grid.cell_size, 0)
 
 
 class Simulator:
     """Runs a trained network on one or several scenes at once."""
 
-    def __init__(self, network: HierarchicalGraphNetwork, frame_rate_hz: float) -> None:
+    def __init__(self, network: ParticleNetwork, frame_rate_hz: float) -> None:
         self.network = network
         self.frame_rate_hz = frame_rate_hz
         self.device = next(network.parameters()).device
@@ -95,6 +106,7 @@ class Simulator:
         counts = [len(scene.position_N3) for scene in scenes]
         position_N3 = np.concatenate([scene.position_N3 for scene in scenes]).astype(np.float32)
         obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes]) if config.obstacle_features else None
+        surface = SurfaceParticles.of([scene.surface() for scene in scenes]) if config.obstacle_particles else None
         return ParticleState(
             position_N3=torch.from_numpy(position_N3).to(self.device),
             velocity_NM3=torch.from_numpy(np.concatenate(velocities)).to(self.device),
@@ -102,6 +114,7 @@ class Simulator:
             scene_N=torch.from_numpy(np.repeat(np.arange(len(scenes)), counts)).to(self.device),
             domain_S3=torch.tensor([scene.domain_size for scene in scenes], dtype=torch.float32).to(self.device),
             obstacles=obstacles and obstacles.to(self.device),
+            surface=surface and surface.to(self.device),
         )
 
     @torch.inference_mode()

@@ -16,7 +16,8 @@ from safetensors.torch import save
 
 from hgn.config import NetworkConfig
 from hgn.files import write_atomically
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.base import ParticleNetwork
+from hgn.network.build import build_network
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 
 FORMAT_VERSION = 1
@@ -34,7 +35,7 @@ class WeightsInfo:
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
 
 
-def save_weights(path: Path, network: HierarchicalGraphNetwork, info: WeightsInfo, half: bool = False) -> None:
+def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, half: bool = False) -> None:
     """Writes the file whole or not at all. `half` stores the learned tensors as float16, for shipping."""
     tensors = {}
     for name, tensor in network.state_dict().items():
@@ -45,7 +46,7 @@ def save_weights(path: Path, network: HierarchicalGraphNetwork, info: WeightsInf
     write_atomically(path, payload)
 
 
-def load_weights(path: Path, device: torch.device | str = "cpu") -> tuple[HierarchicalGraphNetwork, WeightsInfo]:
+def load_weights(path: Path, device: torch.device | str = "cpu") -> tuple[ParticleNetwork, WeightsInfo]:
     """The network in evaluation mode, float32, on `device`.
 
     Raises: ConfigError when the file is missing, is no weights file of ours, has another format version, or
@@ -69,7 +70,7 @@ def load_weights(path: Path, device: torch.device | str = "cpu") -> tuple[Hierar
     if version != FORMAT_VERSION:
         raise ConfigError(f"weights format_version must be {FORMAT_VERSION}, got {version!r} in {path}; export again")
     info = from_mapping(WeightsInfo, mapping, "weights")
-    network = HierarchicalGraphNetwork(info.network)
+    network = build_network(info.network)
     expected = {name: tensor.shape for name, tensor in network.state_dict().items()}
     found = {name: tensor.shape for name, tensor in tensors.items()}
     for name in sorted(expected.keys() | found.keys()):

@@ -46,21 +46,7 @@ def build_obstacle_grid(
 
     Raises: ConfigError for a bad cell size, or a surface too large to sample.
     """
-    require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
-    corner_F33 = np.concatenate(
-        [np.zeros((0, 3, 3))]
-        + [np.asarray(item.vertex_V3, np.float64)[np.asarray(item.triangle_F3)] for item in obstacles]
-    )
-    if domain_size is not None:
-        box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
-        corner_F33, _ = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)
-    vertex_V3 = corner_F33.reshape(-1, 3)
-    triangle_F3 = np.arange(len(vertex_V3)).reshape(-1, 3)
-    rng = np.random.Generator(np.random.PCG64(seed))
-    point_S3, owner_S = sample_surface(vertex_V3, triangle_F3, cell_size / 4, rng)
-    if domain_size is not None:
-        near = ((point_S3 >= box[0]) & (point_S3 < box[1])).all(axis=1)
-        point_S3, owner_S = point_S3[near], owner_S[near]
+    corner_F33, point_S3, owner_S = _samples(obstacles, cell_size, seed, domain_size)
     if len(point_S3) == 0:
         return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
@@ -82,6 +68,41 @@ def build_obstacle_grid(
     length_K[cancelled_K] = 1.0
     cell_K3 = np.stack(np.unravel_index(key_K, extent), axis=1) + low
     return ObstacleGrid(cell_size, cell_K3.astype(np.int32), (sum_K3 / length_K[:, None]).astype(np.float32))
+
+
+def surface_points(
+    obstacles: Sequence[Obstacle],
+    cell_size: float,
+    seed: int,
+    domain_size: tuple[float, float, float] | None = None,
+) -> np.ndarray:
+    """The samples that the normals of `build_obstacle_grid` are made from, float32 [S, 3]: GNS's static particles.
+
+    Raises: ConfigError for a bad cell size, or a surface too large to sample.
+    """
+    return _samples(obstacles, cell_size, seed, domain_size)[1].astype(np.float32)
+
+
+def _samples(
+    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: tuple[float, float, float] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangle corners, surface points no closer than a quarter of a cell, and the triangle of each."""
+    require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
+    corner_F33 = np.concatenate(
+        [np.zeros((0, 3, 3))]
+        + [np.asarray(item.vertex_V3, np.float64)[np.asarray(item.triangle_F3)] for item in obstacles]
+    )
+    if domain_size is not None:
+        box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
+        corner_F33, _ = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)
+    vertex_V3 = corner_F33.reshape(-1, 3)
+    triangle_F3 = np.arange(len(vertex_V3)).reshape(-1, 3)
+    rng = np.random.Generator(np.random.PCG64(seed))
+    point_S3, owner_S = sample_surface(vertex_V3, triangle_F3, cell_size / 4, rng)
+    if domain_size is not None:
+        near = ((point_S3 >= box[0]) & (point_S3 < box[1])).all(axis=1)
+        point_S3, owner_S = point_S3[near], owner_S[near]
+    return corner_F33, point_S3, owner_S
 
 
 def _lexicographic_keys(floor_S3: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:

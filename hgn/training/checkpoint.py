@@ -14,7 +14,8 @@ import torch
 
 from hgn.config import NetworkConfig, TrainConfig
 from hgn.data.order import Cursor
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.base import ParticleNetwork
+from hgn.network.build import build_network
 from hgn.schema import ConfigError, from_mapping, to_mapping
 
 SECTION = "hgn"  # the checkpoint's key for what is ours
@@ -52,7 +53,9 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     Raises: ConfigError naming the first key that differs.
     """
     remedy = "set it so, or choose another run=FOLDER"
-    stored, wanted = checkpoint[SECTION]["network"], to_mapping(config.network)
+    # Through the dataclass: a key that is younger than the checkpoint has its default in it.
+    stored = to_mapping(from_mapping(NetworkConfig, checkpoint[SECTION]["network"], "network"))
+    wanted = to_mapping(config.network)
     for key in sorted(stored.keys() | wanted.keys()):
         if stored.get(key) != wanted.get(key):
             raise ConfigError(
@@ -71,9 +74,9 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
         )
 
 
-def network_of_checkpoint(checkpoint: dict[str, Any]) -> HierarchicalGraphNetwork:
+def network_of_checkpoint(checkpoint: dict[str, Any]) -> ParticleNetwork:
     """The network of a checkpoint, normaliser included, in evaluation mode."""
-    network = HierarchicalGraphNetwork(from_mapping(NetworkConfig, checkpoint[SECTION]["network"], "network"))
+    network = build_network(from_mapping(NetworkConfig, checkpoint[SECTION]["network"], "network"))
     prefix = "network."
     tensors = {k.removeprefix(prefix): v for k, v in checkpoint["state_dict"].items() if k.startswith(prefix)}
     network.load_state_dict(tensors)

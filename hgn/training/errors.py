@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from hgn.data.batch import Batch, make_batch
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.base import ParticleNetwork
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 
@@ -61,7 +61,7 @@ def mean_acceleration(mean_3: torch.Tensor) -> Predictor:
     return lambda batch: mean_3.to(batch.window_WN3).expand_as(batch.window_WN3[0])
 
 
-def trivial_predictors(network: HierarchicalGraphNetwork) -> dict[str, Predictor]:
+def trivial_predictors(network: ParticleNetwork) -> dict[str, Predictor]:
     """What a network must beat to have learned anything."""
     return {
         "constant velocity": constant_velocity,
@@ -70,14 +70,14 @@ def trivial_predictors(network: HierarchicalGraphNetwork) -> dict[str, Predictor
     }
 
 
-def network_predictor(network: HierarchicalGraphNetwork) -> Predictor:
+def network_predictor(network: ParticleNetwork) -> Predictor:
     """The network without noise and jitter."""
     return lambda batch: network(batch.state())
 
 
 def frame_batches(
     episodes: Sequence[Episode],
-    network: HierarchicalGraphNetwork,
+    network: ParticleNetwork,
     stride: int,
     particles_per_batch: int,
     rank: int = 0,
@@ -91,7 +91,7 @@ def frame_batches(
         while taken < len(pairs) and (taken == 0 or particles < particles_per_batch):
             particles += len(pairs[taken][0].material_N)
             taken += 1
-        yield make_batch(pairs[:taken], config.velocity_history, config.materials)
+        yield make_batch(pairs[:taken], config)
         pairs = pairs[taken:]
 
 

@@ -53,11 +53,10 @@ class Feed(LightningDataModule):
         order = SampleOrder(
             self.training.seed, self.training.batch_scenes, self._published, self.cursor, rank, world_size
         )
-        history, materials = self.network.velocity_history, self.network.materials
 
         def read(samples: Sequence[Sample], cursor: Cursor) -> Batch:
             pairs = [(self.store.episodes[sample.episode], sample.frame) for sample in samples]
-            return make_batch(pairs, history, materials, [sample.seed for sample in samples], cursor)
+            return make_batch(pairs, self.network, [sample.seed for sample in samples], cursor)
 
         # The order may have to ask other ranks, so it stays in this thread; reading runs ahead in another.
         with ThreadPoolExecutor(1) as executor:

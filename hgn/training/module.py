@@ -14,16 +14,16 @@ from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
 from hgn.data.order import Cursor
 from hgn.data.statistics import Statistics
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.base import ParticleNetwork
 from hgn.schema import to_mapping
 from hgn.training.checkpoint import SECTION, DataInfo, cursor_of_checkpoint
 from hgn.training.noise import jittered_origin, perturbed_window
 
 
 class TrainingModule(LightningModule):
-    """Trains a hierarchical graph network on one-step accelerations (paper sec. 3.3)."""
+    """Trains a network on one-step accelerations (paper sec. 3.3)."""
 
-    def __init__(self, network: HierarchicalGraphNetwork, training: TrainingConfig, data: DataInfo) -> None:
+    def __init__(self, network: ParticleNetwork, training: TrainingConfig, data: DataInfo) -> None:
         super().__init__()
         self.network = network
         self.training_config = training

@@ -6,7 +6,10 @@ import numpy as np
 import torch
 
 from hgn.config import NetworkConfig
+from hgn.network.base import ParticleNetwork
+from hgn.network.build import build_network
 from hgn.network.features import ParticleState
+from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -58,8 +61,23 @@ def scene_of(state: ParticleState, scene: int, grid: ObstacleCells | None) -> Pa
 def network_of(dtype: torch.dtype = torch.float64, **changes: object) -> HierarchicalGraphNetwork:
     """A small network with random weights, norms included, and a normaliser that is not the identity."""
     values = {"width": 16, "levels": 3, "message_passing_steps": 2} | changes
+    network = _with_random_weights(NetworkConfig(**values), dtype)  # type: ignore[arg-type]
+    assert isinstance(network, HierarchicalGraphNetwork)
+    return network
+
+
+def gns_of(dtype: torch.dtype = torch.float64, **changes: object) -> GraphNetworkSimulator:
+    """The same of GNS; `kind` may be gns_particles."""
+    values = {"kind": "gns", "width": 16, "levels": 1, "message_passing_steps": 3} | changes
+    values = {"obstacle_features": values["kind"] == "gns"} | values
+    network = _with_random_weights(NetworkConfig(**values), dtype)  # type: ignore[arg-type]
+    assert isinstance(network, GraphNetworkSimulator)
+    return network
+
+
+def _with_random_weights(config: NetworkConfig, dtype: torch.dtype) -> ParticleNetwork:
     torch.manual_seed(5)
-    network = HierarchicalGraphNetwork(NetworkConfig(**values))  # type: ignore[arg-type]
+    network = build_network(config)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))

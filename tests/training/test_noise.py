@@ -7,9 +7,9 @@ import math
 import numpy as np
 import torch
 
+from hgn.config import NetworkConfig
 from hgn.data.batch import make_batch
 from hgn.scene.episode import Episode
-from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.training.noise import jittered_origin, perturbed_window, random_walk
 
@@ -36,7 +36,7 @@ def episode(particles: int, frames: int = 12, seed: int = 0) -> Episode:
 
 def batch_of(*episodes: Episode, frame: int = 6, seeds: tuple[int, ...] | None = None):
     pairs = [(e, frame) for e in episodes]
-    return make_batch(pairs, 5, MATERIALS, seeds or tuple(range(1, len(pairs) + 1)))
+    return make_batch(pairs, NetworkConfig(), seeds or tuple(range(1, len(pairs) + 1)))
 
 
 def test_walk_has_the_papers_spread():

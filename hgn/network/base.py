@@ -1,0 +1,57 @@
+"""What every network of particles shares: the features, their normalisation, and the encoder (paper sec. 3.1).
+
+Shape legend: N particles, W width, S scenes.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import nn
+
+from hgn.config import NetworkConfig
+from hgn.network.fcn import FCN, LEAKY_SLOPE
+from hgn.network.features import Normaliser, ParticleState, wall_distances
+
+
+class ParticleNetwork(nn.Module, ABC):
+    """Predicts the acceleration of every particle, in frame units."""
+
+    def __init__(self, config: NetworkConfig, embeddings: int | None = None, slope: float = LEAKY_SLOPE) -> None:
+        """`embeddings` is the number of kinds of particles, where there are others than the materials."""
+        super().__init__()
+        self.config = config
+        self.normaliser = Normaliser()
+        self.embedding = nn.Embedding(embeddings or len(config.materials), config.material_embedding)
+        normal_width = 3 if config.obstacle_features else 0
+        parts = (3 * config.velocity_history, normal_width, 6, config.material_embedding)
+        self.encode = FCN(parts, config.width, config.width, slope=slope)
+
+    @property
+    def parameter_count(self) -> int:
+        return sum(parameter.numel() for parameter in self.parameters())
+
+    def forward(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+        """Accelerations in frame units [N, 3]."""
+        return self.normaliser.restore_acceleration(self.normalised_acceleration(state, origin_S3))
+
+    @abstractmethod
+    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+        """The network's raw output [N, 3], which the loss compares with the normalised target.
+
+        `origin_S3` moves the grid, where the network has one.
+        """
+
+    def encode_particles(self, state: ParticleState) -> torch.Tensor:
+        """Particle features to latent vectors [N, W] (sec. 3.2, step 0). Zero normals are not multiplied."""
+        velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
+        maximum = self.config.wall_distance_cells * self.config.cell_size
+        wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)
+        hidden_NH = self.encode.project(0, velocity_NV) + self.encode.project(2, wall_N6)
+        material_MH = self.encode.project(3, self.embedding.weight) + self.encode.first.bias
+        hidden_NH = hidden_NH + material_MH[state.material_N]
+        if self.config.obstacle_features and state.obstacles is not None:
+            normal_N3 = state.obstacles.normals(state.position_N3, state.scene_N)
+            hidden_NH = hidden_NH + self.encode.project(1, normal_N3)
+        return self.encode.finish(hidden_NH)

@@ -1,0 +1,103 @@
+"""Neighbour lists: all pairs of particles nearer than a radius, found through a sorted list of cells.
+
+Cells are half a radius wide, so that a particle's neighbours lie in 5 x 5 x 5 of them; with z fastest in the keys
+those are 25 contiguous runs of the sorted particles. The work is proportional to the number of neighbours.
+Shape legend: N particles, K candidate pairs, E directed edges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from hgn.network.grid import GridRangeError
+from hgn.network.keys import AXIS_STRIDE, COORDINATE_LIMIT, pack
+from hgn.network.segments import Segments
+
+REACH = 2  # cells on each side
+# Particles a radius apart must never fall more than REACH cells apart. Rounding moves a quotient by up to 0.004 cells
+# at the greatest coordinates, so the cells are a little wider than half a radius.
+SLACK = 1.01
+
+
+@dataclass(frozen=True, eq=False)
+class NeighbourList:
+    """Directed edges between particles in the order of `order_N`, grouped by receiver; each particle is its own
+    neighbour too."""
+
+    order_N: torch.Tensor  # int64: the particle at each place of the sorted order
+    sender_E: torch.Tensor  # int64, places in the sorted order
+    receivers: Segments
+
+    @property
+    def edge_count(self) -> int:
+        return len(self.sender_E)
+
+
+def neighbour_list(
+    position_N3: torch.Tensor, scene_N: torch.Tensor, radius: float, maximum: int | None = None
+) -> NeighbourList:
+    """All ordered pairs of particles of one scene with a distance below `radius`, and each particle with itself.
+
+    With `maximum` each receiver keeps its nearest ones only, itself counted.
+    Raises: GridRangeError when a particle is not finite or too far from the origin.
+    """
+    key_N = _keys(position_N3, scene_N, 0.5 * SLACK * radius)
+    key_N, order_N = torch.sort(key_N, stable=True)
+    position_N3 = position_N3[order_N]
+    first_NR, length_NR = _runs(key_N)
+    # One row a candidate pair: its receiver, and its place in that receiver's runs.
+    runs = length_NR.shape[1]
+    length_Q = length_NR.flatten()
+    end_Q = length_Q.cumsum(0)
+    run_K = torch.repeat_interleave(length_Q)
+    sender_K = torch.arange(len(run_K), device=run_K.device) + (first_NR.flatten() - end_Q + length_Q)[run_K]
+    receiver_K = run_K // runs
+    near_K = _squared_distance(position_N3, sender_K, receiver_K) < radius * radius
+    near_E = torch.nonzero(near_K).flatten()
+    sender_E, receiver_E = sender_K[near_E], receiver_K[near_E]
+    if maximum is not None:
+        kept = _nearest(_squared_distance(position_N3, sender_E, receiver_E), receiver_E, len(key_N), maximum)
+        sender_E, receiver_E = sender_E[kept], receiver_E[kept]
+    return NeighbourList(order_N, sender_E, Segments(_offsets(receiver_E, len(key_N)), receiver_E))
+
+
+def _keys(position_N3: torch.Tensor, scene_N: torch.Tensor, size: float) -> torch.Tensor:
+    grid_N3 = position_N3 / size
+    inside_N3 = grid_N3.abs() < COORDINATE_LIMIT - REACH - 1
+    if not bool(inside_N3.all()):
+        raise GridRangeError(
+            f"positions must be finite and within {(COORDINATE_LIMIT - REACH - 1) * size:.0f} domain units, "
+            f"got {position_N3[inside_N3.logical_not().any(1)][0].tolist()}"
+        )
+    return pack(scene_N, torch.floor(grid_N3).long())
+
+
+def _runs(key_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """First place and length of the 25 runs of each particle, [N, 25]."""
+    side = torch.arange(-REACH, REACH + 1, device=key_N.device)
+    column_R = (side[:, None] * AXIS_STRIDE[0] + side[None] * AXIS_STRIDE[1]).flatten()
+    low_NR = key_N[:, None] + (column_R - REACH * AXIS_STRIDE[2])
+    first_NR = torch.searchsorted(key_N, low_NR)
+    last_NR = torch.searchsorted(key_N, low_NR + 2 * REACH * AXIS_STRIDE[2], right=True)
+    return first_NR, last_NR - first_NR
+
+
+def _squared_distance(position_N3: torch.Tensor, sender_E: torch.Tensor, receiver_E: torch.Tensor) -> torch.Tensor:
+    offset_E3 = position_N3.index_select(0, sender_E) - position_N3.index_select(0, receiver_E)
+    return offset_E3.square().sum(-1)
+
+
+def _offsets(receiver_E: torch.Tensor, count: int) -> torch.Tensor:
+    """Where each receiver's edges begin, and the number of edges, [N + 1]."""
+    return torch.searchsorted(receiver_E, torch.arange(count + 1, device=receiver_E.device))
+
+
+def _nearest(square_E: torch.Tensor, receiver_E: torch.Tensor, count: int, maximum: int) -> torch.Tensor:
+    """The edges of the `maximum` nearest senders of each receiver, in their present order."""
+    by_distance_E = torch.sort(square_E, stable=True).indices
+    by_both_E = by_distance_E[torch.sort(receiver_E[by_distance_E], stable=True).indices]
+    place_E = torch.arange(len(receiver_E), device=receiver_E.device)
+    rank_E = place_E - _offsets(receiver_E, count)[receiver_E]  # receivers keep their rows: the same for both orders
+    return torch.sort(by_both_E[rank_E < maximum]).values

@@ -1,0 +1,95 @@
+"""The baselines through the same commands: trained, exported, simulated, evaluated; and refused where they differ."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from network.states import random_grid
+from training.runs import train_mapping
+
+from hgn import evaluate, rollout, train
+from hgn.config import DatagenConfig, NetworkConfig
+from hgn.data.batch import make_batch
+from hgn.data.reader import EpisodeStore
+from hgn.export import export
+from hgn.runtime.simulator import InitialState
+from hgn.runtime.weights import load_weights
+from hgn.schema import ConfigError
+
+GNS = {"levels": 1, "message_passing_steps": 2, "width": 8, "material_embedding": 2}
+
+
+@pytest.mark.parametrize("kind", ["gns", "gns_particles"])
+def test_every_command_takes_a_baseline(
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    tmp_path: Path,
+    kind: str,
+) -> None:
+    """A baseline is trained, resumed, exported, simulated and evaluated by the commands of the HGN."""
+    config = make_config()
+    make_dataset(config)
+    network = GNS | {"kind": kind, "obstacle_features": kind == "gns"}
+    run = tmp_path / "run"
+    for updates in (2, 4):
+        assert train.main(train_mapping(config, run, maximum_updates=updates) | {"network": network}) == 0
+    with pytest.raises(ConfigError, match=r"network\.kind must be '.*' to go on with"):
+        train.main(train_mapping(config, run))
+    weights = tmp_path / "weights.safetensors"
+    export(run / "checkpoints" / "last.ckpt", weights)
+    loaded, info = load_weights(weights)
+    assert type(loaded).__name__ == "GraphNetworkSimulator" and info.network.kind == kind and info.updates == 4
+    data = config.dataset.folder
+    place = {"weights": str(weights), "data": data}
+    out = tmp_path / "rollout.vtkhdf"
+    assert rollout.main(place | {"episode": "validation-000000", "frames": 4, "out": str(out)}) == 0
+    report = tmp_path / "errors.json"
+    assert evaluate.main(place | {"scenes": 1, "rollout_frames": 4, "json": str(report)}) == 0
+    assert out.is_file() and json.loads(report.read_text())["rows"][0]["one_step_mse"] > 0
+
+
+def test_training_and_rollout_see_the_same_surface(
+    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]
+) -> None:
+    """A batch and a simulation's start hold the same surface points, a quarter of a cell apart, in the obstacles'
+    cells; without obstacles there are none."""
+    config = make_config()
+    make_dataset(config)
+    plain = EpisodeStore(config.dataset.folder, "train").episodes[0]
+    grid = random_grid(3, 40)
+    episode = replace(plain, obstacle_grid=grid, position_TN3=np.array(plain.position_TN3))
+    network = NetworkConfig(kind="gns_particles", obstacle_features=False, **GNS)
+    batch = make_batch([(plain, 1), (episode, 1)], network)
+    surface = batch.state().surface
+    assert batch.obstacles is None and surface is not None and surface.scene_P.eq(1).all()
+    np.testing.assert_array_equal(surface.position_P3, InitialState.of_episode(episode).surface())
+    distance = torch.cdist(surface.position_P3.double(), surface.position_P3.double()).fill_diagonal_(1.0)
+    assert distance.min() > 0.999 * grid.cell_size / 4
+    assert make_batch([(plain, 1)], network).surface is None
+    assert make_batch([(episode, 1)], NetworkConfig()).surface is None
+
+
+@pytest.mark.parametrize("experiment", ["gns", "gns_particles"])
+def test_experiments_name_the_papers_baselines(experiment: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The experiments compose to ten steps, R = 0.035, on the main data set."""
+    from hydra import compose, initialize_config_dir
+
+    from hgn.config import TrainConfig, config_directory
+    from hgn.schema import from_mapping
+
+    with initialize_config_dir(str(config_directory()), version_base="1.3"):
+        from omegaconf import OmegaConf
+
+        mapping = OmegaConf.to_container(compose("train", [f"+experiment={experiment}"]), resolve=True)
+    assert isinstance(mapping, dict)
+    mapping.pop("name")
+    config = from_mapping(TrainConfig, mapping)
+    network = config.network
+    assert (network.kind, network.message_passing_steps, network.cell_size) == (experiment, 10, 0.035)
+    assert config.dataset.folder == "data/obstacles" and network.sees_obstacles

@@ -1,0 +1,71 @@
+"""GNS written the slow, literal way, over the weights of the real one: every MLP on its concatenated input, every
+pair of particles tried. Used only to check the real network.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from hgn.network.features import ParticleState
+from hgn.network.gns import GraphNetworkSimulator
+
+
+def naive_edges(position_N3: torch.Tensor, scene_N: torch.Tensor, radius: float) -> set[tuple[int, int]]:
+    """All (sender, receiver) of one scene with a distance below the radius, each particle with itself too."""
+    distance_NN = (position_N3[:, None] - position_N3[None]).square().sum(-1)
+    near_NN = (distance_NN < radius * radius) & (scene_N[:, None] == scene_N[None])
+    return {(sender, receiver) for sender, receiver in torch.nonzero(near_NN).tolist()}
+
+
+def naive_gns_acceleration(network: GraphNetworkSimulator, state: ParticleState) -> torch.Tensor:
+    """The network's raw output, [N, 3]; all static particles take part, however far away."""
+    config, normaliser = network.config, network.normaliser
+    positions, latent, scenes = [], [], []
+    for i in range(len(state.position_N3)):
+        positions.append(state.position_N3[i])
+        scenes.append(int(state.scene_N[i]))
+        velocity = (state.velocity_NM3[i] - normaliser.velocity_mean) / normaliser.velocity_std
+        normal = state.obstacles.normals(positions[-1][None], state.scene_N[i : i + 1])[0] if state.obstacles else None
+        latent.append(_encode(network, state, positions[-1], scenes[-1], velocity, int(state.material_N[i]), normal))
+    if state.surface is not None:
+        for position, scene in zip(state.surface.position_P3, state.surface.scene_P.tolist(), strict=True):
+            positions.append(position.to(state.position_N3))
+            scenes.append(scene)
+            velocity = -normaliser.velocity_mean.expand(config.velocity_history, 3) / normaliser.velocity_std
+            kind = len(config.materials)
+            latent.append(_encode(network, state, positions[-1], scene, velocity, kind, None))
+
+    pairs = sorted(naive_edges(torch.stack(positions), torch.tensor(scenes), config.cell_size))
+    edges = {}
+    for sender, receiver in pairs:
+        offset = (positions[sender] - positions[receiver]) / config.cell_size
+        distance = offset.square().sum().sqrt().reshape(1)
+        edges[sender, receiver] = _mlp(network.encode_edges, torch.cat([offset, distance]))
+    for step in network.steps:
+        updates = {(s, r): _mlp(step.edge, torch.cat([latent[s], latent[r], value])) for (s, r), value in edges.items()}
+        sums = [torch.zeros_like(value) for value in latent]
+        for (_, receiver), value in updates.items():
+            sums[receiver] = sums[receiver] + value
+        latent = [value + _mlp(step.node, torch.cat([value, total])) for value, total in zip(latent, sums, strict=True)]
+        edges = {pair: value + updates[pair] for pair, value in edges.items()}
+    return torch.stack([_mlp(network.decode, value) for value in latent[: len(state.position_N3)]])
+
+
+def _encode(network, state, position, scene, velocity, kind, normal):
+    config = network.config
+    maximum = config.wall_distance_cells * config.cell_size
+    parts = [velocity.flatten()]
+    if config.obstacle_features:
+        parts.append(torch.zeros_like(position) if normal is None else normal)
+    parts.append(torch.cat([position, state.domain_S3[scene] - position]).clamp(-maximum, maximum) / maximum)
+    parts.append(network.embedding.weight[kind])
+    return _mlp(network.encode, torch.cat(parts))
+
+
+def _mlp(network, value):
+    hidden = torch.relu(network.first.weight @ value + network.first.bias)
+    out = network.second.weight @ hidden + network.second.bias
+    if network.norm is None:
+        return out
+    centred = out - out.mean()
+    return centred / (centred.square().mean() + network.norm.eps).sqrt() * network.norm.weight + network.norm.bias

@@ -1,0 +1,105 @@
+"""Neighbour lists against all pairs, and sums over segments."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from network.naive_gns import naive_edges
+
+from hgn.network.grid import GridRangeError
+from hgn.network.neighbours import NeighbourList, neighbour_list
+from hgn.network.segments import Segments
+
+RADIUS = 0.1
+
+
+def pairs_of(found: NeighbourList) -> set[tuple[int, int]]:
+    """(sender, receiver) in the particles' own order."""
+    order = found.order_N.tolist()
+    edges = zip(found.sender_E.tolist(), found.receivers.segment_E.tolist(), strict=True)
+    return {(order[sender], order[receiver]) for sender, receiver in edges}
+
+
+def points(count: int, spread: float, offset: float = 0.0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(count)
+    return (torch.rand(count, 3, generator=generator, dtype=torch.float64) * spread + offset).to(dtype)
+
+
+@pytest.mark.parametrize(
+    ("count", "scenes", "spread", "offset", "dtype"),
+    [
+        (0, 1, 1.0, 0.0, torch.float32),
+        (1, 1, 1.0, 0.0, torch.float32),
+        (300, 3, 0.6, -0.3, torch.float64),
+        (250, 1, 0.05, 0.0, torch.float32),  # everything near everything
+        (200, 2, 0.5, 3000.0, torch.float32),  # where float32 has few digits left
+        (200, 2, 40.0, -20.0, torch.float32),  # mostly alone
+    ],
+)
+def test_pairs_are_all_within_the_radius(count, scenes, spread, offset, dtype):
+    """Exactly the pairs of one scene below the radius, each once, grouped by receiver; each particle with itself."""
+    position = points(count, spread, offset, dtype)
+    scene = torch.arange(count) % scenes
+    found = neighbour_list(position, scene, RADIUS)
+    assert len(pairs_of(found)) == found.edge_count
+    assert pairs_of(found) == naive_edges(position, scene, RADIUS)
+    receiver, offsets = found.receivers.segment_E, found.receivers.offset_N1
+    assert torch.equal(receiver, torch.repeat_interleave(torch.arange(count), offsets.diff()))
+
+
+def test_particles_on_cell_borders():
+    """Particles exactly on the borders of cells, and exactly one radius apart, obey the definition."""
+    line = torch.arange(-6, 7, dtype=torch.float64) * 0.0505
+    position = torch.cartesian_prod(line, line[:3], line[:3])
+    position = torch.cat([position, torch.tensor([[0.0, 5.0, 0.0], [RADIUS, 5.0, 0.0]], dtype=torch.float64)])
+    scene = torch.zeros(len(position), dtype=torch.long)
+    found = pairs_of(neighbour_list(position, scene, RADIUS))
+    assert found == naive_edges(position, scene, RADIUS)
+    assert (len(position) - 2, len(position) - 1) not in found
+
+
+@pytest.mark.parametrize("maximum", [1, 5, 1000])
+def test_maximum_keeps_the_nearest(maximum):
+    """A limited list holds the nearest of each particle, the particle itself first."""
+    position, scene = points(120, 0.3), torch.arange(120) % 2
+    everything = naive_edges(position, scene, RADIUS)
+    expected = set()
+    for receiver in range(120):
+        senders = [s for s, r in everything if r == receiver]
+        senders.sort(key=lambda s: float((position[s] - position[receiver]).square().sum()))
+        expected |= {(s, receiver) for s in senders[:maximum]}
+    assert pairs_of(neighbour_list(position, scene, RADIUS, maximum)) == expected
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e6])
+def test_positions_out_of_range(value):
+    """A particle that is not finite, or too far away for integer cells, is named."""
+    position = points(5, 1.0)
+    position[3, 1] = value
+    with pytest.raises(GridRangeError, match="must be finite and within"):
+        neighbour_list(position, torch.zeros(5, dtype=torch.long), RADIUS)
+
+
+def test_segment_sums():
+    """Sums and spreads equal loops, with empty segments, and each is the other's gradient."""
+    lengths = torch.tensor([0, 3, 1, 0, 4, 0])
+    offset = torch.cat([torch.zeros(1, dtype=torch.long), lengths.cumsum(0)])
+    segments = Segments(offset, torch.repeat_interleave(lengths))
+    rows = torch.randn(8, 3, dtype=torch.float64, requires_grad=True)
+    value = torch.randn(6, 3, dtype=torch.float64, requires_grad=True)
+    expected = torch.stack([part.sum(0) for part in rows.split(lengths.tolist())])
+    torch.testing.assert_close(segments.sum(rows), expected)
+    assert torch.autograd.gradcheck(segments.sum, (rows,)) and torch.autograd.gradcheck(segments.spread, (value,))
+
+
+@pytest.mark.parametrize("rows", [1, 3, 4, 100])
+def test_blocks_hold_every_row_once(rows):
+    """Blocks cover all segments and rows in order, whatever their size, and sum as the whole does."""
+    lengths = torch.tensor([0, 3, 1, 0, 4, 0])
+    offset = torch.cat([torch.zeros(1, dtype=torch.long), lengths.cumsum(0)])
+    segments = Segments(offset, torch.repeat_interleave(lengths))
+    value = torch.randn(8, 2)
+    blocks = segments.blocks(rows)
+    found = torch.cat([block.part.sum(value[block.rows]) for block in blocks])
+    assert torch.equal(found, segments.sum(value))
+    assert [row for block in blocks for row in range(block.rows.start, block.rows.stop)] == list(range(8))
