@@ -68,6 +68,14 @@ def parse_shard_name(name: str) -> ShardRange | None:
     return shard if shard.name == name and shard.first < shard.stop else None
 
 
+def parse_episode_key(key: str) -> ShardRange | None:
+    """The range of one episode that a key stands for; None when it is no key of ours."""
+    split, _, number = key.rpartition("-")
+    if split not in SPLITS or not number.isdecimal() or episode_key(split, int(number)) != key:
+        return None
+    return ShardRange(split, int(number), int(number) + 1)
+
+
 def shard_ranges(split: str, count: int, episodes_per_shard: int) -> list[ShardRange]:
     """The shards of a split of `count` episodes.
 
@@ -84,6 +92,13 @@ def shard_ranges(split: str, count: int, episodes_per_shard: int) -> list[ShardR
         ranges.append(ShardRange(split, first, stop))
         first = stop
     return ranges
+
+
+def work_order(requested: Mapping[str, int], episodes_per_shard: int) -> list[ShardRange]:
+    """All shards of a data set, in the order in which `generation_order` completes them."""
+    place = {item: i for i, item in enumerate(generation_order(requested))}
+    shards = [shard for split in SPLITS for shard in shard_ranges(split, requested[split], episodes_per_shard)]
+    return sorted(shards, key=lambda shard: place[shard.split, shard.stop - 1])
 
 
 def missing_ranges(planned: Iterable[ShardRange], present: Iterable[ShardRange]) -> list[ShardRange]:

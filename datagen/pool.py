@@ -1,30 +1,32 @@
-"""Local processes that make the missing episodes of a data set: scene makers in front, solvers behind.
+"""Workers that make the missing episodes of a data set: scene makers in front, solvers behind.
 
-The parent hands out work, publishes shards and replaces workers that die. A scene whose worker dies is tried again,
-alone; after `maximum_attempts` it is quarantined and the next seed takes its place.
+The pool hands out work, publishes shards and replaces workers that die. A scene whose worker dies is tried again,
+alone; after `maximum_attempts` it is quarantined and the next seed takes its place. Workers are processes of this
+machine, or of a Ray cluster (datagen/ray_crew.py).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from datagen.plan import SceneTask
+from datagen.plan import SceneTask, generation_order
 from datagen.progress import Progress
-from datagen.worker import Backend, MadeScene, Worker, start_maker, start_solver
+from datagen.worker import Backend, LocalWorker, MadeScene, Worker, receive, start_maker, start_solver
 from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig
 from hgn.schema import ConfigError
 
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
-_GPU_SCENES_PER_LAUNCH = 64
-_GPU_FIRST_LAUNCH = 2  # small, so that training can start early
+_LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
+GPU_SCENES_PER_LAUNCH = 64
+GPU_FIRST_LAUNCH = 2  # small, so that training can start early
 _LAUNCH_GROWTH = 8  # from one launch to the next, up to the full size
-_MAXIMUM_MAKERS = 8
+MAXIMUM_MAKERS = 8
 
 
 class Stopped(Exception):  # noqa: N818 - a request, not an error
@@ -47,9 +49,9 @@ def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int) -
     """One solver for two cores on a CPU; on GPUs one solver, with scene makers on the cores."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
-        launch = launch or _GPU_SCENES_PER_LAUNCH
-        makers = max(1, min(_MAXIMUM_MAKERS, cpu_count - 1))
-        return WorkerPlan(workers or 1, None, makers, launch, min(launch, _GPU_FIRST_LAUNCH), gpus)
+        launch = launch or GPU_SCENES_PER_LAUNCH
+        makers = max(1, min(MAXIMUM_MAKERS, cpu_count - 1))
+        return WorkerPlan(workers or 1, None, makers, launch, min(launch, GPU_FIRST_LAUNCH), gpus)
     solvers = workers or max(1, cpu_count // 2)
     threads = max(1, cpu_count // solvers)
     return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
@@ -70,8 +72,36 @@ def available_cpus() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class Crew(Protocol):
+    """Where workers come from."""
+
+    def start_maker(self) -> Worker: ...
+
+    def start_solver(self, number: int) -> Worker: ...
+
+    def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]: ...
+
+
+class LocalCrew:
+    """Processes of this machine."""
+
+    def __init__(self, config: DatagenConfig, backend: Backend, plan: WorkerPlan) -> None:
+        self._config, self._backend, self._plan = config, backend, plan
+
+    def start_maker(self) -> Worker:
+        return start_maker(self._config.scene, self._backend)
+
+    def start_solver(self, number: int) -> Worker:
+        gpus = self._plan.gpus
+        gpu = gpus[number % len(gpus)] if self._plan.solvers > 1 and gpus else None
+        return start_solver(self._config, self._backend, self._plan.threads, gpu)
+
+    def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
+        return receive([worker for worker in workers if isinstance(worker, LocalWorker)], timeout)
+
+
 class Pool:
-    """Makes every remaining episode of `writer` and publishes the shards."""
+    """Makes every episode of `writer`'s share that no other generator makes, and publishes the shards."""
 
     def __init__(
         self,
@@ -79,34 +109,34 @@ class Pool:
         writer: DatasetWriter,
         progress: Progress,
         plan: WorkerPlan,
-        backend: Backend | None = None,
+        crew: Crew,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
         self._config, self._writer, self._progress = config, writer, progress
-        self._plan, self._backend, self._should_stop = plan, backend or Backend(), should_stop
+        self._plan, self._crew, self._should_stop = plan, crew, should_stop
         self._launch_size = plan.first_launch
         self._deaths_in_a_row = 0
         self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
 
     def run(self) -> None:
-        """Returns when all is published.
+        """Returns when the share is published.
 
         Raises: Stopped; ConfigError, OSError or RuntimeError from a worker. Workers are gone in any case.
         """
-        remaining = self._writer.remaining()
-        self._order = {item: place for place, item in enumerate(remaining)}
-        self._todo = [self._writer.task(*item) for item in remaining]
+        self._order = {item: place for place, item in enumerate(generation_order(self._writer.requested))}
+        self._todo: list[SceneTask] = []
         self._ready: list[MadeScene] = []
         self._makers: list[Worker] = []
         self._solvers: list[Worker] = []
+        self._counted, self._next_look, self._said_waiting = self._writer.done, 0.0, False
         self._progress.start(self._writer.done, self._writer.total, self._config.dataset.frames)
         try:
-            # a solver needs seconds to start, so all start before the first scene is asked for
-            self._solvers = [self._new_solver(i) for i in range(min(self._plan.solvers, len(remaining)))]
-            self._makers = [self._new_maker() for _ in range(min(self._plan.makers, len(remaining)))]
             while True:
                 if self._should_stop():
                     raise Stopped
+                self._claim()
+                if self._todo and not self._solvers:
+                    self._start_workers()
                 self._hand_out()
                 published = self._publish()
                 if not published and self._writer.complete:
@@ -117,13 +147,32 @@ class Pool:
                 worker.kill()
             self._progress.close()
 
-    def _new_maker(self) -> Worker:
-        return start_maker(self._config.scene, self._backend)
+    def _start_workers(self) -> None:
+        missing = self._writer.total - self._writer.done
+        # a solver needs seconds to start, so all start before the first scene is asked for
+        self._solvers = [self._crew.start_solver(i) for i in range(min(self._plan.solvers, missing))]
+        self._makers = [self._crew.start_maker() for _ in range(min(self._plan.makers, missing))]
 
-    def _new_solver(self, number: int) -> Worker:
-        gpus = self._plan.gpus
-        gpu = gpus[number % len(gpus)] if self._plan.solvers > 1 and gpus else None
-        return start_solver(self._config, self._backend, self._plan.threads, gpu)
+    def _claim(self) -> None:
+        """Claims shards as the makers need them, so that other generators on the folder find work too."""
+        if len(self._todo) >= self._plan.makers or time.monotonic() < self._next_look:
+            return
+        self._writer.refresh()
+        while len(self._todo) < self._plan.makers:
+            known = set(self._writer.remaining())
+            shard = self._writer.claim_next()
+            if shard is None:
+                self._next_look = time.monotonic() + _LOOK_SECONDS
+                break
+            for split, index in self._writer.remaining():
+                if (split, index) not in known:
+                    self._put_back(self._writer.task(split, index))
+        found, self._counted = self._writer.done - self._counted, self._writer.done
+        if found > 0:
+            self._progress.found(found)
+        if not self._writer.remaining() and not self._writer.complete and not self._said_waiting:
+            self._said_waiting = True
+            self._progress.message("other generators make the rest; waiting for them")
 
     def _publish(self) -> bool:
         shard = self._writer.publish_next()
@@ -166,17 +215,13 @@ class Pool:
         return batch
 
     def _receive(self, timeout: float) -> None:
-        workers = {worker.connection: worker for worker in (*self._makers, *self._solvers)}
-        for connection in wait(list(workers), timeout):
-            worker = workers[connection]  # type: ignore[index]
-            try:
-                message = worker.connection.recv()
-            except (EOFError, ConnectionResetError):
-                if self._should_stop():  # a signal to the whole process group ends workers too
-                    raise Stopped from None
-                self._replace(worker)
-            else:
+        for worker, message in self._crew.receive((*self._makers, *self._solvers), timeout):
+            if message is not None:
                 self._handle(worker, *message)
+            elif self._should_stop():  # a signal to the whole process group ends workers too
+                raise Stopped
+            else:
+                self._replace(worker)
 
     def _handle(self, worker: Worker, kind: str, *values: Any) -> None:
         if kind == "idle":
@@ -204,6 +249,7 @@ class Pool:
     def _accept(self, task: SceneTask) -> None:
         self._deaths_in_a_row = 0
         self._writer.add_staged(task.split, task.index)
+        self._counted += 1
         self._progress.episode(task.key)
 
     def _quarantine(self, task: SceneTask, cause: str) -> None:
@@ -216,8 +262,8 @@ class Pool:
         self._todo.sort(key=self._place)
 
     def _replace(self, worker: Worker) -> None:
-        cause = worker.cause_of_death()
-        self._deaths_in_a_row += 1
+        cause, blamable = worker.cause_of_death(), worker.blamable()
+        self._deaths_in_a_row += blamable
         attempts = self._config.dataset.maximum_attempts
         if self._deaths_in_a_row > 3 * attempts + self._plan.solvers:
             raise RuntimeError(f"workers keep dying before they finish any scene, the last because {cause}")
@@ -227,17 +273,18 @@ class Pool:
         if worker in self._solvers:
             number = self._solvers.index(worker)
             self._progress.frame(number, 0, 0)
-            self._solvers[number] = self._new_solver(number)
+            self._solvers[number] = self._crew.start_solver(number)
         else:
-            self._makers[self._makers.index(worker)] = self._new_maker()
+            self._makers[self._makers.index(worker)] = self._crew.start_maker()
         for item in lost:
             task = _task(item)
             if isinstance(item, MadeScene) and self._writer.is_staged(task.split, task.index):
                 self._accept(task)
                 continue
             # of several scenes any may be to blame: each is tried alone before it is counted against it
-            self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
-            if self._alone[task.key] >= attempts:
+            if blamable:
+                self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
+            if self._alone.get(task.key, 0) >= attempts:
                 self._quarantine(task, cause)
             elif isinstance(item, MadeScene):
                 self._ready.append(item)

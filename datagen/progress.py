@@ -25,6 +25,9 @@ class Progress:
     def episode(self, key: str) -> None:
         """An episode was simulated and staged."""
 
+    def found(self, count: int) -> None:
+        """`count` more episodes are there: another generator published them, or an earlier run had staged them."""
+
     def shard(self, name: str, episodes: int, revision: int) -> None:
         """A shard was published."""
 
@@ -58,7 +61,10 @@ class BarProgress(Progress):
         self._show()
 
     def episode(self, key: str) -> None:
-        self._done += 1
+        self.found(1)
+
+    def found(self, count: int) -> None:
+        self._done += count
         self._show()
 
     def shard(self, name: str, episodes: int, revision: int) -> None:
@@ -107,6 +113,10 @@ class JsonProgress(Progress):
     def episode(self, key: str) -> None:
         self._done += 1
         self._write("episode", key=key, done=self._done, total=self._total)
+
+    def found(self, count: int) -> None:
+        self._done += count
+        self._write("found", count=count, done=self._done, total=self._total)
 
     def shard(self, name: str, episodes: int, revision: int) -> None:
         self._write("shard", name=name, episodes=episodes, revision=revision)

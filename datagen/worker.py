@@ -16,18 +16,18 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from datagen.plan import SceneTask
-from datagen.writer import stage_episode
+from datagen.shard import stage_episode
 from hgn.config import DatagenConfig, SceneConfig
 from hgn.data.identity import dataset_identity, identity_hash, physics_settings
 from hgn.scene.episode import Episode
@@ -60,9 +60,34 @@ class MadeScene:
 
 
 class Worker:
-    """The parent's end of a worker process."""
+    """The pool's end of a worker, wherever it runs."""
+
+    def __init__(self) -> None:
+        self.idle = False
+        self.tasks: dict[str, SceneTask | MadeScene] = {}  # what it has and has not answered for, by key
+
+    def give(self, message: object) -> None:
+        """Sends work. A worker that has died meanwhile is noticed at the next receive."""
+        raise NotImplementedError
+
+    def kill(self) -> None:
+        """Ends it at once."""
+        raise NotImplementedError
+
+    def cause_of_death(self) -> str:
+        """Why a worker that no longer answers has ended."""
+        raise NotImplementedError
+
+    def blamable(self) -> bool:
+        """Whether what it was working on may have been its end; not where its whole machine went away."""
+        return True
+
+
+class LocalWorker(Worker):
+    """A process of this machine."""
 
     def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
+        super().__init__()
         context = multiprocessing.get_context("spawn")
         self.connection, child = context.Pipe()
         self.process = context.Process(target=_run, args=(target, child, *arguments), daemon=True)
@@ -70,22 +95,19 @@ class Worker:
             self.process.start()
         child.close()
         self.idle = True
-        self.tasks: dict[str, SceneTask | MadeScene] = {}  # what it has and has not answered for, by key
 
     def give(self, message: object) -> None:
-        """Sends work. A worker that has died meanwhile is noticed at the next receive."""
         self.idle = False
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send(message)
 
     def kill(self) -> None:
-        """Ends the process at once; staged files appear whole or not at all, so nothing is half-written."""
+        # staged files appear whole or not at all, so nothing is half-written
         self.process.kill()
         self.process.join()
         self.connection.close()
 
     def cause_of_death(self) -> str:
-        """Why a process that closed its connection has ended."""
         self.process.join(timeout=10)
         code = self.process.exitcode
         if code is not None and code < 0:
@@ -93,14 +115,26 @@ class Worker:
         return f"its process ended with exit code {code}"
 
 
-def start_maker(config: SceneConfig, backend: Backend) -> Worker:
+def start_maker(config: SceneConfig, backend: Backend) -> LocalWorker:
     """A process that answers each SceneTask with a MadeScene, or a cause."""
-    return Worker(_make_scenes, config, backend)
+    return LocalWorker(_make_scenes, config, backend)
 
 
-def start_solver(config: DatagenConfig, backend: Backend, threads: int | None, gpu: str | None) -> Worker:
+def start_solver(config: DatagenConfig, backend: Backend, threads: int | None, gpu: str | None) -> LocalWorker:
     """A process that simulates lists of MadeScene. `gpu` is the one CUDA device that it may see; none: as given."""
-    return Worker(_solve, config, backend, threads, gpu)
+    return LocalWorker(_solve, config, backend, threads, gpu)
+
+
+def receive(workers: Iterable[LocalWorker], timeout: float) -> Iterator[tuple[LocalWorker, tuple[Any, ...] | None]]:
+    """What the workers have said, waiting `timeout` seconds at most for the first word; None from one that died."""
+    by_connection = {worker.connection: worker for worker in workers}
+    for connection in wait(list(by_connection), timeout):
+        worker = by_connection[connection]  # type: ignore[index]
+        try:
+            message = worker.connection.recv()
+        except (EOFError, ConnectionResetError):
+            message = None
+        yield worker, message
 
 
 def _run(target: Callable[..., None], connection: Connection, *arguments: Any) -> None:
@@ -125,30 +159,39 @@ class _Sender:
                 os._exit(0)  # the parent has gone
 
 
+def error_message(error: Exception) -> tuple[Any, ...]:
+    """What a worker tells the pool of a fault that no scene is to blame for."""
+    if isinstance(error, ConfigError):
+        return "config_error", str(error)
+    if isinstance(error, OSError):
+        return "os_error", error.errno, error.strerror, None if error.filename is None else str(error.filename)
+    return "error", "".join(traceback.format_exception(error))
+
+
 @contextlib.contextmanager
 def _errors_sent(send: _Sender) -> Iterator[None]:
     try:
         yield
-    except ConfigError as error:
-        send("config_error", str(error))
-    except OSError as error:
-        send("os_error", error.errno, error.strerror, None if error.filename is None else str(error.filename))
-    except Exception:  # noqa: BLE001 - not swallowed: the parent stops with this text
-        send("error", traceback.format_exc())
+    except Exception as error:  # noqa: BLE001 - not swallowed: the parent stops with this text
+        send(*error_message(error))
 
 
 def _make_scenes(connection: Connection, send: _Sender, config: SceneConfig, backend: Backend) -> None:
+    for task in _received(connection):
+        send(*make_scene(task, config, backend))
+        send("idle")
+
+
+def make_scene(task: SceneTask, config: SceneConfig, backend: Backend) -> tuple[Any, ...]:
+    """What a maker answers: ("made", MadeScene), or ("failed", key, cause)."""
     generate_scene = pkgutil.resolve_name(backend.generate_scene)
     build_obstacle_grid = pkgutil.resolve_name(backend.build_obstacle_grid)
-    for task in _received(connection):
-        try:
-            scene = generate_scene(config, task.seed)
-            grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size)
-        except ConfigError as error:  # no room for the obstacles, say: another seed may do
-            send("failed", task.key, str(error))
-        else:
-            send("made", MadeScene(task, scene, grid))
-        send("idle")
+    try:
+        scene = generate_scene(config, task.seed)
+        grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size)
+    except ConfigError as error:  # no room for the obstacles, say: another seed may do
+        return "failed", task.key, str(error)
+    return "made", MadeScene(task, scene, grid)
 
 
 def _solve(
@@ -187,15 +230,20 @@ def _solve(
 
 def _stage(send: _Sender, config: DatagenConfig, config_hash: str, made: MadeScene, result: Any) -> None:
     with _errors_sent(send):
-        cause = getattr(result, "cause", None)
+        cause = failure_of(result)
         if cause is not None:
-            send("failed", made.task.key, str(cause))
-            return
-        if not np.isfinite(result.position_TN3).all():
-            send("failed", made.task.key, "positions are not finite")
+            send("failed", made.task.key, cause)
             return
         stage_episode(Path(config.dataset.folder), make_episode(made, result, config, config_hash))
         send("staged", made.task.key)
+
+
+def failure_of(result: Any) -> str | None:
+    """Why what the solver returned is no episode; none where it is one."""
+    cause = getattr(result, "cause", None)
+    if cause is not None:
+        return str(cause)
+    return None if np.isfinite(result.position_TN3).all() else "positions are not finite"
 
 
 def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_hash: str) -> Episode:

@@ -135,7 +135,7 @@ class MpmConfig:
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """How many episodes, how long, and where they are kept."""
+    """How many episodes, how long, where they are kept, and who makes them."""
 
     folder: str = "data/obstacles"
     training_scenes: int = 800
@@ -147,6 +147,10 @@ class DatasetConfig:
     episodes_per_shard: int = 8  # the first training shards are smaller, so that training can start early
     workers: int | None = None  # none: one on a GPU, one per two cores on a CPU
     maximum_attempts: int = 3  # per scene before it is quarantined and replaced
+    pool: str = "local"  # processes of this machine; or ray: of a Ray cluster
+    ray_address: str | None = None  # of the cluster; none: what RAY_ADDRESS says, else the one of this machine
+    array_task: int | None = None  # of array_tasks generators, each of which makes its own shards alone
+    array_tasks: int | None = None
 
     def __post_init__(self) -> None:
         require_positive(self, "frame_rate_hz", "episodes_per_shard", "maximum_attempts")
@@ -155,6 +159,13 @@ class DatasetConfig:
         require(self.folder != "", "folder", "a folder name", self.folder)
         if self.workers is not None:
             require(self.workers >= 1, "workers", "at least 1", self.workers)
+        require_one_of(self, "pool", ("local", "ray"))
+        require(self.ray_address is None or self.pool == "ray", "ray_address", "left out without pool=ray", self.pool)
+        task, tasks = self.array_task, self.array_tasks
+        require((task is None) == (tasks is None), "array_task", "given together with array_tasks", [task, tasks])
+        if task is not None and tasks is not None:
+            require(tasks >= 1, "array_tasks", "at least 1", tasks)
+            require(0 <= task < tasks, "array_task", f"0 to {tasks - 1}, below array_tasks", task)
 
     def scenes(self, split: str) -> int:
         return {"train": self.training_scenes, "validation": self.validation_scenes, "test": self.test_scenes}[split]

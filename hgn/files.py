@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,8 +12,16 @@ TEMPORARY_SUFFIX = ".partial"
 
 
 def temporary_path(path: Path) -> Path:
-    """A name beside `path` for writing it; a crash leaves a file that ends in `.partial`, never a cut `path`."""
-    return path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+    """A name beside `path` for writing it; a crash leaves a file that ends in `.partial`, never a cut `path`.
+
+    No two are the same, on several machines and in containers that count their processes alike.
+    """
+    return path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+
+
+def temporary_target(path: Path) -> str:
+    """The name that a file of `temporary_path` was to get."""
+    return path.name.removeprefix(".").removesuffix(TEMPORARY_SUFFIX).rpartition(".")[0]
 
 
 @contextlib.contextmanager

@@ -13,8 +13,9 @@ sys.path.insert(0, str(Path(__file__).parent / "datagen"))  # spawned workers fi
 
 import ballistic_solver
 
+from datagen.shard import stage_episode
 from datagen.worker import Backend, MadeScene, make_episode
-from datagen.writer import DatasetWriter, stage_episode
+from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 
 BALLISTIC = Backend(
@@ -56,9 +57,11 @@ def make_config(tmp_path: Path) -> Callable[..., DatagenConfig]:
 
 @pytest.fixture
 def stage(backend: Backend) -> Callable[[DatasetWriter, str, int], None]:
-    """Simulates one episode in this process and stages it."""
+    """Simulates one episode in this process and stages it; the writer claims what comes before it too."""
 
     def run(writer: DatasetWriter, split: str, index: int) -> None:
+        while (split, index) not in writer.remaining():
+            assert writer.claim_next()
         config, task = writer.config, writer.task(split, index)
         scene = ballistic_solver.generate_scene(config.scene, task.seed)
         grid = ballistic_solver.build_obstacle_grid((), scene.cell_size, 0, scene.domain_size)
@@ -76,10 +79,11 @@ def make_dataset(stage: Callable[[DatasetWriter, str, int], None]) -> Callable[[
 
     def make(config: DatagenConfig) -> Path:
         with DatasetWriter(config) as writer:
-            for split, index in writer.remaining():
-                stage(writer, split, index)
-                while writer.publish_next():
-                    pass
+            while writer.claim_next():
+                for split, index in writer.remaining():
+                    stage(writer, split, index)
+                writer.publish_next()
+            assert writer.complete
         return writer.folder
 
     return make

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import hgn.data.reader
-from datagen.writer import DatasetWriter, locate_members
+from datagen.shard import locate_members
+from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from datagen.plan import scene_seed
-from datagen.pool import Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
+from datagen.pool import LocalCrew, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
 from datagen.progress import Progress
 from datagen.worker import Backend
 from datagen.writer import DatasetWriter
@@ -49,7 +49,7 @@ def generate(config: DatagenConfig, backend: Backend, plan: WorkerPlan = ONE, **
     recorder = Recorder()
     try:
         with DatasetWriter(config, recorder.message) as writer:
-            Pool(config, writer, recorder, plan, backend, **options).run()
+            Pool(config, writer, recorder, plan, LocalCrew(config, backend, plan), **options).run()
     finally:
         assert not multiprocessing.active_children()
     return recorder
@@ -139,7 +139,8 @@ def test_stop_keeps_what_is_staged(make_config: MakeConfig, backend: Backend, co
     config = make_config()
     recorder = Recorder()
     with pytest.raises(Stopped), DatasetWriter(config) as writer:
-        Pool(config, writer, recorder, ONE, backend, lambda: len(recorder.episodes) >= 3).run()
+        crew = LocalCrew(config, backend, ONE)
+        Pool(config, writer, recorder, ONE, crew, lambda: len(recorder.episodes) >= 3).run()
     assert not multiprocessing.active_children()
     # the episode in flight may or may not have been staged when its worker ended
     done = len(recorder.episodes)
@@ -155,7 +156,8 @@ def test_workers_that_die_while_stopping(make_config: MakeConfig, backend: Backe
     (control / f"kill-{scene_seed(0, 'train', 0, 0)}").write_text("1")
     recorder = Recorder()
     with pytest.raises(Stopped), DatasetWriter(config) as writer:
-        Pool(config, writer, recorder, ONE, backend, lambda: (control / "simulated.log").exists()).run()
+        crew = LocalCrew(config, backend, ONE)
+        Pool(config, writer, recorder, ONE, crew, lambda: (control / "simulated.log").exists()).run()
     assert recorder.messages == [] and len(simulated(control)) == 1
 
 
@@ -180,7 +182,7 @@ def test_full_disk_in_a_worker_reaches_the_parent(make_config: MakeConfig, backe
         staging.rmdir()
         staging.write_text("in the way")
         with pytest.raises(NotADirectoryError):
-            Pool(config, writer, Recorder(), ONE, backend).run()
+            Pool(config, writer, Recorder(), ONE, LocalCrew(config, backend, ONE)).run()
         staging.unlink()
         staging.mkdir()
 

@@ -19,9 +19,11 @@ import numpy as np
 import pytest
 import webdataset
 
+import datagen.shard
 import datagen.writer
 from datagen.plan import scene_seed
-from datagen.writer import MAXIMUM_REPLACEMENTS, DatasetWriter, locate_members
+from datagen.shard import locate_members
+from datagen.writer import MAXIMUM_REPLACEMENTS, DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
@@ -156,6 +158,7 @@ def test_resume_after_a_crash_makes_the_same_shards(
 
     with monkeypatch.context() as patch:
         # sync_folder is the last step of each staging and of each shard, so a crash there is a crash between files
+        patch.setattr(datagen.shard, "sync_folder", crash)
         patch.setattr(datagen.writer, "sync_folder", crash)
         patch.setattr("hgn.files.sync_folder", crash)
         try:
@@ -202,7 +205,7 @@ def test_complete_folder_stays_untouched(make_config: MakeConfig, make_dataset: 
     folder = make_dataset(make_config())
     before = snapshot(folder)
     with DatasetWriter(make_config(training_scenes=count)) as writer:
-        assert writer.complete and writer.remaining() == []
+        assert writer.complete and writer.claim_next() is None
     assert snapshot(folder) == before
 
 
@@ -267,16 +270,70 @@ def test_data_of_another_schema_is_refused(make_config: MakeConfig, make_dataset
         make_dataset(make_config())
 
 
-def test_one_generator_at_a_time(make_config: MakeConfig) -> None:
-    """A second generator on the same folder ends with a message that names the first."""
-    with (
-        DatasetWriter(make_config()) as writer,
-        pytest.raises(ConfigError, match=rf"being written by another generator \(process {os.getpid()}\)"),
-        DatasetWriter(make_config()),
-    ):
+def claim_all(writer: DatasetWriter) -> list[tuple[str, int]]:
+    while writer.claim_next():
         pass
-    with DatasetWriter(make_config()) as writer:
-        assert writer.total == 8
+    return writer.remaining()
+
+
+def test_generators_share_a_folder(
+    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, tmp_path: Path, control: Path
+) -> None:
+    """Each of two generators makes the shards that it claims; what one leaves behind the other makes; each sees what
+    the other published."""
+    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
+    (control / "simulated.log").unlink()
+    with DatasetWriter(make_config()) as other:
+        with DatasetWriter(make_config()) as writer:
+            first, second = writer.claim_next(), other.claim_next()
+            assert first and second and not set(writer.remaining()) & set(other.remaining())
+            stage(writer, first.split, first.first)
+            partial = writer.folder / f".{second.name}.77.partial"
+            partial.touch()
+            assert writer.publish_next()
+            assert claim_all(writer) and other.claim_next() is None and not other.complete
+        assert partial.exists() and (other.folder / ".staging").exists()
+        other.refresh()
+        assert other.done == 1
+        for split, index in claim_all(other):
+            stage(other, split, index)
+        while other.publish_next():
+            pass
+        assert other.complete
+    assert not partial.exists() and not (other.folder / ".staging").exists()
+    assert hashes(other.folder) == hashes(whole) and Manifest.load(other.folder).complete
+    seeds = (control / "simulated.log").read_text().split()
+    assert len(seeds) == len(set(seeds)) == 8
+
+
+def test_first_writer_wins(make_config: MakeConfig, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where locks do not hold, two generators make a shard; the second copy is dropped, and it is listed once."""
+    monkeypatch.setattr("datagen.claims.Claims.take", lambda self, shard: True)
+    messages: list[str] = []
+    with DatasetWriter(make_config()) as writer, DatasetWriter(make_config(), messages.append) as other:
+        assert writer.claim_next() == other.claim_next()
+        stage(writer, "train", 0)
+        stage(other, "train", 0)
+        assert writer.publish_next()
+        before = snapshot(writer.folder)
+        assert other.publish_next() == writer.manifest.shards[0]
+        assert snapshot(writer.folder) == before
+    assert messages == ["train-000000-000001.tar was published by another generator; this copy is dropped"]
+    assert len(Manifest.load(writer.folder).shards) == 1
+
+
+def test_array_tasks_make_one_dataset(
+    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, control: Path
+) -> None:
+    """Three tasks of an array make all shards once between them, each knowing nothing of the others."""
+    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
+    (control / "simulated.log").unlink()
+    for task in range(3):
+        folder = make_dataset(make_config(array_task=task, array_tasks=3))
+        assert Manifest.load(folder).complete == (task == 2)
+    assert hashes(folder) == hashes(whole)
+    seeds = (control / "simulated.log").read_text().split()
+    assert len(seeds) == len(set(seeds)) == 8
 
 
 def test_manifest_is_rebuilt_from_the_shards(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
@@ -305,7 +362,7 @@ def test_missing_shard_is_made_again(make_config: MakeConfig, make_dataset: Make
     (folder / "train-000002-000004.tar").unlink()
     messages: list[str] = []
     with DatasetWriter(make_config(), messages.append) as writer:
-        assert writer.remaining() == [("train", 2), ("train", 3)]
+        assert claim_all(writer) == [("train", 2), ("train", 3)]
     assert "train-000002-000004.tar is listed in the manifest but missing" in messages[0]
     make_dataset(make_config())
     assert hashes(folder) == before
@@ -334,7 +391,7 @@ def test_broken_staged_file_is_made_again(make_config: MakeConfig, make_dataset:
     staged.write_bytes(staged.read_bytes()[:2000])
     messages: list[str] = []
     with DatasetWriter(make_config(), messages.append) as writer:
-        assert ("train", 1) in writer.remaining()
+        assert ("train", 1) in claim_all(writer)
     assert "the episode is made again" in messages[0]
     make_dataset(make_config())
 

@@ -1,0 +1,108 @@
+"""One run of the generator on a folder, until its share of the data set is published or it is asked to stop."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Mapping
+from types import FrameType
+from typing import Any
+
+from datagen.pool import LocalCrew, Pool, Stopped, available_cpus, plan_workers, visible_gpus
+from datagen.progress import Progress
+from datagen.worker import Backend
+from datagen.writer import DatasetWriter
+from hgn.command import section
+from hgn.config import DatagenConfig
+from hgn.schema import from_mapping, require
+
+# an experiment file serves all commands: what only hgn.train needs is left out
+KEYS = {
+    "scene": "scene",
+    "mpm": "mpm",
+    "dataset": "dataset",
+    "scenes": "dataset.training_scenes",
+    "out": "dataset.folder",
+    "pool": "dataset.pool",
+    "array_task": "dataset.array_task",
+    "array_tasks": "dataset.array_tasks",
+    "name": None,
+    "network": None,
+    "training": None,
+    "progress": None,
+}
+
+
+class StopRequest:
+    """Ctrl-C or SIGTERM while it is entered: noted, so that what is being written is finished. A second one acts
+    at once.
+    """
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    def __enter__(self) -> StopRequest:
+        self._previous = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._restore()
+
+    def requested(self) -> bool:
+        return self.signal is not None
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.signal = number
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+
+def datagen_config(mapping: Mapping[str, Any], keys: Mapping[str, str | None] = KEYS) -> DatagenConfig:
+    """The generator's configuration out of a composed one. Raises: ConfigError."""
+    return from_mapping(DatagenConfig, section(mapping, keys))
+
+
+def require_local_folder(config: DatagenConfig) -> None:
+    """Raises ConfigError where the folder to write to is a URL: remote folders are read, never written."""
+    folder = config.dataset.folder
+    require("://" not in folder, "out", "a folder to write to", folder, "a URL can only be read, by hgn.train")
+
+
+def generate(
+    config: DatagenConfig, progress: Progress, should_stop: Callable[[], bool], backend: Backend | None = None
+) -> bool:
+    """Makes what is missing; False when it was asked to stop before the end, and the folder can be gone on with.
+
+    Raises: ConfigError, OSError, RuntimeError: what is published and staged is kept then too.
+    """
+    require_local_folder(config)
+    backend = backend or Backend()
+    with DatasetWriter(config, progress.message) as writer:
+        if not writer.complete:
+            try:
+                if config.dataset.pool == "ray":
+                    from datagen.ray_crew import RayCrew
+
+                    with RayCrew(config, backend) as crew:
+                        Pool(config, writer, progress, crew.plan, crew, should_stop).run()
+                else:
+                    plan = plan_workers(config, visible_gpus(), available_cpus())
+                    Pool(config, writer, progress, plan, LocalCrew(config, backend, plan), should_stop).run()
+            except Stopped:
+                progress.message(
+                    f"stopped; {writer.done} of {writer.total} episodes are kept in {writer.folder}: run the same "
+                    "command to go on"
+                )
+                return False
+        progress.message(_summary(config, writer))
+    return True
+
+
+def _summary(config: DatagenConfig, writer: DatasetWriter) -> str:
+    counts = ", ".join(f"{writer.manifest.published(split)} {split}" for split in writer.requested)
+    task, tasks = config.dataset.array_task, config.dataset.array_tasks
+    if task is not None and not writer.manifest.complete:
+        return f"share {task} of {tasks} of {writer.folder} is complete; published so far: {counts} episodes"
+    return f"{writer.folder} is complete: {counts} episodes"

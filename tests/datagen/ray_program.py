@@ -1,0 +1,65 @@
+"""Generates on a Ray cluster of two nodes on loopback and kills one of them midway; prints what happened as JSON.
+
+Run as `python ray_program.py FOLDER`, with this folder on the path and BALLISTIC_FOLDER set.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+from ray.cluster_utils import Cluster
+
+from datagen.generate import generate
+from datagen.progress import Progress
+from datagen.worker import Backend
+from hgn.config import DatagenConfig, DatasetConfig
+
+BALLISTIC = Backend(
+    generate_scene="ballistic_solver:generate_scene",
+    build_obstacle_grid="ballistic_solver:build_obstacle_grid",
+    simulate="ballistic_solver:simulate",
+)
+STORE_BYTES = 80 * 2**20
+
+
+class Killer(Progress):
+    """Kills a node once three episodes are there."""
+
+    def __init__(self, cluster: Cluster, node: object) -> None:
+        self.cluster, self.node, self.episodes, self.messages = cluster, node, 0, []
+
+    def episode(self, key: str) -> None:
+        self.episodes += 1
+        if self.episodes == 3:
+            self.cluster.remove_node(self.node, allow_graceful=False)
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+
+def main(folder: str) -> None:
+    cluster = Cluster(
+        initialize_head=True,
+        head_node_args={"num_cpus": 2, "object_store_memory": STORE_BYTES, "include_dashboard": False},
+    )
+    second = cluster.add_node(num_cpus=2, object_store_memory=STORE_BYTES)
+    try:
+        dataset = DatasetConfig(
+            folder=folder,
+            training_scenes=10,
+            validation_scenes=2,
+            test_scenes=0,
+            frames=6,
+            pool="ray",
+            ray_address=cluster.address,
+        )
+        killer = Killer(cluster, second)
+        finished = generate(DatagenConfig(dataset=dataset), killer, lambda: False, BALLISTIC)
+        print(json.dumps({"finished": finished, "episodes": killer.episodes, "messages": killer.messages}))
+    finally:
+        cluster.shutdown()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,69 @@
+"""Generation on a Ray cluster. Skipped where the optional extra `ray` is not installed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from datagen.pool import WorkerPlan
+from datagen.ray_crew import RayCrew, plan_cluster
+from datagen.worker import Backend
+from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
+from hgn.data.manifest import Manifest
+from hgn.schema import ConfigError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_lost_node(
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    control: Path,
+    tmp_path: Path,
+) -> None:
+    """Two nodes generate; one is killed midway; the set completes, bitwise the one that a single process makes, and no
+    scene is blamed."""
+    pytest.importorskip("ray")
+    whole = make_dataset(make_config(training_scenes=10, test_scenes=0, folder=str(tmp_path / "whole")))
+    (control / "slow").touch()
+    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
+    program = subprocess.run(
+        [sys.executable, str(Path(__file__).with_name("ray_program.py")), "data"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path, "RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert program.returncode == 0, program.stderr
+    report = json.loads(program.stdout.splitlines()[-1])
+    assert report["finished"] and report["episodes"] == 12
+    assert "a worker died" in report["messages"][0] and "on node" in report["messages"][0]
+    manifest = Manifest.load(tmp_path / "data")
+    assert manifest.complete and not manifest.quarantined
+    assert {shard.name: shard.sha256 for shard in manifest.shards} == {
+        shard.name: shard.sha256 for shard in Manifest.load(whole).shards
+    }
+
+
+def test_no_cluster(make_config: Callable[..., DatagenConfig], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without Ray, or without a cluster, the message says what to do."""
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ConfigError, match=r"needs Ray, which is not installed; pip install 'hgn\[ray\]'"):
+        RayCrew(make_config(pool="ray"), Backend())
+
+
+def test_cluster_plans() -> None:
+    """A solver for two cores of a node, or for a GPU; settings win."""
+    default = DatagenConfig()
+    assert plan_cluster(default, [{"CPU": 4.0}, {"CPU": 3.0}, {}]) == WorkerPlan(3, 2, 3, 1, 1)
+    assert plan_cluster(default, [{"CPU": 1.0}, {"CPU": 8.0}]) == WorkerPlan(9, 1, 8, 1, 1)
+    assert plan_cluster(default, [{"CPU": 8.0, "GPU": 2.0}] * 2) == WorkerPlan(4, None, 4, 64, 2)
+    few = DatagenConfig(dataset=DatasetConfig(workers=1), mpm=MpmConfig(device="cpu"))
+    assert plan_cluster(few, [{"CPU": 8.0, "GPU": 2.0}]) == WorkerPlan(1, 2, 1, 1, 1)
