@@ -31,7 +31,7 @@ demo: setup
 	$(RUN) -m hgn.evaluate weights=$(DEMO)/weights.safetensors data=data/demo json=$(DEMO)/errors.json
 	@echo "weights: $(DEMO)/weights.safetensors"
 	@echo "rollout: $(DEMO)/rollout.vtkhdf (HDF5; ParaView opens it)"
-	@echo "picture: $$(ls $(DEMO)/pictures/*.png $(DEMO)/pictures/*.gif | tr '\n' ' ')"
+	@echo "picture: $(DEMO)/pictures/rollout.png, moving: $(DEMO)/pictures/rollout.gif"
 
 test: setup
 	$(RUN) -m pytest
