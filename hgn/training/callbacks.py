@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from hgn.data.reader import EpisodeStore
 from hgn.data.select import first_episodes
-from hgn.files import sync_folder, temporary_path
+from hgn.files import TEMPORARY_SUFFIX, sync_folder, temporary_path
 from hgn.picture import rollout_of_episode
 from hgn.progress import bar
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
@@ -53,6 +53,11 @@ class Checkpoints(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.best_error = state_dict["best_error"]
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_global_zero:
+            for left_by_a_crash in self.folder.glob(f".*{TEMPORARY_SUFFIX}"):
+                left_by_a_crash.unlink()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if trainer.global_step % self.every == 0:

@@ -50,6 +50,7 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
 
     Raises: ConfigError when there are not as many GPUs, or the launcher started another number of processes.
     """
+    _check_restarts()
     launched = _launched()
     devices, nodes = training.devices, training.nodes
     if launched is not None:
@@ -64,6 +65,17 @@ def layout(training: TrainingConfig) -> tuple[int, int]:
             "with srun"
         )
     return devices, nodes
+
+
+def _check_restarts() -> None:
+    shared = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    if shared and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0:
+        # Restarted processes would find the addresses of those that are gone, and wait for half an hour.
+        raise ConfigError(
+            "TORCH_DISABLE_SHARE_RDZV_TCP_STORE must be 1 in torchrun's environment where it may restart processes "
+            f"(--max-restarts {os.environ['TORCHELASTIC_MAX_RESTARTS']}), got "
+            f"{os.environ.get('TORCH_DISABLE_SHARE_RDZV_TCP_STORE', 'nothing')}; see pytorch issue 135712"
+        )
 
 
 def _devices(accelerator: str, wanted: int | None) -> int:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.strategies import DDPStrategy
+from torch.nn.parallel import DistributedDataParallel
 
 from hgn.schema import ConfigError, to_mapping
 from hgn.training.feed import Feed
@@ -17,7 +19,10 @@ def gradient_averaging() -> DDPStrategy:
 
     Buffers are not sent at each update: the normaliser is constant, and the sum of losses is each rank's own.
     """
-    return DDPStrategy(broadcast_buffers=False, gradient_as_bucket_view=True)
+    # torch 2.13 has another name for it
+    renamed = "forward_sync_buffers" in inspect.signature(DistributedDataParallel).parameters
+    keep_buffers: dict[str, Any] = {"forward_sync_buffers" if renamed else "broadcast_buffers": False}
+    return DDPStrategy(gradient_as_bucket_view=True, **keep_buffers)
 
 
 class SameStart(Callback):

@@ -1,15 +1,15 @@
 """One rank of a distributed training, started by torchrun: python ddp_program.py FOLDER.
 
 Trains as FOLDER/mapping.json says and keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update,
-FOLDER/end_RANK.pt with the weights, the update and the exit code. Where FOLDER/signal.json holds
-[rank, update], that rank alone gets SIGTERM at that update.
+FOLDER/end_RANK.pt with the weights, the update and the exit code, FOLDER/starts_RANK with the update of each start.
+FOLDER/signals.json holds [restart, rank, update, signal, target] rows: in that start, that rank sends the signal at
+that update, to itself (target self) or to torchrun (launcher).
 """
 
 from __future__ import annotations
 
 import json
 import os
-import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,25 +22,34 @@ from hgn.training.module import TrainingModule
 
 def main(folder: Path) -> int:
     mapping: dict[str, Any] = json.loads((folder / "mapping.json").read_text())
-    signalled = json.loads((folder / "signal.json").read_text()) if (folder / "signal.json").exists() else None
-    rank = int(os.environ["RANK"])
+    rank, restart = int(os.environ["RANK"]), int(os.environ["TORCHELASTIC_RESTART_COUNT"])
+    signals = {
+        update: (os.getppid() if target == "launcher" else os.getpid(), number)
+        for in_start, of_rank, update, number, target in json.loads((folder / "signals.json").read_text())
+        if (in_start, of_rank) == (restart, rank)
+    }
     end: dict[str, Any] = {}
+
+    def at_start(module: TrainingModule) -> None:
+        with (folder / f"starts_{rank}").open("a") as file:
+            file.write(f"{module.global_step}\n")
 
     def before_step(module: TrainingModule, optimizer: torch.optim.Optimizer) -> None:
         if module.global_step == 0:
             gradients = {name: parameter.grad.clone() for name, parameter in module.named_parameters()}
             torch.save(gradients, folder / f"gradients_{rank}.pt")
-        if signalled == [rank, module.global_step]:
-            os.kill(os.getpid(), signal.SIGTERM)
+        if module.global_step in signals:
+            os.kill(*signals[module.global_step])
 
     def at_end(module: TrainingModule) -> None:
         end.update(weights=module.state_dict(), update=module.global_step)
 
+    TrainingModule.on_train_start = at_start
     TrainingModule.on_before_optimizer_step = before_step
     TrainingModule.on_train_end = at_end
     end["exit_code"] = train.main(mapping)
     torch.save(end, folder / f"end_{rank}.pt")
-    return 0
+    return end["exit_code"]
 
 
 if __name__ == "__main__":

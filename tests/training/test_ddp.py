@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +20,18 @@ from training.runs import metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig, TrainingConfig
+from hgn.data.order import SampleOrder
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.launch import default_run, first_rank, layout
+from hgn.training.module import TrainingModule
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = Path(__file__).with_name("ddp_program.py")
 ADAM_BETA_1 = 0.9
 LAUNCHER_VARIABLES = (
     *("HGN_RUN", "RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "NODE_RANK", "TORCHELASTIC_RUN_ID"),
+    *("TORCHELASTIC_USE_AGENT_STORE", "TORCHELASTIC_MAX_RESTARTS", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"),
     *("SLURM_PROCID", "SLURM_NTASKS", "SLURM_NNODES", "SLURM_JOB_NAME", "SLURM_JOB_ID"),
 )
 
@@ -37,74 +42,173 @@ def free_port() -> int:
         return int(listener.getsockname()[1])
 
 
-def torchrun(folder: Path, processes: int = 2) -> None:
-    """Trains by folder/mapping.json in several CPU processes (gloo)."""
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--nnodes", "1", "--nproc-per-node", str(processes)]
-    address = ["--master-addr", "127.0.0.1", "--master-port", str(free_port())]
-    process = subprocess.run(
-        [*launcher, *address, str(PROGRAM), str(folder)],
+def torchrun(folder: Path, *options: str, prefix: Sequence[str] = (), **variables: str) -> subprocess.Popen[str]:
+    """Starts torchrun on ddp_program.py, CPU processes that talk through gloo."""
+    return subprocess.Popen(
+        [*prefix, sys.executable, "-m", "torch.distributed.run", *options, str(PROGRAM), str(folder)],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
+        env=os.environ
+        | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
+        | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
-        timeout=240,
     )
-    assert process.returncode == 0, process.stderr[-4000:]
+
+
+def output(process: subprocess.Popen[str]) -> str:
+    """What it printed until it ended; nothing may hang."""
+    try:
+        return process.communicate(timeout=180)[0]
+    except subprocess.TimeoutExpired:
+        process.terminate()
+        raise AssertionError(process.communicate(timeout=60)[0][-4000:]) from None
 
 
 def load(path: Path) -> Any:
     return torch.load(path, weights_only=True)
 
 
-def test_two_ranks_train_as_one(
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
-    tmp_path: Path,
-) -> None:
-    """Two ranks with a scene each have the gradients of one with both (to 1e-6); their weights stay bitwise equal;
-    SIGTERM to one of them ends both at the same update, with a checkpoint and the same exit code; one run folder."""
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """The data set, the first gradients of one rank with two scenes, and a folder for a training of two ranks."""
+
+    mapping: Callable[[Path], dict[str, Any]]
+    gradients: dict[str, torch.Tensor]
+
+    def folder(self, path: Path, signals: Sequence[tuple[int, int, int, int, str]]) -> Path:
+        """A folder for ddp_program.py: 40 updates of two ranks with a scene each, and the signals it sends itself."""
+        path.mkdir()
+        (path / "mapping.json").write_text(json.dumps(self.mapping(path)))
+        (path / "signals.json").write_text(json.dumps(signals))
+        return path
+
+    def check(self, folder: Path, exit_code: int) -> dict[str, torch.Tensor]:
+        """The gradients of both ranks are those of one with both scenes, to 1e-6; both ended at update 20 with equal
+        weights, the checkpoint's, and one run folder. Returns the weights."""
+        gradients = [load(folder / f"gradients_{rank}.pt") for rank in (0, 1)]
+        assert gradients[0].keys() == gradients[1].keys() == self.gradients.keys()
+        for name, expected in self.gradients.items():
+            assert torch.equal(gradients[0][name], gradients[1][name]), name
+            difference = float((gradients[0][name] - expected).abs().max())
+            assert difference <= 1e-6 * max(1.0, float(expected.abs().max())), name
+        ends = [load(folder / f"end_{rank}.pt") for rank in (0, 1)]
+        assert [end["update"] for end in ends] == [20, 20]  # ranks agree at every tenth update
+        assert [end["exit_code"] for end in ends] == [exit_code] * 2
+        stored = read_checkpoint(folder / "run" / "checkpoints" / "last.ckpt")
+        assert stored["hgn"]["updates"] == 20
+        cursor = stored["hgn"]["cursor"]
+        assert 25 * cursor["epoch"] + cursor["position"] == 2 * 20  # two samples an update, of 5 episodes with 5 steps
+        for name, tensor in stored["state_dict"].items():
+            assert torch.equal(ends[0]["weights"][name], tensor), name
+            assert torch.equal(ends[1]["weights"][name], tensor), name
+        made = {path.name for path in folder.iterdir() if path.suffix not in (".json", ".pt")}
+        assert made == {"run", "starts_0", "starts_1"}
+        return stored["state_dict"]
+
+
+@pytest.fixture
+def reference(
+    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path], tmp_path: Path
+) -> Reference:
     config = make_config()
     make_dataset(config)
-    folder = tmp_path / "two"
-    folder.mkdir()
-    changes: dict[str, Any] = {"maximum_updates": 40, "monitor_rollout_frames": 0}
-    two = train_mapping(config, folder / "run", **changes, batch_scenes=1, devices=2)
-    (folder / "mapping.json").write_text(json.dumps(two))
-    (folder / "signal.json").write_text("[1, 13]")
-    torchrun(folder)
-
-    one = train_mapping(config, tmp_path / "one", **(changes | {"maximum_updates": 1}), batch_scenes=2)
-    assert train.main(one) == 0
-    alone = read_checkpoint(tmp_path / "one" / "checkpoints" / "last.ckpt")
+    changes: dict[str, Any] = {"monitor_rollout_frames": 0, "monitor_every": 1000}
+    run = tmp_path / "one"
+    assert train.main(train_mapping(config, run, **changes, maximum_updates=1, batch_scenes=2)) == 0
+    alone = read_checkpoint(run / "checkpoints" / "last.ckpt")
     # Adam's first moment after one update is (1 - beta_1) times the gradient
     moments = alone["optimizer_states"][0]["state"]
     names = [name for name in alone["state_dict"] if "normaliser" not in name]
     assert len(moments) == len(names)
-    reference = {name: moments[index]["exp_avg"] / (1 - ADAM_BETA_1) for index, name in enumerate(names)}
+    gradients = {name: moments[index]["exp_avg"] / (1 - ADAM_BETA_1) for index, name in enumerate(names)}
+    assert max(float(gradient.abs().max()) for gradient in gradients.values()) > 0.1
+    two = changes | {"maximum_updates": 40, "batch_scenes": 1}
+    return Reference(lambda folder: train_mapping(config, folder / "run", **two), gradients)
 
-    gradients = [load(folder / f"gradients_{rank}.pt") for rank in (0, 1)]
-    assert gradients[0].keys() == gradients[1].keys() == reference.keys()
-    assert max(float(gradient.abs().max()) for gradient in reference.values()) > 0.1
-    for name, expected in reference.items():
-        assert torch.equal(gradients[0][name], gradients[1][name]), name
-        difference = float((gradients[0][name] - expected).abs().max())
-        assert difference <= 1e-6 * max(1.0, float(expected.abs().max())), name
 
-    ends = [load(folder / f"end_{rank}.pt") for rank in (0, 1)]
-    assert [end["update"] for end in ends] == [20, 20]  # ranks agree at every tenth update
-    assert [end["exit_code"] for end in ends] == [128 + signal.SIGTERM] * 2
-    stored = read_checkpoint(folder / "run" / "checkpoints" / "last.ckpt")
-    assert stored["hgn"]["updates"] == 20
-    cursor = stored["hgn"]["cursor"]
-    assert 25 * cursor["epoch"] + cursor["position"] == 2 * 20  # two samples an update, of 5 episodes with 5 steps
-    for name, tensor in stored["state_dict"].items():
-        assert torch.equal(ends[0]["weights"][name], tensor), name
-        assert torch.equal(ends[1]["weights"][name], tensor), name
-    made = {path.name for path in folder.iterdir() if path.suffix not in (".json", ".pt")}
-    assert made == {"run"}
-    assert len(list((folder / "run" / "tensorboard").glob("events.*"))) == 1
-    updates = [record["update"] for record in metrics(folder / "run") if "loss" in record]
+def test_two_ranks_train_as_one(reference: Reference, tmp_path: Path) -> None:
+    """Two ranks with a scene each have the gradients of one with both (to 1e-6); their weights stay bitwise equal;
+    SIGTERM to one of them ends both at the same update, with a checkpoint and the same exit code. A `kill -9` of a rank
+    instead restarts both from the last checkpoint, SIGTERM to torchrun then ends all ranks in order, and the weights
+    are bitwise the same. A training goes on from there on one rank, where it left the order."""
+    one_machine = ("--nnodes", "1", "--nproc-per-node", "2", "--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0")
+    cut = reference.folder(tmp_path / "cut", [(0, 1, 13, signal.SIGTERM, "self")])
+    assert "exitcode  : 143" in output(torchrun(cut, *one_machine))
+    weights = reference.check(cut, 128 + signal.SIGTERM)
+    assert (cut / "starts_0").read_text() == "0\n"
+    assert len(list((cut / "run" / "tensorboard").glob("events.*"))) == 1
+    updates = [record["update"] for record in metrics(cut / "run") if "loss" in record]
     assert updates == [4, 8, 12, 16, 20]  # one line each: rank 0 alone writes
+
+    signals = [(0, 1, 13, signal.SIGKILL, "self"), (1, 0, 16, signal.SIGTERM, "launcher")]
+    killed = reference.folder(tmp_path / "killed", signals)
+    process = torchrun(killed, *one_machine, "--max-restarts", "1")
+    text = output(process)
+    assert process.returncode != 0 and "signal" in text.lower()
+    assert (killed / "starts_1").read_text() == "0\n10\n", text  # a checkpoint at every fifth update
+    for name, tensor in reference.check(killed, 128 + signal.SIGTERM).items():
+        assert torch.equal(tensor, weights[name]), name
+
+    alone = reference.mapping(cut)
+    alone["training"] |= {"devices": 1, "batch_scenes": 1}
+    seen: list[tuple[int, ...]] = []
+    with pytest.MonkeyPatch.context() as patch:
+        original = TrainingModule.training_step
+        patch.setattr(TrainingModule, "training_step", lambda m, b, i: (seen.append(b.seeds_S), original(m, b, i))[1])
+        assert train.main(alone) == 0
+    order = SampleOrder(alone["training"].get("seed", 0), 2, lambda _: [6] * 5)
+    for _ in range(20):
+        order.next_batch()
+    rest = SampleOrder(order.seed, 1, lambda _: [6] * 5, order.cursor)
+    assert seen == [tuple(sample.seed for sample in rest.next_batch()) for _ in range(20)]
+
+
+@pytest.fixture
+def two_machines() -> Iterator[tuple[str, str, str]]:
+    """Two network namespaces joined by a cable: their names and the address of the first."""
+    if os.geteuid() != 0 or shutil.which("ip") is None:
+        pytest.skip("network namespaces need root and ip")
+    first, second = f"hgn-a-{os.getpid()}", f"hgn-b-{os.getpid()}"
+    if subprocess.run(["ip", "netns", "add", first], capture_output=True).returncode:
+        pytest.skip("this machine allows no network namespaces")
+
+    def ip(*arguments: str) -> None:
+        subprocess.run(["ip", *arguments], check=True, capture_output=True)
+
+    try:
+        ip("netns", "add", second)
+        ip("-n", first, "link", "add", "cable", "type", "veth", "peer", "name", "cable", "netns", second)
+        for name, address in ((first, "10.213.7.1/24"), (second, "10.213.7.2/24")):
+            ip("-n", name, "addr", "add", address, "dev", "cable")
+            ip("-n", name, "link", "set", "cable", "up")
+            ip("-n", name, "link", "set", "lo", "up")
+        yield first, second, "10.213.7.1"
+    finally:
+        for name in (first, second):
+            subprocess.run(["ip", "netns", "del", name], capture_output=True)
+
+
+def test_two_machines_train_as_one(reference: Reference, two_machines: tuple[str, str, str], tmp_path: Path) -> None:
+    """Two machines (network namespaces) under torchrun have the gradients of one process and equal weights after 20
+    updates; SIGUSR1 to one rank of one machine ends both, with a checkpoint."""
+    folder = reference.folder(tmp_path / "two", [(0, 1, 11, signal.SIGUSR1, "self")])
+    *machines, address = two_machines
+    processes = [
+        torchrun(
+            folder,
+            *("--nnodes", "2", "--nproc-per-node", "1", "--rdzv-backend", "c10d", "--rdzv-id", "two"),
+            *("--rdzv-endpoint", f"{address}:29500", "--rdzv-conf", f"is_host={int(number == 0)}"),
+            *("--local-addr", f"10.213.7.{number + 1}"),
+            prefix=("ip", "netns", "exec", machine),
+            GLOO_SOCKET_IFNAME="cable",
+        )
+        for number, machine in enumerate(machines)
+    ]
+    texts = [output(process) for process in processes]
+    assert all(process.returncode != 0 for process in processes)
+    assert any("exitcode  : 138" in text for text in texts), texts
+    reference.check(folder, 128 + signal.SIGUSR1)
 
 
 @pytest.fixture
@@ -180,6 +284,20 @@ def test_layout_follows_the_launcher(
     for name, value in variables.items():
         no_launcher.setenv(name, value)
     assert layout(TrainingConfig(accelerator="cpu")) == expected
+
+
+def test_restarts_that_would_hang_are_refused(no_launcher: pytest.MonkeyPatch) -> None:
+    """Where torchrun may restart processes that share its store, the missing variable is named at the start."""
+    no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "True")
+    no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
+    assert layout(TrainingConfig(accelerator="cpu")) == (1, 1)
+    no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "3")
+    with pytest.raises(
+        ConfigError, match=r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"
+    ):
+        layout(TrainingConfig(accelerator="cpu"))
+    no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "False")
+    assert layout(TrainingConfig(accelerator="cpu")) == (1, 1)
 
 
 @pytest.mark.parametrize(

@@ -148,11 +148,13 @@ def test_signals_end_the_run_after_a_checkpoint(data, tmp_path, monkeypatch, num
 
 
 def test_a_finished_run_stays_finished(data, tmp_path):
-    """Starting a finished run again makes no update and changes no weight."""
+    """Starting a finished run again makes no update and changes no weight; what a crash left half-written is gone."""
     run = tmp_path / "run"
     train.main(train_mapping(data, run))
     before = weights(run / "checkpoints" / "last.ckpt")
+    (run / "checkpoints" / ".last.ckpt.1.partial").write_bytes(b"half")
     assert train.main(train_mapping(data, run)) == 0
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {"last.ckpt", "best.ckpt"}
     after = read_checkpoint(run / "checkpoints" / "last.ckpt")
     assert after["hgn"]["updates"] == 12
     assert all(torch.equal(before[name], tensor) for name, tensor in after["state_dict"].items())
