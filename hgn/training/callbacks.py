@@ -54,7 +54,7 @@ class Checkpoints(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.best_error = state_dict["best_error"]
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if trainer.is_global_zero:
             for left_by_a_crash in self.folder.glob(f".*{TEMPORARY_SUFFIX}"):
                 left_by_a_crash.unlink()
