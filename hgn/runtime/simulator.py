@@ -14,8 +14,10 @@ import torch
 
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
+from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import GridRangeError
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.runtime.gns_graph import GnsGraphs
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_positions
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
@@ -84,6 +86,9 @@ class Simulator:
         self.network = network
         self.frame_rate_hz = frame_rate_hz
         self.device = next(network.parameters()).device
+        self.predict: Callable[[ParticleState], torch.Tensor] = network
+        if isinstance(network, GraphNetworkSimulator) and self.device.type == "cuda":
+            self.predict = GnsGraphs(network)
 
     def start(self, scenes: Sequence[InitialState]) -> ParticleState:
         """The state at frame 0, with a ballistic history.
@@ -120,7 +125,7 @@ class Simulator:
     @torch.inference_mode()
     def step(self, state: ParticleState) -> ParticleState:
         """One frame: v += a, x += v. Velocity is kept as state, not as a difference of positions."""
-        velocity_N3 = state.velocity_NM3[:, 0] + self.network(state)
+        velocity_N3 = state.velocity_NM3[:, 0] + self.predict(state)
         history_NM3 = torch.cat([velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
         return replace(state, position_N3=state.position_N3 + velocity_N3, velocity_NM3=history_NM3)
 
