@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from hgn.config import config_directory
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
@@ -99,7 +99,7 @@ def _compose(config_name: str) -> list[dict[str, Any]]:
         folder = folder / "command"
     composed: list[Any] = []  # one config, or several with --multirun
     arguments, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv = _with_quiet(arguments)
+    sys.argv = _with_quiet(_with_json_as_override(arguments))
     # Hydra would print and exit itself otherwise
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
@@ -114,6 +114,20 @@ def _compose(config_name: str) -> list[dict[str, Any]]:
         else:
             os.environ["HYDRA_FULL_ERROR"] = full_error
     return [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
+
+
+def _with_json_as_override(arguments: list[str]) -> list[str]:
+    """`--json FILE` and `--json=FILE`, which the reports take as other tools do, are the override json=FILE."""
+    result: list[str] = []
+    waiting = iter(arguments)
+    for argument in waiting:
+        if argument == "--json":
+            file = next(waiting, None)
+            require(file is not None, "--json", "followed by a file name", file, "as in --json bench.json")
+            result.append(f"json={file}")
+        else:
+            result.append(argument.removeprefix("--") if argument.startswith("--json=") else argument)
+    return result
 
 
 def _with_quiet(arguments: list[str]) -> list[str]:

@@ -15,6 +15,8 @@ from hgn.schema import ConfigError, require, require_non_negative, require_one_o
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
+BENCH_CASES = ("frame", "train", "gns_frame", "gns_train", "mpm_frame")
+BENCH_PRECISIONS = ("fp32", "tf32")
 
 
 def config_directory() -> Path:
@@ -422,3 +424,36 @@ class CurvesConfig:
 
     run: str
     out: str
+
+
+def _bench_gns() -> NetworkConfig:
+    return NetworkConfig(kind="gns", levels=1, message_passing_steps=10)
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """`python -m tools.bench`: what is timed."""
+
+    cases: tuple[str, ...] = BENCH_CASES
+    particles: tuple[int, ...] | None = None  # of one scene; none: by the device
+    scenes: tuple[int, ...] | None = None  # side by side, of the smallest number of particles; none: by the device
+    precisions: tuple[str, ...] | None = None  # none: TF32 on a GPU, float32 on a CPU
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    gns: NetworkConfig = field(default_factory=_bench_gns)
+    rounds: int = 50  # samples of each contender
+    seconds: float = 20.0  # at most for contenders that take turns, once five rounds are done
+    mpm_frames: int = 20  # of the solver in one sample
+    device: str = "auto"
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "rounds", "seconds")
+        require(self.mpm_frames >= 4, "mpm_frames", "at least 4", self.mpm_frames)
+        for name, known in (("cases", BENCH_CASES), ("precisions", BENCH_PRECISIONS)):
+            for i, value in enumerate(getattr(self, name) or ()):
+                require(value in known, f"{name}[{i}]", f"one of {', '.join(known)}", value)
+        for name in ("particles", "scenes"):
+            for i, value in enumerate(getattr(self, name) or ()):
+                require(value >= 1, f"{name}[{i}]", "at least 1", value)
+        require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
+        require(self.gns.kind == "gns", "gns.kind", "gns", self.gns.kind)

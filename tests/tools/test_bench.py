@@ -1,0 +1,187 @@
+"""python -m tools.bench: its rows, its checks, its states; no assertion on any time."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import datagen.mpm.solver
+from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds
+from hgn.command import _with_json_as_override
+from hgn.config import BenchConfig, MpmConfig, NetworkConfig
+from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.grid import build_hierarchy
+from hgn.network.neighbours import neighbour_list
+from hgn.runtime.simulator import Simulator
+from hgn.schema import ConfigError, from_mapping
+from tools.bench import contenders
+from tools.bench.__main__ import main, workloads
+from tools.bench.states import TILE_PARTICLES, Workload, positions, scene_of
+from tools.bench.timing import Timed, alternate
+
+CPU = torch.device("cpu")
+SMALL = {
+    "particles": [60],
+    "rounds": 5,
+    "network": {"width": 16, "levels": 2, "message_passing_steps": 1},
+    "gns": {"kind": "gns", "width": 16, "levels": 1, "message_passing_steps": 2},
+    "device": "cpu",
+}
+
+
+def fake_simulate(fails: bool) -> Callable[..., list[Any]]:
+    def simulate(scenes, config, frames, frame_rate_hz, on_frame):
+        for frame in range(frames):
+            on_frame(frame)
+        if fails:
+            return [SceneFailure("left the domain") for _ in scenes]
+        return [Simulated(np.stack([scene.position_N3] * frames), {}) for scene in scenes]
+
+    return simulate
+
+
+def test_rows_of_every_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each case gets a row with the report's keys, checked and timed; the table names them all."""
+    monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate(False))
+    path = tmp_path / "reports" / "bench.json"
+    assert main(SMALL | {"scenes": [1, 2], "json": str(path)}) == 0
+    report = json.loads(path.read_text())
+    assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
+    rows = report["rows"]
+    keys = {"case", "particles", "scenes", "precision", "ms", "memory_gb", "check"}
+    assert all(keys <= row.keys() and row["check"] == "pass" and row["ms"] > 0 for row in rows)
+    for scenes in (1, 2):
+        cases = sorted(row["case"] for row in rows if row["scenes"] == scenes)
+        assert cases == ["frame", "gns_frame", "gns_train", "mpm_frame", "train"]
+    phases = {row["case"]: set(row["phases"]) for row in rows if "phases" in row}
+    assert phases == {"frame": {"features", "grid", "network"}, "gns_frame": {"neighbours", "network"}}
+    printed = capsys.readouterr().out
+    assert all(case in printed for case in ("gns_train takes", "mpm_frame takes", "parts without graphs"))
+
+
+def test_no_time_where_a_check_is_red(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A path that differs from float64, a wrong gradient and a solver that fails get a reason instead of a time."""
+    monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate(True))
+    step, project = Simulator.step, GraphNetworkSimulator.propagate
+
+    def wrong_step(self, state):
+        after = step(self, state)
+        return replace(after, velocity_NM3=1.001 * after.velocity_NM3)
+
+    def wrong_gradient(self, state, neighbours):
+        output = project(self, state, neighbours)
+        return output if output.dtype == torch.float64 else output + 0.1 * (output - output.detach())
+
+    monkeypatch.setattr(Simulator, "step", wrong_step)
+    monkeypatch.setattr(GraphNetworkSimulator, "propagate", wrong_gradient)
+    path = tmp_path / "bench.json"
+    cases = ["frame", "gns_train", "mpm_frame"]
+    assert main(SMALL | {"scenes": [1], "cases": cases, "json": str(path)}) == 1
+    rows = {row["case"]: row for row in json.loads(path.read_text())["rows"]}
+    assert all(row["ms"] is None for row in rows.values())
+    assert "relative error of acceleration" in rows["frame"]["check"]
+    assert "relative error of gradient" in rows["gns_train"]["check"]
+    assert rows["mpm_frame"]["check"] == "left the domain"
+    assert "takes" not in capsys.readouterr().out
+
+
+def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plain network passes in float32; a 0.01 % error of the output does not."""
+    frame = contenders.Frame(NetworkConfig(width=16, levels=2), Workload(50, 1), CPU)
+    assert frame.check("fp32") == "pass"
+    predict = frame.simulator.predict
+    frame.simulator.predict = lambda state: 1.0001 * predict(state)
+    assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
+
+
+def test_a_tile_is_like_real_frames() -> None:
+    """A tile has the neighbours and cells that were measured on the paper's obstacle-free scene, within a tenth."""
+    position = torch.from_numpy(positions(Workload(TILE_PARTICLES, 1), 0, 0.035))
+    scene = torch.zeros(TILE_PARTICLES, dtype=torch.long)
+    neighbours = neighbour_list(position, scene, 0.035).edge_count / TILE_PARTICLES
+    grid = build_hierarchy(position, scene, torch.zeros(1, 3), 0.035, 1)
+    assert neighbours == pytest.approx(97, rel=0.1)
+    assert grid.levels[0].cell_count == pytest.approx(1307, rel=0.1)
+
+
+@pytest.mark.parametrize("particles", [1, 5_000, 40_000])
+def test_states_fill_their_domain(particles: int) -> None:
+    """Any number of particles lies inside of its domain, clear of the solver's walls and of the grid's cell borders."""
+    work = Workload(particles, 1)
+    scene = scene_of(work, 3, 0.035)
+    assert scene.particle_count == particles and scene.domain_size[0] * 64 % 1 == 0
+    low_3, high_3 = particle_bounds(scene, MpmConfig())
+    assert (scene.position_N3 > low_3).all() and (scene.position_N3 < high_3).all()
+    fraction = (scene.position_N3 / 0.035 - 0.5) % 1
+    assert fraction.min() > 5e-4 and fraction.max() < 1 - 5e-4
+    assert not np.array_equal(scene.position_N3, scene_of(work, 4, 0.035).position_N3)
+
+
+def test_contenders_take_turns() -> None:
+    """After the warm-up samples alternate, a long contender joins now and then, and the median is of the rest."""
+    order: list[str] = []
+
+    def sample(name: str) -> Callable[[], list[float]]:
+        def run() -> list[float]:
+            order.append(name)
+            return [float(len(order))]
+
+        return run
+
+    contenders_ = [Timed(sample("a")), Timed(sample("b")), Timed(sample("c"), rounds=2)]
+    alternate(contenders_, 6, 60.0)
+    assert "".join(order) == "aaabbbc" + "abc" + "ab" * 2 + "abc" + "ab" * 2
+    assert [len(timed.milliseconds) for timed in contenders_] == [6, 6, 2]
+    low, middle, high = contenders_[0].quartiles()
+    assert low < middle < high
+    alternate(short := [Timed(sample("d"))], 100, 0.0)
+    assert len(short[0].milliseconds) == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cases": ["frames"]}, r"cases\[0\] must be one of frame, train"),
+        ({"particles": [0]}, r"particles\[0\] must be at least 1"),
+        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32"),
+        ({"rounds": 0}, "rounds must be a finite number > 0"),
+        ({"gns": {"kind": "hgn"}}, "gns.kind must be gns"),
+        ({"mpm_frames": 2}, "mpm_frames must be at least 4"),
+    ],
+)
+def test_bad_options(change: dict[str, Any], message: str) -> None:
+    """Each wrong option is named before anything is timed."""
+    with pytest.raises(ConfigError, match=message):
+        from_mapping(BenchConfig, change)
+
+
+def test_workloads() -> None:
+    """Every number of particles as one scene, then several scenes of the smallest."""
+    config = BenchConfig(particles=(400, 40), scenes=(1, 8))
+    assert workloads(config, CPU) == [Workload(400, 1), Workload(40, 1), Workload(40, 8)]
+    assert workloads(BenchConfig(), CPU) == [Workload(TILE_PARTICLES, 1)]
+
+
+def test_json_option(tmp_path: Path) -> None:
+    """The command takes --json FILE as other tools do, beside overrides; without a name it says so."""
+    path = tmp_path / "bench.json"
+    small = ["cases=[frame]", "particles=[30]", "rounds=5", "network.width=8", "network.levels=1", "device=cpu"]
+    command = [sys.executable, "-m", "tools.bench"]
+    subprocess.run([*command, "--json", str(path), *small], check=True, capture_output=True, timeout=120)
+    assert json.loads(path.read_text())["rows"][0]["case"] == "frame"
+    assert _with_json_as_override(["a=1", "--json=b.json", "c=2"]) == ["a=1", "json=b.json", "c=2"]
+    with pytest.raises(ConfigError, match="--json must be followed by a file name"):
+        _with_json_as_override(["a=1", "--json"])

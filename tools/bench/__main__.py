@@ -1,0 +1,181 @@
+"""python -m tools.bench [--json FILE]: times of a frame, a training step and the solver, beside each other.
+
+Prints no time of what fails its check. The JSON holds {"meta": provenance, "rows": [...]}.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hgn.command import run_command
+from hgn.config import BenchConfig
+from hgn.device import choose_device
+from hgn.files import write_atomically
+from hgn.progress import bar
+from hgn.provenance import provenance
+from hgn.schema import from_mapping, to_mapping
+from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, Train, checked_workload
+from tools.bench.states import TILE_PARTICLES, Workload
+from tools.bench.timing import Timed, alternate
+
+GPU_PARTICLES, GPU_SCENES = (TILE_PARTICLES, 40_000, 400_000), (1, 8, 32)
+CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
+PHASE_ROUNDS = 11
+OUT_OF_MEMORY = "out of memory"
+EXIT_RED = 1
+
+
+@dataclass
+class Entry:
+    """A row in the making."""
+
+    row: dict[str, Any]
+    timed: Timed | None = None
+    contender: Any = field(default=None, repr=False)
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table, and writes JSON where asked to; the exit code is 1 where a check is red."""
+    config = from_mapping(BenchConfig, mapping)
+    device = choose_device(config.device)
+    rows: list[dict[str, Any]] = []
+    groups = [
+        (precision, cases, work)
+        for precision in config.precisions or (("tf32",) if device.type == "cuda" else ("fp32",))
+        for work in workloads(config, device)
+        for cases in (("frame", "gns_frame", "mpm_frame"), ("train", "gns_train"))
+        if any(case in config.cases for case in cases) and _meant(cases, work)
+    ]
+    with bar("timing", total=len(groups), unit="group") as progress:
+        for precision, cases, work in groups:
+            wanted = [case for case in cases if case in config.cases]
+            rows += group_rows(config, device, precision, wanted, work)
+            progress.update()
+    print(table(rows))
+    if config.json is not None:
+        path = Path(config.json)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        meta = provenance(device) | {"config": to_mapping(config)}
+        write_atomically(path, json.dumps({"meta": meta, "rows": rows}, indent=1).encode())
+    return 0 if all(row["check"] in (PASS, OUT_OF_MEMORY) for row in rows) else EXIT_RED
+
+
+def workloads(config: BenchConfig, device: torch.device) -> list[Workload]:
+    """One scene of each number of particles, then several scenes of the smallest number."""
+    gpu = device.type == "cuda"
+    particles = config.particles or (GPU_PARTICLES if gpu else CPU_PARTICLES)
+    scenes = config.scenes or (GPU_SCENES if gpu else CPU_SCENES)
+    single = [Workload(count, 1) for count in particles] if 1 in scenes else []
+    return single + [Workload(min(particles), count) for count in scenes if count != 1]
+
+
+def group_rows(
+    config: BenchConfig, device: torch.device, precision: str, cases: list[str], work: Workload
+) -> list[dict[str, Any]]:
+    """The rows of contenders that are timed in turns."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(MATMUL[precision])
+    try:
+        entries = [_prepare(config, device, precision, case, work) for case in cases]
+        ready = [entry.timed for entry in entries if entry.timed is not None]
+        if ready:
+            alternate(ready, config.rounds, config.seconds)
+        for entry in entries:
+            _finish(entry)
+        return [entry.row for entry in entries]
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The figures for people, and how many times slower the others are than ours on the same work."""
+    lines = [
+        f"{'case':<10} {'particles':>9} {'scenes':>6} {'precision':>9} {'ms':>10} {'quartiles':>19} {'GB':>7}  check"
+    ]
+    for row in rows:
+        ms = "-" if row["ms"] is None else f"{row['ms']:.3f}"
+        spread = "-" if row["ms"] is None else f"{row['ms_quartiles'][0]:.3f} … {row['ms_quartiles'][1]:.3f}"
+        memory = "-" if row["memory_gb"] is None else f"{row['memory_gb']:.3f}"
+        lines.append(
+            f"{row['case']:<10} {row['particles']:>9} {row['scenes']:>6} {row['precision']:>9} {ms:>10} {spread:>19} "
+            f"{memory:>7}  {row['check']}"
+        )
+        if row.get("phases"):
+            parts = ", ".join(f"{name} {value:.3f}" for name, value in row["phases"].items())
+            lines.append(f"{'':<10} parts without graphs, ms: {parts}")
+    ours = {_work(row): row["ms"] for row in rows if row["case"] in ("frame", "train") and row["ms"]}
+    for row in rows:
+        key = _work(row)
+        if row["case"] not in ("frame", "train") and row["ms"] and key in ours:
+            lines.append(f"{row['case']} takes {row['ms'] / ours[key]:.2f} times as long as ours at {_text(row)}")
+    return "\n".join(lines)
+
+
+def _prepare(config: BenchConfig, device: torch.device, precision: str, case: str, work: Workload) -> Entry:
+    row: dict[str, Any] = {"case": case, "particles": work.particles, "scenes": work.scenes}
+    row |= {"precision": precision if case != "mpm_frame" else "fp32", "ms": None, "memory_gb": None}
+    network = config.gns if case.startswith("gns") else config.network
+    try:
+        if case == "mpm_frame":
+            mpm = MpmFrame(work, config.network.cell_size, config.mpm_frames, device)
+            return Entry(row | {"check": PASS}, mpm.timed(), mpm)
+        make: Callable[..., Frame | Train] = Frame if case.endswith("frame") else Train
+        checked = checked_workload(work, "frame" if make is Frame else "train")
+        row["check"] = make(network, checked, device).check(precision)
+        row["checked_particles"] = checked.particles * checked.scenes
+        if row["check"] != PASS:
+            return Entry(row)
+        start = _clean(device)
+        contender = make(network, work, device)
+        contender.run()
+        if start is not None:
+            row["memory_gb"] = (torch.cuda.max_memory_allocated(device) - start) / 1e9
+        if isinstance(contender, Frame) and work.scenes == 1:
+            row["phases"] = contender.phases(PHASE_ROUNDS)
+        return Entry(row, contender.timed(), contender)
+    except torch.OutOfMemoryError:
+        return Entry(row | {"check": OUT_OF_MEMORY})
+    finally:
+        _clean(device)
+
+
+def _finish(entry: Entry) -> None:
+    if isinstance(entry.contender, MpmFrame) and entry.contender.failure is not None:
+        entry.row["check"] = entry.contender.failure
+    if entry.timed is not None and entry.row["check"] == PASS:
+        low, middle, high = entry.timed.quartiles()
+        entry.row |= {"ms": middle, "ms_quartiles": [low, high], "samples": len(entry.timed.milliseconds)}
+    entry.timed = entry.contender = None
+
+
+def _clean(device: torch.device) -> int | None:
+    """Frees what is no longer used; returns the bytes still allocated on a GPU, and starts its peak from there."""
+    gc.collect()
+    if device.type != "cuda":
+        return None
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats(device)
+    return torch.cuda.memory_allocated(device)
+
+
+def _meant(cases: tuple[str, ...], work: Workload) -> bool:
+    return "train" not in cases or work.particles <= TILE_PARTICLES  # the paper's scenes; others are simulated only
+
+
+def _work(row: dict[str, Any]) -> tuple[Any, ...]:
+    return row["particles"], row["scenes"], row["case"].endswith("frame")
+
+
+def _text(row: dict[str, Any]) -> str:
+    return f"{row['particles']} particles, {row['scenes']} scene{'s' if row['scenes'] > 1 else ''}"
+
+
+if __name__ == "__main__":
+    run_command(main, "bench")

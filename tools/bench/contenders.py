@@ -1,0 +1,215 @@
+"""What is timed, and how each is checked before: a frame, a training step, the solver's frame.
+
+A check compares with the plain network in float64 on the same input. Work that is too large for float64 is checked
+on one scene of a tile, by the same code.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from hgn.config import MpmConfig, NetworkConfig, TrainingConfig
+from hgn.data.batch import Batch
+from hgn.network.base import ParticleNetwork
+from hgn.network.build import build_network
+from hgn.network.features import ParticleState
+from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.grid import build_hierarchy
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.simulator import Simulator
+from hgn.training.checkpoint import DataInfo
+from hgn.training.module import TrainingModule
+from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_of, state_of
+from tools.bench.timing import Timed, once
+
+BOUNDS = {"fp32": 1e-5, "tf32": 2e-3}  # relative error of accelerations and loss, of the norm
+# Of all gradients together. Looser, for rounding turns the activations that lie next to their kink: of millions of
+# them a share like the rounding itself, and the gradient's error is like that share's root.
+GRADIENT_BOUNDS = {"fp32": 1e-3, "tf32": 5e-2}
+MATMUL = {"fp32": "highest", "tf32": "high"}  # torch.set_float32_matmul_precision
+FRAME_RATE_HZ = 60.0
+CHECKED_AT_MOST = {"frame": 50_000, "train": TILE_PARTICLES}  # particles of all scenes
+MPM_ROUNDS, MPM_WARM_FRAMES = 3, 2
+PASS = "pass"
+
+
+def checked_workload(work: Workload, what: str) -> Workload:
+    """The workload itself, or one scene of it, where float64 would not fit."""
+    if work.particles * work.scenes <= CHECKED_AT_MOST[what]:
+        return work
+    return Workload(min(work.particles, TILE_PARTICLES), 1)
+
+
+def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwork:
+    """Random weights, and a normaliser with the spread of the bench's states."""
+    torch.manual_seed(0)
+    network = build_network(config)
+    for quantity in ("velocity", "acceleration"):
+        network.normaliser.set(quantity, torch.zeros(3), torch.full((3,), SPEED), 0.0)
+    return network.to(device).eval()
+
+
+class Frame:
+    """One frame of a simulation: features, grid or neighbours, network, integration."""
+
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device) -> None:
+        self.device = device
+        self.network = bench_network(config, device)
+        self.simulator = Simulator(self.network, FRAME_RATE_HZ)
+        self.state = state_of(work, config, device)
+
+    def run(self) -> ParticleState:
+        return self.simulator.step(self.state)
+
+    def timed(self) -> Timed:
+        return Timed(lambda: [once(self.run, self.device)])
+
+    def check(self, precision: str) -> str:
+        """`pass`, or by how much the accelerations differ from float64."""
+        found_N3 = self.run().velocity_NM3[:, 0].double() - self.state.velocity_NM3[:, 0].double()
+        with torch.no_grad():
+            expected_N3 = _reference_acceleration(self.network, self.state)
+        return _verdict("acceleration", _relative(found_N3, expected_N3), BOUNDS[precision])
+
+    def phases(self, rounds: int) -> dict[str, float]:
+        """Medians of the plain network's parts, ms."""
+        with torch.inference_mode():
+            return {
+                name: float(np.median([once(part, self.device) for _ in range(rounds)][1:]))
+                for name, part in self._parts().items()
+            }
+
+    def _parts(self) -> dict[str, Callable[[], object]]:
+        network, state = self.network, self.state
+        if isinstance(network, GraphNetworkSimulator):
+            neighbours = network.neighbours(state)
+            return {
+                "neighbours": lambda: network.neighbours(state),
+                "network": lambda: network.propagate(state, neighbours),
+            }
+        assert isinstance(network, HierarchicalGraphNetwork)
+        config, origin_S3 = network.config, torch.zeros_like(state.domain_S3)
+
+        def grid() -> object:
+            return build_hierarchy(state.position_N3, state.scene_N, origin_S3, config.cell_size, config.levels)
+
+        built, latent_NW = grid(), network.encode_particles(state)
+        return {
+            "features": lambda: network.encode_particles(state),
+            "grid": grid,
+            "network": lambda: network.propagate(latent_NW, built),  # type: ignore[arg-type]
+        }
+
+
+class Train:
+    """One training step on data that is on the device: noise, jitter, forward, backward, Adam."""
+
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device) -> None:
+        self.device = device
+        training = TrainingConfig(batch_scenes=work.scenes)
+        self.module = TrainingModule(bench_network(config, device).train(), training, _data_info()).to(device)
+        self.batch = batch_of(work, config, device)
+        self.optimizer = self.module.configure_optimizers()["optimizer"]
+
+    def run(self) -> None:
+        self.optimizer.zero_grad()
+        self.module.loss(self.batch).backward()
+        self.optimizer.step()
+
+    def timed(self) -> Timed:
+        return Timed(lambda: [once(self.run, self.device)])
+
+    def check(self, precision: str) -> str:
+        """`pass`, or by how much loss or gradients differ from float64, without noise and jitter."""
+        plain = replace(self.module.training_config, noise_std=0.0, grid_jitter=False)
+        found = TrainingModule(self.module.network, plain, _data_info())
+        found.network.zero_grad()
+        found_loss = found.loss(self.batch)
+        found_loss.backward()
+        gradients = [_gradient(p) for p in found.network.parameters()]
+        reference = copy.deepcopy(found.network).double()
+        reference.zero_grad()
+        target_N3 = reference.normaliser.normalise_acceleration(_double(self.batch).acceleration())
+        predicted_N3 = _reference_output(reference, self.batch.state())
+        expected_loss = self.batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
+        expected_loss.backward()
+        expected = [_gradient(p) for p in reference.parameters()]
+        verdict = _verdict("loss", _relative(found_loss.detach().double(), expected_loss.detach()), BOUNDS[precision])
+        if verdict != PASS:
+            return verdict
+        error = _relative(torch.cat(gradients).double(), torch.cat(expected))
+        return _verdict("gradient", error, GRADIENT_BOUNDS[precision])
+
+
+class MpmFrame:
+    """One frame of the solver that makes the data, at its converged step, on the same particles at rest."""
+
+    def __init__(self, work: Workload, cell_size: float, frames: int, device: torch.device) -> None:
+        self.scenes = [scene_of(work, seed, cell_size) for seed in range(work.scenes)]
+        self.config = MpmConfig(device="gpu" if device.type == "cuda" else "cpu", scenes_per_launch=work.scenes)
+        self.frames = frames
+        self.failure: str | None = None
+
+    def sample(self) -> list[float]:
+        """Milliseconds of each frame of a short simulation, its first ones left out."""
+        from datagen.mpm.solver import SceneFailure, simulate
+
+        ends: list[float] = []
+        results = simulate(
+            self.scenes, self.config, self.frames, FRAME_RATE_HZ, lambda _: ends.append(time.perf_counter())
+        )
+        for result in results:
+            if isinstance(result, SceneFailure):
+                self.failure = result.cause
+            elif not np.isfinite(result.position_TN3[-1]).all():
+                self.failure = "positions are not finite"
+        return (np.diff(ends)[MPM_WARM_FRAMES:] * 1e3).tolist()
+
+    def timed(self) -> Timed:
+        return Timed(self.sample, MPM_ROUNDS)
+
+
+def _data_info() -> DataInfo:
+    return DataInfo("", FRAME_RATE_HZ, 1 / 64)
+
+
+def _double(batch: Batch) -> Batch:
+    return replace(batch, window_WN3=batch.window_WN3.double(), domain_S3=batch.domain_S3.double())
+
+
+def _reference_acceleration(network: ParticleNetwork, state: ParticleState) -> torch.Tensor:
+    reference = copy.deepcopy(network).double()
+    return reference.normaliser.restore_acceleration(_reference_output(reference, state))
+
+
+def _reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.Tensor:
+    """The float64 network's raw output. Of GNS on the same neighbour list: rounding at the radius is no error."""
+    double = replace(
+        state,
+        position_N3=state.position_N3.double(),
+        velocity_NM3=state.velocity_NM3.double(),
+        domain_S3=state.domain_S3.double(),
+    )
+    if isinstance(reference, GraphNetworkSimulator):
+        return reference.propagate(double, reference.neighbours(state))
+    return reference.normalised_acceleration(double)
+
+
+def _verdict(what: str, error: float, bound: float) -> str:
+    return PASS if error <= bound else f"relative error of {what} {error:.1e} exceeds {bound:.0e}"  # NaN fails
+
+
+def _gradient(parameter: torch.Tensor) -> torch.Tensor:
+    return torch.zeros_like(parameter).flatten() if parameter.grad is None else parameter.grad.flatten()
+
+
+def _relative(found: torch.Tensor, expected: torch.Tensor) -> float:
+    size = float(expected.norm())
+    return float((found - expected).norm()) / size if size > 0 else math.nan

@@ -1,0 +1,114 @@
+"""The frames that are timed: a fixed mixture of clumps and spray, with the neighbours and cells of real frames.
+
+A tile holds what the paper's obstacle-free scene holds in the middle of its 300 frames: 4,296 particles, about 97
+neighbours each within R and 1,200 active cells of R (measured there: 97 and 1,307). More particles are more tiles.
+Shape legend: N particles of all scenes, S scenes, W window frames.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.data.batch import Batch
+from hgn.network.features import ParticleState
+from hgn.scene.scene import Scene
+
+TILE_PARTICLES = 4_296
+TILE_SIZE = 0.5  # domain units
+CLUMPED = 2_120 / TILE_PARTICLES  # share of the particles in four cubes, at the solver's 8 a cell; the rest is spray
+SPRAY_SIZE = 0.31
+MARGIN = 0.04  # of a tile that stays empty: the solver's walls
+BORDER = 1e-3  # of a grid cell, kept free: rounding may not decide which cells a particle touches
+SPEED = 2e-3  # domain units a frame
+
+
+@dataclass(frozen=True)
+class Workload:
+    """How much one launch has to do."""
+
+    particles: int  # of each scene
+    scenes: int
+
+    @property
+    def domain_size(self) -> float:
+        """Side of the cubic domain, domain units: as many tiles as the particles fill."""
+        return TILE_SIZE * max(2, math.ceil((self.particles / TILE_PARTICLES) ** (1 / 3) - 1e-9))
+
+
+def positions(workload: Workload, seed: int, cell_size: float) -> np.ndarray:
+    """One scene's particles, float32 [particles, 3]. A last tile that is not full has fewer of each kind."""
+    generator = np.random.default_rng(seed)
+    side = round(workload.domain_size / TILE_SIZE)
+    parts = []
+    for tile, first in enumerate(range(0, workload.particles, TILE_PARTICLES)):
+        corner = TILE_SIZE * np.array(np.unravel_index(tile, (side, side, side)))
+        parts.append(corner + _tile(min(TILE_PARTICLES, workload.particles - first), generator))
+    position_N3 = np.concatenate(parts)
+    cell_N3 = position_N3 / cell_size - 0.5
+    fraction_N3 = cell_N3 - np.floor(cell_N3)
+    cell_N3 += np.where(fraction_N3 < BORDER, BORDER, 0) - np.where(fraction_N3 > 1 - BORDER, BORDER, 0)
+    return ((cell_N3 + 0.5) * cell_size).astype(np.float32)
+
+
+def scene_of(workload: Workload, seed: int, cell_size: float) -> Scene:
+    """The same particles at rest, for the solver."""
+    position_N3 = positions(workload, seed, cell_size)
+    size = workload.domain_size
+    return Scene(
+        position_N3=position_N3,
+        velocity_N3=np.zeros_like(position_N3),
+        material_N=_materials(len(position_N3), seed),
+        domain_size=(size, size, size),
+        seed=seed,
+    )
+
+
+def batch_of(workload: Workload, network: NetworkConfig, device: torch.device) -> Batch:
+    """A window of such frames, scene s from seed s: particles that move a little, and accelerate."""
+    parts, materials = [], []
+    for seed in range(workload.scenes):
+        last_N3 = positions(workload, seed, network.cell_size)
+        generator = np.random.default_rng([seed, 1])
+        velocity_N3 = generator.normal(0, SPEED, last_N3.shape)
+        change_HN3 = generator.normal(0, 0.3 * SPEED, (network.velocity_history + 1, *last_N3.shape))
+        velocity_HN3 = velocity_N3 + change_HN3  # oldest first, the answer's last
+        after_N3 = last_N3 + velocity_HN3[-1]
+        before_HN3 = last_N3 - velocity_HN3[-2::-1].cumsum(0)
+        parts.append(np.concatenate([before_HN3[::-1], last_N3[None], after_N3[None]]))
+        materials.append(_materials(len(last_N3), seed).astype(np.int64))
+    size, scenes = workload.domain_size, workload.scenes
+    return Batch(
+        window_WN3=torch.from_numpy(np.concatenate(parts, axis=1).astype(np.float32)),
+        material_N=torch.from_numpy(np.concatenate(materials)),
+        scene_N=torch.arange(scenes).repeat_interleave(workload.particles),
+        particles_S=(workload.particles,) * scenes,
+        domain_S3=torch.full((scenes, 3), size),
+        gravity_S3=torch.tensor([[0.0, -9.8 / 60**2, 0.0]]).repeat(scenes, 1),
+        obstacles=None,
+        surface=None,
+        seeds_S=tuple(range(1, scenes + 1)),
+    ).to(device)
+
+
+def state_of(workload: Workload, network: NetworkConfig, device: torch.device) -> ParticleState:
+    """The state that a simulation is in at such a frame."""
+    return batch_of(workload, network, device).state()
+
+
+def _tile(count: int, generator: np.random.Generator) -> np.ndarray:
+    clump = round(CLUMPED * count / 4)
+    side = (clump / 8) ** (1 / 3) / 64
+    corners = np.array([[0, 0, 0], [1, 0, 1], [1, 1, 0], [0, 1, 1]])
+    room = TILE_SIZE - 2 * MARGIN - side
+    clumps = [MARGIN + room * corner + side * generator.random((clump, 3)) for corner in corners]
+    spray = 0.5 * (TILE_SIZE - SPRAY_SIZE) + SPRAY_SIZE * generator.random((count - 4 * clump, 3))
+    return np.concatenate([*clumps, spray])
+
+
+def _materials(count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng([seed, 2]).integers(0, 3, count).astype(np.uint8)
