@@ -15,8 +15,9 @@ from datagen.plan import ShardRange, episode_key, scene_seed
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.data.manifest import EpisodeEntry, ShardEntry
-from hgn.data.reader import file_sha256, read_episode
+from hgn.data.reader import read_episode
 from hgn.data.statistics import episode_statistics, merge_statistics
+from hgn.data.storage import file_sha256
 from hgn.files import sync_folder, temporary_file
 from hgn.scene.episode import Episode, encode_episode
 from hgn.schema import ConfigError

@@ -36,7 +36,7 @@ from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
 _FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ def _received(connection: Connection) -> Iterator[Any]:
 def _die_with_parent() -> None:
     # on Linux the kernel does it; elsewhere a worker ends when it next touches its closed pipe
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         parent = multiprocessing.parent_process()
         if parent is None or os.getppid() != parent.pid:
             os._exit(0)

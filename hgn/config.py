@@ -183,6 +183,19 @@ class DatagenConfig:
 
 
 @dataclass(frozen=True)
+class ServiceConfig:
+    """`python -m datagen.service`: where the data set is served, beside what `python -m datagen` takes."""
+
+    host: str = "127.0.0.1"
+    port: int = 8000  # 0: any free one
+    connections: int = 1024  # at once; more are told to come back
+
+    def __post_init__(self) -> None:
+        require(0 <= self.port < 65536, "port", "0 to 65535", self.port)
+        require_positive(self, "connections")
+
+
+@dataclass(frozen=True)
 class NetworkConfig:
     """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
 

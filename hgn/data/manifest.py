@@ -7,17 +7,21 @@ were published in, so a reader that knows revision r only ever sees shards appen
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hgn.data.statistics import Statistics, merge_statistics
+from hgn.data.storage import PATIENCE_S, open_storage
 from hgn.files import write_atomically
 from hgn.scene.episode import SCHEMA_VERSION, require_schema_version
-from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.schema import ConfigError, from_mapping, require, require_non_negative, require_one_of, to_mapping
 
 MANIFEST_NAME = "manifest.json"
 SPLITS = ("train", "validation", "test")
+_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,13 @@ class ShardEntry:
     episodes: tuple[EpisodeEntry, ...]
     statistics: Statistics
 
+    def __post_init__(self) -> None:
+        # both become file names, and a manifest may come from anywhere
+        require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
+        require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
+        require_one_of(self, "split", SPLITS)
+        require_non_negative(self, "bytes")
+
 
 @dataclass(frozen=True)
 class QuarantinedScene:
@@ -70,27 +81,37 @@ class Manifest:
     schema_version: int = field(default=SCHEMA_VERSION)
 
     @staticmethod
-    def load(folder: Path | str) -> Manifest:
-        """Reads `<folder>/manifest.json`.
+    def load(folder: Path | str, patience_s: float = PATIENCE_S) -> Manifest:
+        """Reads `<folder>/manifest.json`, where `folder` may be a URL whose server may be away for `patience_s`.
 
-        Raises: ConfigError when it is missing, no JSON, of another schema version, or wrong in any field.
+        Raises: ConfigError when it is missing, no JSON, of another schema version, or wrong in any field;
+        UnreachableError when the server stays away.
         """
-        path = Path(folder) / MANIFEST_NAME
+        path = f"{folder}/{MANIFEST_NAME}"
         try:
-            text = path.read_text(encoding="utf-8")
+            content = open_storage(folder).manifest(MANIFEST_NAME, patience_s)
         except (FileNotFoundError, NotADirectoryError):
             raise ConfigError(
                 f"{path} must be the manifest of a data set, got no such file; generate one with "
                 f"python -m datagen +experiment=... out={folder}"
             ) from None
-        except UnicodeDecodeError as error:
-            raise ConfigError(_garbled(path, str(error))) from None
+        return Manifest.parse(content, path)
+
+    @staticmethod
+    def parse(content: bytes, path: str) -> Manifest:
+        """The manifest in a file's bytes; messages name `path`.
+
+        Raises: ConfigError when they are no JSON, of another schema version, or wrong in any field.
+        """
         try:
-            mapping = json.loads(text)
+            mapping = json.loads(content.decode("utf-8"))
         except ValueError as error:
-            raise ConfigError(_garbled(path, str(error))) from None
-        require_schema_version(mapping, str(path))
-        return from_mapping(Manifest, mapping, str(path))
+            raise ConfigError(
+                f"{path} must be JSON written by python -m datagen, got {error}; delete it and run the same command "
+                "again: published shards are found and kept"
+            ) from None
+        require_schema_version(mapping, path)
+        return from_mapping(Manifest, mapping, path)
 
     def save(self, folder: Path | str) -> None:
         """Replaces `<folder>/manifest.json` atomically."""
@@ -113,10 +134,3 @@ class Manifest:
     def complete(self) -> bool:
         """Whether every requested episode is published."""
         return all(self.published(split) >= count for split, count in self.requested.items())
-
-
-def _garbled(path: Path, reason: str) -> str:
-    return (
-        f"{path} must be JSON written by python -m datagen, got {reason}; delete it and run the same command again: "
-        "published shards are found and kept"
-    )

@@ -1,12 +1,13 @@
 """Reads published episodes. Positions are memory-mapped, so a window of frames costs only its own pages.
 
 Each shard is checked against the manifest (size, then sha256) before anything in it is used: a tar cut at a
-member boundary would otherwise read as fewer samples without any error.
+member boundary would otherwise read as fewer samples without any error. Shards of a URL are read from the cache that
+`hgn.data.storage` keeps on this machine.
 """
 
 from __future__ import annotations
 
-import hashlib
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
@@ -15,38 +16,48 @@ import numpy as np
 
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.statistics import Statistics
+from hgn.data.storage import UnreachableError, open_storage
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, require
 
-# (path, size, modification time, sha256) of the shards that this process has verified
-_verified: set[tuple[str, int, int, str]] = set()
-
 
 class EpisodeStore:
-    """The published episodes of one split of a data set; it only grows.
+    """The published episodes of one split of a data set, in a folder or at a URL; it only grows.
 
     Picklable for spawned workers: the folder, split and manifest travel, open files and maps do not.
     """
 
     def __init__(self, folder: Path | str, split: str) -> None:
-        """Raises: ConfigError when the folder holds no readable manifest or the split is unknown."""
+        """Raises: ConfigError when there is no readable manifest or the split is unknown; UnreachableError."""
         require(split in SPLITS, "split", f"one of {', '.join(SPLITS)}", split)
-        self.folder = Path(folder)
+        self.folder = folder
         self.split = split
         self.manifest = Manifest.load(self.folder)
         self._reset()
 
     @staticmethod
     def available(folder: Path | str) -> bool:
-        """Whether there is a data set (perhaps not yet complete, perhaps not yet with any shard) to open."""
-        return (Path(folder) / MANIFEST_NAME).is_file()
+        """Whether there is a data set (perhaps not yet complete, perhaps not yet with any shard) to open.
+
+        Raises: ConfigError where access is refused; UnreachableError.
+        """
+        try:
+            open_storage(folder).manifest(MANIFEST_NAME)
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return True
 
     def refresh(self) -> bool:
         """Reads the manifest again; True when this split has more episodes than before.
 
+        A server that does not answer is no fault: what was known stays.
         Raises: ConfigError when the folder now holds another data set, or published shards were taken away.
         """
-        manifest = Manifest.load(self.folder)
+        try:
+            manifest = Manifest.load(self.folder, patience_s=0.0)
+        except UnreachableError as error:
+            print(f"{error.filename}: {error.strerror}; going on with {len(self)} episodes", file=sys.stderr)
+            return False
         if manifest.config_hash != self.manifest.config_hash:
             raise ConfigError(
                 f"{self.folder} must keep holding the same data set, got config hash {manifest.config_hash[:12]} "
@@ -110,14 +121,14 @@ class EpisodeStore:
         if index not in self._opened:
             shard, entry = self._located[index]
             if shard.name not in self._maps:
-                verify_shard(self.folder, shard)
+                path = open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes)
                 # one map a shard, not one an episode: each map holds a file descriptor
-                self._maps[shard.name] = np.memmap(self.folder / shard.name, dtype=np.uint8, mode="r")
+                self._maps[shard.name] = np.memmap(path, dtype=np.uint8, mode="r")
             episode = read_episode(self._maps[shard.name], shard.name, entry.key, entry.members)
             found = (episode.seed, episode.particle_count, episode.frame_count)
             if found != (entry.seed, entry.particles, entry.frames):
                 raise ConfigError(
-                    f"{self.folder / shard.name}: {entry.key} must have seed, particles, frames "
+                    f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames "
                     f"{(entry.seed, entry.particles, entry.frames)}, got {found}; delete manifest.json and run the "
                     "generator again"
                 )
@@ -147,34 +158,6 @@ class _Episodes(Sequence[Episode]):
 
     def __iter__(self) -> Iterator[Episode]:
         return (self._store._open(i) for i in range(len(self)))
-
-
-def verify_shard(folder: Path, shard: ShardEntry) -> None:
-    """Checks size and sha256 of a published shard, once a process as long as the file does not change.
-
-    Raises: ConfigError naming the shard, what was expected and found, and the remedy.
-    """
-    path = folder / shard.name
-    remedy = "delete it and run the generator again"
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        raise ConfigError(f"{path} is listed in the manifest but missing; run the generator again") from None
-    if status.st_size != shard.bytes:
-        raise ConfigError(f"{path} must have {shard.bytes} bytes, got {status.st_size}; {remedy}")
-    identity = (str(path.resolve()), status.st_size, status.st_mtime_ns, shard.sha256)
-    if identity in _verified:
-        return
-    found = file_sha256(path)
-    if found != shard.sha256:
-        raise ConfigError(f"{path} must have sha256 {shard.sha256}, got {found}: it was altered; {remedy}")
-    _verified.add(identity)
-
-
-def file_sha256(path: Path) -> str:
-    """The sha256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_episode(

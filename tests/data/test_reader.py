@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hgn.data.reader
+import hgn.data.storage
 from datagen.shard import locate_members
 from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig, SceneConfig
@@ -127,8 +127,8 @@ def test_missing_shard_is_named(folder: Path) -> None:
 def test_shards_are_hashed_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process verifies a shard once, however many stores open it."""
     hashed: list[str] = []
-    real = hgn.data.reader.file_sha256
-    monkeypatch.setattr(hgn.data.reader, "file_sha256", lambda path: hashed.append(path.name) or real(path))
+    real = hgn.data.storage.file_sha256
+    monkeypatch.setattr(hgn.data.storage, "file_sha256", lambda path: hashed.append(path.name) or real(path))
     for _ in range(2):
         _ = list(EpisodeStore(folder, "train").episodes)
     assert len(hashed) == len(set(hashed)) == 4

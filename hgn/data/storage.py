@@ -1,0 +1,313 @@
+"""Where a data set lies: a folder of this machine, or a URL (a dataset service, a file server, an object store).
+
+Shards of a URL are kept in a cache on this machine, under their sha256, so that no two data sets collide there; one
+process of the machine brings a shard, the others wait for it. `HGN_CACHE` names the cache's folder (default
+`~/.cache/hgn`), `HGN_DATASET_TOKEN` the token that a dataset service asks for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import functools
+import hashlib
+import io
+import os
+import random
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from hgn.files import TEMPORARY_SUFFIX, sync_folder
+from hgn.schema import ConfigError, require
+
+TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
+CACHE_VARIABLE = "HGN_CACHE"
+PATIENCE_S = 300.0  # with a server that does not answer: time enough to start a service again
+_CHUNK_BYTES = 16 * 2**20  # of a shard at a time: what is lost when a connection is
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 10.0
+_CONNECT_S, _SILENCE_S = 10.0, 60.0
+_NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
+
+T = TypeVar("T")
+# (path, size, modification time, sha256) of the files that this process has verified
+_verified: set[tuple[str, int, int, str]] = set()
+
+
+class UnreachableError(OSError):
+    """A server did not answer for as long as it was waited for."""
+
+    def __init__(self, url: str, patience_s: float, cause: str) -> None:
+        super().__init__(errno.ETIMEDOUT, f"no answer for {patience_s:.0f} s (at last: {cause})", url)
+
+
+class Storage(Protocol):
+    """A data set's files, wherever they are."""
+
+    def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
+        """The manifest's bytes. Raises: FileNotFoundError; UnreachableError; ConfigError (no access)."""
+        ...
+
+    def shard(self, name: str, sha256: str, size: int) -> Path:
+        """The path of a shard on this machine, verified. Raises: ConfigError; UnreachableError; OSError."""
+        ...
+
+
+def is_remote(folder: Path | str) -> bool:
+    """Whether a data set is given by a URL."""
+    return "://" in str(folder) and not str(folder).startswith("file://")
+
+
+def open_storage(folder: Path | str) -> Storage:
+    """The storage of a data set; of a URL the same one each time.
+
+    Raises: ConfigError for a URL whose protocol is not known or not installed.
+    """
+    if is_remote(folder):
+        return _remote(str(folder).rstrip("/"))
+    return _Folder(Path(str(folder).removeprefix("file://")))
+
+
+def dataset_token() -> str | None:
+    """The token of $HGN_DATASET_TOKEN. Raises: ConfigError when it could not stand in a header."""
+    token = os.environ.get(TOKEN_VARIABLE)
+    if token is None:
+        return None
+    plain = token.isascii() and token.isprintable() and " " not in token
+    require(
+        plain and len(token) >= 16, TOKEN_VARIABLE, "16 or more printable ASCII characters", f"{len(token)} of them"
+    )
+    return token
+
+
+def cache_folder() -> Path:
+    """Where shards of URLs are kept."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named:
+        return Path(named) / "shards"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hgn" / "shards"
+
+
+def file_sha256(path: Path) -> str:
+    """The sha256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
+    """Checks size and sha256 of a file, once a process as long as the file does not change.
+
+    Raises: ConfigError naming the file, what was expected and found, and the remedy; FileNotFoundError.
+    """
+    status = path.stat()
+    if status.st_size != size:
+        raise ConfigError(f"{path} must have {size} bytes, got {status.st_size}; {remedy}")
+    identity = (str(path.resolve()), status.st_size, status.st_mtime_ns, sha256)
+    if identity in _verified:
+        return
+    found = file_sha256(path)
+    if found != sha256:
+        raise ConfigError(f"{path} must have sha256 {sha256}, got {found}: it was altered; {remedy}")
+    _verified.add(identity)
+
+
+class _Folder:
+    """A folder of this machine."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
+        return (self._folder / name).read_bytes()
+
+    def shard(self, name: str, sha256: str, size: int) -> Path:
+        path = self._folder / name
+        try:
+            verify_file(path, sha256, size, "delete it and run the generator again")
+        except FileNotFoundError:
+            raise ConfigError(f"{path} is listed in the manifest but missing; run the generator again") from None
+        return path
+
+
+@functools.lru_cache(maxsize=16)
+def _remote(url: str) -> _Remote:
+    return _Remote(url)
+
+
+class _Remote:
+    """A URL that fsspec reads."""
+
+    def __init__(self, url: str) -> None:
+        import fsspec  # loads for a while, and local data sets need none of it
+
+        self._url, self._http = url, url.startswith(("http://", "https://"))
+        options: dict[str, Any] = {}
+        if self._http:
+            import aiohttp
+
+            token = dataset_token()
+            timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_S, sock_read=_SILENCE_S)
+            headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+            options = {"client_kwargs": {"headers": headers, "timeout": timeout}, "use_listings_cache": False}
+        try:
+            self._files, self._root = fsspec.core.url_to_fs(url, **options)
+        except (ValueError, ImportError) as error:
+            raise ConfigError(
+                f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({error})"
+            ) from None
+        self._known: tuple[bytes, str] | None = None  # the manifest last read, and its ETag at a dataset service
+        self._lock = threading.Lock()
+
+    def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
+        with self._lock:
+            options: dict[str, Any] = {}
+            if self._http and self._known is not None:
+                options["headers"] = {"If-None-Match": self._known[1]}
+            content = self._patiently(name, patience_s, lambda path: self._files.cat_file(path, **options))
+            if not content and self._known is not None:  # not modified
+                return self._known[0]
+            self._known = content, f'"{hashlib.sha256(content).hexdigest()}"'
+            return content
+
+    def shard(self, name: str, sha256: str, size: int) -> Path:
+        path = cache_folder() / f"{sha256}.tar"
+        remedy = "it is fetched again"
+        for again in (True, False):
+            if not path.exists():
+                self._fetch(name, sha256, size, path)
+            try:
+                verify_file(path, sha256, size, remedy)
+            except (ConfigError, FileNotFoundError) as error:  # this machine's disk, or somebody cleaning up
+                if not again:
+                    raise
+                print(error, file=sys.stderr)
+                path.unlink(missing_ok=True)
+            else:
+                break
+        return path
+
+    def _fetch(self, name: str, sha256: str, size: int, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _owned(path) as file:
+            if file is None:
+                return
+            # what a process that ended had fetched is gone on with, unless the disk did not keep it
+            for resume in (True, False):
+                if not resume:
+                    file.truncate(0)
+                if self._fill(file, name, size) == sha256:
+                    break
+            else:
+                file.truncate(0)
+                raise ConfigError(
+                    f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
+                )
+            os.fsync(file.fileno())
+            Path(file.name).replace(path)
+        sync_folder(path.parent)
+        status = path.stat()
+        _verified.add((str(path.resolve()), status.st_size, status.st_mtime_ns, sha256))
+
+    def _fill(self, file: io.BufferedRandom, name: str, size: int) -> str:
+        """Appends what is missing and returns the sha256 of the whole."""
+        if os.fstat(file.fileno()).st_size > size:
+            file.truncate(0)
+        file.seek(0)
+        digest = hashlib.file_digest(file, "sha256")
+        have = file.seek(0, os.SEEK_END)
+        while have < size:
+            stop = min(have + _CHUNK_BYTES, size)
+            data = self._patiently(name, PATIENCE_S, _read_range(self._files, have, stop))
+            if len(data) == size > stop - have:  # from a server without ranges
+                data = data[have:]
+            elif len(data) != stop - have:
+                raise ConfigError(
+                    f"{self._url}/{name} must have {size} bytes, got {have + len(data)}; it was cut: generate it again"
+                )
+            file.write(data)
+            digest.update(data)
+            have += len(data)
+        file.flush()
+        return digest.hexdigest()
+
+    def _patiently(self, name: str, patience_s: float, read: Callable[[str], T]) -> T:
+        """Reads, again and again while the server is away. Raises: as `Storage.manifest`."""
+        begin, pause, said = time.monotonic(), _FIRST_PAUSE_S, False
+        while True:
+            try:
+                return read(f"{self._root}/{name}")
+            except FileNotFoundError:
+                raise
+            except Exception as error:
+                cause = _transient(error, f"{self._url}/{name}")
+                if cause is None:
+                    raise
+                if time.monotonic() - begin + pause > patience_s:
+                    raise UnreachableError(f"{self._url}/{name}", patience_s, cause) from error
+                if not said and pause > 1:
+                    said = True
+                    print(f"{self._url} does not answer ({cause}); trying for {patience_s:.0f} s", file=sys.stderr)
+                # no two readers come back at the same moment
+                time.sleep(pause * random.uniform(0.5, 1.0))
+                pause = min(2 * pause, _LONGEST_PAUSE_S)
+
+
+def _read_range(files: Any, start: int, stop: int) -> Callable[[str], bytes]:
+    return lambda path: files.cat_file(path, start=start, end=stop)
+
+
+def _transient(error: Exception, url: str) -> str | None:
+    """What to say of an error that may pass; none of one that is not the network's. Raises: ConfigError (refused)."""
+    status = getattr(error, "status", None)
+    if status in (401, 403) or isinstance(error, PermissionError):
+        raise ConfigError(
+            f"{url} must be open to this reader, got refused; set {TOKEN_VARIABLE} to the service's token (an object "
+            "store asks for its own credentials)"
+        ) from None
+    if isinstance(status, int) and 400 <= status < 500 and status not in (408, 425, 429):
+        raise ConfigError(
+            f"{url} must be a file of a data set, got the answer {status}; check dataset.folder"
+        ) from None
+    packages = {kind.__module__.partition(".")[0] for kind in type(error).__mro__}
+    if not isinstance(error, OSError) and not packages & _NETWORK_PACKAGES:
+        return None
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return None
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@contextlib.contextmanager
+def _owned(path: Path) -> Iterator[io.BufferedRandom | None]:
+    """The partial file of `path`, for this process alone and with what others had written; none when `path` is there.
+
+    The kernel frees a process's hold when it ends, so the next one goes on.
+    """
+    partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
+    while True:
+        with partial.open("a+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if not _is_same(file, partial):
+                continue  # whoever had it before has given it its name
+            if path.exists():
+                partial.unlink()
+                yield None
+                return
+            try:
+                yield file
+            except OSError as error:
+                if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                    error.filename = error.filename or str(path)
+                    partial.unlink(missing_ok=True)
+                raise
+            return
+
+
+def _is_same(file: io.BufferedRandom, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False

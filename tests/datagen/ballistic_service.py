@@ -1,0 +1,13 @@
+"""`python -m datagen.service` with the ballistic stand-in for scenes and solver; run with this folder on the path."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from ballistic_command import BALLISTIC
+
+from datagen.service import main
+from hgn.command import run_command
+
+if __name__ == "__main__":
+    run_command(partial(main, backend=BALLISTIC), "service")
