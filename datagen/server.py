@@ -157,7 +157,7 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
     async def unreadable(request: Request, error: Exception) -> Response:
         return PlainTextResponse(f"{error}\n", 503, {"retry-after": "1"})
 
-    return Starlette(
+    app = Starlette(
         routes=[
             Route(f"/{MANIFEST_NAME}", manifest),
             Route("/progress", progress),
@@ -168,6 +168,8 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         middleware=[Middleware(Guard, token=token, counters=counters)],
         exception_handlers={ConfigError: unreadable},
     )
+    app.router.redirect_slashes = False
+    return app
 
 
 def _unchanged(request: Request, etag: str) -> bool:

@@ -23,6 +23,7 @@ from hgn.data.identity import dataset_identity, identity_hash, require_same_data
 from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.order import Cursor
 from hgn.data.reader import EpisodeStore
+from hgn.data.storage import UnreachableError, is_remote
 from hgn.files import write_atomically
 from hgn.network.build import build_network
 from hgn.progress import bar
@@ -50,7 +51,8 @@ def main(mapping: dict[str, Any]) -> int:
     stop.listen()
     with ExitStack() as stack:
         generator = None
-        if first_rank() and config.training.generate and not _complete(config):
+        # what a URL lacks, its own service makes
+        if first_rank() and config.training.generate and not is_remote(config.dataset.folder) and not _complete(config):
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)
         store = _wait_for_episodes(config, generator, stop)
@@ -93,7 +95,7 @@ def _fit(
     _write_run_files(config, run)
 
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every)
-    monitor = Monitor(run, store, Path(config.dataset.folder), stop, checkpoints)
+    monitor = Monitor(run, store, config.dataset.folder, stop, checkpoints)
     guard = GradientGuard(training.maximum_skipped_updates)
     lines = LogLines(run, monitor, guard, feed, _published_text(config, generator))
     final = FinalMetrics(to_mapping(config), monitor.last, stop)
@@ -129,7 +131,7 @@ def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Cursor
 
 
 def _complete(config: TrainConfig) -> bool:
-    folder = Path(config.dataset.folder)
+    folder = config.dataset.folder
     if not EpisodeStore.available(folder):
         return False
     manifest = Manifest.load(folder)
@@ -138,7 +140,7 @@ def _complete(config: TrainConfig) -> bool:
 
 def _wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: StopRequest) -> EpisodeStore | None:
     """Waits until enough training episodes are published, showing what is awaited; none when asked to stop."""
-    folder, needed = Path(config.dataset.folder), config.training.minimum_episodes
+    folder, needed = config.dataset.folder, config.training.minimum_episodes
     needed = min(needed, config.dataset.training_scenes)
     if generator is None and first_rank() and not EpisodeStore.available(folder):
         raise ConfigError(
@@ -159,7 +161,7 @@ def _wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: S
                     f"training.minimum_episodes must be reachable, got {needed} where the data set has "
                     f"{len(store) if store else 0}; ask for more scenes"
                 )
-        elif first_rank():
+        elif first_rank() and (not is_remote(folder) or (store is not None and store.manifest.complete)):
             raise ConfigError(
                 f"dataset.folder must hold {needed} training episodes, got {len(store) if store else 0} in {folder}; "
                 "generate them, or set training.generate=true"
@@ -175,10 +177,13 @@ def _wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: S
 
 
 def _published_text(config: TrainConfig, generator: Generator | None) -> Callable[[], str]:
-    total = config.dataset.training_scenes
+    folder, total = config.dataset.folder, config.dataset.training_scenes
 
     def text() -> str:
-        count = Manifest.load(config.dataset.folder).published("train")
+        try:
+            count = Manifest.load(folder, patience_s=0.0).published("train")
+        except UnreachableError:
+            return f"{folder} does not answer"
         state = "" if generator is None or generator.running or count >= total else ", generator stopped"
         return f"{count}/{total} episodes{state}"
 

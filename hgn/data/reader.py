@@ -7,7 +7,9 @@ member boundary would otherwise read as fewer samples without any error. Shards 
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
@@ -16,7 +18,7 @@ import numpy as np
 
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.statistics import Statistics
-from hgn.data.storage import UnreachableError, open_storage
+from hgn.data.storage import UnreachableError, is_remote, open_storage
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, require
 
@@ -26,6 +28,8 @@ class EpisodeStore:
 
     Picklable for spawned workers: the folder, split and manifest travel, open files and maps do not.
     """
+
+    _fetcher: threading.Thread | None = None
 
     def __init__(self, folder: Path | str, split: str) -> None:
         """Raises: ConfigError when there is no readable manifest or the split is unknown; UnreachableError."""
@@ -74,6 +78,16 @@ class EpisodeStore:
             self._append(shard)
         return len(now) > len(known)
 
+    def fetch_ahead(self) -> None:
+        """Begins to bring the shards known by now to this machine, one after the other, beside their use.
+
+        Does nothing for a folder.
+        """
+        shards = [shard for shard in self.manifest.shards_of(self.split) if shard.name not in self._maps]
+        if is_remote(self.folder) and shards and (self._fetcher is None or not self._fetcher.is_alive()):
+            self._fetcher = threading.Thread(target=_fetch, args=(self.folder, shards), name="shards", daemon=True)
+            self._fetcher.start()
+
     @property
     def revision(self) -> int:
         """The manifest revision last read."""
@@ -111,6 +125,7 @@ class EpisodeStore:
         self._maps: dict[str, np.ndarray] = {}
         self._opened: dict[int, Episode] = {}
         self._episodes = _Episodes(self)
+        self._fetcher = None
         for shard in self.manifest.shards_of(self.split):
             self._append(shard)
 
@@ -134,6 +149,13 @@ class EpisodeStore:
                 )
             self._opened[index] = episode
         return self._opened[index]
+
+
+def _fetch(folder: Path | str, shards: Sequence[ShardEntry]) -> None:
+    # whoever needs a shard that cannot be had meets the same error again, and says so
+    with contextlib.suppress(ConfigError, OSError):
+        for shard in shards:
+            open_storage(folder).shard(shard.name, shard.sha256, shard.bytes)
 
 
 class _Episodes(Sequence[Episode]):

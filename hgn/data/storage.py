@@ -178,7 +178,12 @@ class _Remote:
         remedy = "it is fetched again"
         for again in (True, False):
             if not path.exists():
-                self._fetch(name, sha256, size, path)
+                try:
+                    self._fetch(name, sha256, size, path)
+                except FileNotFoundError:
+                    raise ConfigError(
+                        f"{self._url}/{name} is listed in the manifest but missing; run the generator again"
+                    ) from None
             try:
                 verify_file(path, sha256, size, remedy)
             except (ConfigError, FileNotFoundError) as error:  # this machine's disk, or somebody cleaning up
@@ -202,7 +207,6 @@ class _Remote:
                 if self._fill(file, name, size) == sha256:
                     break
             else:
-                file.truncate(0)
                 raise ConfigError(
                     f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
                 )
@@ -298,6 +302,9 @@ def _owned(path: Path) -> Iterator[io.BufferedRandom | None]:
                 return
             try:
                 yield file
+            except ConfigError:
+                partial.unlink(missing_ok=True)
+                raise
             except OSError as error:
                 if error.errno in (errno.ENOSPC, errno.EDQUOT):
                     error.filename = error.filename or str(path)

@@ -93,7 +93,7 @@ class Checkpoints(Callback):
 class Monitor(Callback):
     """Measures one-step errors on fixed scenes of both splits, and rollouts of the validation scenes."""
 
-    def __init__(self, run: Path, training: EpisodeStore, folder: Path, stop: StopRequest, checkpoints: Checkpoints):
+    def __init__(self, run: Path, training: EpisodeStore, folder: str, stop: StopRequest, checkpoints: Checkpoints):
         self.run, self.stop, self.checkpoints = run, stop, checkpoints
         self.training_store, self.data_folder = training, folder
         self.last: dict[str, float] = {}

@@ -72,6 +72,7 @@ class Feed(LightningDataModule):
     def _published(self, epoch: int) -> list[int]:
         """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""
         self.store.refresh()
+        self.store.fetch_ahead()
         count = agreed_count(self.store, self.trainer) if self.trainer is not None else len(self.store)
         return [entry.frames for entry in self.store.entries[:count]]
 

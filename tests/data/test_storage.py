@@ -1,0 +1,318 @@
+"""Data sets at a URL: the same episodes as in a folder, whatever the network, the server and the cache do."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import functools
+import http.server
+import json
+import multiprocessing
+import os
+import socket
+import threading
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pytest
+import uvicorn
+
+import hgn.data.storage
+from datagen.server import make_app
+from datagen.supervisor import PoolState
+from hgn.config import DatagenConfig
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.data.storage import CACHE_VARIABLE, TOKEN_VARIABLE, UnreachableError, cache_folder, is_remote, open_storage
+from hgn.schema import ConfigError
+
+MakeConfig = Callable[..., DatagenConfig]
+MakeDataset = Callable[[DatagenConfig], Path]
+TOKEN = "correct-horse-battery"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    monkeypatch.setattr(hgn.data.storage, "_FIRST_PAUSE_S", 0.01)
+    return tmp_path / "cache" / "shards"
+
+
+@pytest.fixture
+def folder(make_config: MakeConfig, make_dataset: MakeDataset) -> Path:
+    return make_dataset(make_config())
+
+
+def in_memory(folder: Path, name: str) -> str:
+    """A copy of a data set in fsspec's memory."""
+    files = fsspec.filesystem("memory")
+    for path in (*folder.glob("*.tar"), folder / "manifest.json"):
+        files.pipe(f"/{name}/{path.name}", path.read_bytes())
+    return f"memory://{name}"
+
+
+@pytest.fixture
+def serve(folder: Path) -> Iterator[Callable[..., str]]:
+    """Starts the service's server, without a pool, on a port of its own: its URL."""
+    running: list[tuple[uvicorn.Server, threading.Thread]] = []
+
+    def start(token: str | None = None, port: int = 0) -> str:
+        listener = socket.create_server(("127.0.0.1", port))
+        app = make_app(folder, token, PoolState)
+        server = uvicorn.Server(uvicorn.Config(app, lifespan="off", ws="none", log_level="error"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        running.append((server, thread))
+        return f"http://127.0.0.1:{listener.getsockname()[1]}"
+
+    def stop() -> None:
+        while running:
+            server, thread = running.pop()
+            server.should_exit = True
+            thread.join()
+
+    start.stop = stop  # type: ignore[attr-defined]
+    yield start
+    stop()
+
+
+def same_episodes(one: EpisodeStore, other: EpisodeStore) -> bool:
+    pairs = zip(one.episodes, other.episodes, strict=True)
+    return all(a.key == b.key and np.array_equal(a.position_TN3, b.position_TN3) for a, b in pairs)
+
+
+def test_url_or_folder() -> None:
+    """URLs are told from folders by their protocol; file:// is a folder."""
+    assert is_remote("http://host:1") and is_remote("s3://bucket/data") and is_remote("memory://x")
+    assert not is_remote("data/obstacles") and not is_remote(Path("/data")) and not is_remote("file:///data")
+    with pytest.raises(ConfigError, match="must be a folder or a URL that fsspec can read, got 'gopher://host'"):
+        open_storage("gopher://host")
+
+
+def test_service_gives_what_the_folder_holds(folder: Path, serve: Callable[..., str], cache: Path) -> None:
+    """Over HTTP the same episodes come, memory-mapped from a cache that names shards by their sha256."""
+    store = EpisodeStore(serve(), "train")
+    assert same_episodes(store, EpisodeStore(folder, "train"))
+    assert all(isinstance(episode.position_TN3, np.memmap) for episode in store.episodes)
+    names = {f"{shard.sha256}.tar" for shard in store.manifest.shards_of("train")}
+    assert {path.name for path in cache.iterdir()} == names
+
+
+def test_manifest_is_sent_once(folder: Path, serve: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Polling a manifest that has not changed costs no more than asking."""
+    url, sizes = serve(), []
+    store = EpisodeStore(url, "train")
+    files = open_storage(url)._files  # type: ignore[attr-defined]
+    real = files.cat_file
+    monkeypatch.setattr(files, "cat_file", lambda *a, **k: sizes.append(len(data := real(*a, **k))) or data)
+    assert not store.refresh()
+    manifest = Manifest.load(folder)
+    dataclasses.replace(manifest, revision=99).save(folder)
+    assert not store.refresh() and store.revision == 99
+    assert sizes[0] == 0 and sizes[1] > 1000
+
+
+def test_growing_data_set(
+    make_config: MakeConfig, make_dataset: MakeDataset, serve: Callable[..., str], folder: Path
+) -> None:
+    """A data set that grows behind its URL is seen to grow; shards that are known stay where they are."""
+    store = EpisodeStore(serve(), "train")
+    first = store.episodes[0]
+    make_dataset(make_config(training_scenes=9))
+    assert store.refresh() and len(store) == 9 and store.episodes[0] is first
+    store.fetch_ahead()
+    assert same_episodes(store, EpisodeStore(folder, "train"))
+
+
+def test_same_names_do_not_collide(make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path) -> None:
+    """Two data sets whose shards have the same names, in one cache, are kept apart."""
+    folders = [make_dataset(make_config(folder=str(tmp_path / name), frames=n)) for name, n in (("a", 4), ("b", 7))]
+    stores = [EpisodeStore(in_memory(folder, f"collide{i}"), "train") for i, folder in enumerate(folders)]
+    assert [store.manifest.shards[0].name for store in stores] == ["train-000000-000001.tar"] * 2
+    assert [store.episodes[0].frame_count for store in stores] == [4, 7]
+    for store, folder in zip(stores, folders, strict=True):
+        assert same_episodes(store, EpisodeStore(folder, "train"))
+
+
+def _read(url: str, barrier: object, results: object) -> None:
+    barrier.wait()  # type: ignore[attr-defined]
+    results.put([episode.key for episode in EpisodeStore(url, "train").episodes])  # type: ignore[attr-defined]
+
+
+def test_ranks_share_the_cache(folder: Path, serve: Callable[..., str], cache: Path) -> None:
+    """Processes of one machine that want the same shards at once each get them whole; each is fetched once."""
+    url = serve()
+    context = multiprocessing.get_context("spawn")
+    barrier, results = context.Barrier(2), context.Queue()
+    processes = [context.Process(target=_read, args=(url, barrier, results)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    keys = [results.get(timeout=60) for _ in processes]
+    for process in processes:
+        process.join()
+    results.close()
+    results.join_thread()
+    assert keys[0] == keys[1] == [entry.key for entry in EpisodeStore(folder, "train").entries]
+    with urllib.request.urlopen(f"{url}/metrics") as answer:
+        text = answer.read().decode()
+    (line,) = [line for line in text.splitlines() if line.startswith('hgn_http_responses_total{code="206"}')]
+    assert int(line.split()[-1]) == len(Manifest.load(folder).shards_of("train"))
+    assert not list(cache.glob("*.partial"))
+
+
+@pytest.mark.parametrize("left", [b"", b"prefix", b"garbage", b"too long"])
+def test_fetching_goes_on_where_it_ended(
+    folder: Path, cache: Path, left: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a killed process had fetched is kept, unless it is not what it should be."""
+    monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 1000)
+    url = in_memory(folder, f"resume-{left.decode().replace(' ', '-')}")
+    entry = Manifest.load(url).shards[0]
+    content = (folder / entry.name).read_bytes()
+    cache.mkdir(parents=True)
+    partial = cache / f".{entry.sha256}.tar.partial"
+    partial.write_bytes(
+        {b"prefix": content[:5000], b"garbage": b"?" * 5000, b"too long": content + b"?"}.get(left, b"")
+    )
+    reads: list[int] = []
+    files = open_storage(url)._files  # type: ignore[attr-defined]
+    real = files.cat_file
+    monkeypatch.setattr(files, "cat_file", lambda *a, **k: reads.append(k["start"]) or real(*a, **k))
+    path = open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
+    assert path.read_bytes() == content and [p.name for p in cache.iterdir()] == [path.name]
+    assert reads[0] == (5000 if left in (b"prefix", b"garbage") else 0)
+    assert (0 in reads) == (left != b"prefix")
+
+
+def test_damaged_cache_is_mended(folder: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A shard that changed on this machine's disk is fetched again."""
+    url = in_memory(folder, "mended")
+    entry = Manifest.load(url).shards[0]
+    path = open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
+    path.write_bytes(b"?" * entry.bytes)
+    os.utime(path, ns=(1, 1))
+    assert open_storage(url).shard(entry.name, entry.sha256, entry.bytes).read_bytes()[:5] == b"train"
+    assert "it was altered; it is fetched again" in capsys.readouterr().err
+
+
+def test_altered_or_cut_shards_are_refused(folder: Path, cache: Path) -> None:
+    """A shard that is not what the manifest says is refused, and never gets into the cache."""
+    url, files = in_memory(folder, "altered"), fsspec.filesystem("memory")
+    first, second = Manifest.load(url).shards_of("train")[:2]
+    content = (folder / first.name).read_bytes()
+    files.pipe(f"/altered/{first.name}", content[:700] + b"?" + content[701:])
+    files.pipe(f"/altered/{second.name}", content[: second.bytes // 2])
+    store = EpisodeStore(url, "train")
+    with pytest.raises(ConfigError, match=r"memory://altered/train-.*\.tar must have sha256 [0-9a-f]{64}, got other"):
+        store.episodes[0]
+    with pytest.raises(ConfigError, match=rf"must have {second.bytes} bytes, got {second.bytes // 2}; it was cut"):
+        store.episodes[1]
+    files.rm(f"/altered/{second.name}")
+    with pytest.raises(ConfigError, match="is listed in the manifest but missing"):
+        store.episodes[1]
+    assert list(cache.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("name", "../../etc/passwd", r"shards\[0\]\.name must be a plain file name"),
+        ("name", ".lock", r"shards\[0\]\.name must be a plain file name"),
+        ("sha256", "../" * 10 + "evil", r"shards\[0\]\.sha256 must be 64 hexadecimal digits"),
+        ("bytes", -1, r"shards\[0\]\.bytes must be a finite number >= 0"),
+        ("split", "../train", r"shards\[0\]\.split must be one of"),
+    ],
+)
+def test_manifest_cannot_name_other_files(folder: Path, key: str, value: object, message: str) -> None:
+    """Names and hashes of a manifest become paths: what could lead elsewhere is refused."""
+    mapping = json.loads((folder / "manifest.json").read_text())
+    mapping["shards"][0][key] = value
+    (folder / "manifest.json").write_text(json.dumps(mapping))
+    with pytest.raises(ConfigError, match=message):
+        Manifest.load(in_memory(folder, "evil"))
+
+
+def test_server_without_ranges(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plain file server that knows no ranges will do."""
+    monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 4000)
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    handler = functools.partial(Quiet, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        store = EpisodeStore(f"http://127.0.0.1:{server.server_port}", "train")
+        assert same_episodes(store, EpisodeStore(folder, "train"))
+        server.shutdown()
+
+
+def test_no_data_set_there(serve: Callable[..., str]) -> None:
+    """A URL without a manifest is told apart from one that does not answer."""
+    fsspec.filesystem("memory").pipe("/empty/readme", b"")
+    assert not EpisodeStore.available("memory://empty")
+    with pytest.raises(ConfigError, match=r"memory://empty/manifest\.json must be the manifest of a data set, got no"):
+        EpisodeStore("memory://empty", "train")
+    assert not EpisodeStore.available(serve() + "/elsewhere")
+
+
+def test_token(folder: Path, serve: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The token of the environment opens the service; without it, or with another one, the message names it."""
+    url = serve(TOKEN)
+    for token in (None, "another-token-of-ours"):
+        if token:
+            monkeypatch.setenv(TOKEN_VARIABLE, token)
+        hgn.data.storage._remote.cache_clear()
+        with pytest.raises(ConfigError, match="must be open to this reader, got refused; set HGN_DATASET_TOKEN"):
+            EpisodeStore(url, "train")
+    monkeypatch.setenv(TOKEN_VARIABLE, TOKEN)
+    hgn.data.storage._remote.cache_clear()
+    assert same_episodes(EpisodeStore(url, "train"), EpisodeStore(folder, "train"))
+
+
+def test_server_that_comes_back(folder: Path, serve: Callable[..., str]) -> None:
+    """A reader waits for a service that is started again, and meanwhile goes on with what it has."""
+    url = serve()
+    store = EpisodeStore(url, "train")
+    _ = store.episodes[0]
+    serve.stop()  # type: ignore[attr-defined]
+    assert not store.refresh() and store.episodes[0].key == "train-000000"
+    threading.Timer(0.5, serve, kwargs={"port": int(url.rpartition(":")[2])}).start()
+    assert same_episodes(store, EpisodeStore(folder, "train"))
+
+
+def test_server_that_stays_away() -> None:
+    """After its patience a reader ends with an error that names the URL and the cause."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    with pytest.raises(UnreachableError, match=r"no answer for 0 s .*: 'http://127.0.0.1:"):
+        Manifest.load(url, patience_s=0.05)
+
+
+def test_full_disk(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the cache is full the error names it, and what was fetched does not stay in the way."""
+    url = in_memory(folder, "full")
+    store = EpisodeStore(url, "train")
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match=r"No space left on device: .*cache/shards"):
+            store.episodes[0]
+    assert list(cache.iterdir()) == []
+    assert store.episodes[0].key == "train-000000"
+
+
+def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """HGN_CACHE names the cache; otherwise it is where programs of this machine keep theirs."""
+    assert cache_folder() == tmp_path / "cache" / "shards"
+    monkeypatch.delenv(CACHE_VARIABLE)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "hgn" / "shards"

@@ -1,0 +1,341 @@
+"""The service: what it serves, to whom, and what becomes of it when something is at fault."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import pytest
+
+from datagen.progress import Progress
+from datagen.server import make_app
+from datagen.service import main
+from datagen.supervisor import PoolState, Supervisor
+from datagen.worker import Backend
+from hgn.command import run_command
+from hgn.config import DatagenConfig
+from hgn.data.manifest import Manifest
+from hgn.data.storage import TOKEN_VARIABLE
+
+MakeConfig = Callable[..., DatagenConfig]
+MakeDataset = Callable[[DatagenConfig], Path]
+Ask = Callable[..., tuple[int, dict[str, str], bytes]]
+ROOT = Path(__file__).resolve().parents[2]
+TOKEN = "correct-horse-battery"
+SHARD = "/train-000002-000004.tar"
+
+
+@pytest.fixture
+def folder(make_config: MakeConfig, make_dataset: MakeDataset) -> Path:
+    return make_dataset(make_config())
+
+
+@pytest.fixture
+def ask(folder: Path) -> Ask:
+    """Sends a request to the service of `folder`, without a network: status, headers, body."""
+
+    def request(path: str, method: str = "GET", token: str | None = None, **headers: str):
+        app = make_app(folder, token, lambda: PoolState("running", 2, 3, 8, 6, {0: (4, 2)}))
+        sent: list[dict[str, Any]] = []
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": b"", "more_body": False}
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+
+        scope = {
+            "type": "http",
+            "asgi": {"version": "3.0", "spec_version": "2.4"},
+            "method": method,
+            "path": unquote(path),
+            "raw_path": path.encode(),
+            "query_string": b"",
+            "root_path": "",
+            "headers": [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()],
+        }
+        asyncio.run(app(scope, receive, send))
+        body = b"".join(message.get("body", b"") for message in sent[1:])
+        return sent[0]["status"], {k.decode(): v.decode() for k, v in sent[0]["headers"]}, body
+
+    return request
+
+
+def test_manifest_and_its_etag(ask: Ask, folder: Path) -> None:
+    """The manifest is served as it is; whoever has it already is told so in a few bytes."""
+    status, headers, body = ask("/manifest.json")
+    assert status == 200 and body == (folder / "manifest.json").read_bytes()
+    assert ask("/manifest.json", if_none_match=headers["etag"])[::2] == (304, b"")
+    assert ask("/manifest.json", if_none_match='"other"')[0] == 200
+    assert ask("/manifest.json", method="HEAD")[1] == headers
+
+
+def test_shards_with_ranges(ask: Ask, folder: Path) -> None:
+    """A shard comes whole or in part; its ETag is its sha256; a range beyond the end is refused."""
+    content = (folder / SHARD[1:]).read_bytes()
+    status, headers, body = ask(SHARD)
+    assert status == 200 and body == content and headers["accept-ranges"] == "bytes"
+    entry = next(shard for shard in Manifest.load(folder).shards if shard.name == SHARD[1:])
+    assert headers["etag"] == f'"{entry.sha256}"' and "immutable" in headers["cache-control"]
+    for given, start, stop in (("100-199", 100, 200), ("100-", 100, len(content)), ("-7", len(content) - 7, None)):
+        status, headers, body = ask(SHARD, range=f"bytes={given}")
+        assert status == 206 and body == content[start:stop]
+    status, headers, _ = ask(SHARD, range=f"bytes={len(content)}-")
+    assert status == 416 and headers["content-range"] == f"bytes */{len(content)}"
+    assert ask(SHARD, range="bytes=5-2")[0] == 400
+    assert ask(SHARD, range="bytes=0-9", if_range=f'"{entry.sha256}"')[2] == content[:10]
+    assert ask(SHARD, range="bytes=0-9", if_range='"of another shard"')[2] == content
+    assert ask(SHARD, if_none_match=f'W/"x", "{entry.sha256}"')[::2] == (304, b"")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/.lock",
+        "/.staging/train-000000.tar",
+        "/train-000090-000091.tar",
+        "/.train-000002-000004.tar.1.partial",
+        "/../outside.txt",
+        "/%2e%2e/outside.txt",
+        "/%2e%2e%2foutside.txt",
+        "//etc/passwd",
+        "/train-000002-000004.tar/",
+        "/",
+    ],
+)
+def test_nothing_else_is_served(ask: Ask, folder: Path, path: str) -> None:
+    """Whatever is not in the manifest does not exist: locks, staged and half-written files, paths that lead out."""
+    (folder.parent / "outside.txt").write_text("secret")
+    (folder / "train-000090-000091.tar").write_bytes(b"not listed")
+    (folder / ".train-000002-000004.tar.1.partial").write_bytes(b"half")
+    assert ask(path)[0] == 404
+
+
+def test_read_only(ask: Ask) -> None:
+    """No method but GET and HEAD does anything."""
+    for method in ("POST", "PUT", "DELETE", "PATCH"):
+        assert ask(SHARD, method=method)[0] == 405
+
+
+def test_token(ask: Ask) -> None:
+    """With a token every path but /healthz asks for it; a wrong one, or a part of it, is refused."""
+    for headers in (
+        {},
+        {"authorization": TOKEN},
+        {"authorization": f"Bearer {TOKEN[:-1]}"},
+        {"authorization": "Bearer "},
+    ):
+        for path in ("/manifest.json", SHARD, "/progress", "/metrics", "/nothing"):
+            status, answer, body = ask(path, token=TOKEN, **headers)
+            assert status == 401 and answer["www-authenticate"] == "Bearer" and TOKEN.encode() not in body
+    assert ask(SHARD, token=TOKEN, authorization=f"Bearer {TOKEN}")[0] == 200
+    assert ask("/healthz", token=TOKEN)[0] == 200
+
+
+def test_damage_is_not_served(ask: Ask, folder: Path) -> None:
+    """A shard that was cut or taken away, and a manifest of another version, are answered with an error."""
+    shard = folder / SHARD[1:]
+    os.truncate(shard, 1024)
+    assert ask(SHARD)[::2] == (500, b"train-000002-000004.tar is damaged or missing here; it must be generated again\n")
+    shard.unlink()
+    assert ask(SHARD)[0] == 500
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"schema_version": 99}))
+    for path in ("/manifest.json", SHARD, "/healthz", "/progress"):
+        status, _, body = ask(path)
+        assert status == 503 and b"schema_version must be 1, got 99" in body
+    (folder / "manifest.json").unlink()
+    assert ask("/manifest.json")[::2] == (503, b"the data set has no manifest yet; ask again in a moment\n")
+
+
+def test_progress_and_metrics(ask: Ask) -> None:
+    """Both tell what is published and what the pool is at; the metrics parse as Prometheus text."""
+    progress = json.loads(ask("/progress")[2])
+    assert progress["episodes"]["train"] == {"requested": 5, "published": 5} and progress["complete"]
+    assert progress["generator"]["status"] == "running" and progress["generator"]["running"] == [
+        {"frame": 4, "scenes": 2}
+    ]
+    text = ask("/metrics")[2].decode()
+    sample = re.compile(r'([a-z_]+)(\{[a-z]+="[a-z0-9]+"\})? [0-9.]+')
+    named = {line.split()[2] for line in text.splitlines() if line.startswith("# TYPE")}
+    values = {}
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            match = sample.fullmatch(line)
+            assert match and match[1] in named, line
+            values[match[1] + (match[2] or "")] = float(line.split()[-1])
+    assert values['hgn_episodes_published{split="train"}'] == 5 and values["hgn_generator_starts_total"] == 2
+
+
+class Recorder(Progress):
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+        self.episodes: list[str] = []
+
+    def episode(self, key: str) -> None:
+        self.episodes.append(key)
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+def children(process: int) -> list[int]:
+    tasks = Path(f"/proc/{process}/task").glob("*/children")
+    return [int(child) for path in tasks for child in path.read_text().split()]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds the pool in /proc")
+def test_pool_that_dies_is_started_again(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """The service outlives its pool: a killed one is started again and completes the data set."""
+    (control / "slow").touch()
+    recorder = Recorder()
+    config = make_config(validation_scenes=0, test_scenes=0, training_scenes=3)
+    with Supervisor(config, recorder, backend) as supervisor:
+        wait_until(lambda: recorder.episodes)
+        (pool,) = [
+            child for child in children(os.getpid()) if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
+        ]
+        os.kill(pool, signal.SIGKILL)
+        wait_until(lambda: supervisor.state.status == "complete")
+    assert supervisor.state.starts == 2 and "the pool ended (ended by SIGKILL); it is started" in recorder.messages[0]
+    assert Manifest.load(config.dataset.folder).complete
+
+
+def test_full_disk_is_waited_for(make_config: MakeConfig, backend: Backend, tmp_path: Path) -> None:
+    """A pool that the machine is in the way of ends, and begins again by itself when it is not."""
+    blocked = tmp_path / "blocked"
+    blocked.write_text("in the way")
+    recorder = Recorder()
+    config = make_config(folder=str(blocked / "data"), training_scenes=1, validation_scenes=0, test_scenes=0)
+    with Supervisor(config, recorder, backend) as supervisor:
+        wait_until(lambda: supervisor.state.status == "waiting")
+        assert "Not a directory" in supervisor.state.error
+        blocked.unlink()
+        wait_until(lambda: supervisor.state.status == "complete")
+    assert Manifest.load(blocked / "data").complete and supervisor.state.error == ""
+
+
+def test_stopping_ends_the_pool_in_order(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """Leaving the supervisor ends the pool as Ctrl-C would: what is staged is kept and nothing is half-written."""
+    (control / "slow").touch()
+    recorder = Recorder()
+    config = make_config()
+    with Supervisor(config, recorder, backend) as supervisor:
+        wait_until(lambda: len(recorder.episodes) >= 2)
+    assert supervisor.state.status == "stopped" and not list(Path(config.dataset.folder).rglob("*.partial"))
+    assert "run the same command to go on" in recorder.messages[-1]
+
+
+def run_service(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(sys, "argv", ["service", *arguments])
+    with pytest.raises(SystemExit) as exit_:
+        run_command(main, "service")
+    return int(exit_.value.code or 0)
+
+
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        yield listener.getsockname()[1]
+
+
+def test_bad_input_is_one_line(
+    taken_port: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """A port in use, an open door and a folder that is none end the service before it makes anything."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    for arguments, message in (
+        (
+            [f"port={taken_port}"],
+            f"host and port must be free to serve on, got 127.0.0.1:{taken_port} (Address already",
+        ),
+        (["port=70000"], "port must be 0 to 65535, got 70000"),
+        (["host=0.0.0.0", "port=0"], "host must be a loopback address without a token, got '0.0.0.0'; set HGN_DATASET"),
+        (["host=no.such.host.invalid"], "host and port must be free to serve on, got no.such.host.invalid:8000 ("),
+        (["out=http://localhost:1"], "out must be a folder to write to, got 'http://localhost:1'"),
+        (["hots=1"], "Could not override 'hots'. To append to your config use +hots=1"),
+    ):
+        assert run_service(arguments, monkeypatch) == 2
+        output, errors = capsys.readouterr()
+        assert errors.startswith(f"error: {message}") and errors.count("\n") == 1 and output == "", errors
+    monkeypatch.setenv(TOKEN_VARIABLE, "short")
+    assert run_service(["port=0"], monkeypatch) == 2
+    assert "HGN_DATASET_TOKEN must be 16 or more" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_data_set_is_not_served(
+    make_config: MakeConfig, make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
+) -> None:
+    """A folder with another data set, or one of another version, ends the service with exit code 2."""
+    folder = make_dataset(make_config())
+    assert run_service([f"out={folder}", "port=0", "dataset.seed=7"], monkeypatch) == 2
+    assert "holds another data set: frames is 6 there" in capsys.readouterr().err
+    mapping = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}
+    (folder / "manifest.json").write_text(json.dumps(mapping))
+    assert run_service([f"out={folder}", "port=0"], monkeypatch) == 2
+    assert "schema_version must be 1, got 99" in capsys.readouterr().err
+
+
+def test_generator_that_cannot_begin_ends_the_service(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
+) -> None:
+    """What only the pool finds out, a file that is no shard say, ends the service too."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "train-000000-000001.tar").write_bytes(b"no tar")
+    assert run_service(["out=made", "port=0", "progress=off"], monkeypatch) == 2
+    assert "train-000000-000001.tar must be a whole tar" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
+def test_stopping_leaves_a_resumable_folder(backend: Backend, control: Path, tmp_path: Path) -> None:
+    """SIGTERM ends the service with 143, and its pool in order: no process stays behind, nothing is half-written.
+
+    `kill -9` is what test_kills.py is about.
+    """
+    (control / "slow").touch()
+    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
+    arguments = ["out=made", "scenes=3", "dataset.validation_scenes=0", "dataset.test_scenes=0", "dataset.frames=5"]
+    with (tmp_path / "log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ballistic_service", *arguments, "port=0", "dataset.workers=1"],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": path},
+            stderr=log,
+            start_new_session=True,
+        )
+    wait_until(lambda: "published" in (tmp_path / "log").read_text())
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 143
+    wait_until(lambda: not [p for p in Path("/proc").glob("[0-9]*/stat") if _in_session(p, process.pid)])
+    folder = tmp_path / "made"
+    assert not list(folder.rglob("*.partial"))
+    assert Manifest.load(folder).revision >= 1 and not Manifest.load(folder).complete
+
+
+def _in_session(stat: Path, session: int) -> bool:
+    try:
+        fields = stat.read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return int(fields[3]) == session and fields[0] != "Z"
