@@ -302,7 +302,7 @@ def _owned(path: Path) -> Iterator[io.BufferedRandom | None]:
                 return
             try:
                 yield file
-            except ConfigError:
+            except (ConfigError, FileNotFoundError):
                 partial.unlink(missing_ok=True)
                 raise
             except OSError as error:
