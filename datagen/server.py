@@ -8,7 +8,8 @@
 | /metrics | the same for Prometheus | |
 | /healthz | 200 while the service serves; needs no token | |
 
-Nothing else of the folder can be reached. With a token each request must carry `Authorization: Bearer <token>`.
+Nothing else of the folder can be reached, and no shard whose bytes are not those that the manifest promises. With a
+token each request must carry `Authorization: Bearer <token>`.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from datagen.supervisor import PoolState
 from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
+from hgn.data.storage import verify_file
 from hgn.schema import ConfigError
 
 _OPEN_PATHS = ("/healthz",)
+_REMEDY = "delete it and run the generator again"
 
 
 class ShardResponse(FileResponse):
@@ -130,13 +133,14 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
             return PlainTextResponse("the manifest lists no such shard\n", 404)
         path, etag = folder / entry.name, f'"{entry.sha256}"'
         try:
+            await to_thread.run_sync(verify_file, path, entry.sha256, entry.bytes, _REMEDY)
             status = await to_thread.run_sync(os.stat, path)
         except FileNotFoundError:
-            status = None
-        if status is None or status.st_size != entry.bytes:
-            return PlainTextResponse(f"{entry.name} is damaged or missing here; it must be generated again\n", 500)
-        # a shard never changes under its name
-        headers = {"etag": etag, "cache-control": "private, max-age=31536000, immutable"}
+            return PlainTextResponse(f"{entry.name} is missing here; it must be generated again\n", 404)
+        except ConfigError:
+            return PlainTextResponse(f"{entry.name} is damaged here; {_REMEDY}\n", 410)
+        # another data set may have a shard of this name, at this address, later
+        headers = {"etag": etag, "cache-control": "private, no-cache"}
         if _unchanged(request, etag):
             return Response(status_code=304, headers=headers)
         return ShardResponse(path, headers=headers, media_type="application/x-tar", stat_result=status)

@@ -272,6 +272,8 @@ def _transient(error: Exception, url: str) -> str | None:
             f"{url} must be open to this reader, got refused; set {TOKEN_VARIABLE} to the service's token (an object "
             "store asks for its own credentials)"
         ) from None
+    if status == 410:
+        raise ConfigError(f"{url} is damaged at its service; delete it there and run the generator again") from None
     if isinstance(status, int) and 400 <= status < 500 and status not in (408, 425, 429):
         raise ConfigError(
             f"{url} must be a file of a data set, got the answer {status}; check dataset.folder"

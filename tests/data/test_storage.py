@@ -310,6 +310,15 @@ def test_full_disk(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -
     assert store.episodes[0].key == "train-000000"
 
 
+def test_damage_at_the_service(folder: Path, serve: Callable[..., str]) -> None:
+    """A reader that asks for a damaged shard is told so at once, and by whom."""
+    store = EpisodeStore(serve(), "train")
+    shard = folder / store.manifest.shards[0].name
+    shard.write_bytes(shard.read_bytes()[:-1] + b"?")
+    with pytest.raises(ConfigError, match=r"train-000000-000001.tar is damaged at its service; delete it there and"):
+        store.episodes[0]
+
+
 def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """HGN_CACHE names the cache; otherwise it is where programs of this machine keep theirs."""
     assert cache_folder() == tmp_path / "cache" / "shards"

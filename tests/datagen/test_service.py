@@ -18,6 +18,7 @@ from urllib.parse import unquote
 
 import pytest
 
+import datagen.supervisor
 from datagen.progress import Progress
 from datagen.server import make_app
 from datagen.service import main
@@ -34,6 +35,11 @@ Ask = Callable[..., tuple[int, dict[str, str], bytes]]
 ROOT = Path(__file__).resolve().parents[2]
 TOKEN = "correct-horse-battery"
 SHARD = "/train-000002-000004.tar"
+
+
+@pytest.fixture(autouse=True)
+def no_long_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(datagen.supervisor, "_FIRST_PAUSE_S", 0.1)
 
 
 @pytest.fixture
@@ -87,7 +93,7 @@ def test_shards_with_ranges(ask: Ask, folder: Path) -> None:
     status, headers, body = ask(SHARD)
     assert status == 200 and body == content and headers["accept-ranges"] == "bytes"
     entry = next(shard for shard in Manifest.load(folder).shards if shard.name == SHARD[1:])
-    assert headers["etag"] == f'"{entry.sha256}"' and "immutable" in headers["cache-control"]
+    assert headers["etag"] == f'"{entry.sha256}"' and "no-cache" in headers["cache-control"]
     for given, start, stop in (("100-199", 100, 200), ("100-", 100, len(content)), ("-7", len(content) - 7, None)):
         status, headers, body = ask(SHARD, range=f"bytes={given}")
         assert status == 206 and body == content[start:stop]
@@ -144,12 +150,16 @@ def test_token(ask: Ask) -> None:
 
 
 def test_damage_is_not_served(ask: Ask, folder: Path) -> None:
-    """A shard that was cut or taken away, and a manifest of another version, are answered with an error."""
+    """A shard that was altered, cut or taken away, and a manifest of another version, are answered with an error."""
     shard = folder / SHARD[1:]
-    os.truncate(shard, 1024)
-    assert ask(SHARD)[::2] == (500, b"train-000002-000004.tar is damaged or missing here; it must be generated again\n")
+    content = bytearray(shard.read_bytes())
+    content[5000] ^= 1
+    for damaged in (content, content[:1024]):
+        shard.write_bytes(damaged)
+        status, _, body = ask(SHARD)
+        assert status == 410 and body.startswith(b"train-000002-000004.tar is damaged here; delete it and run")
     shard.unlink()
-    assert ask(SHARD)[0] == 500
+    assert ask(SHARD)[::2] == (404, b"train-000002-000004.tar is missing here; it must be generated again\n")
     manifest = json.loads((folder / "manifest.json").read_text())
     (folder / "manifest.json").write_text(json.dumps(manifest | {"schema_version": 99}))
     for path in ("/manifest.json", SHARD, "/healthz", "/progress"):
@@ -215,7 +225,10 @@ def test_pool_that_dies_is_started_again(make_config: MakeConfig, backend: Backe
         ]
         os.kill(pool, signal.SIGKILL)
         wait_until(lambda: supervisor.state.status == "complete")
-    assert supervisor.state.starts == 2 and "the pool ended (ended by SIGKILL); it is started" in recorder.messages[0]
+    assert (
+        supervisor.state.starts == 2
+        and "the pool ended (ended by SIGKILL); it is started again" in recorder.messages[0]
+    )
     assert Manifest.load(config.dataset.folder).complete
 
 
