@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
+import signal
 import socket
 import subprocess
 import sys
+import sysconfig
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,11 +18,19 @@ import yaml
 from training.runs import metrics, train_arguments
 
 from hgn.config import DatagenConfig
+from hgn.data.manifest import Manifest
 from hgn.training.checkpoint import read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 JOBS = ROOT / "jobs"
 SCRIPTS = sorted([*JOBS.rglob("*.sh"), *JOBS.rglob("*.sbatch")])
+# the second of two array tasks
+ARRAY = {
+    "SLURM_ARRAY_TASK_ID": "1",
+    "SLURM_ARRAY_TASK_COUNT": "2",
+    "SLURM_ARRAY_TASK_MIN": "0",
+    "SLURM_ARRAY_TASK_MAX": "1",
+}
 SHORT = {"maximum_updates": 4, "batch_scenes": 1, "log_every": 2, "monitor_every": 4, "monitor_rollout_frames": 0}
 
 # starts one process for each task of one node, as srun does, and returns the highest exit code
@@ -30,6 +40,7 @@ pids=()
 for ((task = 0; task < SLURM_NTASKS; task++)); do
     SLURM_PROCID=$task SLURM_LOCALID=$task SLURM_NODEID=0 "$@" &
     pids+=($!)
+    echo $! >> "$SLURM_FAKE/pids"
 done
 highest=0
 for pid in "${pids[@]}"; do
@@ -39,13 +50,33 @@ for pid in "${pids[@]}"; do
 done
 exit "$highest"
 """
+SCONTROL = """#!/usr/bin/env bash
+echo "$@" >> "$SLURM_FAKE/scontrol.log"
+if [[ $1 == show ]]; then echo localhost; fi
+"""
+# hands a signal to the tasks of the job's steps
+SCANCEL = """#!/usr/bin/env bash
+[[ $1 == --signal=* && $2 == "$SLURM_JOB_ID" ]] && xargs kill "-${1#--signal=}" < "$SLURM_FAKE/pids"
+"""
+
+
+def start(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.Popen[str]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "TORCH"))}
+    environment = kept | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | variables
+    return subprocess.Popen(
+        ["bash", str(JOBS / script), *arguments],
+        cwd=cwd,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def run(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
-    environment = kept | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | variables
-    command = ["bash", str(JOBS / script), *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=240)
+    process = start(script, *arguments, cwd=cwd, **variables)
+    output, errors = process.communicate(timeout=240)
+    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
 def write_program(folder: Path, name: str, text: str) -> None:
@@ -56,10 +87,10 @@ def write_program(folder: Path, name: str, text: str) -> None:
 
 @pytest.fixture
 def slurm(tmp_path: Path) -> dict[str, str]:
-    """The environment of a Slurm job on one node with two tasks, with stand-ins for srun and scontrol."""
+    """The environment of a Slurm job on one node with two tasks, with stand-ins for srun, scontrol and scancel."""
     programs = tmp_path / "programs"
-    write_program(programs, "srun", SRUN)
-    write_program(programs, "scontrol", f'#!/usr/bin/env bash\necho "$@" >> {tmp_path}/scontrol.log\n')
+    for name, text in (("srun", SRUN), ("scontrol", SCONTROL), ("scancel", SCANCEL)):
+        write_program(programs, name, text)
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
@@ -67,10 +98,14 @@ def slurm(tmp_path: Path) -> dict[str, str]:
         "PATH": f"{programs}:{os.environ['PATH']}",
         "SLURM_JOB_ID": "4711",
         "SLURM_JOB_NAME": "hgn-train",
+        "SLURM_FAKE": str(tmp_path),
         "SLURM_NNODES": "1",
+        "SLURM_JOB_NUM_NODES": "1",
         "SLURM_NTASKS": "2",
         "SLURM_NTASKS_PER_NODE": "2",
         "SLURM_NODELIST": "localhost",
+        "SLURM_JOB_NODELIST": "localhost",
+        "SLURM_GPUS_ON_NODE": "2",
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": str(port),
     }
@@ -78,24 +113,24 @@ def slurm(tmp_path: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
 def test_scripts_are_valid(script: Path) -> None:
-    """Bash parses each launch file, shellcheck (where installed) finds nothing, and each may be executed."""
+    """Bash parses each launch file, shellcheck finds nothing, and each may be executed."""
     assert subprocess.run(["bash", "-n", str(script)], capture_output=True, text=True).stderr == ""
-    if shutil.which("shellcheck"):
-        checked = subprocess.run(["shellcheck", "--shell", "bash", str(script)], capture_output=True, text=True)
-        assert checked.returncode == 0, checked.stdout
+    shellcheck = Path(sysconfig.get_path("scripts")) / "shellcheck"
+    checked = subprocess.run([str(shellcheck), "--shell", "bash", str(script)], capture_output=True, text=True)
+    assert checked.returncode == 0, checked.stdout
     assert os.access(script, os.X_OK)
 
 
 def test_all_are_listed() -> None:
     """The table names every launch file, and every launch file that it names is there."""
     text = (JOBS / "README.md").read_text()
-    named = set(re.findall(r"jobs/[\w/]+\.\w+", text))
-    assert named == {str(script.relative_to(ROOT)) for script in SCRIPTS}
+    named = set(re.findall(r"`(?:\w+ )?(?:kubectl apply -f )?(jobs/[\w/]+\.\w+)", text))
+    assert named == {str(path.relative_to(ROOT)) for path in [*SCRIPTS, *JOBS.rglob("*.yaml")]}
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
 def test_options_of_slurm_come_first(script: Path) -> None:
-    """sbatch reads its options only before the first command; tasks and GPUs of a node are the same number."""
+    """sbatch reads its options only before the first command; where tasks train, there is one for each GPU."""
     lines = script.read_text().splitlines()
     first_command = next(i for i, line in enumerate(lines) if line and not line.startswith("#"))
     options = [line.removeprefix("#SBATCH ") for line in lines[:first_command] if line.startswith("#SBATCH ")]
@@ -103,7 +138,8 @@ def test_options_of_slurm_come_first(script: Path) -> None:
     assert bool(options) == (script.suffix == ".sbatch")
     assert all(re.fullmatch(r"--[a-z-]+(=\S+)?", option) for option in options)
     values = dict(option.removeprefix("--").partition("=")[::2] for option in options)
-    assert values.get("ntasks-per-node", "1") == values.get("gpus-per-node", "1")
+    tasks = values.get("gpus-per-node", "1") if script.name == "train.sbatch" else "1"
+    assert values.get("ntasks-per-node", "1") == tasks
 
 
 def test_torchrun_trains(
@@ -116,7 +152,7 @@ def test_torchrun_trains(
     assert done.returncode == 0, done.stderr[-4000:]
     assert done.stdout.count("trained 4 of 4 updates") == 1
     stored = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    assert (stored["training"]["devices"], stored["training"]["nodes"]) == (2, 1)
+    assert (stored["training"]["devices"], stored["training"]["nodes"]) == (None, None)  # torchrun says it
     assert [record["update"] for record in metrics(tmp_path / "run") if "loss" in record] == [2, 4]
 
 
@@ -124,8 +160,11 @@ def test_torchrun_trains(
     ("variables", "message"),
     [
         ({"GPUS": "all"}, "error: GPUS must be a whole number of at least 1, got 'all'\n"),
-        ({"NODES": "0"}, "error: NODES must be a whole number of at least 1, got '0'\n"),
+        ({"NODES": "0"}, "error: NODES must be a whole number of at least 1, or two as in 1:4, got '0'\n"),
+        ({"NODES": "1:"}, "error: NODES must be a whole number of at least 1, or two as in 1:4, got '1:'\n"),
         ({"NODES": "2"}, "error: RENDEZVOUS must be host:port of one of the 2 machines, got nothing; as in"),
+        ({"NODES": "1:2"}, "error: RENDEZVOUS must be host:port of one of the 1:2 machines, got nothing; as in"),
+        ({"RESTARTS": "-1"}, "error: RESTARTS must be a whole number, got '-1'\n"),
     ],
 )
 def test_torchrun_refuses(tmp_path: Path, variables: dict[str, str], message: str) -> None:
@@ -135,14 +174,17 @@ def test_torchrun_refuses(tmp_path: Path, variables: dict[str, str], message: st
 
 
 def test_torchrun_on_several_machines(tmp_path: Path) -> None:
-    """With NODES and RENDEZVOUS torchrun is told where to meet, and the training how many take part."""
-    write_program(tmp_path, "shown", '#!/usr/bin/env bash\nprintf "%s\\n" "$@"\n')
+    """With NODES and RENDEZVOUS torchrun is told where to meet and what the run is called; the training follows it."""
+    write_program(tmp_path, "shown", '#!/usr/bin/env bash\nenv | grep ^TORCH | sort\nprintf "%s\\n" "$@"\n')
     variables = {"PYTHON": str(tmp_path / "shown"), "NODES": "3", "GPUS": "4", "RENDEZVOUS": "node0:29500"}
     done = run("torchrun.sh", "run=here and there", cwd=tmp_path, EXPERIMENT="small", **variables)
     assert done.stdout.splitlines() == [
-        *("-m", "torch.distributed.run", "--nnodes", "3", "--nproc-per-node", "4"),
-        *("--rdzv-backend", "c10d", "--rdzv-endpoint", "node0:29500", "--rdzv-id", "hgn-small"),
-        *("-m", "hgn.train", "+experiment=small", "training.nodes=3", "training.devices=4", "run=here and there"),
+        "TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1",
+        "TORCH_ELASTIC_SHUTDOWN_TIMEOUT=120",
+        *("-m", "torch.distributed.run", "--nnodes", "3", "--nproc-per-node", "4", "--max-restarts", "3"),
+        *("--rdzv-backend", "c10d", "--rdzv-endpoint", "node0:29500", "--rdzv-id", "small"),
+        *("--signals-to-handle", "SIGTERM,SIGINT,SIGHUP,SIGQUIT,SIGUSR1"),
+        *("-m", "hgn.train", "+experiment=small", "run=here and there"),
     ]
 
 
@@ -164,12 +206,51 @@ def test_slurm_trains(
     assert not (tmp_path / "scontrol.log").exists()
 
 
+def test_slurm_trains_with_torchrun(
+    slurm: dict[str, str],
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    tmp_path: Path,
+) -> None:
+    """jobs/slurm/train_torchrun.sbatch starts one torchrun a node. At the time limit the training ends with a
+    checkpoint and the job is queued again; started again, it goes on in the same folder, named after the job."""
+    config = make_config()
+    make_dataset(config)
+    (tmp_path / "jobs").symlink_to(JOBS)
+    arguments = [a for a in train_arguments(config, tmp_path, **SHORT) if not a.startswith("run=")]
+    slurm |= {"SLURM_NTASKS": "1", "EXPERIMENT": "small"}
+    started = start(
+        "slurm/train_torchrun.sbatch", *arguments, "training.maximum_updates=1000000", cwd=tmp_path, **slurm
+    )
+    folder = tmp_path / "runs" / "small-4711"
+    deadline = time.monotonic() + 120
+    while not (folder / "metrics.jsonl").exists():
+        assert started.poll() is None and time.monotonic() < deadline, started.communicate()[1][-4000:]
+        time.sleep(0.1)
+    started.send_signal(signal.SIGUSR1)
+    errors = started.communicate(timeout=120)[1]
+    assert started.returncode == 0, errors[-4000:]
+    assert (tmp_path / "scontrol.log").read_text().splitlines() == ["show hostnames localhost", "requeue 4711"]
+    updates = read_checkpoint(folder / "checkpoints" / "last.ckpt")["hgn"]["updates"]
+    assert updates > 0 and updates % 10 == 0  # ranks agree at every tenth update
+
+    last = f"training.maximum_updates={updates + 2}"
+    done = run("slurm/train_torchrun.sbatch", *arguments, last, cwd=tmp_path, **slurm)
+    assert done.returncode == 0, done.stderr[-4000:]
+    assert done.stdout.count(f"trained {updates + 2} of {updates + 2} updates in runs/small-4711") == 1
+    assert not (tmp_path / "scontrol.log").read_text().count("requeue") > 1
+
+
 @pytest.mark.parametrize(
     ("script", "code", "returned", "requeued"),
     [
         ("slurm/train.sbatch", 138, 0, True),
         ("slurm/train.sbatch", 143, 143, False),
         ("slurm/train.sbatch", 2, 2, False),
+        ("slurm/train_torchrun.sbatch", 1, 1, False),
+        ("slurm/train_torchrun.sbatch", 0, 0, False),
+        ("slurm/generate_array.sbatch", 130, 0, True),
+        ("slurm/generate_array.sbatch", 2, 2, False),
         ("slurm/generate.sbatch", 130, 0, True),
         ("slurm/generate.sbatch", 143, 143, False),
         ("slurm/generate.sbatch", 0, 0, False),
@@ -180,9 +261,9 @@ def test_time_limit(
 ) -> None:
     """Stopped by the signal before the time limit, a job is queued again; cancelled or failed, it is not."""
     write_program(tmp_path / "programs", "srun", f"#!/usr/bin/env bash\nexit {code}\n")
-    assert run(script, cwd=tmp_path, **slurm).returncode == returned
+    assert run(script, cwd=tmp_path, **slurm, **ARRAY).returncode == returned
     log = tmp_path / "scontrol.log"
-    assert (log.read_text() if log.exists() else "") == ("requeue 4711\n" if requeued else "")
+    assert ("requeue 4711\n" in (log.read_text() if log.exists() else "")) == requeued
 
 
 def test_slurm_generates(slurm: dict[str, str], tmp_path: Path) -> None:
@@ -192,3 +273,32 @@ def test_slurm_generates(slurm: dict[str, str], tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     composed = yaml.safe_load(done.stdout)
     assert (composed["name"], composed["scenes"]) == ("small", 7)
+
+
+@pytest.mark.usefixtures("backend")
+def test_array_generates(slurm: dict[str, str], tmp_path: Path) -> None:
+    """Tasks of jobs/slurm/generate_array.sbatch make one data set between them, each shard once."""
+    # the solver's stand-in instead of the solver
+    write_program(
+        tmp_path / "programs",
+        "interpreter",
+        f'#!/usr/bin/env bash\n[[ "$1 $2" == "-m datagen" ]] && {sys.executable} -m ballistic_command "${{@:3}}"\n',
+    )
+    variables = slurm | ARRAY | {"SLURM_NTASKS": "1", "EXPERIMENT": "small", "PYTHON": "interpreter"}
+    variables |= {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'datagen'}"}
+    sizes = ["scenes=5", "dataset.validation_scenes=1", "dataset.test_scenes=1", "dataset.frames=5"]
+    for task in ("1", "0"):
+        arguments = [*sizes, "dataset.workers=1", f"out={tmp_path / 'data'}"]
+        done = run("slurm/generate_array.sbatch", *arguments, cwd=tmp_path, **variables | {"SLURM_ARRAY_TASK_ID": task})
+        assert done.returncode == 0, done.stderr[-4000:]
+        manifest = Manifest.load(tmp_path / "data")
+        assert manifest.complete is (task == "0")
+    names = [shard.name for shard in manifest.shards]
+    assert len(names) == len(set(names)) and manifest.published("train") == 5
+
+
+def test_array_with_gaps_is_refused(slurm: dict[str, str], tmp_path: Path) -> None:
+    """Tasks that are missing would leave their shards unmade for ever."""
+    variables = slurm | ARRAY | {"SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_MAX": "2"}
+    done = run("slurm/generate_array.sbatch", cwd=tmp_path, **variables)
+    assert done.returncode == 2 and "--array must be 0-N without gaps, got 2 tasks from 1 to 2;" in done.stderr

@@ -1,0 +1,187 @@
+"""The Kubernetes files: valid by published schemas, and what they start is what the commands accept.
+
+Schemas: Kubernetes' own objects by the OpenAPI schemas in kubernetes-validate; TrainJob by Kubeflow's published
+types (kubeflow-trainer-api). KubeRay publishes no Python types: the keys below are those of the custom resource
+definition ray.io_rayjobs.yaml (version v1) in ray-project/kuberay, and the pods in it are Kubernetes' own.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+from kubeflow_trainer_api.models import TrainerV1alpha1TrainJob
+
+from datagen.generate import datagen_config
+from hgn.command import _compose
+from hgn.config import TrainConfig
+from hgn.schema import from_mapping
+
+K8S = Path(__file__).resolve().parents[2] / "jobs" / "k8s"
+OLDEST, NEWEST = "1.31", "1.37"
+RAY_JOB = {
+    "activeDeadlineSeconds",
+    "backoffLimit",
+    "clusterSelector",
+    "deletionStrategy",
+    "entrypoint",
+    "entrypointNumCpus",
+    "entrypointNumGpus",
+    "entrypointResources",
+    "jobId",
+    "managedBy",
+    "metadata",
+    "preRunningDeadlineSeconds",
+    "rayClusterSpec",
+    "runtimeEnvYAML",
+    "shutdownAfterJobFinishes",
+    "submissionMode",
+    "submitterConfig",
+    "submitterPodTemplate",
+    "suspend",
+    "ttlSecondsAfterFinished",
+}
+RAY_CLUSTER = {
+    "authOptions",
+    "autoscalerOptions",
+    "enableInTreeAutoscaling",
+    "gcsFaultToleranceOptions",
+    "headGroupSpec",
+    "headServiceAnnotations",
+    "managedBy",
+    "networkPolicy",
+    "rayVersion",
+    "suspend",
+    "tlsOptions",
+    "upgradeStrategy",
+    "workerGroupSpecs",
+}
+RAY_HEAD = {"enableIngress", "headService", "labels", "rayStartParams", "resources", "serviceType", "template"}
+RAY_WORKER = {
+    "groupName",
+    "idleTimeoutSeconds",
+    "labels",
+    "maxReplicas",
+    "minReplicas",
+    "numOfHosts",
+    "rayStartParams",
+    "replicas",
+    "resources",
+    "scaleStrategy",
+    "suspend",
+    "template",
+}
+
+
+def documents(name: str) -> list[dict[str, Any]]:
+    return list(yaml.safe_load_all((K8S / name).read_text()))
+
+
+def validate_pod(template: dict[str, Any]) -> None:
+    document = {"apiVersion": "v1", "kind": "PodTemplate", "metadata": {"name": "checked"}, "template": template}
+    for version in (OLDEST, NEWEST):
+        kubernetes_validate.validate(document, version, strict=True)
+
+
+def containers() -> list[dict[str, Any]]:
+    """Every container of every file, and the trainer of the TrainJob."""
+    (ray_job,) = documents("generate.yaml")
+    cluster = ray_job["spec"]["rayClusterSpec"]
+    groups = [cluster["headGroupSpec"], *cluster["workerGroupSpecs"]]
+    pods = [group["template"] for group in groups] + [documents("service.yaml")[0]["spec"]["template"]]
+    found = [container for pod in pods for container in pod["spec"]["containers"]]
+    return [*found, documents("train.yaml")[0]["spec"]["trainer"]]
+
+
+@pytest.mark.parametrize("version", [OLDEST, NEWEST])
+@pytest.mark.parametrize("name", ["service.yaml", "volume.yaml"])
+def test_objects_of_kubernetes(name: str, version: str) -> None:
+    """Deployment, service and volume claim are valid by the published schemas, without an unknown key."""
+    for document in documents(name):
+        kubernetes_validate.validate(document, version, strict=True)
+    with pytest.raises(kubernetes_validate.ValidationError):
+        kubernetes_validate.validate(document | {"colour": 1}, version, strict=True)
+
+
+def test_train_job() -> None:
+    """The TrainJob is one by Kubeflow's types, and they know each of its keys: it comes back as it went in."""
+    (job,) = documents("train.yaml")
+    typed = TrainerV1alpha1TrainJob.from_dict(job)
+    assert typed is not None and typed.to_dict() == job
+    trainer = job["spec"]["trainer"]
+    assert trainer["resourcesPerNode"]["limits"]["nvidia.com/gpu"] == str(trainer["numProcPerNode"])
+    (patch,) = job["spec"]["runtimePatches"]
+    (node,) = patch["trainingRuntimeSpec"]["template"]["spec"]["replicatedJobs"]
+    pod = node["template"]["spec"]["template"]
+    (container,) = pod["spec"]["containers"]
+    assert container["name"] == node["name"] == "node"  # the runtime torch-distributed calls both so
+    whole = container | {"image": trainer["image"], "env": trainer["env"], "args": trainer["args"]}
+    validate_pod({"spec": pod["spec"] | {"containers": [whole | {"resources": trainer["resourcesPerNode"]}]}})
+    timeout = next(e["value"] for e in trainer["env"] if e["name"] == "TORCH_ELASTIC_SHUTDOWN_TIMEOUT")
+    assert pod["spec"]["terminationGracePeriodSeconds"] > int(timeout)
+
+
+def test_ray_job() -> None:
+    """The RayJob has only keys of its definition, those that must be there, and valid pods."""
+    (job,) = documents("generate.yaml")
+    assert (job["apiVersion"], job["kind"], set(job)) == (
+        "ray.io/v1",
+        "RayJob",
+        {"apiVersion", "kind", "metadata", "spec"},
+    )
+    assert set(job["spec"]) <= RAY_JOB
+    cluster = job["spec"]["rayClusterSpec"]
+    assert set(cluster) <= RAY_CLUSTER
+    assert {"template"} <= set(cluster["headGroupSpec"]) <= RAY_HEAD
+    validate_pod(cluster["headGroupSpec"]["template"])
+    for group in cluster["workerGroupSpecs"]:
+        assert {"groupName", "minReplicas", "maxReplicas", "template"} <= set(group) <= RAY_WORKER
+        assert group["minReplicas"] <= group["replicas"] <= group["maxReplicas"]
+        validate_pod(group["template"])
+    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
+        assert all(isinstance(value, str) for value in group.get("rayStartParams", {}).values())
+
+
+def composed(monkeypatch: pytest.MonkeyPatch, config: str, arguments: list[str]) -> dict[str, Any]:
+    monkeypatch.setattr("sys.argv", [config, *arguments])
+    (mapping,) = _compose(config)
+    return mapping
+
+
+def test_commands_take_what_the_files_give_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each file's arguments compose to a valid configuration of the command that it starts."""
+    arguments = documents("train.yaml")[0]["spec"]["trainer"]["args"]
+    mapping = composed(monkeypatch, "train", arguments[arguments.index("hgn.train") + 1 :])
+    mapping.pop("name")
+    assert from_mapping(TrainConfig, mapping | {"run": "runs/any"}).dataset.folder == "/shared/data/obstacles"
+
+    entrypoint = shlex.split(documents("generate.yaml")[0]["spec"]["entrypoint"])
+    assert entrypoint[:3] == ["python", "-m", "datagen"]
+    config = datagen_config(composed(monkeypatch, "datagen", entrypoint[3:]))
+    assert (config.dataset.pool, config.dataset.folder) == ("ray", "/shared/data/obstacles")
+
+
+def test_files_fit_each_other() -> None:
+    """One image, one claim, one secret, one port: what one file names, another makes or the notes tell to make."""
+    assert len({container["image"] for container in containers()}) == 1
+    text = "\n".join(path.read_text() for path in K8S.glob("*.yaml"))
+    claims = set(re.findall(r"claimName: (\S+)", text))
+    assert claims == {documents("volume.yaml")[0]["metadata"]["name"]}
+    deployment, service = documents("service.yaml")
+    pod = deployment["spec"]["template"]
+    assert service["spec"]["selector"] == pod["metadata"]["labels"] == deployment["spec"]["selector"]["matchLabels"]
+    address = f"http://{service['metadata']['name']}:{service['spec']['ports'][0]['port']}"
+    assert f"dataset.folder={address}" in (K8S / "train.yaml").read_text()
+    secrets = {
+        (entry["valueFrom"]["secretKeyRef"]["name"], entry["valueFrom"]["secretKeyRef"]["key"])
+        for container in containers()
+        for entry in container.get("env", [])
+        if "valueFrom" in entry
+    }
+    assert secrets == {("hgn-dataset", "token")}
+    assert "kubectl create secret generic hgn-dataset --from-literal=token=" in text
