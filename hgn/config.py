@@ -439,6 +439,20 @@ class CurvesConfig:
     out: str
 
 
+@dataclass(frozen=True)
+class KillsConfig:
+    """`python -m tools.kills`: how often and when, beside what `python -m datagen` takes."""
+
+    kills: int = 50
+    interval_s: float = 3.0  # between two, on average
+    kill_seed: int = 0
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "kills", "interval_s")
+        require_non_negative(self, "kill_seed")
+
+
 def _bench_gns() -> NetworkConfig:
     return NetworkConfig(kind="gns", levels=1, message_passing_steps=10)
 
