@@ -15,7 +15,8 @@ from hgn.schema import ConfigError, require, require_non_negative, require_one_o
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
-BENCH_CASES = ("frame", "train", "gns_frame", "gns_train", "mpm_frame")
+PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
+BENCH_CASES = ("frame", "train", "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
 BENCH_PRECISIONS = ("fp32", "tf32")
 
 
@@ -461,12 +462,13 @@ def _bench_gns() -> NetworkConfig:
 class BenchConfig:
     """`python -m tools.bench`: what is timed."""
 
-    cases: tuple[str, ...] = BENCH_CASES
+    cases: tuple[str, ...] | None = None  # none: all, those of the public GNS where there is a copy of it
     particles: tuple[int, ...] | None = None  # of one scene; none: by the device
     scenes: tuple[int, ...] | None = None  # side by side, of the smallest number of particles; none: by the device
     precisions: tuple[str, ...] | None = None  # none: TF32 on a GPU, float32 on a CPU
     network: NetworkConfig = field(default_factory=NetworkConfig)
     gns: NetworkConfig = field(default_factory=_bench_gns)
+    public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns
     rounds: int = 50  # samples of each contender
     seconds: float = 20.0  # at most for contenders that take turns, once five rounds are done
     mpm_frames: int = 20  # of the solver in one sample
@@ -484,3 +486,13 @@ class BenchConfig:
                 require(value >= 1, f"{name}[{i}]", "at least 1", value)
         require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
         require(self.gns.kind == "gns", "gns.kind", "gns", self.gns.kind)
+        for case in PUBLIC_GNS_CASES:
+            given = self.public_gns is not None or case not in (self.cases or ())
+            require(given, "public_gns", f"a folder with the public code for {case}", None)
+
+    @property
+    def wanted_cases(self) -> tuple[str, ...]:
+        """The cases to time."""
+        if self.cases is not None:
+            return self.cases
+        return tuple(case for case in BENCH_CASES if self.public_gns is not None or case not in PUBLIC_GNS_CASES)

@@ -5,6 +5,7 @@ Prints no time of what fails its check. The JSON holds {"meta": provenance, "row
 
 from __future__ import annotations
 
+import functools
 import gc
 import json
 from collections.abc import Callable
@@ -15,13 +16,14 @@ from typing import Any
 import torch
 
 from hgn.command import run_command
-from hgn.config import BenchConfig
+from hgn.config import PUBLIC_GNS_CASES, BenchConfig
 from hgn.device import choose_device
 from hgn.files import write_atomically
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.schema import from_mapping, to_mapping
 from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, Train, checked_workload
+from tools.bench.public_gns import PublicFrame, PublicTrain
 from tools.bench.states import TILE_PARTICLES, Workload
 from tools.bench.timing import Timed, alternate
 
@@ -30,6 +32,7 @@ CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
 PHASE_ROUNDS = 11
 OUT_OF_MEMORY = "out of memory"
 EXIT_RED = 1
+Contender = Frame | Train | PublicFrame | PublicTrain
 
 
 @dataclass
@@ -50,12 +53,15 @@ def main(mapping: dict[str, Any]) -> int:
         (precision, cases, work)
         for precision in config.precisions or (("tf32",) if device.type == "cuda" else ("fp32",))
         for work in workloads(config, device)
-        for cases in (("frame", "gns_frame", "mpm_frame"), ("train", "gns_train"))
-        if any(case in config.cases for case in cases) and _meant(cases, work)
+        for cases in (
+            ("frame", "gns_frame", "public_gns_frame", "mpm_frame"),
+            ("train", "gns_train", "public_gns_train"),
+        )
+        if any(case in config.wanted_cases for case in cases) and _meant(cases, work)
     ]
     with bar("timing", total=len(groups), unit="group") as progress:
         for precision, cases, work in groups:
-            wanted = [case for case in cases if case in config.cases]
+            wanted = [case for case in cases if case in config.wanted_cases]
             rows += group_rows(config, device, precision, wanted, work)
             progress.update()
     print(table(rows))
@@ -97,19 +103,19 @@ def group_rows(
 def table(rows: list[dict[str, Any]]) -> str:
     """The figures for people, and how many times slower the others are than ours on the same work."""
     lines = [
-        f"{'case':<10} {'particles':>9} {'scenes':>6} {'precision':>9} {'ms':>10} {'quartiles':>19} {'GB':>7}  check"
+        f"{'case':<16} {'particles':>9} {'scenes':>6} {'precision':>9} {'ms':>10} {'quartiles':>19} {'GB':>7}  check"
     ]
     for row in rows:
         ms = "-" if row["ms"] is None else f"{row['ms']:.3f}"
         spread = "-" if row["ms"] is None else f"{row['ms_quartiles'][0]:.3f} … {row['ms_quartiles'][1]:.3f}"
         memory = "-" if row["memory_gb"] is None else f"{row['memory_gb']:.3f}"
         lines.append(
-            f"{row['case']:<10} {row['particles']:>9} {row['scenes']:>6} {row['precision']:>9} {ms:>10} {spread:>19} "
+            f"{row['case']:<16} {row['particles']:>9} {row['scenes']:>6} {row['precision']:>9} {ms:>10} {spread:>19} "
             f"{memory:>7}  {row['check']}"
         )
         if row.get("phases"):
             parts = ", ".join(f"{name} {value:.3f}" for name, value in row["phases"].items())
-            lines.append(f"{'':<10} parts without graphs, ms: {parts}")
+            lines.append(f"{'':<16} parts without graphs, ms: {parts}")
     ours = {_work(row): row["ms"] for row in rows if row["case"] in ("frame", "train") and row["ms"]}
     for row in rows:
         key = _work(row)
@@ -121,13 +127,16 @@ def table(rows: list[dict[str, Any]]) -> str:
 def _prepare(config: BenchConfig, device: torch.device, precision: str, case: str, work: Workload) -> Entry:
     row: dict[str, Any] = {"case": case, "particles": work.particles, "scenes": work.scenes}
     row |= {"precision": precision if case != "mpm_frame" else "fp32", "ms": None, "memory_gb": None}
-    network = config.gns if case.startswith("gns") else config.network
+    network = config.network if case in ("frame", "train") else config.gns
     try:
         if case == "mpm_frame":
             mpm = MpmFrame(work, config.network.cell_size, config.mpm_frames, device)
             return Entry(row | {"check": PASS}, mpm.timed(), mpm)
-        make: Callable[..., Frame | Train] = Frame if case.endswith("frame") else Train
-        checked = checked_workload(work, "frame" if make is Frame else "train")
+        make: Callable[..., Contender] = Frame if case.endswith("frame") else Train
+        if config.public_gns is not None and case in PUBLIC_GNS_CASES:
+            public: Callable[..., Contender] = PublicFrame if case.endswith("frame") else PublicTrain
+            make = functools.partial(public, Path(config.public_gns))
+        checked = checked_workload(work, "frame" if case.endswith("frame") else "train")
         row["check"] = make(network, checked, device).check(precision)
         row["checked_particles"] = checked.particles * checked.scenes
         if row["check"] != PASS:
@@ -137,7 +146,7 @@ def _prepare(config: BenchConfig, device: torch.device, precision: str, case: st
         contender.run()
         if start is not None:
             row["memory_gb"] = (torch.cuda.max_memory_allocated(device) - start) / 1e9
-        if isinstance(contender, Frame) and work.scenes == 1:
+        if isinstance(contender, Frame | PublicFrame) and work.scenes == 1:
             row["phases"] = contender.phases(PHASE_ROUNDS)
         return Entry(row, contender.timed(), contender)
     except torch.OutOfMemoryError:

@@ -76,7 +76,7 @@ class Frame:
         found_N3 = self.run().velocity_NM3[:, 0].double() - self.state.velocity_NM3[:, 0].double()
         with torch.no_grad():
             expected_N3 = _reference_acceleration(self.network, self.state)
-        return _verdict("acceleration", _relative(found_N3, expected_N3), BOUNDS[precision])
+        return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
 
     def phases(self, rounds: int) -> dict[str, float]:
         """Medians of the plain network's parts, ms."""
@@ -137,15 +137,15 @@ class Train:
         reference = copy.deepcopy(found.network).double()
         reference.zero_grad()
         target_N3 = reference.normaliser.normalise_acceleration(_double(self.batch).acceleration())
-        predicted_N3 = _reference_output(reference, self.batch.state())
+        predicted_N3 = reference_output(reference, self.batch.state())
         expected_loss = self.batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
         expected_loss.backward()
         expected = [_gradient(p) for p in reference.parameters()]
-        verdict = _verdict("loss", _relative(found_loss.detach().double(), expected_loss.detach()), BOUNDS[precision])
-        if verdict != PASS:
-            return verdict
-        error = _relative(torch.cat(gradients).double(), torch.cat(expected))
-        return _verdict("gradient", error, GRADIENT_BOUNDS[precision])
+        first = verdict("loss", relative_error(found_loss.detach().double(), expected_loss.detach()), BOUNDS[precision])
+        if first != PASS:
+            return first
+        error = relative_error(torch.cat(gradients).double(), torch.cat(expected))
+        return verdict("gradient", error, GRADIENT_BOUNDS[precision])
 
 
 class MpmFrame:
@@ -186,10 +186,10 @@ def _double(batch: Batch) -> Batch:
 
 def _reference_acceleration(network: ParticleNetwork, state: ParticleState) -> torch.Tensor:
     reference = copy.deepcopy(network).double()
-    return reference.normaliser.restore_acceleration(_reference_output(reference, state))
+    return reference.normaliser.restore_acceleration(reference_output(reference, state))
 
 
-def _reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.Tensor:
+def reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.Tensor:
     """The float64 network's raw output. Of GNS on the same neighbour list: rounding at the radius is no error."""
     double = replace(
         state,
@@ -202,7 +202,8 @@ def _reference_output(reference: ParticleNetwork, state: ParticleState) -> torch
     return reference.normalised_acceleration(double)
 
 
-def _verdict(what: str, error: float, bound: float) -> str:
+def verdict(what: str, error: float, bound: float) -> str:
+    """`pass`, or the error in words."""
     return PASS if error <= bound else f"relative error of {what} {error:.1e} exceeds {bound:.0e}"  # NaN fails
 
 
@@ -210,6 +211,7 @@ def _gradient(parameter: torch.Tensor) -> torch.Tensor:
     return torch.zeros_like(parameter).flatten() if parameter.grad is None else parameter.grad.flatten()
 
 
-def _relative(found: torch.Tensor, expected: torch.Tensor) -> float:
+def relative_error(found: torch.Tensor, expected: torch.Tensor) -> float:
+    """Of the norm; NaN where nothing is expected."""
     size = float(expected.norm())
     return float((found - expected).norm()) / size if size > 0 else math.nan
