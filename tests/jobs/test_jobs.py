@@ -266,32 +266,38 @@ def test_time_limit(
     assert ("requeue 4711\n" in (log.read_text() if log.exists() else "")) == requeued
 
 
-def test_slurm_generates(slurm: dict[str, str], tmp_path: Path) -> None:
-    """jobs/slurm/generate.sbatch starts the generator with its experiment and arguments."""
-    variables = slurm | {"SLURM_NTASKS": "1", "EXPERIMENT": "small"}
-    done = run("slurm/generate.sbatch", "scenes=7", "--cfg", "job", cwd=tmp_path, **variables)
-    assert done.returncode == 0, done.stderr
-    composed = yaml.safe_load(done.stdout)
-    assert (composed["name"], composed["scenes"]) == ("small", 7)
-
-
-@pytest.mark.usefixtures("backend")
-def test_array_generates(slurm: dict[str, str], tmp_path: Path) -> None:
-    """Tasks of jobs/slurm/generate_array.sbatch make one data set between them, each shard once."""
-    # the solver's stand-in instead of the solver
+@pytest.fixture
+def generating(backend: object, slurm: dict[str, str], tmp_path: Path) -> dict[str, str]:
+    """The environment of one generating task, with an interpreter that has the solver's stand-in for the solver."""
     write_program(
         tmp_path / "programs",
         "interpreter",
         f'#!/usr/bin/env bash\n[[ "$1 $2" == "-m datagen" ]] && {sys.executable} -m ballistic_command "${{@:3}}"\n',
     )
-    variables = slurm | ARRAY | {"SLURM_NTASKS": "1", "EXPERIMENT": "small", "PYTHON": "interpreter"}
-    variables |= {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'datagen'}"}
+    variables = {"SLURM_NTASKS": "1", "EXPERIMENT": "small", "PYTHON": "interpreter"}
+    return slurm | variables | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'datagen'}"}
+
+
+def generate(script: str, tmp_path: Path, variables: dict[str, str]) -> Manifest:
     sizes = ["scenes=5", "dataset.validation_scenes=1", "dataset.test_scenes=1", "dataset.frames=5"]
+    arguments = [*sizes, "dataset.workers=1", f"out={tmp_path / 'data'}"]
+    done = run(script, *arguments, cwd=tmp_path, **variables)
+    assert done.returncode == 0, done.stderr[-4000:]
+    return Manifest.load(tmp_path / "data")
+
+
+def test_slurm_generates(generating: dict[str, str], tmp_path: Path) -> None:
+    """jobs/slurm/generate.sbatch makes the whole data set that its experiment and arguments ask for."""
+    manifest = generate("slurm/generate.sbatch", tmp_path, generating)
+    assert manifest.complete and manifest.published("train") == 5
+    assert not (tmp_path / "scontrol.log").exists()
+
+
+def test_array_generates(generating: dict[str, str], tmp_path: Path) -> None:
+    """Tasks of jobs/slurm/generate_array.sbatch make one data set between them, each shard once."""
     for task in ("1", "0"):
-        arguments = [*sizes, "dataset.workers=1", f"out={tmp_path / 'data'}"]
-        done = run("slurm/generate_array.sbatch", *arguments, cwd=tmp_path, **variables | {"SLURM_ARRAY_TASK_ID": task})
-        assert done.returncode == 0, done.stderr[-4000:]
-        manifest = Manifest.load(tmp_path / "data")
+        variables = generating | ARRAY | {"SLURM_ARRAY_TASK_ID": task}
+        manifest = generate("slurm/generate_array.sbatch", tmp_path, variables)
         assert manifest.complete is (task == "0")
     names = [shard.name for shard in manifest.shards]
     assert len(names) == len(set(names)) and manifest.published("train") == 5

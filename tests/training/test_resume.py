@@ -140,6 +140,51 @@ def test_reading_ahead_changes_nothing(data: DatagenConfig) -> None:
             assert torch.equal(batch.window_WN3, other.window_WN3) and batch.seeds_S == other.seeds_S
 
 
+class Shared:
+    """What a feed asks of the trainer of one rank of several, when all see the same data set."""
+
+    def __init__(self, rank: int, world_size: int) -> None:
+        self.global_rank, self.world_size, self.strategy = rank, world_size, self
+
+    def broadcast(self, count: int) -> int:
+        return count
+
+
+def test_feeds_of_all_ranks_resume_anywhere(data: DatagenConfig) -> None:
+    """Interrupted after any batches, on 1 to 8 ranks that may be others at each start, with 0 to 3 batches read ahead
+    at that moment, the ranks together get the samples of one uninterrupted process, each once and in its order."""
+    network = NetworkConfig(**NETWORK)
+    store = EpisodeStore(data.dataset.folder, "train")
+    whole = SampleOrder(TrainingConfig(**TRAINING).seed, 1, lambda _: [6] * 5)
+    expected = [whole.next_batch()[0].seed for _ in range(8 * 2 * 3 * 4)]
+
+    @settings(max_examples=25, deadline=None, derandomize=True)
+    @given(
+        st.lists(
+            st.tuples(st.integers(1, 8), st.integers(1, 2), st.integers(0, 3), st.integers(1, 4)),
+            min_size=1,
+            max_size=3,
+        )
+    )
+    def interrupted(starts: list[tuple[int, int, int, int]]) -> None:
+        seen: list[int] = []
+        cursor = Cursor()
+        for world_size, batch_scenes, ahead, count in starts:
+            training = TrainingConfig(**TRAINING | {"batch_scenes": batch_scenes})
+            ranks = []
+            for rank in range(world_size):
+                feed = Feed(store, network, training, batches_ahead=ahead)
+                feed.cursor, feed.trainer = cursor, Shared(rank, world_size)
+                ranks.append(list(islice(feed.batches(), count)))
+            for batches in zip(*ranks, strict=True):
+                seen += [seed for batch in batches for seed in batch.seeds_S]
+                assert len({batch.cursor for batch in batches}) == 1
+            cursor = ranks[0][-1].cursor
+        assert seen == expected[: len(seen)]
+
+    interrupted()
+
+
 @pytest.fixture
 def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
     """Makes the next start of a training stop once it has made that many updates in all."""
