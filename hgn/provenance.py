@@ -6,6 +6,7 @@ import datetime
 import importlib.metadata
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -54,8 +55,16 @@ def provenance(device: torch.device | str = "cpu") -> dict[str, Any]:
         "versions": versions,
         "commit": commit(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": " ".join([Path(sys.executable).name, *sys.argv]),
+        "command": command_line(),
     }
+
+
+def command_line() -> str:
+    """How this process was started, without the folders that are this machine's."""
+    specification = getattr(sys.modules["__main__"], "__spec__", None)
+    name = None if specification is None else specification.name.removesuffix(".__main__")
+    program = [Path(sys.argv[0]).name] if name is None else ["-m", name]
+    return shlex.join([Path(sys.executable).name, *program, *sys.argv[1:]])
 
 
 def _git(folder: Path, *arguments: str) -> str:

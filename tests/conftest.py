@@ -11,10 +11,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "datagen"))  # spawned workers find the stand-in by name
 
+import ballistic_dataset
 import ballistic_solver
 
-from datagen.shard import stage_episode
-from datagen.worker import Backend, MadeScene, make_episode
+from datagen.worker import Backend
 from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 
@@ -58,32 +58,10 @@ def make_config(tmp_path: Path) -> Callable[..., DatagenConfig]:
 @pytest.fixture
 def stage(backend: Backend) -> Callable[[DatasetWriter, str, int], None]:
     """Simulates one episode in this process and stages it; the writer claims what comes before it too."""
-
-    def run(writer: DatasetWriter, split: str, index: int) -> None:
-        while (split, index) not in writer.remaining():
-            assert writer.claim_next()
-        config, task = writer.config, writer.task(split, index)
-        scene = ballistic_solver.generate_scene(config.scene, task.seed)
-        grid = ballistic_solver.build_obstacle_grid((), scene.cell_size, 0, scene.domain_size)
-        (result,) = ballistic_solver.simulate([scene], config.mpm, config.dataset.frames, 60.0)
-        episode = make_episode(MadeScene(task, scene, grid), result, config, writer.config_hash)
-        stage_episode(writer.folder, episode)
-        writer.add_staged(split, index)
-
-    return run
+    return ballistic_dataset.stage
 
 
 @pytest.fixture
-def make_dataset(stage: Callable[[DatasetWriter, str, int], None]) -> Callable[[DatagenConfig], Path]:
+def make_dataset(backend: Backend) -> Callable[[DatagenConfig], Path]:
     """Makes a whole data set without any worker process."""
-
-    def make(config: DatagenConfig) -> Path:
-        with DatasetWriter(config) as writer:
-            while writer.claim_next():
-                for split, index in writer.remaining():
-                    stage(writer, split, index)
-                writer.publish_next()
-            assert writer.complete
-        return writer.folder
-
-    return make
+    return ballistic_dataset.make_dataset

@@ -1,0 +1,36 @@
+"""Whole data sets of the ballistic stand-in, made in this process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import ballistic_solver
+
+from datagen.shard import stage_episode
+from datagen.worker import MadeScene, make_episode
+from datagen.writer import DatasetWriter
+from hgn.config import DatagenConfig
+
+
+def stage(writer: DatasetWriter, split: str, index: int) -> None:
+    """Simulates one episode in this process and stages it; the writer claims what comes before it too."""
+    while (split, index) not in writer.remaining():
+        assert writer.claim_next()
+    config, task = writer.config, writer.task(split, index)
+    scene = ballistic_solver.generate_scene(config.scene, task.seed)
+    grid = ballistic_solver.build_obstacle_grid((), scene.cell_size, 0, scene.domain_size)
+    (result,) = ballistic_solver.simulate([scene], config.mpm, config.dataset.frames, 60.0)
+    episode = make_episode(MadeScene(task, scene, grid), result, config, writer.config_hash)
+    stage_episode(writer.folder, episode)
+    writer.add_staged(split, index)
+
+
+def make_dataset(config: DatagenConfig) -> Path:
+    """Makes a whole data set, or what is missing of it, without any worker process."""
+    with DatasetWriter(config) as writer:
+        while writer.claim_next():
+            for split, index in writer.remaining():
+                stage(writer, split, index)
+            writer.publish_next()
+        assert writer.complete
+    return writer.folder
