@@ -496,3 +496,32 @@ class BenchConfig:
         if self.cases is not None:
             return self.cases
         return tuple(case for case in BENCH_CASES if self.public_gns is not None or case not in PUBLIC_GNS_CASES)
+
+
+@dataclass(frozen=True)
+class ScalingConfig:
+    """`python -m tools.scaling`: how training is timed on several devices of this machine."""
+
+    devices: int | None = None  # at most; none: all GPUs, or two processes on a CPU
+    scenes: int = 8  # on each device
+    particles: int = 4_296  # of a scene
+    particle_spread: float = 0.17  # standard deviation of a scene's particles, as a share of their mean
+    batches: int = 8  # of each device; one sample is an update on each of them
+    message_mb: tuple[float, ...] = (25.0,)  # sizes of messages that are timed beside the one that training uses
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    node_devices: int = 8  # of the clusters that the model tells of
+    rounds: int = 20  # samples of each contender
+    seconds: float = 30.0  # at most for all contenders, once three rounds are done
+    device: str = "auto"
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "rounds", "seconds")
+        require_non_negative(self, "particle_spread")
+        for name in ("scenes", "particles", "batches", "node_devices"):
+            require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
+        require(self.devices is None or self.devices >= 1, "devices", "at least 1", self.devices)
+        for i, value in enumerate(self.message_mb):
+            require(value > 0, f"message_mb[{i}]", "> 0", value)
+        require(self.device in ("auto", "cpu", "cuda"), "device", "auto, cpu or cuda", self.device)
+        require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)

@@ -13,20 +13,31 @@ from torch.nn.parallel import DistributedDataParallel
 from hgn.schema import ConfigError, to_mapping
 from hgn.training.feed import Feed
 
+MESSAGE_MB = 4  # gradients of the network's last layers are on their way while those of its first are computed
 
-def gradient_averaging() -> DDPStrategy:
-    """Gradients are averaged over all ranks in buckets, while the backward pass still runs; nothing else travels.
 
-    Buffers are not sent at each update: the normaliser is constant, and the sum of losses is each rank's own.
+def averaging_options() -> dict[str, Any]:
+    """How gradients are averaged: arguments of DistributedDataParallel.
+
+    In buckets, while the backward pass still runs; nothing else travels. Buffers are not sent at each update: the
+    normaliser is constant, and the sum of losses is each rank's own.
     """
     # torch 2.13 has another name for it
     renamed = "forward_sync_buffers" in inspect.signature(DistributedDataParallel).parameters
-    keep_buffers: dict[str, Any] = {"forward_sync_buffers" if renamed else "broadcast_buffers": False}
-    return DDPStrategy(gradient_as_bucket_view=True, **keep_buffers)
+    keep_buffers = "forward_sync_buffers" if renamed else "broadcast_buffers"
+    return {"gradient_as_bucket_view": True, "bucket_cap_mb": MESSAGE_MB, keep_buffers: False}
+
+
+def gradient_averaging() -> DDPStrategy:
+    """The strategy of a training on several ranks."""
+    return DDPStrategy(**averaging_options())
 
 
 class SameStart(Callback):
-    """All ranks begin at one place: the same update, the same samples next, the same normaliser."""
+    """All ranks begin at one place: the same update, the same samples next, the same normaliser.
+
+    From then on nothing but gradients travels at an update, but for those where ranks log, save, measure or agree.
+    """
 
     def __init__(self, feed: Feed) -> None:
         self.feed = feed
@@ -35,6 +46,9 @@ class SameStart(Callback):
         """Raises: ConfigError on every rank when one of them resumes from another checkpoint."""
         if trainer.world_size == 1:
             return
+        # Before each update Lightning asks rank 0 for a SIGTERM, and has the host wait for the device until it answers
+        # (its issue 21487). Ours goes another way: the ranks agree now and then, see Stopper.
+        trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
         mine: dict[str, Any] = {"update": trainer.global_step} | to_mapping(self.feed.cursor)
         first = trainer.strategy.broadcast(mine)
         if not trainer.strategy.reduce_boolean_decision(mine == first, all=True):
@@ -45,3 +59,7 @@ class SameStart(Callback):
         # A data set that grows may have shown other statistics to a rank that looked later.
         for buffer in pl_module.buffers():
             torch.distributed.broadcast(buffer, 0)
+
+
+def _nothing() -> None:
+    pass

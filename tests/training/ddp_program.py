@@ -1,7 +1,8 @@
 """One rank of a distributed training, started by torchrun: python ddp_program.py FOLDER.
 
 Trains as FOLDER/mapping.json says and keeps what this rank saw: FOLDER/gradients_RANK.pt of the first update,
-FOLDER/end_RANK.pt with the weights, the update and the exit code, FOLDER/starts_RANK with the update of each start.
+FOLDER/end_RANK.pt with the weights, the update and the exit code, FOLDER/starts_RANK with the update of each start,
+FOLDER/talk_RANK.json with the updates at which ranks talked of anything but gradients.
 FOLDER/signals.json holds [restart, rank, update, signal, target] rows: in that start, that rank sends the signal at
 that update, to itself (target self) or to torchrun (launcher).
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,21 @@ def main(folder: Path) -> int:
         if (in_start, of_rank) == (restart, rank)
     }
     end: dict[str, Any] = {}
+    update, talked = 0, set()
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            talked.add(update)
+            return function(*arguments, **options)
+
+        return call
+
+    for name in ("all_gather", "all_reduce", "barrier", "broadcast", "broadcast_object_list"):
+        setattr(torch.distributed, name, counted(getattr(torch.distributed, name)))
+
+    def at_update(module: TrainingModule, *_: Any) -> None:
+        nonlocal update
+        update = module.global_step + 1
 
     def at_start(module: TrainingModule) -> None:
         with (folder / f"starts_{rank}").open("a") as file:
@@ -45,10 +62,12 @@ def main(folder: Path) -> int:
         end.update(weights=module.state_dict(), update=module.global_step)
 
     TrainingModule.on_train_start = at_start
+    TrainingModule.on_train_batch_start = at_update
     TrainingModule.on_before_optimizer_step = before_step
     TrainingModule.on_train_end = at_end
     end["exit_code"] = train.main(mapping)
     torch.save(end, folder / f"end_{rank}.pt")
+    (folder / f"talk_{rank}.json").write_text(json.dumps(sorted(talked)))
     return end["exit_code"]
 
 

@@ -85,7 +85,8 @@ class Reference:
 
     def check(self, folder: Path, exit_code: int) -> dict[str, torch.Tensor]:
         """The gradients of both ranks are those of one with both scenes, to 1e-6; both ended at update 20 with equal
-        weights, the checkpoint's, and one run folder. Returns the weights."""
+        weights, the checkpoint's, and one run folder. Where nothing is logged (every 4 updates), saved (5) or agreed on
+        (10), and no epoch begins, gradients alone travelled. Returns the weights."""
         gradients = [load(folder / f"gradients_{rank}.pt") for rank in (0, 1)]
         assert gradients[0].keys() == gradients[1].keys() == self.gradients.keys()
         for name, expected in self.gradients.items():
@@ -102,6 +103,9 @@ class Reference:
         for name, tensor in stored["state_dict"].items():
             assert torch.equal(ends[0]["weights"][name], tensor), name
             assert torch.equal(ends[1]["weights"][name], tensor), name
+        for rank in (0, 1):
+            talked = set(json.loads((folder / f"talk_{rank}.json").read_text()))
+            assert {8, 20} & talked and not {2, 3, 6, 7, 17, 18, 19} & talked
         made = {path.name for path in folder.iterdir() if path.suffix not in (".json", ".pt")}
         assert made == {"run", "starts_0", "starts_1"}
         return stored["state_dict"]

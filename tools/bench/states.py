@@ -8,6 +8,7 @@ Shape legend: N particles of all scenes, S scenes, W window frames.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,10 +70,17 @@ def scene_of(workload: Workload, seed: int, cell_size: float) -> Scene:
 
 
 def batch_of(workload: Workload, network: NetworkConfig, device: torch.device) -> Batch:
-    """A window of such frames, scene s from seed s: particles that move a little, and accelerate."""
+    """A window of such frames, scene s from seed s."""
+    return batch_of_scenes([Workload(workload.particles, 1)] * workload.scenes, network, device)
+
+
+def batch_of_scenes(
+    scenes: Sequence[Workload], network: NetworkConfig, device: torch.device, first_seed: int = 0
+) -> Batch:
+    """Windows of scenes of different sizes, from seeds in a row: particles that move a little, and accelerate."""
     parts, materials = [], []
-    for seed in range(workload.scenes):
-        last_N3 = positions(workload, seed, network.cell_size)
+    for seed, scene in enumerate(scenes, first_seed):
+        last_N3 = positions(scene, seed, network.cell_size)
         generator = np.random.default_rng([seed, 1])
         velocity_N3 = generator.normal(0, SPEED, last_N3.shape)
         change_HN3 = generator.normal(0, 0.3 * SPEED, (network.velocity_history + 1, *last_N3.shape))
@@ -81,17 +89,17 @@ def batch_of(workload: Workload, network: NetworkConfig, device: torch.device) -
         before_HN3 = last_N3 - velocity_HN3[-2::-1].cumsum(0)
         parts.append(np.concatenate([before_HN3[::-1], last_N3[None], after_N3[None]]))
         materials.append(_materials(len(last_N3), seed).astype(np.int64))
-    size, scenes = workload.domain_size, workload.scenes
+    particles = tuple(scene.particles for scene in scenes)
     return Batch(
         window_WN3=torch.from_numpy(np.concatenate(parts, axis=1).astype(np.float32)),
         material_N=torch.from_numpy(np.concatenate(materials)),
-        scene_N=torch.arange(scenes).repeat_interleave(workload.particles),
-        particles_S=(workload.particles,) * scenes,
-        domain_S3=torch.full((scenes, 3), size),
-        gravity_S3=torch.tensor([[0.0, -9.8 / 60**2, 0.0]]).repeat(scenes, 1),
+        scene_N=torch.arange(len(scenes)).repeat_interleave(torch.tensor(particles)),
+        particles_S=particles,
+        domain_S3=torch.tensor([[scene.domain_size] * 3 for scene in scenes]),
+        gravity_S3=torch.tensor([[0.0, -9.8 / 60**2, 0.0]]).repeat(len(scenes), 1),
         obstacles=None,
         surface=None,
-        seeds_S=tuple(range(1, scenes + 1)),
+        seeds_S=tuple(range(first_seed + 1, first_seed + len(scenes) + 1)),
     ).to(device)
 
 

@@ -1,0 +1,181 @@
+"""python -m tools.scaling [--json FILE]: weak scaling of training on this machine's devices, and a model of clusters.
+
+Prints no time of what fails its check. The JSON holds {"meta": provenance, "parts", "rows"}; a row's case is
+weak_scaling, all_reduce or model.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.multiprocessing
+
+from hgn.command import run_command
+from hgn.config import ScalingConfig
+from hgn.files import write_atomically
+from hgn.provenance import provenance
+from hgn.schema import ConfigError, from_mapping, to_mapping
+from tools.bench.contenders import PASS
+from tools.scaling.measure import measure
+from tools.scaling.model import Cluster, Link, Step, all_reduce_seconds, fit, update
+
+EXIT_RED = 1
+SIZES = tuple(2**power for power in range(11))  # 1 to 1,024 GPUs
+# What networks give one GPU in practice: 400 Gb/s for each of them, and 100 Gb/s for a node of eight.
+NETWORKS = {
+    "400 Gb/s a GPU": Link(latency_s=10e-6, bytes_per_second=40e9),
+    "100 Gb/s a node": Link(latency_s=30e-6, bytes_per_second=10e9 / 8),
+}
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints tables, and writes JSON where asked to; the exit code is 1 where a check is red."""
+    config = from_mapping(ScalingConfig, mapping)
+    device_type, count = devices(config)
+    with tempfile.TemporaryDirectory() as folder:
+        torch.multiprocessing.spawn(measure, (count, config, device_type, Path(folder)), nprocs=count)
+        found = json.loads((Path(folder) / "rows.json").read_text())
+    rows = with_efficiency([{"case": "weak_scaling"} | row for row in found["updates"]])
+    rows += predicted([{"case": "all_reduce"} | row for row in found["all_reduces"]], config.node_devices)
+    rows += model_rows(rows, found["parts"], config)
+    print(table(rows))
+    if config.json is not None:
+        path = Path(config.json)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        meta = provenance(device_type) | {"config": to_mapping(config)}
+        write_atomically(path, json.dumps({"meta": meta, "parts": found["parts"], "rows": rows}, indent=1).encode())
+    return 0 if all(row.get("check", PASS) == PASS for row in rows) else EXIT_RED
+
+
+def devices(config: ScalingConfig) -> tuple[str, int]:
+    """(kind of device, how many processes). Raises: ConfigError when there are not as many GPUs."""
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if config.device == "cpu" or (config.device == "auto" and gpus == 0):
+        return "cpu", config.devices or 2
+    wanted = config.devices or max(gpus, 1)
+    if wanted > gpus:
+        raise ConfigError(f"devices must be at most the {gpus} GPUs of this machine, got {wanted}; take device=cpu")
+    return "cuda", wanted
+
+
+def with_efficiency(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Adds each row's scenes per second and device, against one device alone with the same kind of scenes."""
+    alone = {row["particle_spread"]: row["ms"] for row in rows if row["devices"] == 1}
+    for row in rows:
+        base = alone.get(row["particle_spread"])
+        row["efficiency"] = base / row["ms"] if base and row["ms"] else None
+    return rows
+
+
+def predicted(rows: list[dict[str, Any]], node_devices: int) -> list[dict[str, Any]]:
+    """Adds what the model says of each all-reduce, once it is fitted to some of them."""
+    if not rows:
+        return rows
+    cluster = fitted(rows, node_devices, Link(0.0, 1.0))
+    for row in rows:
+        row["model_ms"] = 1e3 * all_reduce_seconds(row["bytes"], row["devices"], cluster)
+    return rows
+
+
+def fitted(rows: Sequence[dict[str, Any]], node_devices: int, between: Link) -> Cluster:
+    """A cluster of nodes like this machine."""
+    measured = [(row["devices"], row["bytes"], row["ms"] / 1e3) for row in rows if row["case"] == "all_reduce"]
+    launch_s, inside = fit(measured)
+    most = max(devices for devices, _, _ in measured)
+    return Cluster(max(node_devices, most), launch_s, inside, between)
+
+
+def model_rows(rows: list[dict[str, Any]], parts: dict[str, float], config: ScalingConfig) -> list[dict[str, Any]]:
+    """One row for each number of GPUs and each network; none without several devices to take the figures from."""
+    trained = [row for row in rows if row["case"] == "weak_scaling" and row["check"] == PASS]
+    single = next((row for row in trained if row["devices"] == 1 and row["particle_spread"] == 0), None)
+    sent = next((row["messages"] for row in trained if row["messages"]), None)
+    if single is None or sent is None:
+        return []
+    # Scenes of a batch are drawn apart from each other; seconds are taken to grow with particles.
+    spread = config.particle_spread / config.scenes**0.5
+    step = Step(single["ms"] / 1e3, parts["backward"], tuple(sent), spread)
+    scene_bytes = config.particles * (config.network.velocity_history + 2) * 12
+    found = []
+    for name, link in NETWORKS.items():
+        cluster = fitted(rows, config.node_devices, link)
+        for gpus in SIZES:
+            seen = update(step, gpus, cluster)
+            found.append(
+                {
+                    "case": "model",
+                    "network": name,
+                    "devices": gpus,
+                    "nodes": seen.nodes,
+                    "all_reduce_ms": 1e3 * seen.all_reduce_s,
+                    "not_hidden_ms": 1e3 * seen.not_hidden_s,
+                    "slowest_ms": 1e3 * seen.slowest_s,
+                    "ms": 1e3 * seen.seconds,
+                    "efficiency": seen.efficiency,
+                    "scenes_per_second": gpus * config.scenes / seen.seconds,
+                    "read_mb_per_second_and_node": config.scenes
+                    * min(gpus, cluster.node_gpus)
+                    * scene_bytes
+                    / seen.seconds
+                    / 1e6,
+                }
+            )
+    return found
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The figures for people, as Markdown."""
+    lines = [
+        "| devices | scenes each | spread | messages | ms an update | quartiles | efficiency | check |",
+        "| --: | --: | --: | :-- | --: | --: | --: | :-- |",
+    ]
+    for row in rows:
+        if row["case"] == "weak_scaling":
+            sent = f"{len(row['messages'])}, up to {row['message_mb']:g} MB" if row["averaged"] else "none"
+            times = ("-", "-") if row["ms"] is None else (f"{row['ms']:.2f}", _range(row["ms_quartiles"]))
+            share = "-" if row["efficiency"] is None else f"{row['efficiency']:.3f}"
+            lines.append(
+                _line((row["devices"], row["scenes"], row["particle_spread"], sent, *times, share, row["check"]))
+            )
+    if any(row["case"] == "all_reduce" for row in rows):
+        lines += ["", "| devices | bytes | all-reduce, ms | quartiles | model, ms |", "| --: | --: | --: | --: | --: |"]
+    for row in rows:
+        if row["case"] == "all_reduce":
+            times = (f"{row['ms']:.4f}", _range(row["ms_quartiles"], 4))
+            lines.append(_line((row["devices"], f"{row['bytes']:,}", *times, f"{row['model_ms']:.4f}")))
+    return "\n".join([*lines, "", model_table(rows)])
+
+
+def model_table(rows: list[dict[str, Any]]) -> str:
+    """What the model says of clusters, as Markdown."""
+    lines = [
+        "| GPUs | nodes | all-reduce, ms | not hidden, ms | slowest rank, ms | update, ms | efficiency | scenes/s "
+        "| read by a node, MB/s |",
+        "| --: | --: | --: | --: | --: | --: | --: | --: | --: |",
+    ]
+    for name in NETWORKS:
+        chosen = [row for row in rows if row["case"] == "model" and row["network"] == name]
+        if chosen:
+            lines.append(_line((f"*{name}*", *[""] * 8)))
+        for row in chosen:
+            parts = [f"{row[key]:.2f}" for key in ("all_reduce_ms", "not_hidden_ms", "slowest_ms", "ms", "efficiency")]
+            reading = f"{row['read_mb_per_second_and_node']:,.0f}"
+            lines.append(_line((row["devices"], row["nodes"], *parts, f"{row['scenes_per_second']:,.0f}", reading)))
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[object]) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _range(pair: Sequence[float], digits: int = 2) -> str:
+    return f"{pair[0]:.{digits}f} … {pair[1]:.{digits}f}"
+
+
+if __name__ == "__main__":
+    run_command(main, "scaling")

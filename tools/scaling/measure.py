@@ -1,0 +1,301 @@
+"""The processes that are timed: one for each device, training together in different numbers, in turns.
+
+What is timed is the update of a training on several ranks: noise, jitter, forward, backward with the gradients'
+averages under way, the guard, Adam. Not in it: Lightning, log lines and the reading of data.
+"""
+
+from __future__ import annotations
+
+import copy
+import datetime
+import json
+import os
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import nn
+from torch.distributed.algorithms.ddp_comm_hooks.default_hooks import allreduce_hook
+from torch.nn.parallel import DistributedDataParallel
+
+from hgn.config import ScalingConfig, TrainingConfig
+from hgn.data.batch import Batch
+from hgn.training.checkpoint import DataInfo
+from hgn.training.gradients import GradientGuard
+from hgn.training.module import TrainingModule
+from hgn.training.ranks import averaging_options
+from tools.bench.contenders import FRAME_RATE_HZ, MATMUL, PASS, bench_network
+from tools.bench.states import Workload, batch_of_scenes
+from tools.bench.timing import once
+
+GRADIENT_BOUND = 1e-5  # relative error of the averaged gradients, of their norm
+ALL_REDUCE_BYTES = (4, 65_536, 1_048_576, 4_194_304, 16_777_216, 67_108_864)
+ALL_REDUCE_CALLS, ALL_REDUCE_SAMPLES = 10, 5
+WARM_UPDATES = 3
+MINIMUM_ROUNDS = 3
+PATIENCE = datetime.timedelta(minutes=2)
+
+
+@dataclass
+class Contender:
+    """Some of the devices training at the same time, together or (`message_mb` is None) each for itself."""
+
+    devices: int
+    message_mb: float | None
+    spread: float  # of the particles of a scene
+    update: Updates | None = field(default=None, repr=False)  # none in the processes that take no part
+    check: str = PASS
+    messages: list[int] = field(default_factory=list)
+    milliseconds: list[float] = field(default_factory=list)  # of one update
+
+
+class Updates:
+    """Training updates of one rank on batches that lie on its device."""
+
+    def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
+        self.batches, self.device = batches, device
+        training = TrainingConfig(batch_scenes=config.scenes)
+        network = bench_network(config.network, device).train()  # the same weights on every rank
+        module = TrainingModule(network, training, DataInfo("", FRAME_RATE_HZ, 1 / 64)).to(device)
+        self.optimizer: torch.optim.Optimizer = module.configure_optimizers()["optimizer"]
+        self.guard = GradientGuard(training.maximum_skipped_updates)
+        self.loss: nn.Module = _Loss(module)
+        self.parameters = list(network.parameters())
+
+    def average(self, group: dist.ProcessGroup, message_mb: float) -> None:
+        """From now on gradients are averaged over the ranks of `group`."""
+        self.loss = _averaged(self.loss, group, message_mb, self.device)
+
+    def run(self) -> None:
+        """One update on each batch."""
+        for batch in self.batches:
+            self.optimizer.zero_grad()
+            self.loss(batch).backward()
+            self.guard.check(self.parameters, self.optimizer)
+            self.optimizer.step()
+
+    def parts(self) -> dict[str, float]:
+        """Seconds of an update's forward and backward passes, medians over the batches."""
+        forward, backward = [], []
+        losses: list[torch.Tensor] = []
+        for batch in self.batches:
+            self.optimizer.zero_grad()
+            forward.append(once(partial(_append_loss, losses, self.loss, batch), self.device))
+            backward.append(once(losses.pop().backward, self.device))
+        return {"forward": float(np.median(forward)) / 1e3, "backward": float(np.median(backward)) / 1e3}
+
+
+class _Loss(nn.Module):
+    """The loss as a forward pass, which is where DistributedDataParallel begins."""
+
+    def __init__(self, module: TrainingModule) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, batch: Batch) -> torch.Tensor:
+        return self.module.loss(batch)
+
+
+def _append_loss(losses: list[torch.Tensor], loss: nn.Module, batch: Batch) -> None:
+    losses.append(loss(batch))
+
+
+def measure(rank: int, count: int, config: ScalingConfig, device_type: str, folder: Path) -> None:
+    """One of `count` processes; the first writes FOLDER/rows.json. Raises in all of them when one of them fails."""
+    device = torch.device(device_type, rank) if device_type == "cuda" else torch.device(device_type)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    else:
+        torch.set_num_threads(max(1, (os.cpu_count() or 1) // count))
+    torch.set_float32_matmul_precision(MATMUL["tf32" if device.type == "cuda" else "fp32"])
+    # all processes talk through this group when nothing is timed; it leaves the devices alone
+    dist.init_process_group(
+        "gloo", init_method=f"file://{folder / 'store'}", rank=rank, world_size=count, timeout=PATIENCE
+    )
+    try:
+        backend = "nccl" if device.type == "cuda" else "gloo"
+        sizes = [size for size in (1, 2, 4, 8, 16, 32, 64) if size < count] + [count]
+        groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
+        batches = {spread: _batches(config, rank, spread, device) for spread in {0.0, config.particle_spread}}
+        contenders = [_prepared(c, config, rank, groups, batches, device) for c in _contenders(config, sizes)]
+        single = contenders[0].update
+        parts = single.parts() if single is not None and rank == 0 else None
+        _alternate(contenders, config, rank)
+        for contender in contenders:
+            _check_weights(contender, groups, rank)
+        rows = [row for size, group in groups.items() for row in _all_reduces(size, group, rank, device)]
+        if rank == 0:
+            assert parts is not None
+            found = {"parts": parts, "updates": [_row(c, config) for c in contenders], "all_reduces": rows}
+            (folder / "rows.json").write_text(json.dumps(found))
+        dist.barrier()
+    finally:
+        dist.destroy_process_group()
+
+
+def _contenders(config: ScalingConfig, sizes: list[int]) -> list[Contender]:
+    chosen = averaging_options()["bucket_cap_mb"]
+    found = []
+    for size in sizes:
+        ways = [None] if size == 1 else [None, *dict.fromkeys([chosen, *config.message_mb])]
+        found += [Contender(size, way, 0.0) for way in ways]
+        if config.particle_spread > 0:
+            found.append(Contender(size, ways[0] if size == 1 else chosen, config.particle_spread))
+    return found
+
+
+def _batches(config: ScalingConfig, rank: int, spread: float, device: torch.device) -> list[Batch]:
+    """Each rank's own scenes."""
+    generator = np.random.default_rng([rank, 7])
+    batches = []
+    for index in range(config.batches):
+        factors = np.clip(1 + spread * generator.standard_normal(config.scenes), 0.2, 3.0)
+        scenes = [Workload(max(1, round(config.particles * factor)), 1) for factor in factors]
+        first_seed = (rank * config.batches + index) * config.scenes
+        batches.append(batch_of_scenes(scenes, config.network, device, first_seed))
+    return batches
+
+
+def _prepared(
+    contender: Contender,
+    config: ScalingConfig,
+    rank: int,
+    groups: dict[int, dist.ProcessGroup],
+    batches: dict[float, list[Batch]],
+    device: torch.device,
+) -> Contender:
+    if rank < contender.devices:
+        contender.update = Updates(config, batches[contender.spread], device)
+        if contender.message_mb is not None:
+            group = groups[contender.devices]
+            contender.check, contender.messages = _check_average(contender.update, group, contender.message_mb)
+            contender.update.average(group, contender.message_mb)
+    _agree(contender)
+    return contender
+
+
+def _averaged(loss: nn.Module, group: dist.ProcessGroup, message_mb: float, device: torch.device) -> nn.Module:
+    options: dict[str, Any] = averaging_options() | {"bucket_cap_mb": message_mb}
+    here = [device] if device.type == "cuda" else None
+    return DistributedDataParallel(loss, device_ids=here, process_group=group, **options)
+
+
+def _check_average(update: Updates, group: dist.ProcessGroup, message_mb: float) -> tuple[str, list[int]]:
+    """`pass`, or by how much averaged gradients differ from the mean of each rank's own; and the messages' bytes."""
+    plain, averaged = copy.deepcopy(update.loss), copy.deepcopy(update.loss)
+    plain(update.batches[0]).backward()
+    expected = _gradients(plain)
+    dist.all_reduce(expected, group=group)
+    expected /= dist.get_world_size(group)
+    messages: list[int] = []
+
+    # torch reads annotations, and takes none for right but not those that are strings
+    def hook(state, bucket):  # type: ignore[no-untyped-def]
+        messages.append(bucket.buffer().nbytes)
+        return allreduce_hook(group, bucket)
+
+    averaged_loss = _averaged(averaged, group, message_mb, update.device)
+    assert isinstance(averaged_loss, DistributedDataParallel)
+    averaged_loss.register_comm_hook(None, hook)
+    for _ in range(2):  # after the first pass the messages follow the order in which gradients came
+        messages.clear()
+        averaged.zero_grad()
+        averaged_loss(update.batches[0]).backward()
+    error = float((_gradients(averaged) - expected).norm() / expected.norm())
+    if not error <= GRADIENT_BOUND:
+        return f"relative error of averaged gradients {error:.1e} exceeds {GRADIENT_BOUND:.0e}", messages
+    return PASS, messages
+
+
+def _check_weights(contender: Contender, groups: dict[int, dist.ProcessGroup], rank: int) -> None:
+    """After the timed updates the weights must be the same, bit for bit, on all ranks."""
+    if contender.update is not None and contender.message_mb is not None:
+        weights = torch.cat([p.detach().flatten() for p in contender.update.parameters])
+        first = weights.clone()
+        dist.broadcast(first, 0, group=groups[contender.devices])
+        if contender.check == PASS and not torch.equal(weights, first):
+            contender.check = f"weights of rank {rank} differ from those of rank 0 after the updates"
+    _agree(contender)
+
+
+def _agree(contender: Contender) -> None:
+    """Every process gets the first reason that one of them has."""
+    checks: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(checks, contender.check)
+    contender.check = next((check for check in checks if check != PASS), PASS)
+
+
+def _alternate(contenders: list[Contender], config: ScalingConfig, rank: int) -> None:
+    ready = [contender for contender in contenders if contender.check == PASS]
+    for contender in ready:
+        for _ in range(-(-WARM_UPDATES // config.batches)):
+            _seconds(contender, rank)
+    started, go_on = time.monotonic(), torch.ones(1)
+    for index in range(config.rounds):
+        if index >= MINIMUM_ROUNDS:
+            go_on.fill_(float(time.monotonic() - started < config.seconds))
+            dist.broadcast(go_on, 0)
+            if not go_on:
+                break
+        for contender in ready:
+            contender.milliseconds.append(1e3 * _seconds(contender, rank) / config.batches)
+
+
+def _seconds(contender: Contender, rank: int) -> float:
+    """Seconds that the slowest rank takes for all batches; the others wait, and so do those that take no part."""
+    taken = torch.zeros(1)
+    dist.barrier()
+    if contender.update is not None:
+        started = time.perf_counter()
+        contender.update.run()
+        if contender.update.device.type == "cuda":
+            torch.cuda.synchronize()
+        taken.fill_(time.perf_counter() - started)
+    dist.all_reduce(taken, dist.ReduceOp.MAX)
+    return float(taken)
+
+
+def _all_reduces(size: int, group: dist.ProcessGroup, rank: int, device: torch.device) -> list[dict[str, Any]]:
+    rows = []
+    for byte_count in ALL_REDUCE_BYTES:
+        dist.barrier()
+        if rank < size:
+            values = torch.zeros(byte_count // 4, device=device)
+            calls = partial(_all_reduce_often, values, group)
+            once(calls, device)
+            samples = [once(calls, device) / ALL_REDUCE_CALLS for _ in range(ALL_REDUCE_SAMPLES)]
+            low, middle, high = np.percentile(samples, (25, 50, 75)).tolist()
+            rows.append({"devices": size, "bytes": byte_count, "ms": middle, "ms_quartiles": [low, high]})
+    return rows
+
+
+def _all_reduce_often(values: torch.Tensor, group: dist.ProcessGroup) -> None:
+    for _ in range(ALL_REDUCE_CALLS):
+        dist.all_reduce(values, group=group)
+
+
+def _row(contender: Contender, config: ScalingConfig) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "devices": contender.devices,
+        "scenes": config.scenes,
+        "particles": config.particles,
+        "particle_spread": contender.spread,
+        "averaged": contender.message_mb is not None,
+        "message_mb": contender.message_mb,
+        "messages": contender.messages,
+        "check": contender.check,
+        "ms": None,
+    }
+    if contender.check == PASS:
+        low, middle, high = np.percentile(contender.milliseconds, (25, 50, 75)).tolist()
+        row |= {"ms": middle, "ms_quartiles": [low, high], "samples": len(contender.milliseconds)}
+    return row
+
+
+def _gradients(module: nn.Module) -> torch.Tensor:
+    return torch.cat([p.grad.flatten() for p in module.parameters() if p.grad is not None])
