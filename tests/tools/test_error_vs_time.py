@@ -1,0 +1,245 @@
+"""python -m tools.error_vs_time: its rows, its measures, what it does with failures; no assertion on any time."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from network.states import gns_of, network_of
+from PIL import Image
+
+import datagen.mpm.solver
+from datagen.mpm.solver import SceneFailure, Simulated
+from hgn.config import DatagenConfig, MpmConfig
+from hgn.data.reader import EpisodeStore
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.scene.shapes import shape_obstacle
+from hgn.schema import ConfigError, from_mapping
+from hgn.training.errors import ballistic, frame_batches, one_step_errors
+from tools.error_vs_time import score
+from tools.error_vs_time.__main__ import main
+from tools.error_vs_time.contenders import TrivialContender
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.error_vs_time.sinkhorn import sinkhorn_divergence
+from tools.measures import energies, energy_scale, inside_obstacles, momentum_error, outside_domain
+from tools.trial import FrameClock, Trial, network_trials, other_grid
+
+CPU = torch.device("cpu")
+FRAMES = 6
+
+
+def fake_simulate(scenes, config, frames, frame_rate_hz, on_frame=None):
+    """Falls a little short of the data; the larger the step, the more; a whole step kills the first scene."""
+    results: list[Any] = []
+    for i, scene in enumerate(scenes):
+        time_T = np.arange(frames)[:, None, None] / frame_rate_hz
+        fall_3 = (
+            0.5 * np.array(scene.gravity) * (1 - 0.1 * config.stability_fraction) * (32 / 64 * scene.cell_size * 64)
+        )
+        path_TN3 = (scene.position_N3 + scene.velocity_N3 * time_T + fall_3 * time_T**2).astype(np.float32)
+        failed = config.stability_fraction == 1.0 and i == 0
+        results.append(SceneFailure("too fast") if failed else Simulated(path_TN3, {}))
+    for frame in range(frames):
+        if on_frame is not None:
+            on_frame(frame)
+    return results
+
+
+def weights_file(path: Path, kind: str) -> Path:
+    network = (network_of if kind == "hgn" else gns_of)(torch.float32, width=8, material_embedding=2)
+    save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64, updates=7))
+    return path
+
+
+@pytest.fixture
+def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> str:
+    return str(make_dataset(make_config(frames=FRAMES)))
+
+
+def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """Every contender gets a row with the report's keys on the same scenes; a solver that fails is counted."""
+    monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
+    weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
+    out = tmp_path / "results" / "report"
+    options = {"data": data, "out": str(out), "weights": weights, "split": "validation", "frame_stride": 2}
+    options |= {"mpm_grids": [32, 64], "timed_frames": 5, "rounds": 1, "batch_scenes": 2, "timed_scenes": 1}
+    options |= {"training_hours": [1.5, 2.0], "generation_hours": 0.5, "sinkhorn_points": 8, "device": "cpu"}
+    assert main(options) == 0
+    report = json.loads(Path(f"{out}.json").read_text())
+    assert {"device", "versions", "commit", "date", "command", "convention", "reference"} <= report["meta"].keys()
+    rows = report["rows"]
+    systems = [row["system"] for row in rows]
+    assert systems == ["hgn", "gns", *["trivial"] * 3, *["mpm"] * 4, *["chaos"] * 2]
+    keys = {
+        "one_step_mse",
+        "position_mse",
+        "sinkhorn",
+        "penetration",
+        "ghost",
+        "momentum_error",
+        "energy_drift",
+        "seeds",
+    }
+    for row in rows:
+        assert keys <= row.keys() and len(row["seeds"]) == 2
+        assert (row["one_step_mse"] is None) == (row["system"] in ("mpm", "chaos"))
+        assert ("ms" in row) == (row["system"] in ("hgn", "gns", "mpm"))
+    mpm = {(row["grid"], row["step"]): row for row in rows if row["system"] == "mpm"}
+    assert mpm[64, 1.0]["failed_scenes"] == 1 and mpm[64, 1.0]["first_failure"] == "too fast"
+    assert mpm[64, 1.0]["scenes_reached"] == {"5": 1} and mpm[64, 0.5]["scenes_reached"] == {"5": 2}
+    assert 0 < mpm[64, 0.5]["position_mse"]["5"] < mpm[32, 0.5]["position_mse"]["5"]
+    floor = {row["floor"]: row["position_mse"]["5"] for row in rows if row["system"] == "chaos"}
+    assert 1e-13 < floor["perturbed by 1e-06"] < 3e-12
+    assert floor["twice the step"] == pytest.approx(mpm[64, 0.5]["position_mse"]["5"])
+    assert rows[0]["training_hours"] == 1.5 and "pay_back_rollouts" in rows[0]
+    for end in ("", "_frames"):
+        with Image.open(f"{out}{end}.png") as picture:
+            assert picture.width > 500
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in ("HGN L = 3, M = 2", "GNS M = 3", "MPM 32³, step 1", "chaos floor"))
+
+
+def test_the_data_can_be_the_reference(data: str, tmp_path: Path) -> None:
+    """Without a solver the data itself is the reference, and what moves like it has no error."""
+    out = tmp_path / "report"
+    assert main({"data": data, "out": str(out), "split": "validation", "resimulate": False, "device": "cpu"}) == 0
+    rows = {row["predictor"]: row for row in json.loads(Path(f"{out}.json").read_text())["rows"]}
+    assert rows["ballistic motion"]["position_mse"]["5"] < 1e-13 < rows["constant velocity"]["position_mse"]["5"]
+    assert rows["ballistic motion"]["one_step_mse"] < 1e-13 < rows["constant velocity"]["one_step_mse"]
+
+
+def test_trivial_errors_are_those_of_training(data: str) -> None:
+    """One-step errors agree with what training measures, at every frame."""
+    (episode,) = EpisodeStore(data, "test").episodes
+    gravity = TrivialContender("fall", lambda e: 0.9 * np.asarray(e.gravity) / e.frame_rate_hz**2, CPU)
+    network = network_of(torch.float32, obstacle_features=False)
+    batches = frame_batches([episode], network, 1, 100)
+    expected = one_step_errors({"fall": lambda b: 0.9 * ballistic(b)}, batches, CPU, network.config.materials)
+    assert gravity.one_step(episode, 1, 0.0).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
+
+
+def test_ghost_acceleration_counts_particles_at_rest(data: str) -> None:
+    """Only particles that have not moved count, each with the length of what is predicted for it."""
+    (episode,) = EpisodeStore(data, "test").episodes
+    position_TN3 = np.repeat(np.array(episode.position_TN3[:1]), 9, axis=0)
+    position_TN3[:, 0] += np.arange(9, dtype=np.float32)[:, None] * 0.01
+    still = replace(
+        episode,
+        position_TN3=position_TN3,
+        initial_velocity_N3=np.zeros_like(episode.initial_velocity_N3),
+        gravity=(0.0, 0.0, 0.0),
+    )
+    step = TrivialContender("push", lambda e: np.array([3e-3, 0.0, 4e-3]), CPU).one_step(still, 1, 1e-4)
+    assert step.rest_count == 8 * (position_TN3.shape[1] - 1)
+    assert score.one_step_figures([step])["ghost"] == pytest.approx(5e-3, rel=1e-5)
+
+
+def test_a_diverging_scene_ends_alone(data: str) -> None:
+    """Beside one that diverges a scene goes on to the end; the other is kept as far as it came, with the cause."""
+    episodes = EpisodeStore(data, "validation").episodes
+    scenes = [InitialState.of_episode(episode) for episode in episodes]
+    scenes = [replace(s, material_N=np.full_like(s.material_N, i)) for i, s in enumerate(scenes)]
+    simulator = Simulator(network_of(torch.float32), 60.0)
+    simulator.predict = lambda state: (state.material_N == 1)[:, None].float().expand(-1, 3)
+    through, failed = network_trials(simulator, scenes, 5)
+    assert through.cause is None and through.frame_count == 5
+    assert failed.cause is not None and "diverged at frame 2" in failed.cause and failed.frame_count == 2
+    assert np.isfinite(failed.position_TN3).all()
+    assert network_trials(simulator, [], 5) == []
+
+
+def test_sinkhorn_against_closed_forms() -> None:
+    """Zero for a permuted cloud, the square of the shift for a shifted one, NaN where a position is not finite."""
+    generator = torch.Generator().manual_seed(0)
+    cloud = torch.rand(120, 3, generator=generator)
+    shift = torch.tensor([0.1, -0.05, 0.2])
+    assert abs(sinkhorn_divergence(cloud, cloud.flip(0), 0.01)) < 1e-9
+    assert sinkhorn_divergence(cloud, cloud + shift, 0.01) == pytest.approx(float(shift.square().sum()), rel=1e-4)
+    assert sinkhorn_divergence(cloud, cloud + 0.01 * shift, 0.01) == pytest.approx(5.25e-6, rel=1e-3)
+    assert sinkhorn_divergence(cloud[:1], cloud[1:2], 0.01) == pytest.approx(
+        float((cloud[0] - cloud[1]).square().sum()), rel=1e-5
+    )
+    cloud[3, 0] = math.nan
+    assert math.isnan(sinkhorn_divergence(cloud, cloud, 0.01))
+
+
+def test_momentum_and_energy_against_closed_forms() -> None:
+    """Free fall keeps its energy and gains momentum as gravity says; standing still loses none and gains none."""
+    gravity = np.array([0.0, -1e-3, 0.0])
+    time = np.arange(20)[:, None, None]
+    start = np.random.default_rng(0).random((1, 7, 3))
+    fall = start + 0.5 * gravity * time**2
+    energy = energies(fall, gravity)
+    np.testing.assert_allclose(energy, energy[0], rtol=2e-4)
+    still = np.repeat(start, 20, axis=0)
+    assert momentum_error(fall, still) == pytest.approx(1e-3 * math.sqrt(np.mean((np.arange(19) + 0.5) ** 2)))
+    assert energy_scale(gravity, (1.0, 2.0, 3.0)) == pytest.approx(2e-3) and energy_scale(0 * gravity, (1, 1, 1)) == 1
+
+
+def test_shares_inside_obstacles_and_outside_of_the_domain() -> None:
+    """Closed bodies hold what is within them, sheets nothing; the domain ends at its planes."""
+    cone = shape_obstacle("cone", 0.4, (0.5, 0.5, 0.5), np.eye(3), "cone")
+    square = shape_obstacle("square", 0.4, (0.5, 0.5, 0.5), np.eye(3), "square")
+    point = np.array([[0.5, 0.5, 0.5], [0.9, 0.9, 0.9], [1.1, 0.5, 0.5], [0.5, -0.1, 0.5]])
+    assert inside_obstacles(point, [cone]) == 0.25 and inside_obstacles(point, [square]) == 0
+    assert outside_domain(point, (1.0, 1.0, 1.0)) == 0.5 and outside_domain(point[:0], (1.0, 1.0, 1.0)) == 0
+
+
+def test_frames_that_are_told_together_are_timed_together() -> None:
+    """The clock counts from the end of the first bunch of frames; with one bunch only it tells nothing."""
+    clock = FrameClock()
+    clock.ends = [1.0, 1.000001, 1.000002, 1.3, 1.300001, 1.300002]
+    assert clock.milliseconds() == pytest.approx(100, rel=1e-3)
+    clock.ends = [1.0, 1.1, 1.2]
+    assert clock.milliseconds() == pytest.approx(100)
+    clock.ends = [1.0, 1.000001]
+    assert clock.milliseconds() is None
+
+
+def test_other_grids_keep_their_walls() -> None:
+    """Three nodes of 1/64 are two of 1/32 at the least, and six of 1/128."""
+    cells = [other_grid(MpmConfig(), 1 / n, 1 / 64).wall_cells for n in (32, 48, 64, 128)]
+    assert cells == [2, 2, 3, 6]
+
+
+def test_pay_back() -> None:
+    """Hours over the time that a rollout saves; none where it saves nothing or hours are not told."""
+    assert score.pay_back({"ms": 1.0}, 4.0, 2.0, 1.0, 300) == pytest.approx(3 * 3.6e6 / 900)
+    assert score.pay_back({"ms": 5.0}, 4.0, 2.0, 1.0, 300) is None
+    assert score.pay_back({"ms": 1.0}, 4.0, None, 1.0, 300) is None
+
+
+def test_scenes_that_failed_leave_the_means(data: str) -> None:
+    """Errors at a frame are means over the scenes that reached it, and say over how many."""
+    episodes = list(EpisodeStore(data, "validation").episodes)
+    config = ErrorVsTimeConfig(data="", out="x", sinkhorn_points=4)
+    paths = [np.array(episode.position_TN3) for episode in episodes]
+    trials = [Trial(paths[0] + np.float32(0.1)), Trial(paths[1][:3] + np.float32(0.2), "why")]
+    row, curve = score.rollout_figures(trials, episodes, config, CPU)
+    np.testing.assert_allclose(curve, [*[0.075] * 3, *[0.03] * 3], rtol=1e-4)
+    assert row["scenes_reached"] == {"5": 1} and row["first_failure_frame"] == 3 and row["first_failure"] == "why"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mpm_steps": [0.0]}, r"mpm_steps\[0\] must be above 0"),
+        ({"weights": ["a/x.safetensors", "b/x.safetensors"]}, "weights must be files of different names"),
+        ({"weights": ["a"], "training_hours": [1.0, 2.0]}, "training_hours must be a list of 1"),
+        ({"frames": 1}, "frames must be at least 2"),
+        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32"),
+        ({"split": "all"}, "split must be one of train"),
+    ],
+)
+def test_bad_options(change: dict[str, Any], message: str) -> None:
+    """Each wrong option is named before anything is simulated."""
+    with pytest.raises(ConfigError, match=message):
+        from_mapping(ErrorVsTimeConfig, {"data": "d", "out": "o"} | change)

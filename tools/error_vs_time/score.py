@@ -1,0 +1,252 @@
+"""The row of a contender: its errors on the test scenes against the reference, and its run times.
+
+Conventions: squared errors sum over axes and average over particles, in frame units; means over scenes, of those
+scenes that reached the frame. Shape legend: T frames, N particles of a scene.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from hgn.scene.episode import Episode
+from hgn.scene.material import MATERIALS
+from hgn.scene.rollout_file import obstacles_of_episode
+from hgn.training.errors import REPORTED_FRAMES, position_mse
+from tools.error_vs_time.contenders import Contender, OneStep, frame_milliseconds
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.error_vs_time.sinkhorn import sinkhorn_divergence
+from tools.measures import energies, energy_scale, inside_obstacles, momentum_error, outside_domain
+from tools.trial import Trial
+
+
+def score(
+    contender: Contender,
+    references: Sequence[Episode],
+    config: ErrorVsTimeConfig,
+    device: torch.device,
+    on_scene: Callable[[int], None],
+) -> tuple[dict[str, Any], np.ndarray]:
+    """The row without run times, and the position MSE of each frame, float64 [T], NaN where no scene came so far."""
+    steps = [contender.one_step(episode, config.frame_stride, config.rest_speed) for episode in references]
+    frames = len(references[0].position_TN3)
+    trials: list[Trial] = []
+    for first in range(0, len(references), config.batch_scenes):
+        some = references[first : first + config.batch_scenes]
+        trials += contender.trials(some, frames, None)
+        on_scene(len(some))
+    row = contender.row | one_step_figures([step for step in steps if step is not None])
+    figures, curve_T = rollout_figures(trials, references, config, device)
+    return row | figures, curve_T
+
+
+def one_step_figures(steps: Sequence[OneStep]) -> dict[str, Any]:
+    """Errors over all scenes, by material, their quartiles over scenes, and the mean acceleration at rest."""
+    if not steps:
+        return {"one_step_mse": None, "one_step_quartiles": None, "one_step_by_material": None, "ghost": None}
+    total = {name: sum(step.error.total.get(name, 0.0) for step in steps) for name in MATERIALS}
+    count = {name: sum(step.error.count.get(name, 0) for step in steps) for name in MATERIALS}
+    resting = sum(step.rest_count for step in steps)
+    return {
+        "one_step_mse": sum(total.values()) / sum(count.values()),
+        "one_step_quartiles": _quartiles([step.error.mse for step in steps]),
+        "one_step_by_material": {name: total[name] / count[name] for name in MATERIALS if count[name]},
+        "ghost": sum(step.rest_sum for step in steps) / resting if resting else None,
+        "ghost_samples": resting,
+    }
+
+
+def rollout_figures(
+    trials: Sequence[Trial], references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
+) -> tuple[dict[str, Any], np.ndarray]:
+    """Everything that rollouts tell, and the position MSE of each frame."""
+    frames = len(references[0].position_TN3)
+    mse_ST = np.full((len(trials), frames), np.nan)
+    for mse_T, trial, reference in zip(mse_ST, trials, references, strict=True):
+        mse_T[: trial.frame_count] = position_mse(trial.position_TN3, reference.position_TN3[: trial.frame_count])
+    reached_T = np.isfinite(mse_ST).sum(0)
+    curve_T = np.where(reached_T > 0, np.nansum(mse_ST, axis=0) / np.maximum(reached_T, 1), np.nan)
+    reported = sorted({frame for frame in (*REPORTED_FRAMES, frames - 1) if frame < frames})
+    told = [frame for frame in reported if reached_T[frame]]
+    motions = [_motion(trial, reference) for trial, reference in zip(trials, references, strict=True)]
+    ends = [_end(trial, reference) for trial, reference in zip(trials, references, strict=True)]
+    failures = [trial for trial in trials if trial.cause is not None]
+    row: dict[str, Any] = {
+        "position_mse": {str(frame): float(curve_T[frame]) for frame in told},
+        "position_quartiles": {str(frame): _quartiles(mse_ST[:, frame]) for frame in told},
+        "scenes_reached": {str(frame): int(reached_T[frame]) for frame in reported},
+        "sinkhorn": _sinkhorn(trials, references, reported, config, device),
+        "failed_scenes": len(failures),
+        "first_failure_frame": min((trial.frame_count for trial in failures), default=None),
+        "first_failure": failures[0].cause if failures else None,
+        "seeds": [reference.seed for reference in references],
+    }
+    for name in ("momentum_error", "energy_drift", "energy_growth"):
+        row[name] = float(np.mean([motion[name] for motion in motions]))
+    for name in ("penetration", "reference_penetration", "outside_domain"):
+        row[name] = float(np.mean([end[name] for end in ends]))
+    return row, curve_T
+
+
+def time_in_turns(
+    contenders: Sequence[Contender], references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
+) -> list[dict[str, Any]]:
+    """Run times of all contenders in this process: each simulates the same scenes once to warm up, then in turns.
+
+    `ms` is a frame of one scene, `ms_batched` a frame of each of `batch_scenes` scenes side by side.
+    """
+    frames = min(config.timed_frames, len(references[0].position_TN3))
+    singles = [[episode] for episode in references[: config.timed_scenes]]
+    batch = list(references[: config.batch_scenes])
+    memory = [_warm_up(contender, singles, batch, frames, device) for contender in contenders]
+    single: list[list[float]] = [[] for _ in contenders]
+    batched: list[list[float]] = [[] for _ in contenders]
+    for _ in range(config.rounds):
+        for scenes in (*singles, batch):
+            for i, contender in enumerate(contenders):
+                taken = frame_milliseconds(contender, scenes, frames)
+                if taken is not None:
+                    (batched[i] if scenes is batch else single[i]).append(taken / len(scenes))
+    return [
+        {
+            "ms": float(np.median(one)) if one else None,
+            "ms_quartiles": _quartiles(one),
+            "ms_batched": float(np.median(many)) if many else None,
+            "batch_scenes": len(batch),
+            "memory_gb": used,
+        }
+        for one, many, used in zip(single, batched, memory, strict=True)
+    ]
+
+
+def pay_back(
+    row: Mapping[str, Any], solver_ms: float | None, hours: float | None, generation: float | None, frames: int
+) -> float | None:
+    """Rollouts after which training and generation are paid for by the time that each saves; none if never."""
+    if hours is None or generation is None or row["ms"] is None or solver_ms is None or row["ms"] >= solver_ms:
+        return None
+    return (hours + generation) * 3.6e6 / ((solver_ms - row["ms"]) * frames)
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The figures for people."""
+    frames = sorted({int(frame) for row in rows for frame in row.get("scenes_reached", {})})
+    head = "".join(f"{f'MSE at {frame}':>12}" for frame in frames)
+    lines = [f"{'system':<40} {'ms':>9} {'batched':>9} {'one-step MSE':>13}{head} {'Sinkhorn':>10} {'failed':>7}"]
+    for row in rows:
+        errors = "".join(f"{_number(row['position_mse'].get(str(frame))):>12}" for frame in frames)
+        last = [values[max(values, key=int)] for values in row["sinkhorn"].values() if values]
+        lines.append(
+            f"{label(row):<40} {_number(row.get('ms'), '.3f'):>9} {_number(row.get('ms_batched'), '.3f'):>9} "
+            f"{_number(row['one_step_mse']):>13}{errors} {_number(float(np.mean(last)) if last else None):>10} "
+            f"{row['failed_scenes']:>7}"
+        )
+    return "\n".join(lines)
+
+
+def label(row: Mapping[str, Any]) -> str:
+    """A contender's name."""
+    match row["system"]:
+        case "mpm":
+            return f"MPM {row['grid']}³, step {row['step']:g}"
+        case "trivial":
+            return str(row["predictor"])
+        case "chaos":
+            return f"chaos floor: {row['floor']}"
+    size = f"M = {row['message_passing_steps']}"
+    size = f"L = {row['levels']}, {size}" if row["system"] == "hgn" else size
+    return f"{row['system'].upper().replace('_', ' ')} {size}, {row['precision']} ({row['weights']})"
+
+
+def as_json(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """The report; numbers that are none are null, for JSON knows no NaN."""
+    return json.dumps({"meta": meta, "rows": _plain(list(rows))}, indent=1, allow_nan=False).encode()
+
+
+def _motion(trial: Trial, reference: Episode) -> dict[str, float]:
+    gravity_3 = np.asarray(reference.gravity, np.float64) / reference.frame_rate_hz**2
+    result = {"momentum_error": momentum_error(trial.position_TN3, reference.position_TN3)}
+    if trial.frame_count < 2:
+        return result | {"energy_drift": 0.0, "energy_growth": 0.0}
+    energy_T = energies(trial.position_TN3, gravity_3)
+    reference_T = energies(np.asarray(reference.position_TN3[: trial.frame_count]), gravity_3)
+    scale = energy_scale(gravity_3, reference.domain_size)
+    drift, growth = np.abs(energy_T - reference_T).mean() / scale, (energy_T - reference_T[0]).max() / scale
+    return result | {"energy_drift": float(drift), "energy_growth": float(max(growth, 0.0))}
+
+
+def _end(trial: Trial, reference: Episode) -> dict[str, float]:
+    obstacles = obstacles_of_episode(reference)
+    last_N3 = trial.position_TN3[-1]
+    return {
+        "penetration": inside_obstacles(last_N3, obstacles),
+        "reference_penetration": inside_obstacles(reference.position_TN3[trial.frame_count - 1], obstacles),
+        "outside_domain": outside_domain(last_N3, reference.domain_size),
+    }
+
+
+def _sinkhorn(
+    trials: Sequence[Trial],
+    references: Sequence[Episode],
+    frames: Sequence[int],
+    config: ErrorVsTimeConfig,
+    device: torch.device,
+) -> dict[str, dict[str, float]]:
+    found: dict[str, dict[str, list[float]]] = {}
+    for trial, reference in zip(trials, references, strict=True):
+        for index in np.unique(reference.material_N):
+            of_material = np.flatnonzero(reference.material_N == index)
+            # The same particles of both: as near to the whole clouds as so few can be.
+            chosen = np.random.default_rng(reference.seed).permutation(of_material)[: config.sinkhorn_points]
+            for frame in frames:
+                if frame < trial.frame_count:
+                    first, second = (
+                        torch.from_numpy(np.ascontiguousarray(path[frame, chosen])).to(device)
+                        for path in (trial.position_TN3, reference.position_TN3)
+                    )
+                    value = sinkhorn_divergence(first, second, config.sinkhorn_blur)
+                    found.setdefault(MATERIALS[index], {}).setdefault(str(frame), []).append(value)
+    return {name: {frame: float(np.mean(v)) for frame, v in values.items()} for name, values in found.items()}
+
+
+def _warm_up(
+    contender: Contender,
+    singles: Sequence[Sequence[Episode]],
+    batch: Sequence[Episode],
+    frames: int,
+    device: torch.device,
+) -> float | None:
+    """Simulates everything once; returns the most GPU memory that one scene took, of what torch knows."""
+    network = contender.row["system"] in ("hgn", "gns", "gns_particles")
+    before = 0
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+    for scenes in singles:
+        contender.trials(scenes, frames, None)
+    peak = torch.cuda.max_memory_allocated(device) - before if device.type == "cuda" else 0
+    contender.trials(batch, frames, None)
+    return peak / 1e9 if network and device.type == "cuda" else None
+
+
+def _quartiles(values: Sequence[float] | np.ndarray) -> list[float] | None:
+    finite = np.asarray(values, np.float64)
+    finite = finite[np.isfinite(finite)]
+    return [float(q) for q in np.percentile(finite, (25, 75))] if len(finite) else None
+
+
+def _number(value: float | None, form: str = ".2e") -> str:
+    return "-" if value is None or not np.isfinite(value) else format(value, form)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,0 +1,69 @@
+"""The options of `python -m tools.error_vs_time`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from hgn.config import BENCH_PRECISIONS
+from hgn.data.manifest import SPLITS
+from hgn.schema import require, require_non_negative, require_one_of, require_positive
+
+
+@dataclass(frozen=True)
+class ErrorVsTimeConfig:
+    """What is compared, on what, and how long. See conf/command/error_vs_time.yaml."""
+
+    data: str
+    out: str
+    weights: tuple[str, ...] = ()
+    split: str = "test"
+    scenes: int = 20
+    frames: int = 300
+    frame_stride: int = 10
+    precisions: tuple[str, ...] | None = None
+    mpm_grids: tuple[int, ...] = (32, 48, 64)
+    mpm_steps: tuple[float, ...] = (1.0, 0.5)
+    reference_step: float = 0.25
+    resimulate: bool = True
+    perturbation: float = 1e-6
+    batch_scenes: int = 8
+    timed_scenes: int = 3
+    timed_frames: int = 100
+    rounds: int = 3
+    sinkhorn_points: int = 1024
+    sinkhorn_blur: float = 0.01
+    rest_speed: float = 1e-4
+    training_hours: tuple[float, ...] | None = None
+    generation_hours: float | None = None
+    device: str = "auto"
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require(self.out != "", "out", "a file name without its ending", self.out)
+        require_one_of(self, "split", SPLITS)
+        require_positive(
+            self,
+            "scenes",
+            "frame_stride",
+            "batch_scenes",
+            "timed_scenes",
+            "rounds",
+            "sinkhorn_points",
+            "sinkhorn_blur",
+        )
+        require_non_negative(self, "perturbation", "rest_speed")
+        require(self.frames >= 2, "frames", "at least 2", self.frames)
+        require(self.timed_frames >= 4, "timed_frames", "at least 4", self.timed_frames)
+        require(0 < self.reference_step <= 1, "reference_step", "above 0 and at most 1", self.reference_step)
+        for i, step in enumerate(self.mpm_steps):
+            require(0 < step <= 1, f"mpm_steps[{i}]", "above 0 and at most 1", step)
+        for i, grid in enumerate(self.mpm_grids):
+            require(grid >= 8, f"mpm_grids[{i}]", "at least 8", grid)
+        for i, name in enumerate(self.precisions or ()):
+            require(name in BENCH_PRECISIONS, f"precisions[{i}]", f"one of {', '.join(BENCH_PRECISIONS)}", name)
+        names = [Path(file).name for file in self.weights]
+        require(len(set(names)) == len(names), "weights", "files of different names", names)
+        if self.training_hours is not None:
+            told, count = len(self.training_hours), len(self.weights)
+            require(told == count, "training_hours", f"a list of {count}, one for each of weights", told)

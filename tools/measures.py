@@ -1,0 +1,54 @@
+"""What is measured of trajectories besides positions: momentum, energy, obstacles, the domain.
+
+All in frame units: displacement a frame for velocities, domain units a frame squared for accelerations.
+Shape legend: T frames, N particles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hgn.scene.distance import contains
+from hgn.scene.scene import Obstacle
+
+
+def momentum_error(path_TN3: np.ndarray, reference_TN3: np.ndarray) -> float:
+    """Root mean square over frames of the difference of the mean velocities, per mass; 0 for a single frame."""
+    if len(path_TN3) < 2:
+        return 0.0
+    reference_TN3 = reference_TN3[: len(path_TN3)]
+    difference_T3 = np.diff(path_TN3.mean(1, dtype=np.float64) - reference_TN3.mean(1, dtype=np.float64), axis=0)
+    return float(np.sqrt((difference_T3**2).sum(-1).mean()))
+
+
+def energies(path_TN3: np.ndarray, gravity_3: np.ndarray) -> np.ndarray:
+    """Kinetic and potential energy per mass between each two frames, float64 [T - 1].
+
+    v² / 2 - g · x at the middle of the frame; gravity in domain units a frame squared. Elastic energy is not in it.
+    """
+    position_TN3 = path_TN3.astype(np.float64)
+    velocity_TN3 = np.diff(position_TN3, axis=0)
+    middle_TN3 = 0.5 * (position_TN3[1:] + position_TN3[:-1])
+    energy_T: np.ndarray = (0.5 * (velocity_TN3**2).sum(-1) - middle_TN3 @ gravity_3).mean(-1)
+    return energy_T
+
+
+def energy_scale(gravity_3: np.ndarray, domain_size: Sequence[float]) -> float:
+    """The energy per mass of a fall through the domain; 1 without gravity."""
+    return float(np.abs(gravity_3) @ np.asarray(domain_size)) or 1.0
+
+
+def inside_obstacles(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> float:
+    """Share of the particles within closed obstacles; nothing is within a sheet."""
+    inside_N = np.zeros(len(position_N3), bool)
+    for obstacle in obstacles:
+        inside_N |= contains(position_N3, obstacle)
+    return float(inside_N.mean()) if len(inside_N) else 0.0
+
+
+def outside_domain(position_N3: np.ndarray, domain_size: Sequence[float]) -> float:
+    """Share of the particles beyond the domain's planes."""
+    outside_N3 = (position_N3 < 0) | (position_N3 > np.asarray(domain_size))
+    return float(outside_N3.any(-1).mean()) if len(position_N3) else 0.0
