@@ -17,13 +17,15 @@ import pytest
 import yaml
 from kubeflow_trainer_api.models import TrainerV1alpha1TrainJob
 
-from datagen.generate import datagen_config
+from datagen.generate import KEYS, datagen_config
 from hgn.command import _compose
-from hgn.config import TrainConfig
+from hgn.config import ServiceConfig, TrainConfig
+from hgn.data.storage import TOKEN_VARIABLE
 from hgn.schema import from_mapping
 
 K8S = Path(__file__).resolve().parents[2] / "jobs" / "k8s"
 OLDEST, NEWEST = "1.31", "1.37"
+SERVICE_KEYS = ("host", "port", "connections")
 RAY_JOB = {
     "activeDeadlineSeconds",
     "backoffLimit",
@@ -164,6 +166,18 @@ def test_commands_take_what_the_files_give_them(monkeypatch: pytest.MonkeyPatch)
     assert entrypoint[:3] == ["python", "-m", "datagen"]
     config = datagen_config(composed(monkeypatch, "datagen", entrypoint[3:]))
     assert (config.dataset.pool, config.dataset.folder) == ("ray", "/shared/data/obstacles")
+
+    (container,) = documents("service.yaml")[0]["spec"]["template"]["spec"]["containers"]
+    assert container["command"] == ["python", "-m", "datagen.service"]
+    mapping = composed(monkeypatch, "service", container["args"])
+    assert datagen_config(mapping, KEYS | dict.fromkeys(SERVICE_KEYS)).dataset.folder == "/shared/data/obstacles"
+    service = from_mapping(ServiceConfig, {key: mapping[key] for key in SERVICE_KEYS})
+    assert [port["containerPort"] for port in container["ports"]] == [service.port]
+    assert (
+        container["env"][0]["name"]
+        == TOKEN_VARIABLE
+        == documents("train.yaml")[0]["spec"]["trainer"]["env"][-1]["name"]
+    )
 
 
 def test_files_fit_each_other() -> None:

@@ -33,7 +33,9 @@ from tools.bench.contenders import FRAME_RATE_HZ, MATMUL, PASS, bench_network
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.timing import once
 
-GRADIENT_BOUND = 1e-5  # relative error of the averaged gradients, of their norm
+# Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
+# order each time, which turns the activations that lie next to their kink.
+GRADIENT_BOUND = 1e-3
 ALL_REDUCE_BYTES = (4, 65_536, 1_048_576, 4_194_304, 16_777_216, 67_108_864)
 ALL_REDUCE_CALLS, ALL_REDUCE_SAMPLES = 10, 5
 WARM_UPDATES = 3
