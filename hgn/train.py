@@ -95,7 +95,7 @@ def _fit(
     _write_run_files(config, run)
 
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every)
-    monitor = Monitor(run, store, config.dataset.folder, stop, checkpoints)
+    monitor = Monitor(run, store, stop, checkpoints)
     guard = GradientGuard(training.maximum_skipped_updates)
     lines = LogLines(run, monitor, guard, feed, _published_text(config, generator))
     final = FinalMetrics(to_mapping(config), monitor.last, stop)
@@ -183,7 +183,7 @@ def _published_text(config: TrainConfig, generator: Generator | None) -> Callabl
         try:
             count = Manifest.load(folder, patience_s=0.0).published("train")
         except UnreachableError:
-            return f"{folder} does not answer"
+            return "the service does not answer"
         state = "" if generator is None or generator.running or count >= total else ", generator stopped"
         return f"{count}/{total} episodes{state}"
 

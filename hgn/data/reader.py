@@ -51,6 +51,13 @@ class EpisodeStore:
             return False
         return True
 
+    def of_split(self, split: str) -> EpisodeStore:
+        """Another split of the same data set, as it is known here: without asking a server."""
+        require(split in SPLITS, "split", f"one of {', '.join(SPLITS)}", split)
+        store = EpisodeStore.__new__(EpisodeStore)
+        store.__setstate__(self.__getstate__() | {"split": split})
+        return store
+
     def refresh(self) -> bool:
         """Reads the manifest again; True when this split has more episodes than before.
 

@@ -31,6 +31,7 @@ PATIENCE_S = 300.0  # with a server that does not answer: time enough to start a
 _CHUNK_BYTES = 16 * 2**20  # of a shard at a time: what is lost when a connection is
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 10.0
 _CONNECT_S, _SILENCE_S = 10.0, 60.0
+_AWAY_S = 10.0
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
@@ -42,6 +43,7 @@ class UnreachableError(OSError):
     """A server did not answer for as long as it was waited for."""
 
     def __init__(self, url: str, patience_s: float, cause: str) -> None:
+        self.cause = cause
         super().__init__(errno.ETIMEDOUT, f"no answer for {patience_s:.0f} s (at last: {cause})", url)
 
 
@@ -161,13 +163,22 @@ class _Remote:
             ) from None
         self._known: tuple[bytes, str] | None = None  # the manifest last read, and its ETag at a dataset service
         self._lock = threading.Lock()
+        self._away = (0.0, "")  # until when, and why, who has no patience need not ask
 
     def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
         with self._lock:
+            if not patience_s and time.monotonic() < self._away[0]:
+                raise UnreachableError(f"{self._url}/{name}", patience_s, self._away[1])
             options: dict[str, Any] = {}
             if self._http and self._known is not None:
                 options["headers"] = {"If-None-Match": self._known[1]}
-            content = self._patiently(name, patience_s, lambda path: self._files.cat_file(path, **options))
+            try:
+                content = self._patiently(name, patience_s, lambda path: self._files.cat_file(path, **options))
+            except UnreachableError as error:
+                # a machine that is switched off costs _CONNECT_S at each asking
+                self._away = time.monotonic() + _AWAY_S, error.cause
+                raise
+            self._away = 0.0, ""
             if not content and self._known is not None:  # not modified
                 return self._known[0]
             self._known = content, f'"{hashlib.sha256(content).hexdigest()}"'

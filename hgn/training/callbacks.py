@@ -93,9 +93,9 @@ class Checkpoints(Callback):
 class Monitor(Callback):
     """Measures one-step errors on fixed scenes of both splits, and rollouts of the validation scenes."""
 
-    def __init__(self, run: Path, training: EpisodeStore, folder: str, stop: StopRequest, checkpoints: Checkpoints):
+    def __init__(self, run: Path, training: EpisodeStore, stop: StopRequest, checkpoints: Checkpoints):
         self.run, self.stop, self.checkpoints = run, stop, checkpoints
-        self.training_store, self.data_folder = training, folder
+        self.stores = {"training": training, "validation": training.of_split("validation")}
         self.last: dict[str, float] = {}
         self._measured_update = -1
 
@@ -117,10 +117,10 @@ class Monitor(Callback):
         config, network = module.training_config, module.network
         network.eval()
         started = time.monotonic()
-        stores = {"training": self.training_store, "validation": EpisodeStore(self.data_folder, "validation")}
+        self.stores["validation"].refresh()
         scenes = {
             split: first_episodes(store, config.monitor_scenes, agreed_count(store, trainer))
-            for split, store in stores.items()
+            for split, store in self.stores.items()
         }
         values: dict[str, float] = {}
         for split, episodes in scenes.items():

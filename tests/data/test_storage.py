@@ -294,6 +294,20 @@ def test_server_that_stays_away() -> None:
         Manifest.load(url, patience_s=0.05)
 
 
+def test_server_that_is_away_is_not_asked_at_once_again(
+    folder: Path, serve: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Looking for news at a machine that is off costs one wait in a while, and a split is read without it."""
+    url = serve()
+    store = EpisodeStore(url, "train")
+    _ = store.of_split("validation").episodes[:]
+    serve.stop()  # type: ignore[attr-defined]
+    assert not store.refresh()
+    files = open_storage(url)._files  # type: ignore[attr-defined]
+    monkeypatch.setattr(files, "cat_file", lambda *a, **k: pytest.fail("it was asked"))
+    assert not store.refresh() and same_episodes(store.of_split("validation"), EpisodeStore(folder, "validation"))
+
+
 def test_full_disk(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the cache is full the error names it, and what was fetched does not stay in the way."""
     url = in_memory(folder, "full")

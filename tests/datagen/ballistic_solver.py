@@ -77,6 +77,8 @@ def simulate(
             log.write(f"{scene.seed}\n")
         if control("slow").exists():
             time.sleep(0.5)
+        while control(f"hold-{scene.seed}").exists():
+            time.sleep(0.02)
         if control("raise").exists():
             raise RuntimeError("a fault in the solver")
         kill = control(f"kill-{scene.seed}")

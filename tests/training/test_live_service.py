@@ -1,0 +1,134 @@
+"""Training from a data set that a service makes and serves at the same time."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from training.runs import metrics, train_mapping
+
+import hgn.data.storage
+from datagen.plan import scene_seed
+from hgn import train
+from hgn.config import DatagenConfig
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.data.storage import CACHE_VARIABLE, TOKEN_VARIABLE
+from hgn.training.checkpoint import read_checkpoint
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENES = 5
+
+
+@pytest.fixture(autouse=True)
+def keep_signal_handlers() -> Iterator[None]:
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+class Service:
+    """The ballistic service in processes of its own, always on the same port."""
+
+    def __init__(self, folder: Path, log: Path) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            self.port = listener.getsockname()[1]
+        self.folder, self.url, self._log = folder, f"http://127.0.0.1:{self.port}", log
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "datagen")])
+        dataset = {"training_scenes": SCENES, "validation_scenes": 1, "test_scenes": 0, "frames": 6, "workers": 1}
+        overrides = [f"dataset.{key}={value}" for key, value in dataset.items()]
+        with self._log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "ballistic_service", *overrides, f"out={self.folder}", f"port={self.port}"],
+                env=os.environ | {"PYTHONPATH": path},
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+
+    def kill(self) -> None:
+        """Ends the service and all processes below it at once."""
+        if self.process is not None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+            self.process = None
+
+
+@pytest.fixture
+def service(control: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(TOKEN_VARIABLE, "correct-horse-battery")
+    monkeypatch.setattr(hgn.data.storage, "_AWAY_S", 0.2)
+    service = Service(tmp_path / "made", tmp_path / "service.log")
+    yield service
+    service.kill()
+
+
+def test_service_restarted_midway(
+    make_config: Callable[..., DatagenConfig], service: Service, control: Path, tmp_path: Path
+) -> None:
+    """A trainer reads over HTTP what a service makes meanwhile. The service is killed with all its processes and
+    started again: training goes on through it, with the scenes it has and then with those that come."""
+    config = make_config(folder=service.url, training_scenes=SCENES, validation_scenes=1, test_scenes=0)
+    run = tmp_path / "run"
+    seen: dict[str, int] = {}
+    held = control / f"hold-{scene_seed(0, 'train', 2, 0)}"
+    held.touch()
+    service.start()
+
+    def steer() -> None:
+        try:
+            wait_until(lambda: updates(run) >= 8)
+            service.kill()
+            held.unlink()
+            seen["published"] = Manifest.load(service.folder).published("train")
+            seen["killed at"] = updates(run)
+            wait_until(lambda: updates(run) >= seen["killed at"] + 8)
+            service.start()
+            wait_until(lambda: any(record.get("episodes") == SCENES for record in metrics(run)))
+        finally:
+            os.kill(os.getpid(), signal.SIGUSR1)
+
+    steering = threading.Thread(target=steer)
+    steering.start()
+    code = train.main(
+        train_mapping(
+            config, run, maximum_updates=10**6, minimum_episodes=1, log_every=4, monitor_every=8, monitor_scenes=1
+        )
+    )
+    steering.join()
+    log = (tmp_path / "service.log").read_text()
+    assert code == 128 + signal.SIGUSR1, log
+    lines = [record for record in metrics(run) if "loss" in record]
+    assert [line["update"] for line in lines] == [4.0 * (i + 1) for i in range(len(lines))]
+    assert lines[0]["episodes"] <= seen["published"] == 2
+    assert lines[-1]["episodes"] == SCENES, log
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] >= lines[-1]["update"]
+    cached = {path.stem for path in (tmp_path / "cache" / "shards").glob("*.tar")}
+    assert cached >= {shard.sha256 for shard in EpisodeStore(service.folder, "train").manifest.shards_of("train")}
+
+
+def updates(run: Path) -> int:
+    try:
+        return int(metrics(run)[-1]["update"])
+    except (FileNotFoundError, IndexError):
+        return 0
+
+
+def wait_until(condition: Callable[[], object], seconds: float = 90.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
