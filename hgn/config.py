@@ -17,7 +17,9 @@ GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
 BENCH_CASES = ("frame", "train", "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
-BENCH_PRECISIONS = ("fp32", "tf32")
+BENCH_PRECISIONS = ("fp32", "tf32", "fp16")
+PATHS = ("auto", "plain", "fast")
+PRECISIONS = ("highest", "high", "half")
 
 
 def config_directory() -> Path:
@@ -271,7 +273,8 @@ class TrainingConfig:
     accelerator: str = "auto"  # or cpu, gpu
     devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
     nodes: int | None = None  # machines; none: as launched, without a launcher one
-    precision: str = "high"  # float32 matrix products: highest (float32), high (TF32 where there is one)
+    precision: str = "high"  # matrix products: highest (float32), high (TF32 where there is one), half (fast path only)
+    path: str = "auto"  # plain (PyTorch), fast (kernels in CUDA graphs); auto: fast where it runs
     minimum_episodes: int = 1  # training starts once that many training episodes are published
     generate: bool = True  # start the generator where the data set is missing or incomplete
     maximum_skipped_updates: int = 100  # in a row, for gradients that are not finite; then training ends
@@ -301,7 +304,8 @@ class TrainingConfig:
         )
         require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames")
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
-        require_one_of(self, "precision", ("highest", "high"))
+        require_one_of(self, "precision", PRECISIONS)
+        require_one_of(self, "path", PATHS)
         require(
             self.final_learning_rate <= self.learning_rate,
             "final_learning_rate",
@@ -363,9 +367,13 @@ class RolloutConfig:
     episode: str | None = None  # … and the key of one of its episodes
     frames: int = 300
     device: str = "auto"  # or cpu, cuda, cuda:1, …
+    path: str = "auto"  # plain (PyTorch), fast (kernels in CUDA graphs); auto: fast where it runs
+    precision: str = "high"  # matrix products: highest (float32), high (TF32 where there is one), half (fast path only)
 
     def __post_init__(self) -> None:
         require(self.frames >= 2, "frames", "at least 2", self.frames)
+        require_one_of(self, "path", PATHS)
+        require_one_of(self, "precision", PRECISIONS)
         require(
             (self.scene is None) == (self.data is not None and self.episode is not None),
             "scene",
@@ -387,12 +395,16 @@ class EvaluateConfig:
     rollout_frames: int = 300  # 0: none
     particles_per_batch: int = 32_768
     device: str = "auto"
+    path: str = "auto"  # of the rollouts: plain, fast; auto: fast where it runs
+    precision: str = "high"  # matrix products: highest, high, half (rollouts on the fast path only)
     json: str | None = None  # also write the figures to this file
 
     def __post_init__(self) -> None:
         require_positive(self, "scenes", "frame_stride", "particles_per_batch")
         require_non_negative(self, "rollout_frames")
         require_one_of(self, "split", ("train", "validation", "test"))
+        require_one_of(self, "path", PATHS)
+        require_one_of(self, "precision", PRECISIONS)
 
 
 @dataclass(frozen=True)

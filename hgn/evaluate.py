@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from hgn.files import write_atomically
 from hgn.network.base import ParticleNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
+from hgn.runtime.path import choose_path, why_not_fast
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
@@ -37,6 +39,10 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(EvaluateConfig, mapping)
     device = choose_device(config.device)
     network, info = load_weights(Path(config.weights), device)
+    path, text = choose_path("path", config.path, config.precision, why_not_fast(device, network.config))
+    if config.rollout_frames >= 2:
+        print(text, file=sys.stderr)
+    torch.set_float32_matmul_precision("highest" if config.precision == "highest" else "high")
     store = EpisodeStore(config.data, config.split)
     if not len(store):
         raise ConfigError(f"data must hold episodes of the split {config.split}, got none in {config.data}")
@@ -44,13 +50,14 @@ def main(mapping: dict[str, Any]) -> int:
     require_frame_rate(info, episodes[0].frame_rate_hz)
     rows = one_step_rows(network, episodes, config)
     if config.rollout_frames >= 2:
-        rows.append(rollout_row(network, info.frame_rate_hz, episodes, config.rollout_frames))
+        simulator = Simulator(network, info.frame_rate_hz, path, config.precision)
+        rows.append(rollout_row(simulator, episodes, config.rollout_frames))
     print(table(rows, config, len(episodes)))
     if config.json is not None:
         report = {"meta": provenance(device) | {"weights": config.weights, "updates": info.updates}, "rows": rows}
-        path = Path(config.json)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, json.dumps(report, indent=1).encode())
+        file = Path(config.json)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, json.dumps(report, indent=1).encode())
     return 0
 
 
@@ -73,13 +80,13 @@ def one_step_rows(network: ParticleNetwork, episodes: list[Episode], config: Eva
     ]
 
 
-def rollout_row(network: ParticleNetwork, frame_rate_hz: float, episodes: list[Episode], frames: int) -> dict[str, Any]:
+def rollout_row(simulator: Simulator, episodes: list[Episode], frames: int) -> dict[str, Any]:
     """{"system", "position_mse": {frame: value}, "mean_position_mse"}, or where the rollout diverged."""
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     with bar("rollouts", total=frames - 1, unit="frame") as progress:
         try:
             initial = [InitialState.of_episode(episode) for episode in episodes]
-            predicted = Simulator(network, frame_rate_hz).rollout(initial, frames, lambda _: progress.update())
+            predicted = simulator.rollout(initial, frames, lambda _: progress.update())
         except DivergenceError as error:
             return {"system": "network rollout", "diverged_at_frame": error.frame}
     pairs = zip(predicted, episodes, strict=True)
@@ -113,5 +120,4 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
 
 
 if __name__ == "__main__":
-    torch.set_float32_matmul_precision("high")
     run_command(main, "evaluate")

@@ -28,6 +28,7 @@ from hgn.files import write_atomically
 from hgn.network.build import build_network
 from hgn.progress import bar
 from hgn.provenance import provenance
+from hgn.runtime.path import choose_path, why_not_fast
 from hgn.schema import ConfigError, from_mapping, to_mapping
 from hgn.training.checkpoint import DataInfo, check_checkpoint, cursor_of_checkpoint, read_checkpoint
 from hgn.training.generator import Generator
@@ -85,11 +86,15 @@ def _fit(
     training = config.training
     data = DataInfo(store.manifest.config_hash, config.dataset.frame_rate_hz, config.scene.cell_size)
     _quieten_lightning()
-    torch.set_float32_matmul_precision(training.precision)
+    devices, nodes = layout(training)
+    path, text = _path(config, devices * nodes)
+    if first_rank():
+        print(text, file=sys.stderr)
+    torch.set_float32_matmul_precision("highest" if training.precision == "highest" else "high")
     seed_everything(training.seed, verbose=False)
-    module = TrainingModule(build_network(config.network), training, data)
+    module = TrainingModule(build_network(config.network), training, data, path)
     module.set_statistics(store.statistics())
-    feed = Feed(store, config.network, training)
+    feed = Feed(store, config.network, training, chunks=path == "fast")
     if checkpoint is not None:
         feed.cursor = checkpoint[1]
     _write_run_files(config, run)
@@ -99,7 +104,6 @@ def _fit(
     guard = GradientGuard(training.maximum_skipped_updates)
     lines = LogLines(run, monitor, guard, feed, _published_text(config, generator))
     final = FinalMetrics(to_mapping(config), monitor.last, stop)
-    devices, nodes = layout(training)
     trainer = Trainer(
         accelerator=training.accelerator,
         devices=devices,
@@ -121,6 +125,16 @@ def _fit(
         _report(config, run, trainer.global_step, monitor.last, stop)
     # a signal that came after the last update changed nothing
     return 0 if trainer.global_step >= training.maximum_updates else stop.exit_code
+
+
+def _path(config: TrainConfig, processes: int) -> tuple[str, str]:
+    """`plain` or `fast`, and a line that says so."""
+    training = config.training
+    on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
+    reason = why_not_fast(torch.device("cuda" if on_gpu else "cpu"), config.network)
+    if reason is None and processes > 1:
+        reason = f"it trains on one device, not {processes}"
+    return choose_path("training.path", training.path, training.precision, reason)
 
 
 def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Cursor]:

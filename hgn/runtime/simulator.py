@@ -16,6 +16,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import GridRangeError
+from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.runtime.gns_graph import GnsGraphs
 from hgn.scene.episode import Episode
@@ -82,9 +83,13 @@ class InitialState:
 class Simulator:
     """Runs a trained network on one or several scenes at once."""
 
-    def __init__(self, network: ParticleNetwork, frame_rate_hz: float) -> None:
+    def __init__(
+        self, network: ParticleNetwork, frame_rate_hz: float, path: str = "plain", precision: str = "high"
+    ) -> None:
+        """`path` is plain or fast, as hgn.runtime.path chooses it; `precision` is that of the fast path."""
         self.network = network
         self.frame_rate_hz = frame_rate_hz
+        self.path, self.precision = path, precision
         self.device = next(network.parameters()).device
         self.predict: Callable[[ParticleState], torch.Tensor] = network
         if isinstance(network, GraphNetworkSimulator) and self.device.type == "cuda":
@@ -141,6 +146,8 @@ class Simulator:
         """
         state = self.start(scenes)
         counts = [len(scene.position_N3) for scene in scenes]
+        if self.path == "fast":
+            return np.split(self._fast_rollout(state, frames, on_frame), np.cumsum(counts)[:-1], axis=1)
         positions = [state.position_N3.cpu().numpy()]
         for frame in range(1, frames):
             try:
@@ -153,13 +160,26 @@ class Simulator:
                 on_frame(frame)
         return np.split(np.stack(positions), np.cumsum(counts)[:-1], axis=1)
 
+    def _fast_rollout(self, state: ParticleState, frames: int, on_frame: Callable[[int], None] | None) -> np.ndarray:
+        # Triton, which the plain path does without, is loaded here.
+        from hgn.runtime.fast import FastRollout, LeftDomainError
+
+        assert isinstance(self.network, HierarchicalGraphNetwork)
+        first_1N3 = state.position_N3[None].cpu().numpy()
+        try:
+            later_TN3 = FastRollout(self.network, state, self.precision).run(frames - 1, on_frame)
+        except LeftDomainError as error:
+            raise DivergenceError(error.frame, _left(error.lost, len(state.position_N3))) from None
+        return np.concatenate([first_1N3, later_TN3])
+
     @staticmethod
     def _check(state: ParticleState, frame: int) -> None:
         domain_N3 = state.domain_S3[state.scene_N]
         inside = (state.position_N3 > -domain_N3) & (state.position_N3 < 2 * domain_N3)  # NaN is outside
         if not bool(inside.all()):
             left = int(inside.logical_not().any(-1).sum())
-            count = len(state.position_N3)
-            raise DivergenceError(
-                frame, f"{left} of {count} particles are not finite or farther from the domain than its own size"
-            )
+            raise DivergenceError(frame, _left(left, len(state.position_N3)))
+
+
+def _left(left: int, count: int) -> str:
+    return f"{left} of {count} particles are not finite or farther from the domain than its own size"

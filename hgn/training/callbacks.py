@@ -168,7 +168,8 @@ class Monitor(Callback):
     def _rollout(
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
-        simulator = Simulator(module.network, episodes[0].frame_rate_hz)
+        path = "plain" if module.automatic_optimization else "fast"
+        simulator = Simulator(module.network, episodes[0].frame_rate_hz, path, module.training_config.precision)
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
         try:
             predicted = simulator.rollout([InitialState.of_episode(episode) for episode in episodes], frames)
@@ -246,15 +247,18 @@ class Stopper(Callback):
 
     def __init__(self, stop: StopRequest, checkpoints: Checkpoints) -> None:
         self.stop, self.checkpoints = stop, checkpoints
+        self._agreed_update = 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._agreed_update = trainer.global_step
         # Lightning has just put a handler of its own before ours: on SIGTERM it talks to the other ranks from within
         # the handler, and leaves the loop by an exception, past the checkpoint.
         self.stop.listen()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        if trainer.world_size > 1 and trainer.global_step % self.AGREE_EVERY:
+        if trainer.world_size > 1 and trainer.global_step < self._agreed_update + self.AGREE_EVERY:
             return
+        self._agreed_update = trainer.global_step
         if trainer.strategy.reduce_boolean_decision(self.stop.requested, all=False):
             trainer.should_stop = True
             # A signal may have reached one rank alone; all end with its exit code.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import torch
 from lightning.pytorch import LightningDataModule, Trainer
@@ -13,12 +14,15 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch, make_batch
+from hgn.data.chunk import Chunk, whole_episode
 from hgn.data.order import Cursor, Sample, SampleOrder
 from hgn.data.reader import EpisodeStore
 from hgn.schema import ConfigError
 
+T = TypeVar("T")
 SHARED_FOLDER_PATIENCE_S = 300.0
 BATCHES_AHEAD = 2
+UPDATES_AT_ONCE = 64  # in a chunk, at most
 
 
 class Feed(LightningDataModule):
@@ -30,44 +34,75 @@ class Feed(LightningDataModule):
         network: NetworkConfig,
         training: TrainingConfig,
         batches_ahead: int = BATCHES_AHEAD,
+        chunks: bool = False,
     ) -> None:
+        """With `chunks` it hands out Chunk instead of Batch."""
         super().__init__()
         assert batches_ahead >= 0
         self.store = store
         self.network = network
         self.training = training
         self.batches_ahead = batches_ahead  # read while another is trained on; 0: read when asked for
+        self.hands_out_chunks = chunks
         self.cursor = Cursor()  # where to begin; set from the checkpoint on a resume
         self.waited_s = 0.0  # time that the training has waited for a batch
 
-    def train_dataloader(self) -> DataLoader[Batch]:
+    def train_dataloader(self) -> DataLoader[Batch | Chunk]:
         # The windows are memory-mapped and small: a worker process would cost more than it saves.
         return DataLoader(_Stream(self), batch_size=None, num_workers=0)
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        return batch.to(device, non_blocking=True)
+    def transfer_batch_to_device(
+        self, batch: Batch | Chunk, device: torch.device, dataloader_idx: int
+    ) -> Batch | Chunk:
+        return batch.to(device, non_blocking=True) if isinstance(batch, Batch) else batch
 
     def batches(self) -> Iterator[Batch]:
         """This rank's batches, without end."""
-        rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        order = SampleOrder(
-            self.training.seed, self.training.batch_scenes, self._published, self.cursor, rank, world_size
-        )
+        order = self._order()
 
         def read(samples: Sequence[Sample], cursor: Cursor) -> Batch:
             pairs = [(self.store.episodes[sample.episode], sample.frame) for sample in samples]
             return make_batch(pairs, self.network, [sample.seed for sample in samples], cursor)
 
+        yield from self._ahead(lambda: (order.next_batch(), order.cursor), read)
+
+    def chunks(self) -> Iterator[Chunk]:
+        """The same samples, those of many updates at once. A chunk ends wherever something is due between updates."""
+        order = self._order()
+        begun = update = self.trainer.global_step if self.trainer is not None else 0
+        known: set[int] = set()
+
+        def draw() -> tuple[list[tuple[Sample, ...]], Cursor]:
+            nonlocal update
+            count = chunk_length(self.training, begun, update)
+            update += count
+            return [tuple(order.next_batch()) for _ in range(count)], order.cursor
+
+        def read(samples: list[tuple[Sample, ...]], cursor: Cursor) -> Chunk:
+            new = sorted({sample.episode for batch in samples for sample in batch} - known)
+            known.update(new)
+            episodes = {index: whole_episode(self.store.episodes[index], self.network) for index in new}
+            return Chunk(tuple(samples), episodes, cursor)
+
+        yield from self._ahead(draw, read)
+
+    def _order(self) -> SampleOrder:
+        rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        return SampleOrder(
+            self.training.seed, self.training.batch_scenes, self._published, self.cursor, rank, world_size
+        )
+
+    def _ahead(self, draw: Callable[[], tuple[Any, Cursor]], read: Callable[[Any, Cursor], T]) -> Iterator[T]:
         # The order may have to ask other ranks, so it stays in this thread; reading runs ahead in another.
         with ThreadPoolExecutor(1) as executor:
-            waiting: deque[Future[Batch]] = deque()
+            waiting: deque[Future[T]] = deque()
             while True:
                 started = time.monotonic()
                 while len(waiting) <= self.batches_ahead:
-                    waiting.append(executor.submit(read, order.next_batch(), order.cursor))
-                batch = waiting.popleft().result()
+                    waiting.append(executor.submit(read, *draw()))
+                item = waiting.popleft().result()
                 self.waited_s += time.monotonic() - started
-                yield batch
+                yield item
 
     def _published(self, epoch: int) -> list[int]:
         """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""
@@ -75,6 +110,17 @@ class Feed(LightningDataModule):
         self.store.fetch_ahead()
         count = agreed_count(self.store, self.trainer) if self.trainer is not None else len(self.store)
         return [entry.frames for entry in self.store.entries[:count]]
+
+
+def chunk_length(training: TrainingConfig, begun: int, update: int) -> int:
+    """Updates of the chunk that begins at `update`, in a training that began at `begun`; the same on all ranks.
+
+    The first chunks are short: they bring the most episodes that are not in memory yet.
+    """
+    due = (training.log_every, training.checkpoint_every, training.monitor_every)
+    until_due = min([every - update % every for every in due])
+    until_end = max(training.maximum_updates - update, 1)
+    return min(until_due, until_end, UPDATES_AT_ONCE, max(1, update - begun))
 
 
 def agreed_count(store: EpisodeStore, trainer: Trainer) -> int:
@@ -98,9 +144,9 @@ def agreed_count(store: EpisodeStore, trainer: Trainer) -> int:
     return count
 
 
-class _Stream(IterableDataset[Batch]):
+class _Stream(IterableDataset[Batch | Chunk]):
     def __init__(self, feed: Feed) -> None:
         self.feed = feed
 
-    def __iter__(self) -> Iterator[Batch]:
-        return self.feed.batches()
+    def __iter__(self) -> Iterator[Batch | Chunk]:
+        return self.feed.chunks() if self.feed.hands_out_chunks else self.feed.batches()

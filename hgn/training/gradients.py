@@ -27,6 +27,12 @@ class GradientGuard(Callback):
         self.maximum_in_a_row = maximum_in_a_row
         self._skipped_before = 0
         self._counters: torch.Tensor | None = None
+        self._skip: torch.Tensor | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        counters = pl_module.gradient_counters
+        assert isinstance(counters, torch.Tensor)
+        self._counters = counters  # the fast path's kernels count there by themselves
 
     def state_dict(self) -> dict[str, Any]:
         return {"skipped": self.skipped}
@@ -51,6 +57,7 @@ class GradientGuard(Callback):
         if self._counters is None:
             # sum of finite norms, how many those are, skipped, skipped in a row, most in a row since the last look
             self._counters = torch.zeros(5, device=norm.device)
+        if self._skip is None:
             self._skip = torch.zeros((), device=norm.device)
         finite = norm.isfinite()
         self._skip.copy_(~finite)

@@ -12,19 +12,23 @@ from lightning.pytorch import LightningModule
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
+from hgn.data.chunk import Chunk
 from hgn.data.order import Cursor
 from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
+from hgn.network.network import HierarchicalGraphNetwork
 from hgn.schema import to_mapping
-from hgn.training.checkpoint import SECTION, DataInfo, cursor_of_checkpoint
+from hgn.training.checkpoint import SECTION, DataInfo, cursor_of_checkpoint, updates_of_checkpoint
 from hgn.training.noise import jittered_origin, perturbed_window
 
 
 class TrainingModule(LightningModule):
     """Trains a network on one-step accelerations (paper sec. 3.3)."""
 
-    def __init__(self, network: ParticleNetwork, training: TrainingConfig, data: DataInfo) -> None:
+    def __init__(self, network: ParticleNetwork, training: TrainingConfig, data: DataInfo, path: str = "plain") -> None:
+        """`path` is plain or fast, as hgn.runtime.path chooses it: a training step is an update, or a chunk of them."""
         super().__init__()
+        self.automatic_optimization = path == "plain"
         self.network = network
         self.training_config = training
         self.data = data
@@ -32,6 +36,10 @@ class TrainingModule(LightningModule):
         # Sum of finite losses and their number since the last log line, kept on the device: no synchronisation.
         self.loss_sum: torch.Tensor
         self.register_buffer("loss_sum", torch.zeros(2), persistent=False)
+        # what GradientGuard counts, see there
+        self.gradient_counters: torch.Tensor
+        self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
+        self._fast: Any = None
 
     def set_statistics(self, statistics: Statistics) -> None:
         """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
@@ -50,7 +58,27 @@ class TrainingModule(LightningModule):
         predicted_N3 = self.network.normalised_acceleration(batch.state(window_WN3), origin_S3)
         return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
 
-    def training_step(self, batch: Batch, batch_index: int) -> torch.Tensor:
+    def on_train_start(self) -> None:
+        if not self.automatic_optimization:
+            # Triton, which the plain path does without, is loaded here.
+            from hgn.training.fast import FastTraining
+
+            assert isinstance(self.network, HierarchicalGraphNetwork)
+            optimizer = self.optimizers(use_pl_optimizer=False)
+            assert isinstance(optimizer, torch.optim.Adam)
+            self._fast = FastTraining(
+                self.network,
+                optimizer,
+                self.training_config,
+                self.data.obstacle_cell_size,
+                self.loss_sum,
+                self.gradient_counters,
+            )
+
+    def training_step(self, batch: Batch | Chunk, batch_index: int) -> torch.Tensor | None:
+        if isinstance(batch, Chunk):
+            self._train_chunk(batch)
+            return None
         loss = self.loss(batch)
         known = loss.detach()
         self.loss_sum += torch.where(known.isfinite(), torch.stack([known, torch.ones_like(known)]), 0)
@@ -58,11 +86,36 @@ class TrainingModule(LightningModule):
         self.cursor = batch.cursor
         return loss
 
+    def _train_chunk(self, chunk: Chunk) -> None:
+        first, count = self.global_step, len(chunk.samples)
+        self._fast.run(chunk, [self._rate(first + k) for k in range(count)])
+        self.cursor = chunk.cursor
+        # what an optimiser's and a scheduler's step leave behind, `count` times
+        progress = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
+        for tracker in (progress.total, progress.current):
+            tracker.ready += count
+            tracker.completed += count
+        scheduler = self.lr_schedulers()
+        assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
+        rate = self._rate(first + count)
+        scheduler.last_epoch, scheduler._step_count = first + count, first + count + 1
+        scheduler._last_lr = [rate]
+        scheduler.optimizer.param_groups[0]["lr"] = rate
+
+    def _rate(self, update: int) -> float:
+        """The learning rate of update number `update`, from 0."""
+        return self.training_config.learning_rate * self._decay**update
+
+    @property
+    def _decay(self) -> float:
+        config = self.training_config
+        return (config.final_learning_rate / config.learning_rate) ** (1 / config.maximum_updates)
+
     def configure_optimizers(self) -> Any:
         config = self.training_config
         # One launch instead of several for each group of tensors; and only the fused kind can skip a step by itself.
         optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=True)
-        decay = (config.final_learning_rate / config.learning_rate) ** (1 / config.maximum_updates)
+        decay = self._decay
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda update: decay**update)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
@@ -77,3 +130,8 @@ class TrainingModule(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.cursor = cursor_of_checkpoint(checkpoint)
+        # Lightning counts updates in one of two places, by the path that made them.
+        updates = {"ready": updates_of_checkpoint(checkpoint), "completed": updates_of_checkpoint(checkpoint)}
+        loops = checkpoint["loops"]["fit_loop"]
+        loops["epoch_loop.automatic_optimization.optim_progress"]["optimizer"]["step"]["total"] = dict(updates)
+        loops["epoch_loop.manual_optimization.optim_step_progress"]["total"] = dict(updates)

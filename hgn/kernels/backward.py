@@ -1,0 +1,461 @@
+"""The engine with its backward pass: the forward pass's list of launches from behind, then all weights at once.
+
+Shape legend: N particles, C cells, W width.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.kernels.engine import OUT, Block, Engine, Tuning
+from hgn.kernels.grid.op import DeviceGrid
+from hgn.kernels.message.kernel import message_backward
+from hgn.kernels.packing import PackedFCN, PackedNetwork
+from hgn.kernels.pairs.kernel import pairs_backward
+from hgn.kernels.rows.kernel import gather_project_backward, rows_backward
+from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
+
+CHUNK_ROWS = 512
+
+
+class TrainingEngine(Engine):
+    """An engine whose `backward` leaves the gradients in `totals`, float32, laid out as `values`."""
+
+    def __init__(
+        self,
+        config: NetworkConfig,
+        packed: PackedNetwork,
+        values: torch.Tensor,
+        grid: DeviceGrid,
+        particle_count: torch.Tensor,
+        precision: str,
+        loss_scale: float = 1.0,
+        tuning: Tuning | None = None,
+        tail: int = 0,
+    ) -> None:
+        """`output_gradient` comes multiplied by `loss_scale`, which float16 gradients need; `totals` are without it.
+
+        Behind the gradients `totals` has the encoder's combined first layer, and `tail` elements for other use.
+        """
+        super().__init__(config, packed, values, grid, particle_count, precision, True, tuning)
+        self.unscale = 1.0 / loss_scale
+        self._allocate_gradients(tail)
+
+    def _allocate_gradients(self, tail: int) -> None:
+        width, grid, steps = self.width, self.grid, self.config.message_passing_steps
+        particles, capacities = grid.particles, grid.capacities
+        self.totals = self._float(self.packed.size + width * grid.features + tail)
+        self.output_gradient = self._float(particles, OUT)
+        self.latent_gradient = self._float(particles, width)
+        self.product_gradient = self._float(capacities[0], width)  # of what the pairs read of the cells
+        self.cell_gradient_up = [self._float(c, width) for c in capacities]
+        self.cell_gradient_down = [self._float(c, width) for c in capacities]
+        self.edge_gradient = self._float(capacities[0], 6, width)
+        # what the weight products read: the gradients in one arena, so that one launch can reach them all
+        shapes: dict[str, tuple[int, ...]] = {
+            "encode_h": (particles, width),
+            "encode_z": (particles, width),
+            "decode_h": (particles, width),
+            "decode_z": (particles, OUT),
+            "down_z": (8 * particles, width),
+            "up_z": (8 * particles, width),
+            "down_p": (particles, width),
+            "up_p": (particles, width),
+        }
+        for block, name in self._named_blocks():
+            capacity = capacities[block.level]
+            for m in range(steps):
+                shapes |= {f"{name}{m}_eh": (capacity, 6, width), f"{name}{m}_ez": (capacity, 6, width)}
+                shapes |= {f"{name}{m}_{key}": (capacity, width) for key in ("ch", "cz", "s", "r")}
+        for i in range(self.config.levels):
+            shapes |= {f"product{i}": (capacities[i], width)}
+        for i in range(self.config.levels - 1):
+            shapes |= {f"{key}{i}": (capacities[i], width) for key in ("fc_h", "fc_z", "cf_h", "cf_z")}
+        self.left = self._operand(sum(torch.Size(shape).numel() for shape in shapes.values()))
+        views = self.left.split([torch.Size(shape).numel() for shape in shapes.values()])
+        self.g = {name: view.view(shape) for (name, shape), view in zip(shapes.items(), views, strict=True)}
+        self.pair_hidden_down = self._operand(8 * particles, width)
+        self.pair_hidden_up = self._operand(8 * particles, width)
+        self._plan_weight_gradients()
+
+    def _named_blocks(self) -> list[tuple[Block, str]]:
+        return [(b, f"down{b.level}_") for b in self.down] + [(b, f"up{b.level}_") for b in self.up]
+
+    def _plan_weight_gradients(self) -> None:
+        packed, grid, steps = self.packed, self.grid, self.config.message_passing_steps
+        particles = grid.levels  # row of the counts table
+        self.counts = torch.zeros(grid.levels + 1, dtype=torch.int32, device=self.device)
+        jobs: list[tuple[torch.Tensor, torch.Tensor, int, int, int, int]] = []
+
+        def job(
+            left: torch.Tensor, right: torch.Tensor, at: int, count: int, bias: int = -1, multiple: int = 1
+        ) -> None:
+            jobs.append((left, right, at, count, bias, multiple))
+
+        g = self.g
+        pair, back = packed.particle_to_cell, packed.cell_to_particle
+        job(g["encode_h"], grid.feature_NF, packed.size, particles)
+        job(g["encode_z"], self.encode_hidden, packed.encode.second, particles, packed.encode.second_bias)
+        job(g["decode_h"], self.decoder_input, packed.decode.parts[0], particles, packed.decode.first_bias)
+        job(g["decode_z"], self.decode_hidden, packed.decode.second, particles, packed.decode.second_bias)
+        job(g["down_p"], self.latent, pair.parts[0], particles, pair.first_bias)
+        job(g["down_z"], self.pair_hidden_down, pair.second, particles, pair.second_bias, 8)
+        job(g["up_p"], self.latent, back.parts[1], particles, back.first_bias)
+        job(g["up_z"], self.pair_hidden_up, back.second, particles, back.second_bias, 8)
+        for block, name in self._named_blocks():
+            for m in range(steps):
+                edge, cell = block.packed.edge[m], block.packed.cell[m]
+                job(g[f"{name}{m}_ez"], block.edge_hidden[m], edge.second, block.level, edge.second_bias)
+                if m > 0:
+                    job(g[f"{name}{m}_eh"], block.edge[m - 1], edge.parts[2], block.level)
+                job(g[f"{name}{m}_s"], block.cell[m], edge.parts[0], block.level)
+                job(g[f"{name}{m}_r"], block.cell[m], edge.parts[1], block.level, edge.first_bias)
+                job(g[f"{name}{m}_ch"], block.cell[m], cell.parts[0], block.level, cell.first_bias)
+                job(g[f"{name}{m}_ch"], block.sum[m], cell.parts[1], block.level)
+                job(g[f"{name}{m}_cz"], block.cell_hidden[m], cell.second, block.level, cell.second_bias)
+        for i in range(grid.levels):
+            block = self.down[i] if i == grid.levels - 1 else self.up[i]
+            job(g[f"product{i}"], block.cell[-1], block.next_at, i)
+        for i in range(grid.levels - 1):
+            down, up = packed.fine_to_coarse[i], packed.coarse_to_fine[i]
+            job(g[f"fc_h{i}"], self.down[i].cell[-1], down.parts[0], i, down.first_bias)
+            job(g[f"fc_z{i}"], self.transfer_hidden_down[i], down.second, i, down.second_bias)
+            job(g[f"cf_h{i}"], self.down[i].cell[-1], up.parts[1], i, up.first_bias)
+            job(g[f"cf_z{i}"], self.transfer_hidden_up[i], up.second, i, up.second_bias)
+        self._weight_jobs = []
+        for dtype in dict.fromkeys((torch.float32, self.operand)):
+            mine = [entry for entry in jobs if entry[1].dtype == dtype]
+            # offsets from the lowest address: allocations are aligned far beyond an element
+            base = min((right for _, right, *_ in mine), key=lambda tensor: tensor.data_ptr())
+            rows: list[list[int]] = []
+            chunk_job: list[int] = []
+            chunk_first: list[int] = []
+            for left, right, at, count, bias, multiple in mine:
+                rows_held = left.numel() // left.shape[-1]
+                multiple = 6 if left.dim() == 3 else multiple
+                left_at = (left.data_ptr() - self.left.data_ptr()) // left.element_size()
+                right_at = (right.data_ptr() - base.data_ptr()) // right.element_size()
+                row = [left_at, right_at, at, count, left.shape[-1], right.shape[-1], multiple, bias]
+                assert len(row) == JOB_COLUMNS and left_at % 16 == 0 and right_at % 16 == 0
+                starts = range(0, rows_held, CHUNK_ROWS)
+                chunk_job += [len(rows)] * len(starts)
+                chunk_first += list(starts)
+                rows.append(row)
+            tables = [(rows, torch.int64), (chunk_job, torch.int32), (chunk_first, torch.int32)]
+            on_device = [torch.tensor(table, dtype=kind, device=self.device) for table, kind in tables]
+            self._weight_jobs.append((base, *on_device))
+
+    def backward(self) -> None:
+        """From `output_gradient` [N, OUT] (times the loss scale) to `totals`."""
+        packed, grid, g, levels = self.packed, self.grid, self.g, self.config.levels
+        self.totals.zero_()
+        self.product_gradient.zero_()
+        self.counts[: grid.levels].copy_(grid.counts_L)
+        self.counts[grid.levels :].copy_(self.particle_count)
+        self._rows_backward(
+            packed.decode,
+            self.output_gradient,
+            self.particle_count,
+            self.decode_hidden,
+            g["decode_h"],
+            g["decode_z"],
+            into=(self.latent_gradient, 1),
+            norm=False,
+        )
+        top = self.up[0] if levels > 1 else self.down[0]
+        assert top.product is not None
+        self._pairs_backward(
+            packed.cell_to_particle,
+            self.latent_gradient,
+            self.by_particle_up,
+            top.product,
+            self.pair_hidden_up,
+            g["up_z"],
+            g["up_p"],
+            self.product_gradient,
+            False,
+        )
+        self._gather_backward(
+            0, self.product_gradient, grid.children(0), 0, top.next_at, g["product0"], self._gradient_of(top), False
+        )
+        for i in range(levels - 1):
+            block, fcn = self.up[i], packed.coarse_to_fine[i]
+            self._passing_backward(block, f"up{i}_")
+            self._rows_backward(
+                fcn,
+                self.cell_gradient_up[i],
+                grid.count(i),
+                self.transfer_hidden_up[i],
+                g[f"cf_h{i}"],
+                g[f"cf_z{i}"],
+                first_at=fcn.parts[1],
+                offset=(fcn.parts[2], -1),
+                octant=grid.octant(i),
+                into=(self.cell_gradient_down[i], 1),
+                residual=True,
+            )
+            coarse = self.up[i + 1] if i + 1 < levels - 1 else self.down[-1]
+            self._gather_backward(
+                i + 1,
+                g[f"cf_h{i}"],
+                grid.children(i + 1),
+                8,
+                coarse.next_at,
+                g[f"product{i + 1}"],
+                self._gradient_of(coarse),
+                False,
+            )
+        for i in reversed(range(levels)):
+            if i < levels - 1:
+                fcn = packed.fine_to_coarse[i]
+                self._rows_backward(
+                    fcn,
+                    self.cell_gradient_down[i + 1],
+                    grid.count(i),
+                    self.transfer_hidden_down[i],
+                    g[f"fc_h{i}"],
+                    g[f"fc_z{i}"],
+                    gradient_index=grid.parent(i),
+                    offset=(fcn.parts[1], 1),
+                    octant=grid.octant(i),
+                    into=(self.cell_gradient_down[i], 2),
+                )
+            self._passing_backward(self.down[i], f"down{i}_")
+        self._pairs_backward(
+            packed.particle_to_cell,
+            self.cell_gradient_down[0],
+            self.by_particle_down,
+            self.by_particle_down,
+            self.pair_hidden_down,
+            g["down_z"],
+            g["down_p"],
+            self.product_gradient,
+            True,
+        )
+        self._rows_backward(
+            packed.encode,
+            self.latent_gradient,
+            self.particle_count,
+            self.encode_hidden,
+            g["encode_h"],
+            g["encode_z"],
+            following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
+            products=(g["down_p"], g["up_p"]),
+        )
+        for base, jobs, chunk_job, chunk_first in self._weight_jobs:
+            weight_gradient[(len(chunk_job),)](
+                self.left,
+                base,
+                self.totals,
+                jobs,
+                chunk_job,
+                chunk_first,
+                self.counts,
+                self.unscale,
+                TILE=max(self.width, grid.features, OUT),
+                CHUNK=CHUNK_ROWS,
+                STEP=32 if self.precision != "half" else 64,
+                PRECISION=self.precision,
+                num_warps=8,
+            )
+        self._encode_gradients()
+
+    def _gradient_of(self, block: Block) -> torch.Tensor:
+        """Where the gradient of a block's output is collected, and left as that of its input."""
+        down = any(block is other for other in self.down)
+        return (self.cell_gradient_down if down else self.cell_gradient_up)[block.level]
+
+    def _encode_gradients(self) -> None:
+        """Takes the gradient of the encoder's combined first layer apart: features, embedding, bias."""
+        config = self.config
+        used, materials = config.feature_width - config.material_embedding, len(config.materials)
+        size = self.width * self.grid.features
+        combined = self.totals[self.packed.size : self.packed.size + size].view(self.width, self.grid.features)
+        table = combined[:, used : used + materials]
+        first, embedding, bias = self._encode_views(self.totals)
+        value, rows, _ = self._encode_views(self.values)
+        first[:, :used].copy_(combined[:, :used])
+        first[:, used:].copy_(table @ rows)
+        embedding.copy_(table.T @ value[:, used:])
+        bias.copy_(table.sum(1))
+
+    def _rows_backward(
+        self,
+        fcn: PackedFCN,
+        gradient: torch.Tensor,
+        count: torch.Tensor,
+        hidden: torch.Tensor,
+        hidden_gradient: torch.Tensor,
+        second_gradient: torch.Tensor,
+        first_at: int | None = None,
+        gradient_index: torch.Tensor | None = None,
+        offset: tuple[int, int] = (0, 0),
+        octant: torch.Tensor | None = None,
+        into: tuple[torch.Tensor | None, int] = (None, 0),
+        norm: bool = True,
+        residual: bool = False,
+        following: tuple[int, ...] = (),
+        products: tuple[torch.Tensor, ...] = (),
+    ) -> None:
+        block, warps = self._row_block(len(hidden))
+        at, given = (*following, 0, 0), (*products, hidden, hidden)
+        rows_backward[self._blocks(len(hidden), block)](
+            gradient,
+            gradient_index if gradient_index is not None else count,
+            given[0],
+            given[1],
+            into[0] if into[0] is not None else gradient,
+            count,
+            self.weights,
+            self.values,
+            self.totals,
+            fcn.parts[0] if first_at is None else first_at,
+            offset[0],
+            fcn.second,
+            fcn.second_bias,
+            fcn.gain,
+            fcn.shift,
+            octant if octant is not None else count,
+            at[0],
+            at[1],
+            hidden,
+            hidden_gradient,
+            second_gradient,
+            self.unscale,
+            WIDTH=self.width,
+            OUT=fcn.out,
+            GATHER=gradient_index is not None,
+            OFFSET=offset[1],
+            NORM=norm,
+            RESIDUAL=residual,
+            NEXT=len(following),
+            INTO=into[1],
+            BLOCK=block,
+            PRECISION=self.precision,
+            num_warps=warps,
+        )
+
+    def _pairs_backward(
+        self,
+        fcn: PackedFCN,
+        gradient: torch.Tensor,
+        by_particle: torch.Tensor,
+        by_cell: torch.Tensor,
+        hidden: torch.Tensor,
+        second_gradient: torch.Tensor,
+        by_particle_gradient: torch.Tensor,
+        by_cell_gradient: torch.Tensor,
+        to_cell: bool,
+    ) -> None:
+        grid = self.grid
+        pairs_backward[self._blocks(grid.particles, self.tuning.pair_particles)](
+            gradient,
+            by_particle,
+            by_cell,
+            grid.cell_N8,
+            grid.weight_N8,
+            grid.fraction_N3,
+            self.particle_count,
+            self.weights,
+            self.values,
+            self.totals,
+            fcn.parts[-1],
+            fcn.first_bias,
+            fcn.second,
+            fcn.second_bias,
+            fcn.gain,
+            fcn.shift,
+            hidden,
+            second_gradient,
+            by_particle_gradient,
+            by_cell_gradient,
+            self.unscale,
+            TO_CELL=to_cell,
+            WIDTH=self.width,
+            PARTICLES=self.tuning.pair_particles,
+            PRECISION=self.precision,
+            num_warps=self.tuning.pair_warps,
+        )
+
+    def _gather_backward(
+        self,
+        level: int,
+        x: torch.Tensor,
+        table: torch.Tensor,
+        summands: int,
+        at: int,
+        summed: torch.Tensor,
+        gradient: torch.Tensor,
+        add: bool,
+        reverse: bool = False,
+    ) -> None:
+        rows = self.grid.capacities[level]
+        size, warps = self._row_block(rows)
+        gather_project_backward[self._blocks(rows, size)](
+            x,
+            table,
+            self.grid.count(level),
+            self.weights,
+            at,
+            summed,
+            gradient,
+            rows,
+            SUM=summands,
+            REVERSE=reverse,
+            ADD=add,
+            WIDTH=self.width,
+            BLOCK=size,
+            PRECISION=self.precision,
+            num_warps=warps,
+        )
+
+    def _passing_backward(self, block: Block, name: str) -> None:
+        grid, level, steps, g = self.grid, block.level, self.config.message_passing_steps, self.g
+        rows = grid.capacities[level]
+        gradient = self._gradient_of(block)
+        edge_gradient = self.edge_gradient[:rows]
+        size, warps = self._cell_block(True)
+        for m in reversed(range(steps)):
+            edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
+            message_backward[self._blocks(rows, size)](
+                gradient,
+                g[f"{name}{m if last else m + 1}_eh"],
+                g[f"{name}{m if last else m + 1}_s"],
+                edge_gradient,
+                grid.neighbour(level),
+                grid.count(level),
+                self.weights,
+                self.values,
+                self.totals,
+                0 if last else block.packed.edge[m + 1].parts[0],
+                edge.parts[1],
+                edge.parts[2],
+                edge.second,
+                edge.second_bias,
+                edge.gain,
+                edge.shift,
+                cell.parts[0],
+                cell.parts[1],
+                cell.second,
+                cell.second_bias,
+                cell.gain,
+                cell.shift,
+                block.edge_hidden[m],
+                block.cell_hidden[m],
+                g[f"{name}{m}_eh"],
+                g[f"{name}{m}_ez"],
+                g[f"{name}{m}_ch"],
+                g[f"{name}{m}_cz"],
+                g[f"{name}{m}_r"],
+                rows,
+                self.unscale,
+                FIRST=m == 0,
+                LAST=last,
+                WIDTH=self.width,
+                BLOCK=size,
+                PRECISION=self.precision,
+                num_warps=warps,
+            )
+        table, first = grid.neighbour(level), block.packed.edge[0].parts[0]
+        self._gather_backward(level, g[f"{name}0_eh"], table, 6, first, g[f"{name}0_s"], gradient, True, True)

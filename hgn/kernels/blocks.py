@@ -1,0 +1,68 @@
+"""What the kernels share: matrix products at a chosen precision, layer normalisation and its gradient.
+
+Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range, "half" to 10 bits
+with float16's range, "tf32x3" makes float32 of three TF32 products (Triton's plain float32 product takes minutes to
+compile at this size), and "ieee" is what it is in the interpreter. Sums are float32 always.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+LEAKY = tl.constexpr(0.01)  # hgn.network.fcn.LEAKY_SLOPE
+EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
+
+
+@triton.jit
+def product(x, w, PRECISION: tl.constexpr):
+    """x [R, K] @ w [K, N] in float32 accumulation."""
+    if PRECISION == "half":
+        result = tl.dot(x.to(tl.float16), w.to(tl.float16))
+    else:
+        result = tl.dot(x.to(tl.float32), w.to(tl.float32), input_precision=PRECISION)
+    return result
+
+
+@triton.jit
+def matrix(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """The row-major matrix [ROWS, COLUMNS] at `pointer`."""
+    row = tl.arange(0, ROWS)
+    column = tl.arange(0, COLUMNS)
+    return tl.load(pointer + row[:, None] * COLUMNS + column[None, :])
+
+
+@triton.jit
+def transposed(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """The transpose [COLUMNS, ROWS] of the row-major matrix [ROWS, COLUMNS] at `pointer`."""
+    row = tl.arange(0, ROWS)
+    column = tl.arange(0, COLUMNS)
+    return tl.load(pointer + row[None, :] * COLUMNS + column[:, None])
+
+
+@triton.jit
+def leaky(h):
+    return tl.where(h > 0, h, LEAKY * h)
+
+
+@triton.jit
+def leaky_backward(gradient, a):
+    """The gradient before the activation; `a` is its output, which has the sign of its input."""
+    return tl.where(a > 0, gradient, LEAKY * gradient)
+
+
+@triton.jit
+def normalise(z, WIDTH: tl.constexpr):
+    """Rows of zero mean and unit variance, and one over the standard deviation."""
+    centred = z - (tl.sum(z, 1) / WIDTH)[:, None]
+    scale = 1.0 / tl.sqrt(tl.sum(centred * centred, 1) / WIDTH + EPSILON)
+    return centred * scale[:, None], scale
+
+
+@triton.jit
+def normalise_backward(gradient, normalised, scale, gamma, WIDTH: tl.constexpr):
+    """The gradient before the normalisation, from the gradient after its gain `gamma` [W]."""
+    inner = gradient * gamma[None, :]
+    mean = tl.sum(inner, 1) / WIDTH
+    slope = tl.sum(inner * normalised, 1) / WIDTH
+    return (inner - mean[:, None] - normalised * slope[:, None]) * scale[:, None]

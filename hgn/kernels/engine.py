@@ -1,0 +1,410 @@
+"""The network on fixed-capacity buffers: its forward pass as a fixed list of launches, fit for one CUDA graph.
+
+Nothing here reads a value back to the host. What each launch computes is in its kernel's file; the order is the
+paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+import triton
+
+from hgn.config import NetworkConfig
+from hgn.kernels.grid.op import DeviceGrid
+from hgn.kernels.message.kernel import message_forward
+from hgn.kernels.packing import PackedFCN, PackedMessagePassing, PackedNetwork
+from hgn.kernels.pairs.kernel import pairs_forward
+from hgn.kernels.rows.kernel import gather_project, rows_forward
+
+PRECISIONS = ("ieee", "tf32x3", "tf32", "half")
+OUT = 16  # the decoder's three outputs, padded
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Rows and warps of a program. They change how fast, never what."""
+
+    cell_block: int  # cells of a message step, eight rows each
+    cell_warps: int
+    cell_backward_block: int
+    cell_backward_warps: int
+    row_block: int
+    row_warps: int
+    pair_particles: int  # eight rows each
+    pair_warps: int
+    small_block: int = 16  # where there are few rows
+    small_warps: int = 4
+
+    @staticmethod
+    def of(precision: str, cells: int, particles: int) -> Tuning:
+        """What was fastest on an H100 for a finest level of `cells` cells."""
+        if precision in ("ieee", "tf32x3"):
+            return Tuning(16, 4, 16, 4, 16, 4, 2 if precision == "ieee" else 4, 4)
+        return Tuning(16, 8, 16, 8, 64 if particles > 20_000 else 32, 4, 8, 4)
+
+
+@dataclass
+class Block:
+    """One message-passing block: its level, weights, and buffers (lists over iterations)."""
+
+    level: int
+    packed: PackedMessagePassing
+    cell: list[torch.Tensor] = field(default_factory=list)  # M + 1 of [C, W]
+    edge: list[torch.Tensor] = field(default_factory=list)  # M - 1 of [C, 6, W]
+    edge_hidden: list[torch.Tensor] = field(default_factory=list)
+    sum: list[torch.Tensor] = field(default_factory=list)
+    cell_hidden: list[torch.Tensor] = field(default_factory=list)
+    send: list[torch.Tensor] = field(default_factory=list)
+    receive: list[torch.Tensor] = field(default_factory=list)
+    product: torch.Tensor | None = None  # of the block's output, for the step that follows
+    next_at: int = 0  # weights of that product
+
+
+def feature_columns(config: NetworkConfig) -> int:
+    """Columns of the encoder's input: features, one-hot material, padding to a power of two that matrix units take."""
+    used = config.feature_width - config.material_embedding + len(config.materials)
+    return max(16, triton.next_power_of_2(used))
+
+
+class Engine:
+    """Runs a packed network on a DeviceGrid.
+
+    `values` float32 [packed.size] are the parameters. In half precision the kernels read `weights`, their float16
+    copy; call `refresh` after every change of `values`. With `training` everything that a backward pass reads is kept.
+    """
+
+    def __init__(
+        self,
+        config: NetworkConfig,
+        packed: PackedNetwork,
+        values: torch.Tensor,
+        grid: DeviceGrid,
+        particle_count: torch.Tensor,
+        precision: str,
+        training: bool = False,
+        tuning: Tuning | None = None,
+    ) -> None:
+        assert precision in PRECISIONS
+        # elements are addressed in int32: 2 million particles, 2.7 million cells at width 128
+        assert max(8 * grid.particles, 6 * grid.capacities[0]) * config.width < 2**31, "too large for one launch"
+        self.config, self.packed, self.grid, self.precision = config, packed, grid, precision
+        self.values, self.training, self.width = values, training, config.width
+        self.particle_count = particle_count
+        self.operand = torch.float16 if precision == "half" else torch.float32
+        self.device = values.device
+        self.weights = values.to(self.operand) if precision == "half" else values
+        self.encode_weights = torch.zeros(self.width, grid.features, dtype=self.operand, device=self.device)
+        self.tuning = tuning or Tuning.of(precision, grid.capacities[0], grid.particles)
+        self._allocate()
+        self.refresh()
+
+    # buffers
+
+    def _operand(self, *shape: int) -> torch.Tensor:
+        return torch.zeros(shape, dtype=self.operand, device=self.device)
+
+    def _float(self, *shape: int) -> torch.Tensor:
+        return torch.zeros(shape, device=self.device)
+
+    def _allocate(self) -> None:
+        width, config, grid, packed = self.width, self.config, self.grid, self.packed
+        particles, levels, steps = grid.particles, config.levels, config.message_passing_steps
+        capacities = grid.capacities
+        self.latent = self._float(particles, width)
+        self.by_particle_down, self.by_particle_up = self._operand(particles, width), self._operand(particles, width)
+        self.decoder_input = self._float(particles, width)
+        self.output = self._float(particles, OUT)
+        self.encode_hidden = self._operand(particles, width)
+        self.decode_hidden = self._operand(particles, width)
+        self.message = [self._operand(capacities[i], width) for i in range(levels - 1)]  # to the parents
+        self.transfer_hidden_down = [self._operand(capacities[i], width) for i in range(levels - 1)]
+        self.transfer_hidden_up = [self._operand(capacities[i], width) for i in range(levels - 1)]
+        shared_edge = None if self.training else self._float(capacities[0], 6, width)
+        self.down = [Block(i, packed.passing_down[i]) for i in range(levels)]
+        self.up = [Block(i, packed.passing_up[i]) for i in range(levels - 1)]
+        for block in (*self.down, *self.up):
+            capacity = capacities[block.level]
+            block.send = [self._operand(capacity, width) for _ in range(2)]
+            block.receive = [self._operand(capacity, width) for _ in range(2)]
+            if self.training:
+                block.cell = [self._float(capacity, width) for _ in range(steps + 1)]
+                block.edge = [self._float(capacity, 6, width) for _ in range(steps - 1)]
+                block.edge_hidden = [self._operand(capacity, 6, width) for _ in range(steps)]
+                block.sum = [self._float(capacity, width) for _ in range(steps)]
+                block.cell_hidden = [self._operand(capacity, width) for _ in range(steps)]
+            else:
+                assert shared_edge is not None
+                first, second = self._float(capacity, width), self._float(capacity, width)
+                block.cell = [(first, second)[m % 2] for m in range(steps + 1)]
+                block.edge = [shared_edge.flatten(0, 1)[: 6 * capacity].view(capacity, 6, width)] * max(steps - 1, 0)
+                block.edge_hidden = [block.send[0]] * steps
+                block.sum = [block.cell[0]] * steps
+                block.cell_hidden = [block.send[0]] * steps
+        for i in range(levels):
+            block = self.down[i] if i == levels - 1 else self.up[i]
+            block.product = self._operand(capacities[i], width)
+            block.next_at = packed.cell_to_particle.parts[0] if i == 0 else packed.coarse_to_fine[i - 1].parts[0]
+
+    # parameters
+
+    def refresh(self) -> None:
+        """Copies what the kernels read in another form: all weights in float16, and the encoder's first layer."""
+        if self.precision == "half":
+            self.weights.copy_(self.values)
+        self.refresh_encoder()
+
+    def refresh_encoder(self) -> None:
+        """The encoder's first layer on features and one-hot materials: embedding and bias are multiplied out."""
+        first, embedding, bias = self._encode_views(self.values)
+        used = self.config.feature_width - self.config.material_embedding
+        materials = len(self.config.materials)
+        self.encode_weights[:, :used].copy_(first[:, :used])
+        table = torch.addmm(bias[:, None], first[:, used:], embedding.T)
+        self.encode_weights[:, used : used + materials].copy_(table)
+
+    def _encode_views(self, flat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        config, packed, width = self.config, self.packed, self.width
+        at, columns = packed.encode.parts[0], config.feature_width
+        first = flat[at : at + width * columns].view(width, columns)
+        rows, embedding = len(config.materials), config.material_embedding
+        table = flat[packed.embedding : packed.embedding + rows * embedding].view(rows, embedding)
+        return first, table, flat[packed.encode.first_bias : packed.encode.first_bias + width]
+
+    # forward
+
+    def forward(self) -> None:
+        """From the grid's features and tables to `output` [N, OUT]: normalised accelerations in columns 0 to 2."""
+        packed, grid, levels = self.packed, self.grid, self.config.levels
+        self._rows(
+            packed.encode,
+            grid.feature_NF,
+            self.particle_count,
+            self.latent,
+            self.encode_hidden,
+            first=(self.encode_weights, 0),
+            bias=False,
+            following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
+            products=(self.by_particle_down, self.by_particle_up),
+        )
+        self.down[0].cell[0].zero_()
+        self._pairs(packed.particle_to_cell, self.by_particle_down, self.by_particle_down, self.down[0].cell[0], True)
+        for i, block in enumerate(self.down):
+            self._begin(block, i > 0)
+            self._passing(block)
+            if i < levels - 1:
+                self._rows(
+                    packed.fine_to_coarse[i],
+                    block.cell[-1],
+                    grid.count(i),
+                    self.message[i],
+                    self.transfer_hidden_down[i],
+                    offset=(packed.fine_to_coarse[i].parts[1], 1),
+                    octant=grid.octant(i),
+                )
+        coarse = self.down[-1]
+        for i in reversed(range(levels - 1)):
+            block = self.up[i]
+            edge = block.packed.edge[0]
+            assert coarse.product is not None
+            self._rows(
+                packed.coarse_to_fine[i],
+                self.down[i].cell[-1],
+                grid.count(i),
+                block.cell[0],
+                self.transfer_hidden_up[i],
+                first=(self.weights, packed.coarse_to_fine[i].parts[1]),
+                gathered=coarse.product,
+                index=grid.parent(i),
+                offset=(packed.coarse_to_fine[i].parts[2], -1),
+                octant=grid.octant(i),
+                residual=True,
+                following=(edge.parts[0], edge.parts[1]),
+                products=(block.send[0], block.receive[0]),
+            )
+            self._passing(block)
+            coarse = block
+        assert coarse.product is not None
+        self._pairs(packed.cell_to_particle, self.by_particle_up, coarse.product, self.decoder_input, False)
+        self._rows(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
+
+    def _blocks(self, rows: int, block: int) -> tuple[int]:
+        return (triton.cdiv(rows, block),)
+
+    def _row_block(self, rows: int) -> tuple[int, int]:
+        """Rows and warps of a program over so many rows."""
+        tuning = self.tuning
+        return (tuning.small_block, tuning.small_warps) if rows < 4096 else (tuning.row_block, tuning.row_warps)
+
+    def _cell_block(self, backward: bool) -> tuple[int, int]:
+        tuning = self.tuning
+        if backward:
+            return tuning.cell_backward_block, tuning.cell_backward_warps
+        return tuning.cell_block, tuning.cell_warps
+
+    def _rows(
+        self,
+        fcn: PackedFCN,
+        x: torch.Tensor,
+        count: torch.Tensor,
+        y: torch.Tensor,
+        hidden: torch.Tensor,
+        first: tuple[torch.Tensor, int] | None = None,
+        gathered: torch.Tensor | None = None,
+        index: torch.Tensor | None = None,
+        offset: tuple[int, int] = (0, 0),
+        octant: torch.Tensor | None = None,
+        bias: bool = True,
+        norm: bool = True,
+        residual: bool = False,
+        following: tuple[int, ...] = (),
+        products: tuple[torch.Tensor, ...] = (),
+    ) -> None:
+        first = first or (self.weights, fcn.parts[0])
+        block, warps = self._row_block(len(x))
+        at = (*following, 0, 0)
+        into = (*products, hidden, hidden)
+        rows_forward[self._blocks(len(x), block)](
+            x,
+            count,
+            self.weights,
+            self.values,
+            first[0],
+            first[1],
+            offset[0],
+            fcn.first_bias,
+            fcn.second,
+            fcn.second_bias,
+            fcn.gain,
+            fcn.shift,
+            gathered if gathered is not None else x,
+            index if index is not None else count,
+            octant if octant is not None else count,
+            at[0],
+            at[1],
+            y,
+            hidden,
+            into[0],
+            into[1],
+            INPUT=x.shape[-1],
+            WIDTH=self.width,
+            OUT=fcn.out,
+            GATHER=gathered is not None,
+            OFFSET=offset[1],
+            BIAS=bias,
+            NORM=norm,
+            RESIDUAL=residual,
+            NEXT=len(following),
+            SAVE=self.training,
+            BLOCK=block,
+            PRECISION=self.precision,
+            num_warps=warps,
+        )
+
+    def _pairs(
+        self, fcn: PackedFCN, by_particle: torch.Tensor, by_cell: torch.Tensor, out: torch.Tensor, to_cell: bool
+    ) -> None:
+        grid = self.grid
+        pairs_forward[self._blocks(grid.particles, self.tuning.pair_particles)](
+            by_particle,
+            by_cell,
+            self.latent,
+            grid.cell_N8,
+            grid.weight_N8,
+            grid.fraction_N3,
+            self.particle_count,
+            self.weights,
+            self.values,
+            fcn.parts[-1],
+            fcn.first_bias,
+            fcn.second,
+            fcn.second_bias,
+            fcn.gain,
+            fcn.shift,
+            out,
+            TO_CELL=to_cell,
+            WIDTH=self.width,
+            PARTICLES=self.tuning.pair_particles,
+            PRECISION=self.precision,
+            num_warps=self.tuning.pair_warps,
+        )
+
+    def _begin(self, block: Block, from_children: bool) -> None:
+        """The block's input and its products for the first iteration."""
+        grid, level, edge = self.grid, block.level, block.packed.edge[0]
+        rows = grid.capacities[level]
+        size, warps = self._row_block(rows)
+        gather_project[self._blocks(rows, size)](
+            self.message[level - 1] if from_children else block.cell[0],
+            grid.children(level),
+            grid.count(level),
+            self.weights,
+            edge.parts[0],
+            edge.parts[1],
+            block.cell[0],
+            block.send[0],
+            block.receive[0],
+            rows,
+            SUM=8 if from_children else 0,
+            NEXT=2,
+            WIDTH=self.width,
+            BLOCK=size,
+            PRECISION=self.precision,
+            num_warps=warps,
+        )
+
+    def _passing(self, block: Block) -> None:
+        grid, level, steps = self.grid, block.level, self.config.message_passing_steps
+        rows = grid.capacities[level]
+        size, warps = self._cell_block(False)
+        for m in range(steps):
+            edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
+            if not last:
+                following = block.packed.edge[m + 1].parts
+                next_at, into = (following[0], following[1]), (block.send[(m + 1) % 2], block.receive[(m + 1) % 2])
+                products = 2
+            else:
+                product = block.product if block.product is not None else block.send[(m + 1) % 2]
+                next_at, into, products = (block.next_at, 0), (product, product), int(block.product is not None)
+            message_forward[self._blocks(rows, size)](
+                block.cell[m],
+                block.send[m % 2],
+                block.receive[m % 2],
+                block.edge[m - 1] if m > 0 else block.cell[m],
+                grid.neighbour(level),
+                grid.count(level),
+                self.weights,
+                self.values,
+                edge.parts[2],
+                edge.first_bias,
+                edge.second,
+                edge.second_bias,
+                edge.gain,
+                edge.shift,
+                cell.parts[0],
+                cell.parts[1],
+                cell.first_bias,
+                cell.second,
+                cell.second_bias,
+                cell.gain,
+                cell.shift,
+                next_at[0],
+                next_at[1],
+                block.cell[m + 1],
+                block.edge[m] if not last else block.cell[m],
+                block.edge_hidden[m],
+                block.sum[m],
+                block.cell_hidden[m],
+                into[0],
+                into[1],
+                rows,
+                FIRST=m == 0,
+                STORE_EDGE=not last,
+                NEXT=products,
+                SAVE=self.training,
+                WIDTH=self.width,
+                BLOCK=size,
+                PRECISION=self.precision,
+                num_warps=warps,
+            )

@@ -1,0 +1,294 @@
+"""The grid hierarchy on the device: marking, numbering, tables. Nothing here waits for the host.
+
+All levels of all scenes lie in one array of slots: a window of cells around the domain, a border of one cell at each
+level so that neighbours need no bounds check. Shape legend: N particles, C cells of a level, L levels.
+Row of the geometry table of a level: first slot, slots, cells of the window in y and z with borders, slots of a
+scene, capacity, first cell in tables, window cells in x with borders.
+Row of the obstacle table of a scene, int64: addresses of its hash buckets (0: no obstacle), keys and normals, and the
+mask of the buckets.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+GEOMETRY_COLUMNS = tl.constexpr(8)
+OBSTACLE_COLUMNS = tl.constexpr(4)
+OVERFLOW = tl.constexpr(1)  # more active cells than capacity
+OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
+
+
+@triton.jit
+def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
+    x = tl.load(position + row * 3 + axis, mask=live, other=0.0)
+    u = tl.div_rn(x - tl.load(origin + scene * 3 + axis, mask=live, other=0.0), cell_size) - 0.5
+    base = tl.floor(u)
+    return base, u - base
+
+
+@triton.jit
+def _slot(x, y, z, scene, geometry, level: tl.constexpr):
+    line = geometry + level * GEOMETRY_COLUMNS
+    ny, nz = tl.load(line + 2), tl.load(line + 3)
+    inside = ((x + 1) * ny + (y + 1)) * nz + z + 1
+    return tl.load(line) + scene * tl.load(line + 4) + inside
+
+
+@triton.jit
+def mark_cells(
+    position,
+    scene_of,
+    origin,
+    particle_count,
+    low,
+    geometry,
+    mark,
+    status,
+    cell_size,
+    LEVELS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Sets the slots of the cells that particles reach, and of their ancestors; one pass for all levels."""
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    scene = tl.load(scene_of + row, mask=live, other=0)
+    bx, fx = _base(position, origin, scene, row, live, 0, cell_size)
+    by, fy = _base(position, origin, scene, row, live, 1, cell_size)
+    bz, fz = _base(position, origin, scene, row, live, 2, cell_size)
+    # in floats first: a wild position has no integer
+    x, y, z = bx - tl.load(low), by - tl.load(low + 1), bz - tl.load(low + 2)
+    nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
+    inside = (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
+    lost = tl.sum((live & (inside == 0)).to(tl.int32), 0)
+    if lost > 0:
+        tl.atomic_or(status, OUT_OF_WINDOW)
+    inside = inside & live
+    x = tl.where(inside, x, 0.0).to(tl.int32)
+    y = tl.where(inside, y, 0.0).to(tl.int32)
+    z = tl.where(inside, z, 0.0).to(tl.int32)
+    for corner in tl.static_range(8):
+        cx = x + (corner >> 2 & 1) * (fx > 0).to(tl.int32)
+        cy = y + (corner >> 1 & 1) * (fy > 0).to(tl.int32)
+        cz = z + (corner & 1) * (fz > 0).to(tl.int32)
+        for level in tl.static_range(LEVELS):
+            slot = _slot(cx >> level, cy >> level, cz >> level, scene, geometry, level)
+            tl.store(mark + slot, 1, mask=inside)
+
+
+@triton.jit
+def _cell(mark, rank, slot, first, capacity, ask):
+    """The number of the cell in a slot, -1 where it is not active."""
+    there = tl.load(mark + slot, mask=ask, other=0) > 0
+    cell = tl.load(rank + slot, mask=ask & there, other=0) - 1 - first
+    return tl.where(ask & there & (cell < capacity), cell, -1)
+
+
+@triton.jit
+def fill_tables(
+    mark,
+    rank,
+    geometry,
+    slot_of,
+    neighbour,
+    parent,
+    octant,
+    children,
+    counts,
+    needed,
+    status,
+    LEVELS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Each active slot writes its cell's neighbours, parent and children, int32, -1 where there is none."""
+    level = tl.program_id(1)
+    line = geometry + level * GEOMETRY_COLUMNS
+    start, slots = tl.load(line), tl.load(line + 1)
+    if tl.program_id(0) * BLOCK >= slots:
+        return
+    ny, nz, stride, capacity, at = (
+        tl.load(line + 2),
+        tl.load(line + 3),
+        tl.load(line + 4),
+        tl.load(line + 5),
+        tl.load(line + 6),
+    )
+    first = tl.load(rank + start - 1, mask=level > 0, other=0)
+    if tl.program_id(0) == 0:
+        total = tl.load(rank + start + slots - 1) - first
+        tl.store(needed + level, total)
+        tl.store(counts + level, tl.minimum(total, capacity))
+        if total > capacity:
+            tl.atomic_or(status, OVERFLOW)
+    local = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    slot = start + local
+    cell = _cell(mark, rank, slot, first, capacity, local < slots)
+    live = cell >= 0
+    if tl.sum(live.to(tl.int32), 0) == 0:
+        return
+    tl.store(slot_of + at + cell, local, mask=live)
+    table = neighbour + 6 * at
+    for direction in tl.static_range(6):
+        step = ny * nz
+        if direction // 2 == 1:
+            step = nz
+        if direction // 2 == 2:
+            step = step * 0 + 1
+        if direction % 2 == 1:
+            step = -step
+        found = _cell(mark, rank, slot + step, first, capacity, live)
+        tl.store(table + direction * capacity + cell, found, mask=live)
+    scene = local // stride
+    inside = local % stride
+    x, y, z = inside // (ny * nz) - 1, inside // nz % ny - 1, inside % nz - 1
+    tl.store(octant + at + cell, ((x & 1) * 2 + (y & 1)) * 2 + (z & 1), mask=live)
+    if level < LEVELS - 1:
+        above = line + GEOMETRY_COLUMNS
+        above_y, above_z = tl.load(above + 2), tl.load(above + 3)
+        above_slot = tl.load(above) + scene * tl.load(above + 4)
+        above_slot += (((x >> 1) + 1) * above_y + (y >> 1) + 1) * above_z + (z >> 1) + 1
+        above_first = tl.load(rank + tl.load(above) - 1)
+        found = _cell(mark, rank, above_slot, above_first, tl.load(above + 5), live)
+        tl.store(parent + at + cell, found, mask=live)
+    if level > 0:
+        below = line - GEOMETRY_COLUMNS
+        below_y, below_z = tl.load(below + 2), tl.load(below + 3)
+        below_first = tl.load(rank + tl.load(below) - 1, mask=level > 1, other=0)
+        for child in tl.static_range(8):
+            cx, cy, cz = 2 * x + (child >> 2 & 1), 2 * y + (child >> 1 & 1), 2 * z + (child & 1)
+            below_slot = tl.load(below) + scene * tl.load(below + 4)
+            below_slot += ((cx + 1) * below_y + cy + 1) * below_z + cz + 1
+            found = _cell(mark, rank, below_slot, below_first, tl.load(below + 5), live)
+            tl.store(children + 8 * at + child * capacity + cell, found, mask=live)
+
+
+@triton.jit
+def _find_obstacle(x, y, z, line, live):
+    """Row of the obstacle cell (x, y, z) in its scene's hash table, -1 where there is none."""
+    key = ((x + 65536) * 131072 + y + 65536) * 131072 + z + 65536
+    # products stay far below 2^63
+    mixed = (x + 65536) * 73856093 ^ (y + 65536) * 19349663 ^ (z + 65536) * 83492791
+    place = (mixed ^ mixed >> 15) & tl.load(line + 3, mask=live, other=0)
+    bucket = tl.load(line, mask=live, other=0).to(tl.pointer_type(tl.int32))
+    entry_key = tl.load(line + 1, mask=live, other=0).to(tl.pointer_type(tl.int64))
+    start = tl.load(bucket + place, mask=live, other=0)
+    end = tl.load(bucket + place + 1, mask=live, other=0)
+    found = tl.zeros_like(start) - 1
+    ask = live & (start < end)
+    while tl.max(ask.to(tl.int32), 0) > 0:
+        here = tl.load(entry_key + start, mask=ask, other=-1)
+        found = tl.where(ask & (here == key), start, found)
+        start += 1
+        ask = ask & (start < end)
+    return found
+
+
+@triton.jit
+def prepare_particles(
+    position,
+    velocity,
+    scene_of,
+    material_of,
+    origin,
+    domain,
+    particle_count,
+    low,
+    geometry,
+    mark,
+    rank,
+    mean,
+    std,
+    obstacle_table,
+    obstacle_cell_size,
+    features,
+    cell_of,
+    weight_of,
+    fraction_of,
+    cell_size,
+    wall_maximum,
+    capacity,
+    HISTORY: tl.constexpr,
+    NORMALS: tl.constexpr,
+    OBSTACLES: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES]; its 8 cells,
+    their weights, and its fraction. Without OBSTACLES nothing is looked up and the normals stay zero."""
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    scene = tl.load(scene_of + row, mask=live, other=0)
+    bx, fx = _base(position, origin, scene, row, live, 0, cell_size)
+    by, fy = _base(position, origin, scene, row, live, 1, cell_size)
+    bz, fz = _base(position, origin, scene, row, live, 2, cell_size)
+    x, y, z = bx - tl.load(low), by - tl.load(low + 1), bz - tl.load(low + 2)
+    nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
+    inside = live & (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
+    x = tl.where(inside, x, 0.0).to(tl.int32)
+    y = tl.where(inside, y, 0.0).to(tl.int32)
+    z = tl.where(inside, z, 0.0).to(tl.int32)
+    tl.store(fraction_of + row * 3, fx, mask=live)
+    tl.store(fraction_of + row * 3 + 1, fy, mask=live)
+    tl.store(fraction_of + row * 3 + 2, fz, mask=live)
+    for corner in tl.static_range(8):
+        cx = x + (corner >> 2 & 1) * (fx > 0).to(tl.int32)
+        cy = y + (corner >> 1 & 1) * (fy > 0).to(tl.int32)
+        cz = z + (corner & 1) * (fz > 0).to(tl.int32)
+        slot = _slot(cx, cy, cz, scene, geometry, 0)
+        cell = _cell(mark, rank, slot, 0, capacity, inside)
+        weight = tl.full((BLOCK,), 1.0, tl.float32)
+        weight *= fx if (corner >> 2 & 1) == 1 else 1 - fx
+        weight *= fy if (corner >> 1 & 1) == 1 else 1 - fy
+        weight *= fz if (corner & 1) == 1 else 1 - fz
+        # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
+        tl.store(cell_of + row * 8 + corner, tl.maximum(cell, 0), mask=live)
+        tl.store(weight_of + row * 8 + corner, weight, mask=live)
+
+    column = tl.arange(0, FEATURES)
+    axis = column % 3
+    here = live[:, None]
+    # 3 * HISTORY velocities: column 3 k + axis
+    is_velocity = column < 3 * HISTORY
+    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + column[None, :], mask=here & is_velocity[None, :], other=0.0)
+    centred = v - tl.load(mean + axis)[None, :]
+    value = tl.where(
+        is_velocity[None, :], tl.div_rn(centred, tl.load(std + axis)[None, :] + tl.zeros_like(centred)), 0.0
+    )
+    WALLS: tl.constexpr = 3 * HISTORY + 3 * NORMALS
+    if OBSTACLES:
+        ox = tl.load(position + row * 3, mask=live, other=0.0)
+        oy = tl.load(position + row * 3 + 1, mask=live, other=0.0)
+        oz = tl.load(position + row * 3 + 2, mask=live, other=0.0)
+        ox = tl.floor(tl.div_rn(ox, obstacle_cell_size))
+        oy = tl.floor(tl.div_rn(oy, obstacle_cell_size))
+        oz = tl.floor(tl.div_rn(oz, obstacle_cell_size))
+        near = live & (tl.abs(ox) < 65536.0) & (tl.abs(oy) < 65536.0) & (tl.abs(oz) < 65536.0)
+        ox = tl.where(near, ox, 0.0).to(tl.int64)
+        oy = tl.where(near, oy, 0.0).to(tl.int64)
+        oz = tl.where(near, oz, 0.0).to(tl.int64)
+        line = obstacle_table + scene * OBSTACLE_COLUMNS
+        near = near & (tl.load(line, mask=near, other=0) != 0)
+        found = _find_obstacle(ox, oy, oz, line, near)
+        is_normal = (column >= 3 * HISTORY) & (column < WALLS)
+        entry_normal = tl.load(line + 2, mask=near, other=0).to(tl.pointer_type(tl.float32))
+        normal = tl.load(
+            (entry_normal + found * 3)[:, None] + axis[None, :],
+            mask=(found >= 0)[:, None] & is_normal[None, :],
+            other=0.0,
+        )
+        value += normal
+    is_wall = (column >= WALLS) & (column < WALLS + 6)
+    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
+    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
+    distance = tl.where((column >= WALLS + 3)[None, :], size - place, place)
+    distance = tl.minimum(tl.maximum(distance, -wall_maximum), wall_maximum) / wall_maximum
+    value = tl.where(is_wall[None, :], distance, value)
+    material = tl.load(material_of + row, mask=live, other=0)
+    value = tl.where((column[None, :] - (WALLS + 6)) == material[:, None], 1.0, value)
+    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)

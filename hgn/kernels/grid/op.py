@@ -1,0 +1,251 @@
+"""The device grid: capacities, buffers and launches of the grid kernels.
+
+Shape legend: N particles, C cells of a level, S scenes, L levels, K obstacle cells of all scenes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import triton
+
+from hgn.kernels.grid import kernel
+from hgn.network.keys import SCENE_LIMIT, unpack
+from hgn.network.obstacles import ObstacleCells
+
+MARK_BLOCK = 128
+FILL_BLOCK = 1024
+OBSTACLE_COLUMNS = 4
+OVERFLOW = 1
+OUT_OF_WINDOW = 2
+NOT_FINITE = 4  # set by whoever integrates or updates
+
+
+@dataclass(frozen=True)
+class Window:
+    """The cells of the finest level that exist: `low` to `low + cells - 1` on each axis, in every scene.
+
+    Both are multiples of 2^(levels - 1), so that parents never straddle it.
+    """
+
+    low: tuple[int, int, int]
+    cells: tuple[int, int, int]
+
+    @staticmethod
+    def around(
+        lower_3: Sequence[float], upper_3: Sequence[float], cell_size: float, levels: int, margin: int
+    ) -> Window:
+        """Holds every cell within `margin` cells of a box given in domain units."""
+        unit = 1 << (levels - 1)
+        low, cells = [], []
+        for lower, upper in zip(lower_3, upper_3, strict=True):
+            first = math.floor((math.floor(lower / cell_size) - margin - 1) / unit) * unit
+            last = math.ceil(upper / cell_size) + margin + 1
+            low.append(first)
+            cells.append(math.ceil((last - first + 1) / unit) * unit)
+        return Window((low[0], low[1], low[2]), (cells[0], cells[1], cells[2]))
+
+    @property
+    def slots(self) -> int:
+        return math.prod(n + 2 for n in self.cells)
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleHash:
+    """One scene's obstacle cells in hash buckets: entries of bucket b are rows bucket_B[b] to bucket_B[b + 1]."""
+
+    bucket_B: torch.Tensor  # int32
+    key_K: torch.Tensor  # int64
+    normal_K3: torch.Tensor  # float32
+
+    @staticmethod
+    def of(cell_K3: torch.Tensor, normal_K3: torch.Tensor) -> ObstacleHash:
+        """Of cells int [K, 3] with normals [K, 3], on their device."""
+        count = len(cell_K3)
+        mask = (1 << max(4, math.ceil(math.log2(2 * max(count, 1))))) - 1
+        x, y, z = (cell_K3.long() + 65536).unbind(-1)
+        mixed = x * 73856093 ^ y * 19349663 ^ z * 83492791
+        place_K = (mixed ^ mixed >> 15) & mask
+        order = torch.argsort(place_K, stable=True)
+        size_B = torch.bincount(place_K, minlength=mask + 1)
+        bucket_B = torch.cat([size_B.new_zeros(1), size_B.cumsum(0)]).int()
+        key_K = (x * 131072 + y) * 131072 + z
+        return ObstacleHash(bucket_B, key_K[order].contiguous(), normal_K3[order].float().contiguous())
+
+    def to(self, device: torch.device) -> ObstacleHash:
+        return ObstacleHash(self.bucket_B.to(device), self.key_K.to(device), self.normal_K3.to(device))
+
+    def row(self) -> list[int]:
+        """This scene's row of an obstacle table; valid as long as this object lives."""
+        pointers = [self.bucket_B.data_ptr(), self.key_K.data_ptr(), self.normal_K3.data_ptr()]
+        return [*pointers, len(self.bucket_B) - 2]
+
+
+class ObstacleTable:
+    """The obstacles of the scenes of a batch, for the kernels; its rows may be rewritten on the device."""
+
+    def __init__(self, hashes: Sequence[ObstacleHash | None], cell_size: float, device: torch.device) -> None:
+        self._hashes = [entry.to(device) if entry is not None else None for entry in hashes]
+        rows = [entry.row() if entry is not None else [0] * OBSTACLE_COLUMNS for entry in self._hashes]
+        self.row_S4 = torch.tensor(rows, dtype=torch.int64, device=device)
+        self.cell_size = cell_size
+
+    @staticmethod
+    def of(cells: ObstacleCells, scenes: int) -> ObstacleTable:
+        """Of a batch's obstacle cells, on their device."""
+        scene_K, cell_K3 = unpack(cells.key_K)
+        counts = torch.bincount(scene_K, minlength=scenes).tolist()
+        parts = zip(cell_K3.split(counts), cells.normal_K3.split(counts), strict=True)
+        hashes = [ObstacleHash.of(cell, normal) if len(cell) else None for cell, normal in parts]
+        return ObstacleTable(hashes, cells.cell_size, cells.key_K.device)
+
+
+class DeviceGrid:
+    """Tables of all levels at fixed capacities; counts stay on the device.
+
+    Buffers (int32): counts_L (after clipping), needed_L (before), status (sticky flags); neighbour, parent, octant and
+    children of level l as views; per particle cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF.
+    """
+
+    def __init__(
+        self,
+        window: Window,
+        scenes: int,
+        capacities: Sequence[int],
+        particles: int,
+        features: int,
+        cell_size: float,
+        device: torch.device,
+    ) -> None:
+        assert scenes < SCENE_LIMIT
+        self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
+        self.cell_size, self.levels, self.features = cell_size, len(capacities), features
+        rows, start, at = [], 0, 0
+        for level, capacity in enumerate(capacities):
+            nx, ny, nz = ((n >> level) + 2 for n in window.cells)
+            rows.append([start, scenes * nx * ny * nz, ny, nz, nx * ny * nz, capacity, at, nx])
+            start += rows[-1][1]
+            at += capacity
+        assert start < 2**31, "slots are numbered in int32"
+        self.largest = max(row[1] for row in rows)
+
+        def integers(*shape: int) -> torch.Tensor:
+            return torch.zeros(shape, dtype=torch.int32, device=device)
+
+        self.geometry = torch.tensor(rows, dtype=torch.int32, device=device)
+        self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
+        self.mark, self.rank = integers(start), integers(start)
+        self.slot_of, self._parent, self._octant = integers(at), integers(at), integers(at)
+        self._neighbour, self._children = integers(6 * at), integers(8 * at)
+        self.counts_L, self.needed_L = integers(self.levels), integers(self.levels)
+        self.status = integers(1)
+        self.cell_N8 = integers(particles, 8)
+        self.weight_N8 = torch.zeros(particles, 8, device=device)
+        self.fraction_N3 = torch.zeros(particles, 3, device=device)
+        self.feature_NF = torch.zeros(particles, features, device=device)
+        self._at = [row[6] for row in rows]
+
+    def neighbour(self, level: int) -> torch.Tensor:
+        """[6, capacity]: the cell in each direction of DIRECTION_63, or -1."""
+        at, capacity = self._at[level], self.capacities[level]
+        return self._neighbour[6 * at : 6 * (at + capacity)].view(6, capacity)
+
+    def children(self, level: int) -> torch.Tensor:
+        """[8, capacity]: the cell of the finer level at each corner of CORNER_83, or -1."""
+        at, capacity = self._at[level], self.capacities[level]
+        return self._children[8 * at : 8 * (at + capacity)].view(8, capacity)
+
+    def parent(self, level: int) -> torch.Tensor:
+        return self._parent[self._at[level] : self._at[level] + self.capacities[level]]
+
+    def octant(self, level: int) -> torch.Tensor:
+        return self._octant[self._at[level] : self._at[level] + self.capacities[level]]
+
+    def count(self, level: int) -> torch.Tensor:
+        """How many cells are active, [1], on the device."""
+        return self.counts_L[level : level + 1]
+
+    def build(
+        self, position: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor, count: torch.Tensor
+    ) -> None:
+        """Marks, numbers and tabulates the cells of all levels."""
+        self.mark.zero_()
+        kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
+            position,
+            scene_N,
+            origin_S3,
+            count,
+            self.low,
+            self.geometry,
+            self.mark,
+            self.status,
+            self.cell_size,
+            LEVELS=self.levels,
+            BLOCK=MARK_BLOCK,
+        )
+        torch.cumsum(self.mark, 0, dtype=torch.int32, out=self.rank)
+        kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](
+            self.mark,
+            self.rank,
+            self.geometry,
+            self.slot_of,
+            self._neighbour,
+            self._parent,
+            self._octant,
+            self._children,
+            self.counts_L,
+            self.needed_L,
+            self.status,
+            LEVELS=self.levels,
+            BLOCK=FILL_BLOCK,
+        )
+
+    def prepare(
+        self,
+        position: torch.Tensor,
+        velocity: torch.Tensor,
+        scene_N: torch.Tensor,
+        material_N: torch.Tensor,
+        origin_S3: torch.Tensor,
+        domain_S3: torch.Tensor,
+        count: torch.Tensor,
+        mean_3: torch.Tensor,
+        std_3: torch.Tensor,
+        obstacles: ObstacleTable | None,
+        history: int,
+        normals: bool,
+        wall_maximum: float,
+    ) -> None:
+        """Features and cells of every particle; without `obstacles` normals are zero, and nothing is looked up."""
+        kernel.prepare_particles[(triton.cdiv(self.particles, 32),)](
+            position,
+            velocity,
+            scene_N,
+            material_N,
+            origin_S3,
+            domain_S3,
+            count,
+            self.low,
+            self.geometry,
+            self.mark,
+            self.rank,
+            mean_3,
+            std_3,
+            obstacles.row_S4 if obstacles else self.counts_L,
+            obstacles.cell_size if obstacles else 1.0,
+            self.feature_NF,
+            self.cell_N8,
+            self.weight_N8,
+            self.fraction_N3,
+            self.cell_size,
+            wall_maximum,
+            self.capacities[0],
+            HISTORY=history,
+            NORMALS=int(normals),
+            OBSTACLES=normals and obstacles is not None,
+            FEATURES=self.features,
+            BLOCK=32,
+        )

@@ -1,0 +1,142 @@
+"""The network's parameters in one flat buffer, each FCN a contiguous block that the kernels can read in whole tiles.
+
+Block of an FCN: the first layer's wide parts, each [hidden, part] row-major; its narrow parts (offsets), each
+transposed to [part, hidden]; bias; second layer [out, hidden]; its bias; the norm's gain and shift.
+An output of 3 is padded with zero rows to PADDED_OUT. Padding never receives a gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from hgn.network.fcn import FCN
+from hgn.network.network import HierarchicalGraphNetwork, MessagePassing
+
+NARROW = 8  # parts of fewer columns are offsets
+PADDED_OUT = 16
+
+
+@dataclass(frozen=True)
+class PackedFCN:
+    """Offsets of an FCN's tensors in the flat buffer, in elements."""
+
+    parts: tuple[int, ...]
+    first_bias: int
+    second: int
+    second_bias: int
+    gain: int  # 0 without a norm
+    shift: int
+    out: int
+
+
+@dataclass(frozen=True)
+class PackedMessagePassing:
+    edge: tuple[PackedFCN, ...]
+    cell: tuple[PackedFCN, ...]
+
+
+@dataclass(frozen=True)
+class PackedNetwork:
+    """Where everything is. `index` maps packed elements to the concatenated parameters, -1 for padding."""
+
+    encode: PackedFCN
+    particle_to_cell: PackedFCN
+    passing_down: tuple[PackedMessagePassing, ...]
+    fine_to_coarse: tuple[PackedFCN, ...]
+    coarse_to_fine: tuple[PackedFCN, ...]
+    passing_up: tuple[PackedMessagePassing, ...]
+    cell_to_particle: PackedFCN
+    decode: PackedFCN
+    embedding: int
+    size: int
+    index: torch.Tensor
+
+    def gather(self, tensors: list[torch.Tensor]) -> torch.Tensor:
+        """Packs tensors shaped as the network's parameters, in their order: float32 [size]."""
+        flat = torch.cat([tensor.detach().reshape(-1).float() for tensor in tensors])
+        index = self.index.to(flat.device)
+        return torch.where(index >= 0, flat[index.clamp(min=0)], 0.0)
+
+    def scatter(self, packed: torch.Tensor, tensors: list[torch.Tensor]) -> None:
+        """The inverse of `gather`, into the tensors."""
+        index = self.index.to(packed.device)
+        flat = packed.new_empty(sum(tensor.numel() for tensor in tensors))
+        flat[index[index >= 0]] = packed[index >= 0]
+        with torch.no_grad():
+            for tensor, part in zip(tensors, flat.split([t.numel() for t in tensors]), strict=True):
+                tensor.copy_(part.view(tensor.shape))
+
+
+class _Packer:
+    def __init__(self, network: HierarchicalGraphNetwork) -> None:
+        self.start: dict[int, int] = {}
+        total = 0
+        for parameter in network.parameters():
+            self.start[id(parameter)] = total
+            total += parameter.numel()
+        self.pieces: list[torch.Tensor] = []
+        self.size = 0
+
+    def positions(self, parameter: torch.Tensor) -> torch.Tensor:
+        return torch.arange(parameter.numel()).view(parameter.shape) + self.start[id(parameter)]
+
+    def add(self, positions: torch.Tensor) -> int:
+        offset = self.size
+        flat = positions.reshape(-1)
+        padding = -len(flat) % 16  # vector loads stay aligned
+        self.pieces += [flat, torch.full((padding,), -1)]
+        self.size += len(flat) + padding
+        return offset
+
+    def fcn(self, fcn: FCN, whole_first: bool = False) -> PackedFCN:
+        out = max(len(fcn.second.weight), PADDED_OUT)
+        missing = out - len(fcn.second.weight)
+        first = self.positions(fcn.first.weight)
+        parts = [first] if whole_first else list(first.split(fcn.parts, dim=1))
+        offsets = [self.add(part.T if part.shape[1] < NARROW else part) for part in parts]
+        bias = self.add(self.positions(fcn.first.bias))
+        second = self.add(torch.nn.functional.pad(self.positions(fcn.second.weight), (0, 0, 0, missing), value=-1))
+        second_bias = self.add(torch.nn.functional.pad(self.positions(fcn.second.bias), (0, missing), value=-1))
+        gain = shift = 0
+        if fcn.norm is not None:
+            gain, shift = self.add(self.positions(fcn.norm.weight)), self.add(self.positions(fcn.norm.bias))
+        return PackedFCN(tuple(offsets), bias, second, second_bias, gain, shift, out)
+
+    def fcns(self, modules: torch.nn.ModuleList) -> tuple[PackedFCN, ...]:
+        return tuple(self.fcn(module) for module in modules if isinstance(module, FCN))
+
+    def passings(self, modules: torch.nn.ModuleList) -> tuple[PackedMessagePassing, ...]:
+        return tuple(
+            PackedMessagePassing(self.fcns(module.edge), self.fcns(module.cell))
+            for module in modules
+            if isinstance(module, MessagePassing)
+        )
+
+
+def pack_network(network: HierarchicalGraphNetwork) -> PackedNetwork:
+    """The layout of a network; a pure function of its configuration."""
+    packer = _Packer(network)
+    encode = packer.fcn(network.encode, whole_first=True)
+    particle_to_cell = packer.fcn(network.particle_to_cell)
+    down = packer.passings(network.passing_down)
+    fine_to_coarse = packer.fcns(network.fine_to_coarse)
+    coarse_to_fine = packer.fcns(network.coarse_to_fine)
+    up = packer.passings(network.passing_up)
+    cell_to_particle = packer.fcn(network.cell_to_particle)
+    decode = packer.fcn(network.decode)
+    embedding = packer.add(packer.positions(network.embedding.weight))
+    return PackedNetwork(
+        encode,
+        particle_to_cell,
+        down,
+        fine_to_coarse,
+        coarse_to_fine,
+        up,
+        cell_to_particle,
+        decode,
+        embedding,
+        packer.size,
+        torch.cat(packer.pieces),
+    )

@@ -1,0 +1,162 @@
+"""Particle-cell pairs (paper steps 1 and 11), forward and backward: pair FCN, norm, weight and sum in one launch.
+
+Row r of a tile is corner r % 8 of particle r // 8. Sums to cells are atomic additions, whose order, and with it the
+last bits, may differ from run to run. Shape legend: N particles, W width.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from hgn.kernels.blocks import leaky, leaky_backward, normalise, normalise_backward, product, transposed
+
+
+@triton.jit
+def _offset(fraction, particle, corner, live, axis: tl.constexpr):
+    """Cell centre minus particle, in cells."""
+    bit = (corner >> (2 - axis)) & 1
+    return bit.to(tl.float32) - tl.load(fraction + particle * 3 + axis, mask=live, other=0.0)
+
+
+@triton.jit
+def pairs_forward(
+    by_particle,
+    by_cell,
+    particle,
+    cell_of,
+    weight_of,
+    fraction,
+    count_ptr,
+    weights,
+    values,
+    offset_at,
+    bias_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
+    out,
+    TO_CELL: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PARTICLES: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """TO_CELL: out [C, W] += weight * FCN(by_particle_n + offset). Otherwise out [N, W] = particle + sum over the
+    corners of weight * FCN(by_cell_c + by_particle_n - offset). The by_… are products with first-layer weights."""
+    ROWS: tl.constexpr = PARTICLES * 8
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * PARTICLES >= count:
+        return
+    row = tl.arange(0, ROWS)
+    owner = tl.program_id(0) * PARTICLES + row // 8
+    corner = row % 8
+    live = owner < count
+    column = tl.arange(0, WIDTH)
+    cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
+    weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
+    h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0).to(tl.float32)
+    h += tl.load(values + bias_at + column)[None, :]
+    if not TO_CELL:
+        h += tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0).to(tl.float32)
+    for axis in tl.static_range(3):
+        side = _offset(fraction, owner, corner, live, axis)
+        if not TO_CELL:
+            side = -side
+        h += side[:, None] * tl.load(values + offset_at + axis * WIDTH + column)[None, :]
+    z = product(leaky(h), transposed(weights + second_at, WIDTH, WIDTH), PRECISION)
+    z, _scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
+    z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
+    z = z * weight[:, None]
+    if TO_CELL:
+        # a weight of zero points at a cell that may be another's: it adds nothing
+        touched = (live & (weight != 0))[:, None]
+        tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
+    else:
+        summed = tl.sum(tl.reshape(z, (PARTICLES, 8, WIDTH)), 1)
+        mine = tl.program_id(0) * PARTICLES + tl.arange(0, PARTICLES)
+        at = mine[:, None] * WIDTH + column[None, :]
+        alive = (mine < count)[:, None]
+        tl.store(out + at, summed + tl.load(particle + at, mask=alive, other=0.0), mask=alive)
+
+
+@triton.jit
+def pairs_backward(
+    gradient,
+    by_particle,
+    by_cell,
+    cell_of,
+    weight_of,
+    fraction,
+    count_ptr,
+    weights,
+    values,
+    totals,
+    offset_at,
+    bias_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
+    hidden,
+    second_gradient,
+    by_particle_gradient,
+    by_cell_gradient,
+    unscale,
+    TO_CELL: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PARTICLES: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """From the gradient of `out` ([C, W] if TO_CELL, else [N, W]) to those of by_particle, and of by_cell by atomics.
+
+    hidden and second_gradient [8 N, W] are left for the weight product.
+    """
+    ROWS: tl.constexpr = PARTICLES * 8
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * PARTICLES >= count:
+        return
+    row = tl.arange(0, ROWS)
+    owner = tl.program_id(0) * PARTICLES + row // 8
+    corner = row % 8
+    live = owner < count
+    here = live[:, None]
+    column = tl.arange(0, WIDTH)
+    cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
+    weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
+    h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0).to(tl.float32)
+    h += tl.load(values + bias_at + column)[None, :]
+    if not TO_CELL:
+        h += tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0).to(tl.float32)
+    for axis in tl.static_range(3):
+        side = _offset(fraction, owner, corner, live, axis)
+        if not TO_CELL:
+            side = -side
+        h += side[:, None] * tl.load(values + offset_at + axis * WIDTH + column)[None, :]
+    a = leaky(h)
+    pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
+    tl.store(hidden + pair_at, a, mask=here)
+    second = transposed(weights + second_at, WIDTH, WIDTH)
+    z = product(a, second, PRECISION) + tl.load(values + second_bias_at + column)[None, :]
+    z, scale = normalise(z, WIDTH)
+    if TO_CELL:
+        dy = tl.load(gradient + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+    else:
+        dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+    dy = dy * weight[:, None]
+    tl.atomic_add(totals + gain_at + column, tl.sum(dy * z, 0) * unscale)
+    tl.atomic_add(totals + shift_at + column, tl.sum(dy, 0) * unscale)
+    dz = normalise_backward(dy, z, scale, tl.load(values + gain_at + column), WIDTH)
+    tl.store(second_gradient + pair_at, dz, mask=here)
+    dh = leaky_backward(product(dz, tl.trans(second), PRECISION), a)
+    for axis in tl.static_range(3):
+        side = _offset(fraction, owner, corner, live, axis)
+        if not TO_CELL:
+            side = -side
+        tl.atomic_add(totals + offset_at + axis * WIDTH + column, tl.sum(dh * side[:, None], 0) * unscale)
+    if not TO_CELL:
+        touched = (live & (weight != 0))[:, None]
+        tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
+    mine = tl.program_id(0) * PARTICLES + tl.arange(0, PARTICLES)
+    summed = tl.sum(tl.reshape(dh, (PARTICLES, 8, WIDTH)), 1)
+    tl.store(by_particle_gradient + mine[:, None] * WIDTH + column[None, :], summed, mask=(mine < count)[:, None])

@@ -1,0 +1,270 @@
+"""An FCN on rows, forward and backward: encoder, decoder, and the steps between levels.
+
+Forward of row r: h = x W + gathered[index_r] + offset_octant + b; a = leaky(h); y = norm(a W2 + b2) (+ x).
+Up to two products of y follow, for whoever reads it next. Shape legend: R rows, W width.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from hgn.kernels.blocks import leaky, leaky_backward, matrix, normalise, normalise_backward, product, transposed
+
+
+@triton.jit
+def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
+    """Sum over axes of (1/2 - bit) times the offset weights [3, W]: towards the parent's centre for SIGN = 1."""
+    column = tl.arange(0, WIDTH)
+    result = tl.zeros((octant.shape[0], WIDTH), tl.float32)
+    for axis in tl.static_range(3):
+        bit = (octant >> (2 - axis)) & 1
+        weight = tl.load(values + offset_at + axis * WIDTH + column)
+        result += (SIGN * (0.5 - bit.to(tl.float32)))[:, None] * weight[None, :]
+    return result
+
+
+@triton.jit
+def rows_forward(
+    x,
+    count_ptr,
+    weights,
+    values,
+    first_weights,
+    first_at,
+    offset_at,
+    bias_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
+    gathered,
+    index,
+    octant,
+    next_at_0,
+    next_at_1,
+    y,
+    hidden,
+    next_0,
+    next_1,
+    INPUT: tl.constexpr,
+    WIDTH: tl.constexpr,
+    OUT: tl.constexpr,
+    GATHER: tl.constexpr,
+    OFFSET: tl.constexpr,
+    BIAS: tl.constexpr,
+    NORM: tl.constexpr,
+    RESIDUAL: tl.constexpr,
+    NEXT: tl.constexpr,
+    SAVE: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = (row < count)[:, None]
+    column = tl.arange(0, WIDTH)
+    at = row[:, None] * WIDTH + column[None, :]
+    inputs = tl.arange(0, INPUT)
+    x_tile = tl.load(x + row[:, None] * INPUT + inputs[None, :], mask=live, other=0.0).to(tl.float32)
+    h = product(x_tile, transposed(first_weights + first_at, WIDTH, INPUT), PRECISION)
+    if GATHER:
+        where = tl.load(index + row, mask=row < count, other=0)
+        h += tl.load(gathered + where[:, None] * WIDTH + column[None, :], mask=live, other=0.0).to(tl.float32)
+    if OFFSET != 0:
+        h += _shift(values, offset_at, tl.load(octant + row, mask=row < count, other=0), OFFSET, WIDTH)
+    if BIAS:
+        h += tl.load(values + bias_at + column)[None, :]
+    a = leaky(h)
+    if SAVE:
+        tl.store(hidden + at, a, mask=live)
+    outs = tl.arange(0, OUT)
+    z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
+    z += tl.load(values + second_bias_at + outs)[None, :]
+    if NORM:
+        z, _scale = normalise(z, OUT)
+        z = z * tl.load(values + gain_at + outs)[None, :] + tl.load(values + shift_at + outs)[None, :]
+    if RESIDUAL:
+        z += x_tile
+    tl.store(y + row[:, None] * OUT + outs[None, :], z, mask=live)
+    if NEXT > 0:
+        tl.store(next_0 + at, product(z, transposed(weights + next_at_0, WIDTH, WIDTH), PRECISION), mask=live)
+    if NEXT > 1:
+        tl.store(next_1 + at, product(z, transposed(weights + next_at_1, WIDTH, WIDTH), PRECISION), mask=live)
+
+
+@triton.jit
+def rows_backward(
+    gradient,
+    gradient_index,
+    from_0,
+    from_1,
+    x_gradient,
+    count_ptr,
+    weights,
+    values,
+    totals,
+    first_at,
+    offset_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
+    octant,
+    next_at_0,
+    next_at_1,
+    hidden,
+    hidden_gradient,
+    second_gradient,
+    unscale,
+    WIDTH: tl.constexpr,
+    OUT: tl.constexpr,
+    GATHER: tl.constexpr,
+    OFFSET: tl.constexpr,
+    NORM: tl.constexpr,
+    RESIDUAL: tl.constexpr,
+    NEXT: tl.constexpr,
+    INTO: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """Gradients of all inputs of rows_forward.
+
+    The gradient of y is `gradient` (row gradient_index_r if GATHER) plus from_0, from_1 times their products' weights
+    (NEXT). INTO: 0 no gradient of x, 1 write it, 2 add it to what is there. Gains, shifts and offset weights are summed
+    into `totals`, divided by the loss scale (`unscale`); hidden_gradient and second_gradient are left for the others.
+    """
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = (row < count)[:, None]
+    column = tl.arange(0, WIDTH)
+    outs = tl.arange(0, OUT)
+    at = row[:, None] * WIDTH + column[None, :]
+    out_at = row[:, None] * OUT + outs[None, :]
+    if GATHER:
+        where = tl.load(gradient_index + row, mask=row < count, other=0)
+        dy = tl.load(gradient + where[:, None] * OUT + outs[None, :], mask=live, other=0.0).to(tl.float32)
+    else:
+        dy = tl.load(gradient + out_at, mask=live, other=0.0).to(tl.float32)
+    if NEXT > 0:
+        tile = tl.load(from_0 + at, mask=live, other=0.0).to(tl.float32)
+        dy += product(tile, matrix(weights + next_at_0, WIDTH, WIDTH), PRECISION)
+    if NEXT > 1:
+        tile = tl.load(from_1 + at, mask=live, other=0.0).to(tl.float32)
+        dy += product(tile, matrix(weights + next_at_1, WIDTH, WIDTH), PRECISION)
+    a = tl.load(hidden + at, mask=live, other=0.0).to(tl.float32)
+    if NORM:
+        z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
+        z += tl.load(values + second_bias_at + outs)[None, :]
+        normalised, scale = normalise(z, OUT)
+        tl.atomic_add(totals + gain_at + outs, tl.sum(dy * normalised, 0) * unscale)
+        tl.atomic_add(totals + shift_at + outs, tl.sum(dy, 0) * unscale)
+        dz = normalise_backward(dy, normalised, scale, tl.load(values + gain_at + outs), OUT)
+    else:
+        dz = dy
+    dz = tl.where(live, dz, 0.0)
+    tl.store(second_gradient + out_at, dz, mask=live)
+    dh = leaky_backward(product(dz, matrix(weights + second_at, OUT, WIDTH), PRECISION), a)
+    tl.store(hidden_gradient + at, dh, mask=live)
+    if OFFSET != 0:
+        code = tl.load(octant + row, mask=row < count, other=0)
+        for axis in tl.static_range(3):
+            side = OFFSET * (0.5 - ((code >> (2 - axis)) & 1).to(tl.float32))
+            tl.atomic_add(totals + offset_at + axis * WIDTH + column, tl.sum(dh * side[:, None], 0) * unscale)
+    if INTO > 0:
+        dx = product(dh, matrix(weights + first_at, WIDTH, WIDTH), PRECISION)
+        if RESIDUAL:
+            dx += dy
+        if INTO > 1:
+            dx += tl.load(x_gradient + at, mask=live, other=0.0)
+        tl.store(x_gradient + at, dx, mask=live)
+
+
+@triton.jit
+def gather_project(
+    x,
+    table,
+    count_ptr,
+    weights,
+    at_0,
+    at_1,
+    y,
+    next_0,
+    next_1,
+    capacity,
+    SUM: tl.constexpr,
+    NEXT: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and products of y."""
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = (row < count)[:, None]
+    column = tl.arange(0, WIDTH)
+    at = row[:, None] * WIDTH + column[None, :]
+    if SUM > 0:
+        tile = tl.zeros((BLOCK, WIDTH), tl.float32)
+        for i in tl.static_range(SUM):
+            where = tl.load(table + i * capacity + row, mask=row < count, other=-1)
+            there = (where >= 0)[:, None]
+            tile += tl.load(x + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
+        tl.store(y + at, tile, mask=live)
+    else:
+        tile = tl.load(x + at, mask=live, other=0.0).to(tl.float32)
+    if NEXT > 0:
+        tl.store(next_0 + at, product(tile, transposed(weights + at_0, WIDTH, WIDTH), PRECISION), mask=live)
+    if NEXT > 1:
+        tl.store(next_1 + at, product(tile, transposed(weights + at_1, WIDTH, WIDTH), PRECISION), mask=live)
+
+
+@triton.jit
+def gather_project_backward(
+    x,
+    table,
+    count_ptr,
+    weights,
+    at_0,
+    summed,
+    gradient,
+    capacity,
+    SUM: tl.constexpr,
+    REVERSE: tl.constexpr,
+    ADD: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """summed = x, or the sum of x's rows listed in the table [SUM, capacity]; gradient (+)= summed W.
+
+    With REVERSE, x is [capacity, SUM, W], and of the row listed for a direction the opposite direction's part is taken.
+    """
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = (row < count)[:, None]
+    column = tl.arange(0, WIDTH)
+    at = row[:, None] * WIDTH + column[None, :]
+    if SUM == 0:
+        tile = tl.load(x + at, mask=live, other=0.0).to(tl.float32)
+    else:
+        tile = tl.zeros((BLOCK, WIDTH), tl.float32)
+    for i in tl.static_range(SUM):
+        where = tl.load(table + i * capacity + row, mask=row < count, other=-1)
+        there = (where >= 0)[:, None]
+        if REVERSE:
+            where = where * SUM + (i ^ 1)
+        tile += tl.load(x + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
+    tl.store(summed + at, tile, mask=live)
+    result = product(tile, matrix(weights + at_0, WIDTH, WIDTH), PRECISION)
+    if ADD:
+        result += tl.load(gradient + at, mask=live, other=0.0)
+    tl.store(gradient + at, result, mask=live)

@@ -1,0 +1,213 @@
+"""What a training step needs around the network: assembling a batch, loss, Adam, bookkeeping; all on the device.
+
+Row of the sample table, int64, one for each scene of each update: address of the window's first frame of positions,
+particles, first row in the batch, seed, address of the materials (int32), and the scene's row of the obstacle table.
+Shape legend: N particles of all scenes, S scenes, H velocity history.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+SAMPLE_COLUMNS = tl.constexpr(9)
+OBSTACLE_COLUMNS = tl.constexpr(4)
+JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
+REPEAT = tl.constexpr(8)  # another rank must repeat the update
+AGAIN = tl.constexpr(11)  # overflow, out of the window, or REPEAT: the same update again, with more room
+BETA_1 = tl.constexpr(0.9)  # torch.optim.Adam's defaults
+BETA_2 = tl.constexpr(0.999)
+EPSILON = tl.constexpr(1e-8)
+
+
+@triton.jit
+def assemble_batch(
+    samples,
+    sample_domain,
+    update,
+    position,
+    velocity,
+    scene_of,
+    material_of,
+    target,
+    share_of,
+    origin,
+    domain,
+    obstacle_table,
+    particle_count,
+    mean,
+    std,
+    noise_step,
+    jitter,
+    scenes,
+    HISTORY: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow.
+
+    The target is v_true^{n+1} - v_noisy^n, normalised. Grid origins are uniform in [-jitter, 0]. Noise and jitter are
+    Philox numbers of the sample's seed: they depend on nothing else.
+    """
+    table = samples + tl.load(update).to(tl.int64) * scenes * SAMPLE_COLUMNS
+    domains = sample_domain + tl.load(update) * scenes * 3
+    last = table + (scenes - 1) * SAMPLE_COLUMNS
+    count = (tl.load(last + 1) + tl.load(last + 2)).to(tl.int32)
+    if tl.program_id(0) == 0:
+        tl.store(particle_count, count)
+        scene = 0
+        while scene < scenes:
+            seed = tl.load(table + scene * SAMPLE_COLUMNS + 3)
+            for axis in tl.static_range(3):
+                draw = tl.rand(seed, count * 0 + JITTER_OFFSET + axis)
+                tl.store(origin + scene * 3 + axis, -jitter * draw)
+                tl.store(domain + scene * 3 + axis, tl.load(domains + scene * 3 + axis))
+            for i in tl.static_range(OBSTACLE_COLUMNS):
+                value = tl.load(table + scene * SAMPLE_COLUMNS + SAMPLE_COLUMNS - OBSTACLE_COLUMNS + i)
+                tl.store(obstacle_table + scene * OBSTACLE_COLUMNS + i, value)
+            scene += 1
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    scene_row = tl.zeros((BLOCK,), tl.int32)
+    other = 1
+    while other < scenes:
+        scene_row += (row >= tl.load(table + other * SAMPLE_COLUMNS + 2)).to(tl.int32)
+        other += 1
+    line = table + scene_row * SAMPLE_COLUMNS
+    address = tl.load(line, mask=live, other=0)
+    particles = tl.load(line + 1, mask=live, other=1)
+    own = row - tl.load(line + 2, mask=live, other=0)
+    seed_row = tl.load(line + 3, mask=live, other=0)
+    tl.store(scene_of + row, scene_row, mask=live)
+    materials = tl.load(line + 4, mask=live, other=0).to(tl.pointer_type(tl.int32))
+    tl.store(material_of + row, tl.load(materials + own, mask=live, other=0), mask=live)
+    tl.store(share_of + row, 1.0 / (scenes * particles.to(tl.float32)), mask=live)
+    first = address.to(tl.pointer_type(tl.float32)) + own * 3
+    frame = particles * 3
+    for axis in tl.static_range(3):
+        walk = tl.zeros((BLOCK,), tl.float32)
+        moved = tl.zeros((BLOCK,), tl.float32)
+        before = tl.load(first + axis, mask=live, other=0.0)
+        v = walk
+        for k in tl.static_range(HISTORY):
+            walk += noise_step * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
+            moved += walk
+            now = tl.load(first + (k + 1) * frame + axis, mask=live, other=0.0)
+            v = now - before + walk
+            before = now
+            # newest first
+            tl.store(velocity + row * (3 * HISTORY) + 3 * (HISTORY - 1 - k) + axis, v, mask=live)
+        after = tl.load(first + (HISTORY + 1) * frame + axis, mask=live, other=0.0)
+        tl.store(position + row * 3 + axis, before + moved, mask=live)
+        acceleration = after - before - v
+        scaled = (acceleration - tl.load(mean + axis)) / tl.load(std + axis)
+        tl.store(target + row * 3 + axis, scaled, mask=live)
+
+
+@triton.jit
+def loss_gradient(
+    output, target, share_of, particle_count, gradient, loss, scale, OUT: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Mean squared error of the normalised acceleration over axes, particles, scenes; its gradient times `scale`."""
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = tl.arange(0, OUT)
+    live = (row < count)[:, None] & (column < 3)[None, :]
+    at = row[:, None] * OUT + column[None, :]
+    error = tl.load(output + at, mask=live, other=0.0)
+    error -= tl.load(target + row[:, None] * 3 + column[None, :], mask=live, other=0.0)
+    share = tl.load(share_of + row, mask=row < count, other=0.0)[:, None] / 3
+    tl.store(gradient + at, 2 * scale * share * error, mask=(row < count)[:, None])
+    tl.atomic_add(loss, tl.sum(tl.sum(share * error * error, 1), 0))
+
+
+@triton.jit
+def tell_overflow(status, flag):
+    """Puts into the gradient's last element whether this rank must repeat the update: it travels with the gradient."""
+    tl.store(flag, (tl.load(status) & AGAIN).to(tl.float32))
+
+
+@triton.jit
+def square_norm(gradient, size, share, flag, status, norm, BLOCK: tl.constexpr):
+    """Adds the squares of `gradient` times `share` to norm[0]; not finite if one of them is not."""
+    if tl.program_id(0) == 0 and tl.load(flag) > 0:
+        tl.atomic_or(status, REPEAT)
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    value = tl.load(gradient + at, mask=at < size, other=0.0) * share
+    tl.atomic_add(norm, tl.sum(value * value, 0))
+
+
+@triton.jit
+def adam(
+    value,
+    half,
+    gradient,
+    share,
+    first_moment,
+    second_moment,
+    rates,
+    update,
+    step,
+    status,
+    norm,
+    size,
+    HALF: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Adam (Kingma & Ba 2015) on flat buffers, unless the status is not zero or the gradient not finite.
+
+    rates [updates]; step, float64 [1], counts the steps made. With HALF the result's float16 copy is written too.
+    """
+    if tl.load(status) != 0:
+        return
+    if (tl.load(norm) < float("inf")) == 0:
+        return
+    time = tl.load(step) + 1
+    first_bias = (1 - tl.exp(time * -0.10536051565782628)).to(tl.float32)  # 1 - BETA_1^time
+    second_bias = (1 - tl.exp(time * -0.0010005003335835335)).to(tl.float32)  # 1 - BETA_2^time
+    rate = tl.load(rates + tl.load(update))
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = at < size
+    g = tl.load(gradient + at, mask=mask, other=0.0) * share
+    m = tl.load(first_moment + at, mask=mask, other=0.0)
+    v = tl.load(second_moment + at, mask=mask, other=0.0)
+    m += (g - m) * (1 - BETA_1)
+    v += (g * g - v) * (1 - BETA_2)
+    tl.store(first_moment + at, m, mask=mask)
+    tl.store(second_moment + at, v, mask=mask)
+    x = tl.load(value + at, mask=mask, other=0.0)
+    x -= rate / first_bias * m / (tl.sqrt(v / second_bias) + EPSILON)
+    tl.store(value + at, x, mask=mask)
+    if HALF:
+        tl.store(half + at, x, mask=mask)
+
+
+@triton.jit
+def finish_update(status, update, step, loss, norm, loss_sum, counters):
+    """Counts the update, unless it has to be done again with more room.
+
+    loss_sum: sum and number of finite losses. counters: sum of finite norms, how many those are, skipped updates,
+    skipped in a row, most in a row.
+    """
+    if (tl.load(status) & AGAIN) == 0:
+        tl.store(update, tl.load(update) + 1)
+        value = tl.load(loss)
+        if tl.abs(value) < float("inf"):
+            tl.store(loss_sum, tl.load(loss_sum) + value)
+            tl.store(loss_sum + 1, tl.load(loss_sum + 1) + 1.0)
+        square = tl.load(norm)
+        if square < float("inf"):
+            tl.store(step, tl.load(step) + 1)
+            tl.store(counters, tl.load(counters) + tl.sqrt(square))
+            tl.store(counters + 1, tl.load(counters + 1) + 1.0)
+            tl.store(counters + 3, 0.0)
+        else:
+            tl.store(counters + 2, tl.load(counters + 2) + 1.0)
+            row = tl.load(counters + 3) + 1.0
+            tl.store(counters + 3, row)
+            tl.store(counters + 4, tl.maximum(tl.load(counters + 4), row))
+    tl.store(loss, 0.0)
+    tl.store(norm, 0.0)

@@ -1,0 +1,349 @@
+"""Training updates on the device: batch, grid, forward, backward and Adam, in one CUDA graph for an update.
+
+Nothing waits for the host: it uploads a table of the samples of many updates, replays the graph as often, and looks
+afterwards. An update whose grid lacked room changes nothing; the host makes room and repeats it.
+Shape legend: K updates, S scenes, N particles of all scenes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import triton
+
+from hgn.kernels.backward import TrainingEngine
+from hgn.kernels.engine import OUT, feature_columns
+from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
+from hgn.kernels.packing import pack_network
+from hgn.kernels.update import kernel
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.schema import ConfigError
+
+SAMPLE_COLUMNS = 9
+MARGIN_CELLS = 4
+GROWTH = 1.25
+BLOCK = 128
+FLAT_BLOCK = 1024
+TAIL = 16  # elements behind the gradient, of which the first tells the other ranks of an overflow
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceEpisode:
+    """An episode where the kernels can read it: on the device, or in pinned memory of the host.
+
+    position_TN3 float32 begins with the frames before frame 0, so that each window is one piece of it.
+    """
+
+    position_TN3: torch.Tensor
+    material_N: torch.Tensor  # int32, index into the network's materials
+    obstacles: ObstacleHash | None
+    domain_size: tuple[float, float, float]
+
+    @property
+    def particles(self) -> int:
+        return len(self.material_N)
+
+
+@dataclass(frozen=True)
+class UpdateSettings:
+    """What an update does, as hgn.config.TrainingConfig says it."""
+
+    scenes: int
+    noise_std: float
+    grid_jitter: bool
+    obstacle_cell_size: float
+
+
+class Updates:
+    """Parameters and Adam's moments in flat buffers, and the launches that update them.
+
+    loss_sum [2] and counters [5] are added to, see finish_update. With `reduce`, which must sum a float32 tensor over
+    all ranks in place, the gradients of `ranks` ranks are averaged; then all make the same updates.
+    """
+
+    grid: DeviceGrid
+    engine: TrainingEngine
+
+    def __init__(
+        self,
+        network: HierarchicalGraphNetwork,
+        settings: UpdateSettings,
+        precision: str,
+        loss_sum: torch.Tensor,
+        counters: torch.Tensor,
+        reduce: Callable[[torch.Tensor], None] | None = None,
+        ranks: int = 1,
+        capacities: tuple[int, ...] = (),
+    ) -> None:
+        """`capacities` are cells of each level to begin with; without, they follow from the first update."""
+        self.network, self.config, self.settings, self.precision = network, network.config, settings, precision
+        self.loss_sum, self.counters, self.reduce, self.ranks = loss_sum, counters, reduce, ranks
+        self.device = device = next(network.parameters()).device
+        self.packed = pack_network(network)
+        self.values = self.packed.gather(list(network.parameters()))
+        self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
+        self.step = torch.zeros(1, dtype=torch.float64, device=device)
+        self.update = torch.zeros(1, dtype=torch.int32, device=device)
+        self.particle_count = torch.zeros(1, dtype=torch.int32, device=device)
+        self.loss, self.norm = torch.zeros(1, device=device), torch.zeros(1, device=device)
+        scenes, normaliser = settings.scenes, network.normaliser
+        self.origin_S3, self.domain_S3 = torch.zeros(scenes, 3, device=device), torch.ones(scenes, 3, device=device)
+        sees = self.config.obstacle_features
+        self.obstacles = ObstacleTable([None] * scenes, settings.obstacle_cell_size, device) if sees else None
+        self._obstacle_row = self.obstacles.row_S4 if self.obstacles else self.origin_S3.new_zeros((scenes, 4)).long()
+        self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
+        self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
+        self.capacities = capacities
+        self.particles = 0
+        self.growths = 0  # how often the buffers had to grow
+        self._reach = (torch.zeros(3), torch.zeros(3))  # what the window must hold
+        self._graphs: list[torch.cuda.CUDAGraph] = []
+        self._samples = self._domains = self._rates = torch.empty(0)
+
+    # updates
+
+    def run(self, chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]], rates: Sequence[float]) -> None:
+        """One update for each entry of `chunk`, which lists episode, frame and seed of every scene.
+
+        Raises: ConfigError when positions are not finite.
+        """
+        assert len(chunk) == len(rates)
+        particles = self._upload(chunk, rates)
+        if particles > self.particles or not self._inside(self._reach):
+            self.particles = max(self.particles, 16 * math.ceil(particles / 16))
+            self._build()
+        done = 0
+        while True:
+            for _ in range(len(chunk) - done):
+                self._replay()
+            done, status, *needed = torch.cat([self.update, self.grid.status, self.grid.needed_L]).tolist()
+            if done == len(chunk):
+                return
+            self._make_room(status, needed)
+
+    def _upload(self, chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]], rates: Sequence[float]) -> int:
+        """Writes the chunk's tables; the most particles of an update."""
+        scenes, most = self.settings.scenes, 0
+        table = np.zeros((len(chunk), scenes, SAMPLE_COLUMNS), np.int64)
+        domain = np.ones((len(chunk), scenes, 3), np.float32)
+        for k, samples in enumerate(chunk):
+            assert len(samples) == scenes
+            first = 0
+            for s, (episode, frame, seed) in enumerate(samples):
+                count = episode.particles
+                at = episode.position_TN3.data_ptr() + frame * count * 12
+                row = episode.obstacles.row() if episode.obstacles is not None else [0] * OBSTACLE_COLUMNS
+                table[k, s] = [at, count, first, seed, episode.material_N.data_ptr(), *row]
+                domain[k, s] = episode.domain_size
+                first += count
+            most = max(most, first)
+        if len(chunk) > len(self._rates):
+            self._graphs = []  # they read the old tables
+            length = len(chunk)
+            self._samples = torch.zeros(table.shape, dtype=torch.int64, device=self.device)
+            self._domains = torch.zeros(domain.shape, device=self.device)
+            self._rates = torch.zeros(length, device=self.device)
+        self._samples[: len(chunk)].copy_(torch.from_numpy(table))
+        self._domains[: len(chunk)].copy_(torch.from_numpy(domain))
+        self._rates[: len(chunk)].copy_(torch.tensor(rates, dtype=torch.float64))
+        self.update.zero_()
+        largest = torch.from_numpy(domain.reshape(-1, 3)).amax(0)
+        self._reach = (self._reach[0], torch.maximum(self._reach[1], largest))
+        return most
+
+    def _replay(self) -> None:
+        if self.device.type == "cuda" and not self._graphs:
+            self._capture()
+        if self.reduce is None:
+            self._graphs[0].replay() if self._graphs else self.launches()
+            return
+        self._graphs[0].replay() if self._graphs else self.launches_before_reduction()
+        self.reduce(self.engine.totals)
+        self._graphs[1].replay() if self._graphs else self.launches_after_reduction()
+
+    # launches
+
+    def launches(self) -> None:
+        """All launches of one update."""
+        self.launches_before_reduction()
+        self.launches_after_reduction()
+
+    def launches_before_reduction(self) -> None:
+        """From the sample table to this rank's gradients."""
+        self._assemble()
+        self._grid()
+        engine = self.engine
+        engine.forward()
+        kernel.loss_gradient[(triton.cdiv(self.particles, BLOCK),)](
+            engine.output,
+            self.target_N3,
+            self.share_N,
+            self.particle_count,
+            engine.output_gradient,
+            self.loss,
+            1.0 / engine.unscale,
+            OUT=OUT,
+            BLOCK=BLOCK,
+        )
+        engine.backward()
+        if self.reduce is not None:
+            kernel.tell_overflow[(1,)](self.grid.status, engine.totals[-TAIL:])
+
+    def launches_after_reduction(self) -> None:
+        """From the gradients to new parameters."""
+        engine, size, share = self.engine, self.packed.size, 1.0 / self.ranks
+        blocks = (triton.cdiv(size, FLAT_BLOCK),)
+        kernel.square_norm[blocks](
+            engine.totals, size, share, engine.totals[-TAIL:], self.grid.status, self.norm, BLOCK=FLAT_BLOCK
+        )
+        kernel.adam[blocks](
+            self.values,
+            engine.weights,
+            engine.totals,
+            share,
+            self.first_moment,
+            self.second_moment,
+            self._rates,
+            self.update,
+            self.step,
+            self.grid.status,
+            self.norm,
+            size,
+            HALF=self.precision == "half",
+            BLOCK=FLAT_BLOCK,
+        )
+        engine.refresh_encoder()
+        kernel.finish_update[(1,)](
+            self.grid.status, self.update, self.step, self.loss, self.norm, self.loss_sum, self.counters
+        )
+
+    def _assemble(self) -> None:
+        settings, config = self.settings, self.config
+        kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
+            self._samples,
+            self._domains,
+            self.update,
+            self.position_N3,
+            self.velocity_NV,
+            self.scene_N,
+            self.material_N,
+            self.target_N3,
+            self.share_N,
+            self.origin_S3,
+            self.domain_S3,
+            self._obstacle_row,
+            self.particle_count,
+            self.mean,
+            self.std,
+            settings.noise_std / math.sqrt(config.velocity_history),
+            config.cell_size if settings.grid_jitter else 0.0,
+            settings.scenes,
+            HISTORY=config.velocity_history,
+            BLOCK=BLOCK,
+        )
+
+    def _grid(self) -> None:
+        config, grid = self.config, self.grid
+        grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
+        grid.prepare(
+            self.position_N3,
+            self.velocity_NV,
+            self.scene_N,
+            self.material_N,
+            self.origin_S3,
+            self.domain_S3,
+            self.particle_count,
+            self.velocity_mean,
+            self.velocity_std,
+            self.obstacles,
+            config.velocity_history,
+            config.obstacle_features,
+            config.wall_distance_cells * config.cell_size,
+        )
+
+    # room
+
+    def _window(self) -> Window:
+        config, (lower, upper) = self.config, self._reach
+        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels, MARGIN_CELLS)
+
+    def _inside(self, reach: tuple[torch.Tensor, torch.Tensor]) -> bool:
+        return bool((self._built_reach[0] <= reach[0]).all() and (self._built_reach[1] >= reach[1]).all())
+
+    def _build(self) -> None:
+        """Buffers for `particles` particles and `capacities` cells, which are measured first where unknown."""
+        config, device, particles = self.config, self.device, self.particles
+        self._graphs = []
+        if hasattr(self, "engine"):
+            del self.engine, self.grid  # before the new ones are allocated
+        self._built_reach = self._reach
+        self.position_N3 = torch.zeros(particles, 3, device=device)
+        self.velocity_NV = torch.zeros(particles, 3 * config.velocity_history, device=device)
+        self.scene_N = torch.zeros(particles, dtype=torch.int32, device=device)
+        self.material_N = torch.zeros(particles, dtype=torch.int32, device=device)
+        self.target_N3 = torch.zeros(particles, 3, device=device)
+        self.share_N = torch.zeros(particles, device=device)
+        if not self.capacities:
+            self.grid = self._device_grid((16,) * config.levels)
+            self._assemble()
+            self.grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
+            self.capacities = _rounded(self.grid.needed_L.tolist())
+        self.grid = self._device_grid(self.capacities)
+        # gradients of the mean over particles are small: float16 would lose them
+        scale = 2.0 ** round(math.log2(max(particles, 2))) if self.precision == "half" else 1.0
+        self.engine = TrainingEngine(
+            config, self.packed, self.values, self.grid, self.particle_count, self.precision, scale, tail=TAIL
+        )
+
+    def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
+        config = self.config
+        return DeviceGrid(
+            self._window(),
+            self.settings.scenes,
+            capacities,
+            self.particles,
+            feature_columns(config),
+            config.cell_size,
+            self.device,
+        )
+
+    def _make_room(self, status: int, needed: list[int]) -> None:
+        if status & OUT_OF_WINDOW:
+            position = self.position_N3[: int(self.particle_count)]
+            if not bool(position.isfinite().all()):
+                raise ConfigError("positions of the training episodes must be finite, got some that are not")
+            low, high = position.amin(0).cpu(), position.amax(0).cpu()
+            self._reach = (torch.minimum(self._reach[0], low), torch.maximum(self._reach[1], high))
+        grown = _rounded(needed)
+        self.capacities = tuple(
+            c if n <= c else max(c, g) for c, n, g in zip(self.capacities, needed, grown, strict=True)
+        )
+        self.growths += 1
+        self._build()
+
+    def _capture(self) -> None:
+        parts = (
+            [self.launches] if self.reduce is None else [self.launches_before_reduction, self.launches_after_reduction]
+        )
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            self.grid.status.fill_(kernel.REPEAT.value)  # compile and warm up without changing anything
+            for part in parts:
+                part()
+            self.grid.status.zero_()
+        torch.cuda.current_stream().wait_stream(stream)
+        torch.cuda.synchronize()
+        for part in parts:
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                part()
+            self._graphs.append(graph)
+
+
+def _rounded(needed: Sequence[int]) -> tuple[int, ...]:
+    return tuple(16 * math.ceil(max(GROWTH * count, 32) / 16) for count in needed)

@@ -1,0 +1,63 @@
+"""All weight and bias gradients: a list of products A^T B over rows, and of column sums of A, cut into chunks of rows.
+
+Row of the job table: offset of A, of B, of the result, rows' count (index), width of A, width of B, rows that a count
+stands for, offset of the column sums (-1: none). Offsets in elements.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+JOB_COLUMNS = 8
+
+
+@triton.jit
+def weight_gradient(
+    left,
+    right,
+    totals,
+    jobs,
+    chunk_job,
+    chunk_first,
+    counts,
+    unscale,
+    TILE: tl.constexpr,
+    CHUNK: tl.constexpr,
+    STEP: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """Program i adds its chunk's part of A^T B [width A, width B] to totals; widths are at most TILE."""
+    job = jobs + tl.load(chunk_job + tl.program_id(0)) * 8
+    first = tl.load(chunk_first + tl.program_id(0))
+    rows = tl.load(counts + tl.load(job + 3)) * tl.load(job + 6)
+    if first >= rows:
+        return
+    a_at = tl.multiple_of(tl.load(job), 16)
+    b_at = tl.multiple_of(tl.load(job + 1), 16)
+    out_at = tl.load(job + 2)
+    a_width = tl.multiple_of(tl.load(job + 4), 16)
+    b_width = tl.multiple_of(tl.load(job + 5), 16)
+    column = tl.arange(0, TILE)
+    total = tl.zeros((TILE, TILE), tl.float32)
+    lines = tl.zeros((STEP, TILE), tl.float32)
+    last = tl.minimum(rows, first + CHUNK)
+    for start in range(0, CHUNK, STEP):
+        row = first + start + tl.arange(0, STEP)
+        place = row[:, None]
+        live = (row < last)[:, None]
+        a = tl.load(left + a_at + place * a_width + column[None, :], mask=live & (column < a_width)[None, :], other=0.0)
+        b = tl.load(
+            right + b_at + place * b_width + column[None, :], mask=live & (column < b_width)[None, :], other=0.0
+        )
+        lines += a.to(tl.float32)
+        if PRECISION == "half":
+            total = tl.dot(tl.trans(a.to(tl.float16)), b.to(tl.float16), total)
+        else:
+            total = tl.dot(tl.trans(a), b, total, input_precision=PRECISION)
+    bias_at = tl.load(job + 7)
+    if bias_at >= 0:
+        tl.atomic_add(totals + bias_at + column, tl.sum(lines, 0) * unscale, mask=column < a_width, sem="relaxed")
+    at = out_at + column[:, None] * b_width + column[None, :]
+    mask = (column < a_width)[:, None] & (column < b_width)[None, :]
+    tl.atomic_add(totals + at, total * unscale, mask=mask, sem="relaxed")

@@ -1,0 +1,202 @@
+"""The simulation loop as one CUDA graph a frame (paper algorithm 1): no host synchronisation between looks.
+
+The host looks every LOOK_FRAMES frames. Where the grid needed more room than it had, the frames before are kept, the
+buffers grow, and the simulation goes on from the last good frame: nothing is lost, and nothing is done twice.
+Shape legend: N particles of all scenes, S scenes, T frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from hgn.kernels.engine import OUT, Engine, feature_columns
+from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
+from hgn.kernels.packing import pack_network
+from hgn.kernels.rollout.kernel import DIVERGED, advance, integrate
+from hgn.network.features import ParticleState
+from hgn.network.grid import build_hierarchy
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.path import kernel_precision
+
+LOOK_FRAMES = 32
+MARGIN_CELLS = 4
+GROWTH = 2.0
+INTEGRATE_BLOCK = 256
+
+
+class LeftDomainError(RuntimeError):
+    """Particles are no longer finite, or farther from the domain than its own size."""
+
+    def __init__(self, frame: int, lost: int) -> None:
+        super().__init__(f"{lost} particles at frame {frame}")
+        self.frame, self.lost = frame, lost
+
+
+class FastRollout:
+    """A simulation in progress on one device. Without CUDA the same launches run one by one (for tests)."""
+
+    def __init__(
+        self,
+        network: HierarchicalGraphNetwork,
+        state: ParticleState,
+        precision: str,
+        capacities: tuple[int, ...] | None = None,
+    ) -> None:
+        """`precision` is highest, high or half; `capacities` are cells of each level to begin with."""
+        self.config, self.device = network.config, state.position_N3.device
+        self.precision = kernel_precision(precision, self.device)
+        self.packed = pack_network(network)
+        self.values = self.packed.gather(list(network.parameters()))
+        self.particles = len(state.position_N3)
+        self.scenes = state.scene_count
+
+        def integers(value: int) -> torch.Tensor:
+            return torch.full((1,), value, dtype=torch.int32, device=self.device)
+
+        self.count, self.lost, self.frame = integers(self.particles), integers(0), integers(0)
+        self.position_N3 = state.position_N3.float().clone()
+        self.velocity_NV = state.velocity_NM3.float().flatten(1).contiguous().clone()
+        self.scene_N, self.material_N = state.scene_N.int(), state.material_N.int()
+        self.domain_S3 = state.domain_S3.float().contiguous()
+        self.origin_S3 = torch.zeros_like(self.domain_S3)
+        self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count) if state.obstacles is not None else None
+        self.path_TN3 = torch.zeros(LOOK_FRAMES, self.particles, 3, device=self.device)
+        normaliser = network.normaliser
+        self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
+        self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
+        self.frames_done = 0
+        self.growths = 0
+        self._build(capacities or self._first_capacities())
+
+    def _first_capacities(self) -> tuple[int, ...]:
+        """Room for the cells of now several times over; what falls spreads."""
+        grid = build_hierarchy(
+            self.position_N3, self.scene_N.long(), self.origin_S3, self.config.cell_size, self.config.levels
+        )
+        return tuple(max(256 >> i, int(GROWTH * level.cell_count)) for i, level in enumerate(grid.levels))
+
+    def _window(self) -> Window:
+        box = torch.stack([self.position_N3.amin(0), self.position_N3.amax(0)]).cpu()
+        size = self.domain_S3.amax(0).cpu()
+        lower, upper = torch.minimum(box[0], torch.zeros(3)), torch.maximum(box[1], size)
+        config = self.config
+        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels, MARGIN_CELLS)
+
+    def _build(self, capacities: tuple[int, ...]) -> None:
+        config, window = self.config, self._window()
+        self.graph = None
+        # never more than the window or the particles' corners can hold
+        limits = [self.scenes * math.prod(n >> i for n in window.cells) for i in range(config.levels)]
+        limits = [min(limit, 8 * self.particles) for limit in limits]
+        rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
+        self.grid = DeviceGrid(
+            window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size, self.device
+        )
+        self.engine = Engine(config, self.packed, self.values, self.grid, self.count, self.precision)
+        if self.device.type == "cuda":
+            self.graph = self._capture()
+
+    def _capture(self) -> torch.cuda.CUDAGraph:
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            # compile and warm up without moving anything: a status that is not zero stops the integration
+            self._network_pass()
+            self.grid.status.fill_(OVERFLOW)
+            self._integrate()
+            self.grid.status.zero_()
+        torch.cuda.current_stream().wait_stream(stream)
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            self.frame_launches()
+        return graph
+
+    def frame_launches(self) -> None:
+        """All launches of one frame: what the graph holds."""
+        self._network_pass()
+        self._integrate()
+
+    def _network_pass(self) -> None:
+        config, grid = self.config, self.grid
+        grid.build(self.position_N3, self.scene_N, self.origin_S3, self.count)
+        grid.prepare(
+            self.position_N3,
+            self.velocity_NV,
+            self.scene_N,
+            self.material_N,
+            self.origin_S3,
+            self.domain_S3,
+            self.count,
+            self.velocity_mean,
+            self.velocity_std,
+            self.obstacles,
+            config.velocity_history,
+            config.obstacle_features,
+            config.wall_distance_cells * config.cell_size,
+        )
+        self.engine.forward()
+
+    def _integrate(self) -> None:
+        integrate[(-(-3 * self.particles // INTEGRATE_BLOCK),)](
+            self.engine.output,
+            self.position_N3,
+            self.velocity_NV,
+            self.scene_N,
+            self.domain_S3,
+            self.mean,
+            self.std,
+            self.count,
+            self.grid.status,
+            self.lost,
+            self.frame,
+            self.path_TN3,
+            OUT=OUT,
+            HISTORY=self.config.velocity_history,
+            BLOCK=INTEGRATE_BLOCK,
+        )
+        advance[(1,)](self.grid.status, self.lost, self.frame)
+
+    def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:
+        """Simulates `frames` more frames; their positions, float32 [frames, N, 3].
+
+        Raises: LeftDomainError, with the number of the frame.
+        """
+        kept = np.empty((frames, self.particles, 3), np.float32)
+        done = 0
+        while done < frames:
+            self.frame.zero_()
+            for _ in range(min(LOOK_FRAMES, frames - done)):
+                if self.graph is None:
+                    self.frame_launches()
+                else:
+                    self.graph.replay()
+            taken, status = torch.cat([self.frame, self.grid.status]).tolist()
+            kept[done : done + taken] = self.path_TN3[:taken].cpu().numpy()
+            if on_frame is not None:
+                for frame in range(done, done + taken):
+                    on_frame(self.frames_done + frame - done + 1)
+            done += taken
+            self.frames_done += taken
+            if status & DIVERGED.value:
+                raise LeftDomainError(self.frames_done, self._lost())
+            if status & (OVERFLOW | OUT_OF_WINDOW):
+                self._grow()
+        return kept
+
+    def _lost(self) -> int:
+        domain_N3 = self.domain_S3[self.scene_N.long()]
+        inside = (self.position_N3 > -domain_N3) & (self.position_N3 < 2 * domain_N3)
+        return int(inside.logical_not().any(-1).sum())
+
+    def _grow(self) -> None:
+        needed = self.grid.needed_L.tolist()
+        capacities = [
+            max(c, int(GROWTH * n) if n > c else c) for c, n in zip(self.grid.capacities, needed, strict=True)
+        ]
+        self.growths += 1
+        self._build(tuple(capacities))

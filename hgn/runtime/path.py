@@ -1,0 +1,55 @@
+"""Which implementation computes the network: the plain one, or the fast one (Triton kernels in CUDA graphs).
+
+`auto` takes the fast one wherever it runs, and the choice is always said.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.schema import ConfigError
+
+# what the configuration calls them, and what the kernels do; float32 in three TF32 products
+KERNEL_PRECISION = {"highest": "tf32x3", "high": "tf32", "half": "half"}
+FAST_WIDTHS = (16, 32, 64, 128)
+FAST_LEVELS = 8
+
+
+def why_not_fast(device: torch.device, config: NetworkConfig) -> str | None:
+    """What keeps the fast path from running, in words; none if nothing does."""
+    if config.kind != "hgn":
+        return f"it computes hgn networks, not {config.kind}"
+    if device.type != "cuda":
+        return f"it needs a CUDA device, not {device.type}"
+    if importlib.util.find_spec("triton") is None:
+        return "it needs the package triton"
+    if config.width not in FAST_WIDTHS:
+        return f"network.width must be one of {', '.join(map(str, FAST_WIDTHS))} for it, not {config.width}"
+    if config.levels > FAST_LEVELS:
+        return f"network.levels must be at most {FAST_LEVELS} for it, not {config.levels}"
+    return None
+
+
+def choose_path(field: str, path: str, precision: str, reason: str | None) -> tuple[str, str]:
+    """`plain` or `fast`, and a line that says so; `reason` is what keeps the fast one from running.
+
+    Raises: ConfigError when the fast path is asked for and cannot run, or half precision without it.
+    """
+    if path == "fast" and reason is not None:
+        raise ConfigError(f"{field} must be plain or auto here, got fast: {reason}")
+    chosen = "fast" if path != "plain" and reason is None else "plain"
+    if chosen == "plain" and precision == "half":
+        raise ConfigError(
+            f"precision must be high or highest on the plain path, got half; {reason or f'{field}=plain was asked for'}"
+        )
+    because = f" ({reason})" if chosen == "plain" and path == "auto" else ""
+    return chosen, f"{field.rpartition('.')[0] or 'runtime'} path: {chosen}{because}, precision {precision}"
+
+
+def kernel_precision(precision: str, device: torch.device) -> str:
+    """What the kernels call `highest`, `high` or `half`; without a GPU float32 needs no detour."""
+    name = KERNEL_PRECISION[precision]
+    return "ieee" if device.type == "cpu" and name != "half" else name

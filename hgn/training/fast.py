@@ -1,0 +1,100 @@
+"""Training by captured updates: what Lightning sees stays true, what runs is hgn.kernels.update.
+
+Parameters and Adam's moments live in the kernels' layout while a chunk of updates runs, and are copied back after it,
+so that checkpoints, monitoring and the other path find them where they belong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+from hgn.config import TrainingConfig
+from hgn.data.chunk import Chunk, WholeEpisode
+from hgn.kernels.grid.op import ObstacleHash
+from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.path import kernel_precision
+
+DATA_SHARE = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
+
+
+class FastTraining:
+    """Makes the updates of chunks on a network and its optimiser, a torch.optim.Adam."""
+
+    def __init__(
+        self,
+        network: HierarchicalGraphNetwork,
+        optimizer: torch.optim.Optimizer,
+        training: TrainingConfig,
+        obstacle_cell_size: float,
+        loss_sum: torch.Tensor,
+        counters: torch.Tensor,
+        reduce: Callable[[torch.Tensor], None] | None = None,
+        ranks: int = 1,
+    ) -> None:
+        """loss_sum [2] and counters [5] are added to, as hgn.kernels.update.kernel.finish_update says."""
+        self.network, self.optimizer = network, optimizer
+        self.device = next(network.parameters()).device
+        settings = UpdateSettings(training.batch_scenes, training.noise_std, training.grid_jitter, obstacle_cell_size)
+        precision = kernel_precision(training.precision, self.device)
+        self._take_over()
+        self.updates = Updates(network, settings, precision, loss_sum, counters, reduce, ranks)
+        self._read_moments()
+        self._episodes: dict[int, DeviceEpisode] = {}
+
+    def run(self, chunk: Chunk, rates: list[float]) -> None:
+        """Makes an update for each entry of the chunk, at these learning rates.
+
+        Raises: ConfigError when positions are not finite.
+        """
+        for index, episode in chunk.episodes.items():
+            self._episodes[index] = self._placed(episode)
+        self.updates.run([[(self._episodes[s.episode], s.frame, s.seed) for s in u] for u in chunk.samples], rates)
+        self._write_back()
+
+    def _placed(self, episode: WholeEpisode) -> DeviceEpisode:
+        """On the device while there is room, else in pinned memory, which the kernels read through the bus."""
+        position_TN3 = episode.position_TN3
+        if self.device.type == "cuda":
+            free, total = torch.cuda.mem_get_info(self.device)
+            fits = free - position_TN3.nbytes > (1 - DATA_SHARE) * total
+            position_TN3 = position_TN3.to(self.device) if fits else position_TN3.pin_memory()
+        cells, normals = episode.obstacle_cell_K3, episode.obstacle_normal_K3
+        obstacles = ObstacleHash.of(cells, normals).to(self.device) if len(cells) else None
+        return DeviceEpisode(position_TN3, episode.material_N.to(self.device), obstacles, episode.domain_size)
+
+    def _take_over(self) -> None:
+        """Makes parameters and moments views of flat buffers, so that one launch copies all of them."""
+        parameters = list(self.network.parameters())
+        counts = [parameter.numel() for parameter in parameters]
+        self._flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
+        self._moments = torch.zeros(2, sum(counts), device=self.device)
+        self._steps = torch.zeros(len(parameters), device=self.device)
+        first, second = (flat.split(counts) for flat in self._moments)
+        for i, (parameter, view) in enumerate(zip(parameters, self._flat.split(counts), strict=True)):
+            state = self.optimizer.state[parameter]
+            if state:
+                first[i].copy_(state["exp_avg"].reshape(-1))
+                second[i].copy_(state["exp_avg_sq"].reshape(-1))
+                self._steps[i] = state["step"]
+            parameter.data = view.view(parameter.shape)
+            state["step"] = self._steps[i]
+            state["exp_avg"], state["exp_avg_sq"] = (m[i].view(parameter.shape) for m in (first, second))
+
+    def _read_moments(self) -> None:
+        index = self.updates.packed.index.to(self.device)
+        used = index >= 0
+        for flat, packed in zip(self._moments, (self.updates.first_moment, self.updates.second_moment), strict=True):
+            packed.copy_(torch.where(used, flat[index.clamp(min=0)], 0.0))
+        self.updates.step.fill_(float(self._steps.max()))
+        self._place = torch.empty_like(index[used])  # of each parameter element in the packed buffers
+        self._place[index[used]] = torch.nonzero(used).flatten()
+
+    def _write_back(self) -> None:
+        updates = self.updates
+        torch.index_select(updates.values, 0, self._place, out=self._flat)
+        torch.index_select(updates.first_moment, 0, self._place, out=self._moments[0])
+        torch.index_select(updates.second_moment, 0, self._place, out=self._moments[1])
+        self._steps.copy_(updates.step.expand_as(self._steps))

@@ -1,0 +1,91 @@
+"""An engine on the particles of a reference state, for the parity tests."""
+
+from __future__ import annotations
+
+import torch
+
+from hgn.kernels.backward import TrainingEngine
+from hgn.kernels.engine import feature_columns
+from hgn.kernels.grid.op import DeviceGrid, ObstacleTable, Window
+from hgn.kernels.packing import pack_network
+from hgn.network.features import ParticleState
+from hgn.network.network import HierarchicalGraphNetwork
+
+
+def device() -> torch.device:
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def engine_of(
+    network: HierarchicalGraphNetwork,
+    state: ParticleState,
+    precision: str = "ieee",
+    capacities: tuple[int, ...] = (),
+    spare_particles: int = 3,
+    loss_scale: float = 1.0,
+) -> TrainingEngine:
+    """All buffers that the forward pass writes are NaN before, so that what nobody writes shows."""
+    config, where = network.config, device()
+    particles = len(state.position_N3)
+    capacities = capacities or tuple(max(16, 8 * particles) for _ in range(config.levels))
+    box = state.position_N3.float()
+    lower, upper = box.min(0).values.tolist(), box.max(0).values.tolist()
+    window = Window.around(lower, upper, config.cell_size, config.levels, 2)
+    grid = DeviceGrid(
+        window,
+        state.scene_count,
+        capacities,
+        particles + spare_particles,
+        feature_columns(config),
+        config.cell_size,
+        where,
+    )
+    packed = pack_network(network)
+    values = packed.gather(list(network.parameters())).to(where)
+    count = torch.tensor([particles], dtype=torch.int32, device=where)
+    return TrainingEngine(config, packed, values, grid, count, precision, loss_scale)
+
+
+def run_forward(
+    engine: TrainingEngine, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
+) -> torch.Tensor:
+    """The engine's normalised accelerations of the state, [N, 3]."""
+    where, grid, config = engine.device, engine.grid, network.config
+
+    def padded(value: torch.Tensor) -> torch.Tensor:
+        full = torch.full((grid.particles, *value.shape[1:]), 7, dtype=value.dtype)
+        full[: len(value)] = value
+        return full.to(where)
+
+    position = padded(state.position_N3.float())
+    velocity = padded(state.velocity_NM3.float().flatten(1))
+    scene = padded(state.scene_N.int())
+    material = padded(state.material_N.int())
+    origin, domain = origin_S3.float().to(where), state.domain_S3.float().to(where)
+    obstacles = ObstacleTable.of(state.obstacles.to(where), state.scene_count) if state.obstacles is not None else None
+    grid.build(position, scene, origin, engine.particle_count)
+    normaliser = network.normaliser
+    grid.prepare(
+        position,
+        velocity,
+        scene,
+        material,
+        origin,
+        domain,
+        engine.particle_count,
+        normaliser.velocity_mean.float().to(where),
+        normaliser.velocity_std.float().to(where),
+        obstacles,
+        config.velocity_history,
+        config.obstacle_features,
+        config.wall_distance_cells * config.cell_size,
+    )
+    engine.forward()
+    return engine.output[: len(state.position_N3), :3].cpu()
+
+
+def gradients(engine: TrainingEngine, network: HierarchicalGraphNetwork) -> list[torch.Tensor]:
+    """What `backward` left, shaped as the network's parameters."""
+    found = [torch.zeros_like(p, dtype=torch.float32) for p in network.parameters()]
+    engine.packed.scatter(engine.totals[: engine.packed.size].cpu(), found)
+    return found

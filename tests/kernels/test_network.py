@@ -1,0 +1,169 @@
+"""The kernels' network against the plain one in float64: outputs and all gradients."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from kernels.engines import device, engine_of, gradients, run_forward
+from network.states import network_of, random_state
+
+from hgn.network.features import ParticleState
+from hgn.network.network import HierarchicalGraphNetwork
+
+SEVERAL = (7, 1, 4)  # particles of three scenes
+gpu = pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
+
+
+def reference(
+    network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor, weight_N3: torch.Tensor
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Output and gradients of the sum of outputs times `weight_N3`."""
+    output = network.normalised_acceleration(state, origin_S3)
+    found = torch.autograd.grad((output * weight_N3).sum(), list(network.parameters()), allow_unused=True)
+    pairs = zip(network.parameters(), found, strict=True)
+    return output.detach(), [torch.zeros_like(p) if gradient is None else gradient for p, gradient in pairs]
+
+
+def relative(found: torch.Tensor, expected: torch.Tensor) -> float:
+    difference, size = (found.double() - expected).norm(), expected.norm()
+    return float(difference / size) if size > 0 else float(difference)
+
+
+def flat(tensors: list[torch.Tensor]) -> torch.Tensor:
+    return torch.cat([tensor.double().cpu().flatten() for tensor in tensors])
+
+
+def float32_state(counts: tuple[int, ...], obstacles: bool = True, spread: float = 0.3) -> ParticleState:
+    """A state whose numbers float32 holds exactly, in float64."""
+    state = random_state(counts, 3, torch.float32, obstacles, spread)
+    doubled = {name: getattr(state, name).double() for name in ("position_N3", "velocity_NM3", "domain_S3")}
+    return replace(state, **doubled)
+
+
+def compare(
+    network: HierarchicalGraphNetwork, state: ParticleState, precision: str, loss_scale: float, room: int
+) -> tuple[float, float, list[float]]:
+    """Relative errors of the output, of all gradients together, of each gradient."""
+    generator = torch.Generator().manual_seed(1)
+    origin_S3 = (-network.config.cell_size * torch.rand(state.scene_count, 3, generator=generator)).double()
+    weight_N3 = torch.randn(state.position_N3.shape, generator=generator, dtype=torch.float64)
+    output, expected = reference(network, state, origin_S3, weight_N3)
+    engine = engine_of(network, state, precision, (room,) * network.config.levels, loss_scale=loss_scale)
+    found = run_forward(engine, network, state, origin_S3)
+    assert int(engine.grid.status) == 0
+    engine.output_gradient[: len(weight_N3), :3] = (loss_scale * weight_N3).float()
+    engine.backward()
+    each = gradients(engine, network)
+    pairs = zip(each, expected, strict=True)
+    return relative(found, output), relative(flat(each), flat(expected)), [relative(a, b) for a, b in pairs]
+
+
+@pytest.mark.parametrize(
+    ("counts", "spread", "changes"),
+    [
+        (SEVERAL, 0.2, {"levels": 2, "message_passing_steps": 2}),
+        ((1,), 0.3, {"levels": 3, "message_passing_steps": 1, "obstacle_features": False}),
+        ((5,), 0.1, {"levels": 1, "message_passing_steps": 1, "materials": ("water", "snow", "sand")}),
+    ],
+)
+def test_outputs_and_gradients(counts: tuple[int, ...], spread: float, changes: dict) -> None:
+    """In float32 several scenes in one batch, a single particle, and a single level, with odd numbers of particles and
+    cells, give the outputs and every gradient of the plain network to 1e-5."""
+    network = network_of(width=16, **changes)
+    state = float32_state(counts, network.config.obstacle_features, spread)
+    precision = "ieee" if device().type == "cpu" else "tf32x3"
+    output, together, each = compare(network, state, precision, 1.0, 128)
+    assert output < 1e-5 and together < 1e-5 and max(each) < 2e-5
+
+
+def test_half_precision_keeps_small_gradients() -> None:
+    """Operands rounded to float16 change the output by less than 5e-3, and with a loss scale no gradient is lost."""
+    network = network_of(width=16, levels=1, message_passing_steps=1)
+    state = float32_state((5,), spread=0.1)
+    weight = 2.0**-14
+    output, _, _ = compare(network, state, "half", 1.0, 64)
+    assert output < 5e-3
+    origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
+    engine = engine_of(network, state, "half", (64,), loss_scale=1 / weight)
+    run_forward(engine, network, state, origin_S3)
+    engine.output_gradient[:5, :3] = 1.0
+    engine.backward()
+    _, expected = reference(network, state, origin_S3, torch.full((5, 3), weight, dtype=torch.float64))
+    assert relative(flat(gradients(engine, network)), flat(expected)) < 5e-2
+
+
+def test_cells_on_the_border_of_the_grid() -> None:
+    """Particles exactly at cell centres and cell faces activate the cells that the plain grid activates."""
+    network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.0625)
+    state = float32_state((4,), spread=0.2)
+    position = torch.tensor([[0.0, 0.0, 0.0], [0.03125, 0.09375, 0.0625], [0.125, 0.125, 0.125], [0.28125, 0.25, 0.0]])
+    state = replace(state, position_N3=position.double())
+    origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
+    engine = engine_of(network, state, "ieee" if device().type == "cpu" else "tf32x3", (64, 32))
+    found = run_forward(engine, network, state, origin_S3)
+    assert relative(found, network.normalised_acceleration(state, origin_S3).detach()) < 1e-5
+
+
+def test_without_obstacles_nothing_is_looked_up() -> None:
+    """A network with obstacle features gives in a scene without obstacles exactly what it gives when all normals are
+    looked up and none is found."""
+    network = network_of(width=16, levels=1, message_passing_steps=1)
+    state = float32_state((6,), spread=0.1)
+    assert state.obstacles is not None
+    far = replace(state.obstacles, key_K=state.obstacles.key_K[:1] * 0, normal_K3=state.obstacles.normal_K3[:1])
+    origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
+    outputs = []
+    for obstacles in (None, far):
+        engine = engine_of(network, state, "ieee" if device().type == "cpu" else "tf32", (64,))
+        outputs.append(run_forward(engine, network, replace(state, obstacles=obstacles), origin_S3).clone())
+    assert torch.equal(*outputs)
+
+
+@gpu
+@pytest.mark.gpu
+@pytest.mark.parametrize("counts", [(300, 131, 77), (1,)])
+def test_whole_networks_on_a_gpu(counts: tuple[int, ...]) -> None:
+    """At the paper's size the output is within 2e-3 of float64 in TF32 and float16, within 1e-5 in float32; gradients
+    are as near as those of the plain network with TF32 products, whose error comes from activations next to their
+    kink, and within 1e-3 in float32."""
+    network = network_of(width=128, levels=4, message_passing_steps=4)
+    state = float32_state(counts)
+    plain = plain_tf32_errors(network, state)
+    for precision, bound in (("tf32x3", 1e-5), ("tf32", 2e-3), ("half", 2e-3)):
+        output, together, _ = compare(network, state, precision, 256.0 if precision == "half" else 1.0, 8192)
+        assert output < bound, precision
+        assert together < (1e-3 if precision == "tf32x3" else max(2e-3, 2 * plain)), precision
+
+
+def plain_tf32_errors(network: HierarchicalGraphNetwork, state: ParticleState) -> float:
+    """Relative error of all gradients of the plain network with TF32 products."""
+    generator = torch.Generator().manual_seed(1)
+    origin_S3 = (-network.config.cell_size * torch.rand(state.scene_count, 3, generator=generator)).double()
+    weight_N3 = torch.randn(state.position_N3.shape, generator=generator, dtype=torch.float64)
+    _, expected = reference(network, state, origin_S3, weight_N3)
+    where = device()
+    single = network_of(
+        torch.float32,
+        width=network.config.width,
+        levels=network.config.levels,
+        message_passing_steps=network.config.message_passing_steps,
+    ).to(where)
+    single.load_state_dict({name: value.float() for name, value in network.state_dict().items()})
+    assert state.obstacles is not None
+    moved = ParticleState(
+        state.position_N3.float().to(where),
+        state.velocity_NM3.float().to(where),
+        state.material_N.to(where),
+        state.scene_N.to(where),
+        state.domain_S3.float().to(where),
+        state.obstacles.to(where),
+    )
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        _, found = reference(single, moved, origin_S3.float().to(where), weight_N3.float().to(where))
+    finally:
+        torch.set_float32_matmul_precision(before)
+    return relative(flat(found), flat(expected))

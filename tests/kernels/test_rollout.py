@@ -1,0 +1,70 @@
+"""The simulation loop on the device against the plain one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from kernels.engines import device
+from network.states import network_of, random_grid
+
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.fast import FastRollout
+from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+
+GRAVITY = (0.0, -9.8, 0.0)
+
+
+def scene(particles: int, seed: int = 0) -> InitialState:
+    rng = np.random.default_rng(seed)
+    return InitialState(
+        position_N3=(0.05 + 0.1 * rng.random((particles, 3))).astype(np.float32),
+        velocity_N3=rng.normal(0, 0.1, (particles, 3)).astype(np.float32),
+        material_N=rng.integers(0, 3, particles).astype(np.uint8),
+        obstacle_grid=random_grid(seed, 4_000),
+        domain_size=(0.4, 0.4, 0.4),
+        gravity=GRAVITY,
+    )
+
+
+def network() -> HierarchicalGraphNetwork:
+    return network_of(torch.float32, width=16, levels=2, message_passing_steps=1).to(device())
+
+
+def test_frames_are_those_of_the_plain_loop() -> None:
+    """Two scenes at once move as in the plain simulator, frame by frame, and each frame is announced once."""
+    scenes, seen = [scene(5), scene(3, 1)], []
+    expected = Simulator(network(), 60.0).rollout(scenes, 4)
+    found = Simulator(network(), 60.0, "fast", "highest").rollout(scenes, 4, seen.append)
+    assert seen == [1, 2, 3]
+    for path_TN3, expected_TN3 in zip(found, expected, strict=True):
+        assert path_TN3.shape == expected_TN3.shape and path_TN3.dtype == np.float32
+        np.testing.assert_allclose(path_TN3, expected_TN3, rtol=0, atol=1e-6)
+
+
+def test_overflow_loses_nothing() -> None:
+    """A rollout whose cells outgrow its buffers grows them, and its frames equal those of one that had room."""
+    spreading = network()
+    with torch.no_grad():
+        spreading.normaliser.acceleration_std.fill_(0.03)
+    state = Simulator(spreading, 60.0).start([scene(5)])
+    roomy = FastRollout(spreading, state, "highest", (64, 64))
+    tight = FastRollout(spreading, state, "highest", (16, 16))
+    expected = roomy.run(3)
+    found = np.concatenate([tight.run(1), tight.run(2)])
+    assert tight.growths > 0 and roomy.growths == 0
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+def test_divergence_names_the_frame() -> None:
+    """Particles that leave the domain by more than its size end the simulation with the plain path's message."""
+    wild = network()
+    with torch.no_grad():
+        wild.normaliser.acceleration_mean.fill_(0.15)
+        wild.normaliser.acceleration_std.fill_(0.0)
+    messages = []
+    for path in ("plain", "fast"):
+        with pytest.raises(DivergenceError) as caught:
+            Simulator(wild, 60.0, path).rollout([scene(4)], 4)
+        messages.append(str(caught.value))
+    assert messages[0] == messages[1] and "4 of 4 particles" in messages[0]

@@ -1,0 +1,148 @@
+"""The training command on the fast path: counts, logs, checkpoints, resume, and the way back to the plain path."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from kernels.engines import device
+from training.runs import metrics, train_mapping
+
+from hgn import train
+from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
+from hgn.runtime.path import choose_path, why_not_fast
+from hgn.schema import ConfigError
+from hgn.training.checkpoint import read_checkpoint
+from hgn.training.feed import UPDATES_AT_ONCE, chunk_length
+
+NETWORK = {"width": 16, "levels": 1, "message_passing_steps": 1, "material_embedding": 2, "cell_size": 0.2}
+
+
+@pytest.fixture(autouse=True)
+def keep_signal_handlers():
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
+    config = make_config(training_scenes=2, validation_scenes=1, test_scenes=0)
+    make_dataset(config)
+    return config
+
+
+def run_mapping(config: DatagenConfig, run: Path, **training: Any) -> dict[str, Any]:
+    values = {"maximum_updates": 4, "log_every": 2, "checkpoint_every": 3, "monitor_every": 3, "monitor_scenes": 1}
+    values |= {"path": "fast", "precision": "highest", "monitor_frame_stride": 3, "accelerator": "auto"} | training
+    mapping = train_mapping(config, run, **values)
+    return mapping | {"network": NETWORK}
+
+
+def test_fast_training_is_the_plain_one(
+    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without noise and jitter both paths make the same updates: every count and log line is there, weights and
+    moments agree; a training may change path at any checkpoint, and ends where the others do."""
+    if device().type == "cpu":
+        monkeypatch.setattr(train, "why_not_fast", lambda device, config: None)  # kernels run in the interpreter
+    same = {"noise_std": 0.0, "grid_jitter": False}
+    ends = {}
+    for name, parts in {
+        "plain": [("plain", 4)],
+        "fast": [("fast", 4)],
+        "mixed": [("fast", 1), ("plain", 2), ("fast", 4)],
+    }.items():
+        for path, updates in parts:
+            with monkeypatch.context() as patch:
+                if updates < 4:
+                    stop_at(patch, updates)
+                assert train.main(run_mapping(data, tmp_path / name, path=path, **same)) == 0
+            ends[name] = read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
+            assert ends[name]["hgn"]["updates"] == updates
+    assert "training path: fast, precision highest" in capsys.readouterr().err
+    for name in ("fast", "mixed"):
+        for key in ("lr_schedulers", "hgn"):
+            assert ends[name][key] == ends["plain"][key], key
+        for key, value in ends["plain"]["state_dict"].items():
+            torch.testing.assert_close(ends[name]["state_dict"][key], value, rtol=1e-3, atol=2e-5)
+        states, expected = ends[name]["optimizer_states"][0], ends["plain"]["optimizer_states"][0]
+        assert states["param_groups"] == expected["param_groups"]
+        for parameter, state in expected["state"].items():
+            assert float(states["state"][parameter]["step"]) == float(state["step"]) == 4
+            torch.testing.assert_close(states["state"][parameter]["exp_avg"], state["exp_avg"], rtol=1e-2, atol=1e-6)
+    plain, fast = ([record for record in metrics(tmp_path / name) if "loss" in record] for name in ("plain", "fast"))
+    assert [record["update"] for record in fast] == [record["update"] for record in plain] == [2, 4]
+    for found, expected in zip(fast, plain, strict=True):
+        assert found["learning_rate"] == expected["learning_rate"] and found["skipped_updates"] == 0
+        assert found["loss"] == pytest.approx(expected["loss"], rel=1e-4)
+        assert found["gradient_norm"] == pytest.approx(expected["gradient_norm"], rel=1e-3)
+    monitored = [
+        [record["one_step/validation"] for record in metrics(tmp_path / name) if "one_step/validation" in record]
+        for name in ("plain", "fast")
+    ]
+    assert len(monitored[0]) == 2 and monitored[1] == pytest.approx(monitored[0], rel=1e-3)
+
+
+def stop_at(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
+    """Lets the next training end once it has made that many updates, or just after."""
+    from hgn.training.callbacks import Stopper
+
+    original = Stopper.on_train_batch_end
+
+    def on_train_batch_end(self, trainer, *arguments):
+        trainer.should_stop = trainer.global_step >= update
+        return original(self, trainer, *arguments)
+
+    monkeypatch.setattr(Stopper, "on_train_batch_end", on_train_batch_end)
+
+
+def test_chunks_end_where_something_is_due() -> None:
+    """Chunks meet every multiple of the log, checkpoint and monitor intervals and the last update, whatever update a
+    training begins at, and the first ones are short."""
+    training = TrainingConfig(maximum_updates=1000, log_every=50, checkpoint_every=70, monitor_every=300)
+    for begun in (0, 37, 999):
+        update, ends = begun, []
+        while update < 1000:
+            count = chunk_length(training, begun, update)
+            assert 1 <= count <= UPDATES_AT_ONCE
+            update += count
+            ends.append(update)
+        due = {n for every in (50, 70, 300) for n in range(every, 1001, every) if n > begun} | {1000}
+        assert due <= set(ends) and ends[-1] == 1000 and ends[0] == begun + 1
+    assert chunk_length(training, 0, 1000) >= 1
+
+
+@pytest.mark.parametrize(
+    ("path", "precision", "reason", "expected"),
+    [
+        ("auto", "high", None, ("fast", "training path: fast, precision high")),
+        ("plain", "high", None, ("plain", "training path: plain, precision high")),
+        ("auto", "high", "it needs gold", ("plain", "training path: plain (it needs gold), precision high")),
+        ("fast", "high", "it needs gold", "training.path must be plain or auto here, got fast: it needs gold"),
+        ("auto", "half", "it needs gold", "precision must be high or highest on the plain path, got half"),
+        ("plain", "half", None, "got half; training.path=plain was asked for"),
+    ],
+)
+def test_the_path_is_chosen_and_said(path: str, precision: str, reason: str | None, expected: Any) -> None:
+    """auto takes the fast path where it runs and says so; what cannot be had is refused, never replaced silently."""
+    if isinstance(expected, tuple):
+        assert choose_path("training.path", path, precision, reason) == expected
+    else:
+        with pytest.raises(ConfigError, match=expected):
+            choose_path("training.path", path, precision, reason)
+
+
+def test_why_the_fast_path_does_not_run() -> None:
+    """A CPU, GNS, an odd width and too many levels are each named."""
+    gpu, hgn = torch.device("cuda"), NetworkConfig()
+    assert why_not_fast(gpu, hgn) is None
+    assert "not cpu" in str(why_not_fast(torch.device("cpu"), hgn))
+    assert "not gns" in str(why_not_fast(gpu, NetworkConfig(kind="gns", levels=1)))
+    assert "not 48" in str(why_not_fast(gpu, NetworkConfig(width=48)))
+    assert "at most 8" in str(why_not_fast(gpu, NetworkConfig(levels=9)))

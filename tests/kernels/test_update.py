@@ -1,0 +1,146 @@
+"""Training updates on the device against the plain network under torch's Adam."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from kernels.engines import device
+from network.states import network_of, random_grid
+
+from hgn.kernels.grid.op import ObstacleHash
+from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
+from hgn.network.features import ParticleState
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.obstacles import ObstacleCells
+
+HISTORY = 5
+CELL_SIZE = 1 / 64
+
+
+def episode(seed: int, particles: int, obstacles: bool, spread: float = 0.12) -> tuple[DeviceEpisode, list]:
+    """Particles that move at random, and the grids that the plain network asks for the same obstacles."""
+    generator = torch.Generator().manual_seed(seed)
+    start = torch.rand(1, particles, 3, generator=generator) * spread + 0.2
+    position = start + (torch.randn(HISTORY + 4, particles, 3, generator=generator) * 1e-3).cumsum(0)
+    grid = random_grid(seed, 4_000)
+    cell, normal = torch.from_numpy(grid.cell_K3), torch.from_numpy(grid.normal_K3)
+    made = DeviceEpisode(
+        position.to(device()),
+        torch.randint(0, 3, (particles,), generator=generator, dtype=torch.int32).to(device()),
+        ObstacleHash.of(cell, normal).to(device()) if obstacles else None,
+        (1.0, 1.0, 1.0),
+    )
+    return made, [grid] if obstacles else []
+
+
+def plain_updates(network: HierarchicalGraphNetwork, chunk: list, grids: list, rates: list[float]) -> list[float]:
+    """The same with autograd and torch's Adam, without noise and jitter; the losses."""
+    optimizer = torch.optim.Adam(network.parameters(), lr=1.0)
+    losses = []
+    for samples, obstacles, rate in zip(chunk, grids, rates, strict=True):
+        loss = torch.zeros((), dtype=torch.float64)
+        for (made, frame, _), grid in zip(samples, obstacles, strict=True):
+            window = made.position_TN3[frame : frame + HISTORY + 2].cpu().double()
+            velocity = (window[1:-1] - window[:-2]).flip(0).transpose(0, 1)
+            state = ParticleState(
+                window[-2],
+                velocity,
+                made.material_N.cpu().long(),
+                torch.zeros(made.particles, dtype=torch.long),
+                torch.ones(1, 3, dtype=torch.float64),
+                ObstacleCells.of(grid) if grid else None,
+            )
+            acceleration = (window[-1] - window[-2]) - (window[-2] - window[-3])
+            target = network.normaliser.normalise_acceleration(acceleration)
+            loss = loss + (network.normalised_acceleration(state) - target).square().mean() / len(samples)
+        losses.append(float(loss.detach()))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.param_groups[0]["lr"] = rate
+        optimizer.step()
+    return losses
+
+
+def updates_of(
+    network: HierarchicalGraphNetwork, scenes: int, capacities: tuple[int, ...] = (), **changes: object
+) -> Updates:
+    settings = {"noise_std": 0.0, "grid_jitter": False} | changes
+    return Updates(
+        copy.deepcopy(network).float().to(device()),
+        UpdateSettings(scenes=scenes, obstacle_cell_size=CELL_SIZE, **settings),
+        "ieee" if device().type == "cpu" else "tf32x3",
+        torch.zeros(2, device=device()),
+        torch.zeros(5, device=device()),
+        capacities=capacities,
+    )
+
+
+def parameters_of(updates: Updates) -> torch.Tensor:
+    found = [torch.zeros_like(p) for p in updates.network.parameters()]
+    updates.packed.scatter(updates.values, found)
+    return torch.cat([tensor.flatten() for tensor in found]).cpu().double()
+
+
+def test_updates_are_those_of_torch() -> None:
+    """Two updates of two scenes, with and without obstacles, at different rates: losses and parameters are those
+    of autograd in float64 with torch's Adam; an update that needs more room than there is gets it, and is repeated."""
+    network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.1)
+    small, grid = episode(1, 5, True)
+    open_space, none = episode(2, 3, False)
+    wide, other = episode(3, 5, True, spread=0.6)
+    chunk = [
+        [(small, 0, 1), (open_space, 1, 2)],
+        [(wide, 2, 3), (open_space, 0, 4)],
+    ]
+    rates = [1e-3, 3e-4]
+    updates = updates_of(network, 2, capacities=(32, 16))
+    updates.run(chunk, rates)
+    assert updates.growths >= 1
+    reference = copy.deepcopy(network)
+    losses = plain_updates(reference, chunk, [[grid, none], [other, none]], rates)
+    total, count = updates.loss_sum.tolist()
+    assert count == 2 and total == pytest.approx(sum(losses), rel=1e-5)
+    expected = torch.cat([p.detach().flatten() for p in reference.parameters()])
+    before = torch.cat([p.detach().flatten() for p in network.parameters()])
+    moved = (expected - before).norm()
+    assert float((parameters_of(updates) - expected).norm() / moved) < 1e-3
+    assert int(updates.step) == 2 and updates.counters[1] == 2 and updates.counters[2] == 0
+
+
+def test_noise_and_jitter() -> None:
+    """Noise is a random walk whose last step has the asked standard deviation, positions follow the velocities, the
+    target undoes the velocity error; origins lie in [-cell, 0]; the same seed draws the same, another seed another."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
+    made, _ = episode(1, 400, False, spread=0.3)
+    still, _ = episode(2, 300, False, spread=0.3)
+    updates = updates_of(network, 2, noise_std=1e-3, grid_jitter=True)
+    drawn = []
+    for seeds in ((5, 6), (5, 6), (7, 6)):
+        updates._upload([[(made, 1, seeds[0]), (still, 0, seeds[1])]], [1e-3])
+        updates.particles = 704
+        if not drawn:
+            updates._reach = (torch.zeros(3), torch.ones(3))
+            updates.capacities = (512,)
+            updates._build()
+        updates._assemble()
+        names = ("position_N3", "velocity_NV", "target_N3", "origin_S3", "share_N", "scene_N")
+        drawn.append({name: getattr(updates, name).cpu().clone() for name in names})
+    first, again, other = drawn
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert torch.equal(first["position_N3"][400:700], other["position_N3"][400:700])
+    assert not torch.equal(first["position_N3"][:400], other["position_N3"][:400])
+    torch.testing.assert_close(first["share_N"][:700], torch.tensor([1 / 800] * 400 + [1 / 600] * 300))
+    assert first["scene_N"][:700].tolist() == [0] * 400 + [1] * 300
+    assert ((first["origin_S3"] <= 0) & (first["origin_S3"] >= -0.1)).all() and first["origin_S3"].unique().numel() == 6
+    window = made.position_TN3[1 : 1 + HISTORY + 2].cpu()
+    clean = (window[1:-1] - window[:-2]).flip(0).transpose(0, 1)
+    walk = first["velocity_NV"][:400].view(400, HISTORY, 3) - clean  # newest first
+    assert walk[:, 0].std() == pytest.approx(1e-3, rel=0.1)
+    assert walk[:, -1].std() == pytest.approx(1e-3 / HISTORY**0.5, rel=0.1)
+    moved = first["position_N3"][:400] - window[-2]
+    torch.testing.assert_close(moved, walk.sum(1), rtol=0, atol=1e-6)
+    wanted = (window[-1] - window[-2]) - first["velocity_NV"][:400, :3]
+    expected = network.float().normaliser.normalise_acceleration(wanted)
+    torch.testing.assert_close(first["target_N3"][:400], expected, rtol=0, atol=1e-3)
