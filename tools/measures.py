@@ -13,6 +13,8 @@ import numpy as np
 from hgn.scene.distance import contains
 from hgn.scene.scene import Obstacle
 
+FRAMES_AT_ONCE = 50  # in float64
+
 
 def momentum_error(path_TN3: np.ndarray, reference_TN3: np.ndarray) -> float:
     """Root mean square over frames of the difference of the mean velocities, per mass; 0 for a single frame."""
@@ -28,11 +30,13 @@ def energies(path_TN3: np.ndarray, gravity_3: np.ndarray) -> np.ndarray:
 
     v² / 2 - g · x at the middle of the frame; gravity in domain units a frame squared. Elastic energy is not in it.
     """
-    position_TN3 = path_TN3.astype(np.float64)
-    velocity_TN3 = np.diff(position_TN3, axis=0)
-    middle_TN3 = 0.5 * (position_TN3[1:] + position_TN3[:-1])
-    energy_T: np.ndarray = (0.5 * (velocity_TN3**2).sum(-1) - middle_TN3 @ gravity_3).mean(-1)
-    return energy_T
+    parts = [np.zeros(0)]
+    for first in range(0, len(path_TN3) - 1, FRAMES_AT_ONCE):
+        position_TN3 = path_TN3[first : first + FRAMES_AT_ONCE + 1].astype(np.float64)
+        velocity_TN3 = np.diff(position_TN3, axis=0)
+        middle_TN3 = 0.5 * (position_TN3[1:] + position_TN3[:-1])
+        parts.append((0.5 * (velocity_TN3**2).sum(-1) - middle_TN3 @ gravity_3).mean(-1))
+    return np.concatenate(parts)
 
 
 def energy_scale(gravity_3: np.ndarray, domain_size: Sequence[float]) -> float:

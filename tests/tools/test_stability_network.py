@@ -1,0 +1,134 @@
+"""python -m tools.stability network: its cases, what counts as held, and the runtime's guard."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from network.states import network_of
+
+from hgn.config import SceneConfig
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.schema import ConfigError, from_mapping
+from tools.stability.network import case_row, energy_growth, main
+from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
+from tools.trial import Trial
+
+SCENE = {
+    "obstacle_count": 1,
+    "group_shapes": ["cube"],
+    "obstacle_size": [0.1, 0.2],
+    "group_count": 2,
+    "group_size": 0.04,
+}
+SMALL = {"frames": 3, "long_frames": 5, "domain_factors": [4], "scene": SCENE, "device": "cpu"}
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> str:
+    network = network_of(torch.float32, width=8, material_embedding=2, message_passing_steps=1, levels=2)
+    with torch.no_grad():  # nothing accelerates: whatever happens is the scene's
+        network.decode.second.weight.zero_()
+        network.decode.second.bias.zero_()
+        network.normaliser.acceleration_mean.zero_()
+    path = tmp_path / "still.safetensors"
+    save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64, updates=3))
+    return str(path)
+
+
+def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each case is simulated and told with the report's keys; what rests holds everywhere."""
+    path = tmp_path / "reports" / "stability.json"
+    assert main(SMALL | {"weights": weights, "json": str(path), "speed_factor": 8.0}) == 0
+    report = json.loads(path.read_text())
+    assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
+    rows = {row["case"]: row for row in report["rows"]}
+    singles = [f"single particle, {name}" for name in ("water", "sand", "snow")]
+    alone = [f"{name} alone" for name in ("water", "sand", "snow")]
+    thrown = f"thrown at up to {8 * (2 * 9.8) ** 0.5:.1f} a second"
+    held = ["5 frames", "particles x10", "domain x4", *singles, *alone, "at the end of 64000 cells"]
+    assert list(rows) == [*held[:3], thrown, *held[3:], "a weight that is not finite"]
+    keys = {"part", "case", "predicted", "measured", "held", "beyond"}
+    assert all(keys <= row.keys() and row["part"] == "network" for row in rows.values())
+    for name in held:
+        assert rows[name]["held"] and rows[name]["guard"] == "not needed", rows[name]
+    assert rows["particles x10"]["particles"] == pytest.approx(10 * rows["5 frames"]["particles"], rel=0.05)
+    assert rows["domain x4"]["particles"] == 4 * rows["5 frames"]["particles"]
+    assert rows["domain x4"]["domain_size"] == [2.0, 1.0, 2.0]
+    broken = rows["a weight that is not finite"]
+    assert broken["held"] and broken["guard"] == "raised" and "diverged at frame 1" in broken["beyond"]
+    assert "a weight that is not finite" in capsys.readouterr().out
+
+
+def test_failures_are_told(weights: str) -> None:
+    """A rollout that diverges says at which frame; energy from nowhere and particles that leave are failures too."""
+    config = from_mapping(StabilityNetworkConfig, SMALL | {"weights": weights, "cases": ["single"]})
+    network = network_of(torch.float32)
+    case = next(iter(cases(config, network.config)))
+    simulator = Simulator(network, 60.0)
+    push = torch.tensor([0.0, -9.8 / 60**2, 0.0])
+    simulator.predict = lambda state: push.expand(len(state.position_N3), 3)
+    case = Case(case.name, case.scenes, 16)
+    assert case_row(simulator, case, 0.02).held
+    push[0] = 1e-2
+    row = case_row(simulator, Case(case.name, case.scenes, 40), 0.02)
+    assert not row.held and row.measured < 40 and "diverged at frame" in row.beyond
+    assert row.more["guard"] == "raised" and row.more["failed_scenes"] == 1
+    row = case_row(simulator, case, 0.02)
+    assert not row.held and row.measured == 16 and row.beyond.startswith("energy grows")
+    row = case_row(simulator, case, 1e9)
+    assert not row.held and row.beyond == "1e+02 % of the particles end outside of the domain"
+
+
+def test_energy_growth_against_a_closed_form() -> None:
+    """Free fall from rest makes no energy; a throw upwards that was not there makes that of its speed."""
+    scene = next(iter(cases(StabilityNetworkConfig("", cases=("single",)), network_of().config))).scenes[0]
+    initial = InitialState.of_scene(scene)
+    time = np.arange(12)[:, None, None] / 60
+    fall = scene.position_N3 + 0.5 * np.array(scene.gravity) * time**2
+    assert energy_growth(Trial(fall.astype(np.float32)), initial, 60.0) < 1e-4
+    thrown = fall + np.array([0, 1.4, 0]) * time
+    assert energy_growth(Trial(thrown.astype(np.float32)), initial, 60.0) == pytest.approx(0.5 * 1.4**2 / 9.8, rel=5e-3)
+    assert energy_growth(Trial(thrown[:1]), initial, 60.0) == 0
+
+
+def test_scenes_follow_the_network() -> None:
+    """A network that sees no obstacles gets none, and one that knows two materials gets those."""
+    blind = network_of(obstacle_features=False, materials=("water", "snow")).config
+    config = StabilityNetworkConfig("", cases=("domain", "material"), scene=SceneConfig(**{"group_size": 0.05}))
+    made = list(cases(config, blind))
+    assert [case.name for case in made] == ["domain x4", "domain x9", "domain x16", "water alone", "snow alone"]
+    assert all(not scene.obstacles for case in made for scene in case.scenes)
+    assert not any((scene.material_N == 1).any() for case in made for scene in case.scenes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cases": ["wide"]}, r"cases\[0\] must be one of long"),
+        ({"domain_factors": [5]}, r"domain_factors\[0\] must be a square"),
+        ({"frames": 1}, "frames must be at least 2"),
+        ({"energy_bound": 0.0}, "energy_bound must be a finite number > 0"),
+        ({"precision": "half"}, "precision must be one of highest, high"),
+    ],
+)
+def test_bad_options(change: dict[str, Any], message: str) -> None:
+    """Each wrong option is named before anything is simulated."""
+    with pytest.raises(ConfigError, match=message):
+        from_mapping(StabilityNetworkConfig, {"weights": "w"} | change)
+
+
+def test_the_command_names_its_parts() -> None:
+    """An unknown part is refused with those that there are; a known one takes the options of its own."""
+    command = [sys.executable, "-m", "tools.stability"]
+    refused = subprocess.run([*command, "bridge"], capture_output=True, text=True, timeout=120)
+    assert refused.returncode == 2 and "must be one of" in refused.stderr and "network" in refused.stderr
+    missing = subprocess.run([*command, "network", "weights=none"], capture_output=True, text=True, timeout=120)
+    assert missing.returncode == 2 and "weights must be an existing file" in missing.stderr

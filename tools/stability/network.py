@@ -1,0 +1,134 @@
+"""python -m tools.stability network weights=…: how long, how large, how fast and how far a network holds.
+
+A row is a case: frames asked for, frames reached, and whether everything stayed finite, inside of the domain and
+without energy from nowhere. Where a rollout fails, the runtime must have said so; a last case breaks a weight for that.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hgn.command import run_command
+from hgn.device import choose_device
+from hgn.files import write_atomically
+from hgn.network.base import ParticleNetwork
+from hgn.progress import bar
+from hgn.provenance import provenance
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.weights import load_weights
+from hgn.schema import from_mapping, to_mapping
+from tools.measures import energies, energy_scale, outside_domain
+from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
+from tools.stability.row import Row, table
+from tools.trial import FrameClock, Trial, network_trials
+
+PART = "network"
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table, and writes JSON where asked to; what does not hold is a finding, and the exit code is 0."""
+    config = from_mapping(StabilityNetworkConfig, mapping)
+    device = choose_device(config.device)
+    torch.set_float32_matmul_precision(config.precision)
+    network, info = load_weights(Path(config.weights), device)
+    simulator = Simulator(network, info.frame_rate_hz)
+    rows = []
+    made = list(cases(config, network.config))
+    with bar("cases", total=len(made), unit="case") as progress:
+        for case in made:
+            rows.append(case_row(simulator, case, config.energy_bound))
+            progress.update()
+    if "guard" in (config.cases or CASES):
+        rows.append(guard_row(network, info.frame_rate_hz, config))
+    print(table(rows))
+    if config.json is not None:
+        meta = provenance(device) | {"config": to_mapping(config), "weights": Path(config.weights).name}
+        meta |= {"updates": info.updates, "network": to_mapping(info.network)}
+        report = {"meta": meta, "rows": [row.mapping(PART) for row in rows]}
+        path = Path(config.json)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, json.dumps(report, indent=1, allow_nan=False).encode())
+    return 0
+
+
+def case_row(simulator: Simulator, case: Case, energy_bound: float) -> Row:
+    """Simulates a case and says whether it held."""
+    initial = [InitialState.of_scene(scene) for scene in case.scenes]
+    clock = FrameClock()
+    trials = network_trials(simulator, initial, case.frames, clock)
+    reached = min(trial.frame_count for trial in trials)
+    finite = all(bool(np.isfinite(trial.position_TN3).all()) for trial in trials)
+    growth = max(
+        energy_growth(trial, scene, simulator.frame_rate_hz) for trial, scene in zip(trials, initial, strict=True)
+    )
+    outside = max(
+        outside_domain(trial.position_TN3[-1], scene.domain_size) for trial, scene in zip(trials, initial, strict=True)
+    )
+    causes = [trial.cause for trial in trials if trial.cause is not None]
+    if causes:
+        beyond = causes[0]
+    elif not finite:
+        beyond = "positions are not finite, and the runtime did not say so"
+    elif growth > energy_bound:
+        beyond = f"energy grows by {growth:.2g} of a fall through the domain"
+    elif outside:
+        beyond = f"{100 * outside:.2g} % of the particles end outside of the domain"
+    else:
+        beyond = "nothing seen"
+    return Row(
+        case.name,
+        predicted=case.frames,
+        measured=reached,
+        held=finite and not causes and growth <= energy_bound and not outside,
+        beyond=beyond,
+        more={
+            "particles": sum(len(scene.position_N3) for scene in initial),
+            "scenes": len(initial),
+            "domain_size": list(initial[0].domain_size),
+            "energy_growth": growth if math.isfinite(growth) else None,
+            "outside_domain": outside,
+            "failed_scenes": len(causes),
+            "guard": "missed" if not finite else "raised" if causes else "not needed",
+            "ms": clock.milliseconds(),
+        },
+    )
+
+
+def energy_growth(trial: Trial, scene: InitialState, frame_rate_hz: float) -> float:
+    """The most that kinetic and potential energy exceed those at the start, of a fall through the domain."""
+    if trial.frame_count < 2:
+        return 0.0
+    gravity_3 = np.asarray(scene.gravity, np.float64) / frame_rate_hz**2
+    energy_T = energies(trial.position_TN3, gravity_3)
+    speed_N3 = scene.velocity_N3 / frame_rate_hz
+    start = float((0.5 * (speed_N3**2).sum(-1) - trial.position_TN3[0].astype(np.float64) @ gravity_3).mean())
+    return max(0.0, float(energy_T.max()) - start) / energy_scale(gravity_3, scene.domain_size)
+
+
+def guard_row(network: ParticleNetwork, frame_rate_hz: float, config: StabilityNetworkConfig) -> Row:
+    """A network with a weight that is not finite: the runtime must stop at the first frame."""
+    broken = copy.deepcopy(network)
+    with torch.no_grad():
+        dict(broken.named_parameters())["decode.second.bias"][0] = math.nan
+    only = StabilityNetworkConfig(config.weights, cases=("single",), frames=4, scene=config.scene)
+    scenes: Sequence[InitialState] = [
+        InitialState.of_scene(scene) for case in cases(only, network.config) for scene in case.scenes
+    ]
+    trials = network_trials(Simulator(broken, frame_rate_hz), scenes, only.frames)
+    caught = all(trial.cause is not None and trial.frame_count == 1 for trial in trials)
+    beyond = next((trial.cause for trial in trials if trial.cause is not None), "the runtime did not say so")
+    frames = max(trial.frame_count for trial in trials)
+    guard = {"guard": "raised" if caught else "missed"}
+    return Row("a weight that is not finite", predicted=1, measured=frames, held=caught, beyond=beyond, more=guard)
+
+
+if __name__ == "__main__":
+    run_command(main, "stability_network")

@@ -1,0 +1,138 @@
+"""The scenes that a network is tried on beyond those that it was trained on.
+
+Shape legend: N particles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hgn.config import NetworkConfig, SceneConfig
+from hgn.scene.material import MATERIALS
+from hgn.scene.random_scene import generate_scene
+from hgn.scene.scene import Scene
+from hgn.schema import ConfigError, require, require_one_of, require_positive
+
+CASES = ("long", "particles", "domain", "speed", "single", "material", "far", "guard")
+SEED = 1_000_000  # beyond those of any data set's first scenes; a scene's own seed is added
+ATTEMPTS = 20  # at scenes that turn out to be too full
+
+
+@dataclass(frozen=True)
+class StabilityNetworkConfig:
+    """The options of `python -m tools.stability network`. See conf/command/stability_network.yaml."""
+
+    weights: str
+    cases: tuple[str, ...] | None = None
+    frames: int = 300
+    long_frames: int = 3000
+    particle_factor: float = 10.0
+    domain_factors: tuple[int, ...] = (4, 9, 16)
+    speed_factor: float = 3.0
+    far_cells: int = 64_000
+    seeds: int = 1
+    energy_bound: float = 0.02
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    precision: str = "high"
+    device: str = "auto"
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "particle_factor", "speed_factor", "far_cells", "seeds", "energy_bound")
+        require_one_of(self, "precision", ("highest", "high"))
+        for name in ("frames", "long_frames"):
+            require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
+        for i, case in enumerate(self.cases or ()):
+            require(case in CASES, f"cases[{i}]", f"one of {', '.join(CASES)}", case)
+        for i, factor in enumerate(self.domain_factors):
+            rule = "a square of a whole number above 1"
+            require(factor > 1 and math.isqrt(factor) ** 2 == factor, f"domain_factors[{i}]", rule, factor)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Scenes to simulate side by side, and for how long."""
+
+    name: str
+    scenes: tuple[Scene, ...]
+    frames: int
+
+
+def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Case]:
+    """All cases but the guard's, made when asked for.
+
+    Raises: ConfigError where a scene has no room for what it is to hold.
+    """
+    wanted = config.cases or CASES
+    base = config.scene if network.sees_obstacles else replace(config.scene, obstacle_count=0)
+    base = replace(base, materials=tuple(name for name in base.materials if name in network.materials))
+    side = base.domain_size[1]
+
+    def case(name: str, scene: SceneConfig, frames: int = config.frames) -> Case:
+        return Case(name, tuple(_scene(scene, SEED + i) for i in range(config.seeds)), frames)
+
+    if "long" in wanted:
+        yield case(f"{config.long_frames} frames", base, config.long_frames)
+    if "particles" in wanted:
+        size = base.group_size * config.particle_factor ** (1 / 3)
+        yield case(f"particles x{config.particle_factor:g}", replace(base, group_size=size))
+    for factor in config.domain_factors if "domain" in wanted else ():
+        width, height, depth = base.domain_size
+        root = math.isqrt(factor)
+        larger = replace(
+            base,
+            domain_size=(width * root, height, depth * root),
+            obstacle_count=base.obstacle_count * factor,
+            group_count=base.group_count * factor,
+        )
+        yield case(f"domain x{factor}", larger)
+    if "speed" in wanted:
+        speed = config.speed_factor * math.sqrt(2 * float(np.linalg.norm(base.gravity)) * side)
+        yield case(f"thrown at up to {speed:.1f} a second", replace(base, maximum_initial_speed=speed))
+    for material in base.materials if "single" in wanted else ():
+        yield Case(f"single particle, {material}", (_single(base, material),), config.frames)
+    for material in base.materials if "material" in wanted else ():
+        yield case(f"{material} alone", replace(base, materials=(material,)))
+    if "far" in wanted:
+        yield Case(
+            f"at the end of {config.far_cells} cells", (_far(_scene(base, SEED), config.far_cells),), config.frames
+        )
+
+
+def _scene(config: SceneConfig, seed: int) -> Scene:
+    """The first of some scenes that has room for everything."""
+    for attempt in range(ATTEMPTS):
+        try:
+            return generate_scene(config, seed + attempt * SEED)
+        except ConfigError:
+            if attempt + 1 == ATTEMPTS:
+                raise
+    raise AssertionError
+
+
+def _single(config: SceneConfig, material: str) -> Scene:
+    return Scene(
+        position_N3=np.array([[0.5 * length for length in config.domain_size]], np.float32),
+        velocity_N3=np.zeros((1, 3), np.float32),
+        material_N=np.array([MATERIALS.index(material)], np.uint8),
+        domain_size=config.domain_size,
+        cell_size=config.cell_size,
+        gravity=config.gravity,
+    )
+
+
+def _far(scene: Scene, cells: int) -> Scene:
+    """The same at the far end of a long domain: where coordinates are coarse."""
+    length = cells * scene.cell_size
+    shift_3 = np.array([length - scene.domain_size[0], 0.0, 0.0])
+    obstacles = tuple(replace(body, vertex_V3=body.vertex_V3 + shift_3) for body in scene.obstacles)
+    return replace(
+        scene,
+        position_N3=(scene.position_N3 + shift_3).astype(np.float32),
+        obstacles=obstacles,
+        domain_size=(length, *scene.domain_size[1:]),
+    )
