@@ -18,6 +18,7 @@ from PIL import Image
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated
 from hgn.config import DatagenConfig, MpmConfig
+from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
@@ -25,8 +26,8 @@ from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, from_mapping
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import score
-from tools.error_vs_time.__main__ import main
-from tools.error_vs_time.contenders import TrivialContender
+from tools.error_vs_time.__main__ import main, network_contenders
+from tools.error_vs_time.contenders import FastPredictor, TrivialContender
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergence
 from tools.measures import energies, energy_scale, inside_obstacles, momentum_error, outside_domain
@@ -104,7 +105,9 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
         with Image.open(f"{out}{end}.png") as picture:
             assert picture.width > 500
     printed = capsys.readouterr().out
-    assert all(name in printed for name in ("HGN L = 3, M = 2", "GNS M = 3", "MPM 32³, step 1", "chaos floor"))
+    assert all(
+        name in printed for name in ("HGN L = 3, M = 2", "GNS M = 3, plain fp32", "MPM 32³, step 1", "chaos floor")
+    )
 
 
 def test_the_data_can_be_the_reference(data: str, tmp_path: Path) -> None:
@@ -124,6 +127,30 @@ def test_trivial_errors_are_those_of_training(data: str) -> None:
     batches = frame_batches([episode], network, 1, 100)
     expected = one_step_errors({"fall": lambda b: 0.9 * ballistic(b)}, batches, CPU, network.config.materials)
     assert gravity.one_step(episode, 1, 0.0).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
+
+
+def test_the_fast_path_tells_its_own_errors(data: str) -> None:
+    """One-step errors of the fast path come from its kernels: in float32 they are the plain network's."""
+    (episode,) = EpisodeStore(data, "test").episodes
+    network = network_of(torch.float32, width=16, levels=2, message_passing_steps=1)
+    with torch.inference_mode():
+        for frame in (0, 3):
+            batch = make_batch([(episode, frame)], network.config)
+            if frame == 0:
+                predict = FastPredictor(network, "highest")
+            torch.testing.assert_close(predict(batch), network(batch.state()), rtol=1e-4, atol=1e-8)
+
+
+def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Half precision off the fast path is left out, and that is said; the fast path must run where it is asked for."""
+    file = weights_file(tmp_path / "gns.safetensors", "gns")
+    options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": [str(file)]}
+    config = from_mapping(ErrorVsTimeConfig, options | {"precisions": ["fp32", "fp16"]})
+    (episode,) = EpisodeStore(data, "test").episodes
+    (only,) = network_contenders(config, CPU, episode)
+    assert only.row["precision"] == "fp32" and "left out: gns.safetensors at fp16" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="path must be plain or auto here, got fast"):
+        network_contenders(replace(config, path="fast"), CPU, episode)
 
 
 def test_ghost_acceleration_counts_particles_at_rest(data: str) -> None:
@@ -235,7 +262,7 @@ def test_scenes_that_failed_leave_the_means(data: str) -> None:
         ({"weights": ["a/x.safetensors", "b/x.safetensors"]}, "weights must be files of different names"),
         ({"weights": ["a"], "training_hours": [1.0, 2.0]}, "training_hours must be a list of 1"),
         ({"frames": 1}, "frames must be at least 2"),
-        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32"),
+        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32, fp16"),
         ({"split": "all"}, "split must be one of train"),
     ],
 )

@@ -6,6 +6,7 @@ scored by one converged simulation. Writes a table, OUT.json, OUT.png and OUT_fr
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +28,7 @@ from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from tools.error_vs_time.contenders import Contender, NetworkContender, SolverContender, TrivialContender
 from tools.error_vs_time.plot import CONVENTION, draw_frames, draw_pareto
 from tools.error_vs_time.score import as_json, pay_back, score, table, time_in_turns
-from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.error_vs_time.settings import PRECISIONS, ErrorVsTimeConfig
 from tools.trial import other_grid, solver_scene, solver_trials
 
 
@@ -86,13 +87,18 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def network_contenders(config: ErrorVsTimeConfig, device: torch.device, episode: Episode) -> list[Contender]:
-    """Every weights file at every precision."""
-    precisions = config.precisions or (("fp32", "tf32") if device.type == "cuda" else ("fp32",))
-    return [
-        NetworkContender(Path(file), precision, device, episode.frame_rate_hz)
-        for file in config.weights
-        for precision in precisions
-    ]
+    """Every weights file at every precision that its path knows; what is left out is said."""
+    precisions = config.precisions or (PRECISIONS if device.type == "cuda" else ("fp32",))
+    contenders: list[Contender] = []
+    for file in config.weights:
+        for precision in precisions:
+            try:
+                contenders.append(NetworkContender(Path(file), precision, config.path, device, episode.frame_rate_hz))
+            except ConfigError as error:
+                if precision != "fp16":
+                    raise
+                print(f"left out: {Path(file).name} at fp16: {error}", file=sys.stderr)
+    return contenders
 
 
 def trivial_contenders(store: EpisodeStore, device: torch.device) -> list[Contender]:

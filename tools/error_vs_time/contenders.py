@@ -16,15 +16,17 @@ import numpy as np
 import torch
 
 from hgn.config import MpmConfig, NetworkConfig
-from hgn.data.batch import make_batch
+from hgn.data.batch import Batch, make_batch
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.path import choose_path, why_not_fast
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError
-from tools.bench.contenders import MATMUL
 from tools.trial import FrameClock, Trial, network_trials, solver_scene, solver_trials
 
 PARTICLES_PER_BATCH = 32_768
+PRECISIONS = {"fp32": "highest", "tf32": "high", "fp16": "half"}  # names of the report, and of the paths
 
 
 @dataclass
@@ -49,21 +51,24 @@ class Contender(Protocol):
 
 
 class NetworkContender:
-    """A weights file at one precision of its matrix products."""
+    """A weights file at one precision of its matrix products, on the path that a simulation would take."""
 
-    def __init__(self, file: Path, precision: str, device: torch.device, frame_rate_hz: float) -> None:
+    def __init__(self, file: Path, precision: str, path: str, device: torch.device, frame_rate_hz: float) -> None:
+        """Raises: ConfigError where the path does not take the network or the precision."""
         self.network, info = load_weights(file, device)
         require_frame_rate(info, frame_rate_hz)
-        self.device, self.precision = device, precision
-        with self.matmul():
-            self.simulator = Simulator(self.network, info.frame_rate_hz)
         config = info.network
+        self.device, self.precision = device, PRECISIONS[precision]
+        self.path, _ = choose_path("path", path, self.precision, why_not_fast(device, config))
+        with self.matmul():
+            self.simulator = Simulator(self.network, info.frame_rate_hz, self.path, self.precision)
         self.row: dict[str, Any] = {
             "system": config.kind,
             "weights": file.name,
             "levels": config.levels,
             "message_passing_steps": config.message_passing_steps,
             "width": config.width,
+            "path": self.path,
             "precision": precision,
             "updates": info.updates,
         }
@@ -71,17 +76,20 @@ class NetworkContender:
     @contextmanager
     def matmul(self) -> Iterator[None]:
         before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision(MATMUL[self.precision])
+        torch.set_float32_matmul_precision("highest" if self.precision == "highest" else "high")
         try:
             yield
         finally:
             torch.set_float32_matmul_precision(before)
 
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep:
+        config = self.network.config
         with self.matmul():
-            return one_step(
-                lambda b: self.network(b.state()), self.network.config, episode, stride, rest_speed, self.device
-            )
+            if self.path == "fast":
+                assert isinstance(self.network, HierarchicalGraphNetwork)
+                fast = FastPredictor(self.network, self.precision)
+                return one_step(fast, config, episode, stride, rest_speed, self.device, particles_per_batch=1)
+            return one_step(lambda b: self.network(b.state()), config, episode, stride, rest_speed, self.device)
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
         with self.matmul():
@@ -139,6 +147,24 @@ class TrivialContender:
         return trials
 
 
+class FastPredictor:
+    """Accelerations by the fast path's own launches: a frame simulated from each given state of one scene."""
+
+    def __init__(self, network: HierarchicalGraphNetwork, precision: str) -> None:
+        from hgn.runtime.fast import FastRollout  # loads Triton
+
+        self._make = lambda state: FastRollout(network, state, precision)
+        self._rollout: FastRollout | None = None
+
+    def __call__(self, batch: Batch) -> torch.Tensor:
+        state = batch.state()
+        rollout = self._rollout = self._rollout or self._make(state)
+        rollout.position_N3.copy_(state.position_N3)
+        rollout.velocity_NV.copy_(state.velocity_NM3.flatten(1))
+        rollout.run(1)
+        return rollout.velocity_NV[:, :3] - state.velocity_NM3[:, 0]
+
+
 def one_step(
     predict: Predictor,
     network: NetworkConfig,
@@ -146,11 +172,12 @@ def one_step(
     stride: int,
     rest_speed: float,
     device: torch.device,
+    particles_per_batch: int = PARTICLES_PER_BATCH,
 ) -> OneStep:
     """Errors of a predictor on every stride-th frame of an episode, without noise."""
     result = OneStep()
     frames = list(range(0, len(episode.position_TN3) - 1, stride))
-    together = max(1, PARTICLES_PER_BATCH // max(1, len(episode.material_N)))
+    together = max(1, particles_per_batch // max(1, len(episode.material_N)))
     with torch.inference_mode():
         for first in range(0, len(frames), together):
             batch = make_batch([(episode, n) for n in frames[first : first + together]], network).to(device)

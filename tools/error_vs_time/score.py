@@ -136,12 +136,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The figures for people."""
     frames = sorted({int(frame) for row in rows for frame in row.get("scenes_reached", {})})
     head = "".join(f"{f'MSE at {frame}':>12}" for frame in frames)
-    lines = [f"{'system':<40} {'ms':>9} {'batched':>9} {'one-step MSE':>13}{head} {'Sinkhorn':>10} {'failed':>7}"]
+    lines = [f"{'system':<48} {'ms':>9} {'batched':>9} {'one-step MSE':>13}{head} {'Sinkhorn':>10} {'failed':>7}"]
     for row in rows:
         errors = "".join(f"{_number(row['position_mse'].get(str(frame))):>12}" for frame in frames)
         last = [values[max(values, key=int)] for values in row["sinkhorn"].values() if values]
         lines.append(
-            f"{label(row):<40} {_number(row.get('ms'), '.3f'):>9} {_number(row.get('ms_batched'), '.3f'):>9} "
+            f"{label(row):<48} {_number(row.get('ms'), '.3f'):>9} {_number(row.get('ms_batched'), '.3f'):>9} "
             f"{_number(row['one_step_mse']):>13}{errors} {_number(float(np.mean(last)) if last else None):>10} "
             f"{row['failed_scenes']:>7}"
         )
@@ -159,7 +159,7 @@ def label(row: Mapping[str, Any]) -> str:
             return f"chaos floor: {row['floor']}"
     size = f"M = {row['message_passing_steps']}"
     size = f"L = {row['levels']}, {size}" if row["system"] == "hgn" else size
-    return f"{row['system'].upper().replace('_', ' ')} {size}, {row['precision']} ({row['weights']})"
+    return f"{row['system'].upper().replace('_', ' ')} {size}, {row['path']} {row['precision']} ({row['weights']})"
 
 
 def as_json(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> bytes:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,9 @@ import torch
 from hgn.command import run_command
 from hgn.device import choose_device
 from hgn.files import write_atomically
-from hgn.network.base import ParticleNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
+from hgn.runtime.path import choose_path, why_not_fast
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights
 from hgn.schema import from_mapping, to_mapping
@@ -37,9 +38,11 @@ def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; what does not hold is a finding, and the exit code is 0."""
     config = from_mapping(StabilityNetworkConfig, mapping)
     device = choose_device(config.device)
-    torch.set_float32_matmul_precision(config.precision)
     network, info = load_weights(Path(config.weights), device)
-    simulator = Simulator(network, info.frame_rate_hz)
+    path, text = choose_path("path", config.path, config.precision, why_not_fast(device, network.config))
+    print(text, file=sys.stderr)
+    torch.set_float32_matmul_precision("highest" if config.precision == "highest" else "high")
+    simulator = Simulator(network, info.frame_rate_hz, path, config.precision)
     rows = []
     made = list(cases(config, network.config))
     with bar("cases", total=len(made), unit="case") as progress:
@@ -47,15 +50,15 @@ def main(mapping: dict[str, Any]) -> int:
             rows.append(case_row(simulator, case, config.energy_bound))
             progress.update()
     if "guard" in (config.cases or CASES):
-        rows.append(guard_row(network, info.frame_rate_hz, config))
+        rows.append(guard_row(simulator, config))
     print(table(rows))
     if config.json is not None:
         meta = provenance(device) | {"config": to_mapping(config), "weights": Path(config.weights).name}
-        meta |= {"updates": info.updates, "network": to_mapping(info.network)}
+        meta |= {"updates": info.updates, "path": path, "network": to_mapping(info.network)}
         report = {"meta": meta, "rows": [row.mapping(PART) for row in rows]}
-        path = Path(config.json)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, json.dumps(report, indent=1, allow_nan=False).encode())
+        file = Path(config.json)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
     return 0
 
 
@@ -113,16 +116,17 @@ def energy_growth(trial: Trial, scene: InitialState, frame_rate_hz: float) -> fl
     return max(0.0, float(energy_T.max()) - start) / energy_scale(gravity_3, scene.domain_size)
 
 
-def guard_row(network: ParticleNetwork, frame_rate_hz: float, config: StabilityNetworkConfig) -> Row:
+def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
     """A network with a weight that is not finite: the runtime must stop at the first frame."""
-    broken = copy.deepcopy(network)
+    broken = copy.deepcopy(simulator.network)
     with torch.no_grad():
         dict(broken.named_parameters())["decode.second.bias"][0] = math.nan
     only = StabilityNetworkConfig(config.weights, cases=("single",), frames=4, scene=config.scene)
     scenes: Sequence[InitialState] = [
-        InitialState.of_scene(scene) for case in cases(only, network.config) for scene in case.scenes
+        InitialState.of_scene(scene) for case in cases(only, broken.config) for scene in case.scenes
     ]
-    trials = network_trials(Simulator(broken, frame_rate_hz), scenes, only.frames)
+    sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.path, simulator.precision)
+    trials = network_trials(sabotaged, scenes, only.frames)
     caught = all(trial.cause is not None and trial.frame_count == 1 for trial in trials)
     beyond = next((trial.cause for trial in trials if trial.cause is not None), "the runtime did not say so")
     frames = max(trial.frame_count for trial in trials)

@@ -37,13 +37,15 @@ class StabilityNetworkConfig:
     seeds: int = 1
     energy_bound: float = 0.02
     scene: SceneConfig = field(default_factory=SceneConfig)
+    path: str = "auto"
     precision: str = "high"
     device: str = "auto"
     json: str | None = None
 
     def __post_init__(self) -> None:
         require_positive(self, "particle_factor", "speed_factor", "far_cells", "seeds", "energy_bound")
-        require_one_of(self, "precision", ("highest", "high"))
+        require_one_of(self, "path", ("auto", "plain", "fast"))
+        require_one_of(self, "precision", ("highest", "high", "half"))
         for name in ("frames", "long_frames"):
             require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
         for i, case in enumerate(self.cases or ()):
