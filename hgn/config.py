@@ -16,7 +16,8 @@ OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
-BENCH_CASES = ("frame", "train", "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
+PLAIN_CASES = ("plain_frame", "plain_train")
+BENCH_CASES = ("frame", "train", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
 BENCH_PRECISIONS = ("fp32", "tf32", "fp16")
 PATHS = ("auto", "plain", "fast")
 PRECISIONS = ("highest", "high", "half")
@@ -474,10 +475,10 @@ def _bench_gns() -> NetworkConfig:
 class BenchConfig:
     """`python -m tools.bench`: what is timed."""
 
-    cases: tuple[str, ...] | None = None  # none: all, those of the public GNS where there is a copy of it
+    cases: tuple[str, ...] | None = None  # none: all that differ here; of the public GNS where there is a copy of it
     particles: tuple[int, ...] | None = None  # of one scene; none: by the device
     scenes: tuple[int, ...] | None = None  # side by side, of the smallest number of particles; none: by the device
-    precisions: tuple[str, ...] | None = None  # none: TF32 on a GPU, float32 on a CPU
+    precisions: tuple[str, ...] | None = None  # none: TF32 and half on a GPU, float32 on a CPU
     network: NetworkConfig = field(default_factory=NetworkConfig)
     gns: NetworkConfig = field(default_factory=_bench_gns)
     public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns
@@ -501,13 +502,6 @@ class BenchConfig:
         for case in PUBLIC_GNS_CASES:
             given = self.public_gns is not None or case not in (self.cases or ())
             require(given, "public_gns", f"a folder with the public code for {case}", None)
-
-    @property
-    def wanted_cases(self) -> tuple[str, ...]:
-        """The cases to time."""
-        if self.cases is not None:
-            return self.cases
-        return tuple(case for case in BENCH_CASES if self.public_gns is not None or case not in PUBLIC_GNS_CASES)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.schema import ConfigError, from_mapping
 from tools.bench import contenders
 from tools.bench.__main__ import main, workloads
+from tools.bench.fast import FastFrame, FastTrain
 from tools.bench.states import TILE_PARTICLES, Workload, positions, scene_of
 from tools.bench.timing import Timed, alternate
 
@@ -107,6 +108,24 @@ def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:
     assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
 
 
+def test_the_fast_path_is_checked_like_the_plain_one() -> None:
+    """Frames, loss and gradients of the fast path pass in float32 (in Triton's interpreter), and a wrong weight not."""
+    config = NetworkConfig(width=16, levels=2, message_passing_steps=1)
+    frame = FastFrame("fp32", config, Workload(3, 1), CPU)
+    assert frame.check("fp32") == "pass"
+    frame.rollout.values.mul_(1.001)
+    frame.rollout._build(frame.rollout.grid.capacities)
+    assert frame.check("fp32").startswith("relative error of acceleration")
+    train = FastTrain("fp32", replace(config, levels=1), Workload(2, 2), CPU)
+    assert train.check("fp32") == "pass"
+    with torch.no_grad():
+        train.network.decode.second.bias += 0.1
+    expected = contenders.reference_gradients(train.network, train.batch)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tools.bench.fast.reference_gradients", lambda *_: (1.001 * expected[0], expected[1]))
+        assert train.check("fp32").startswith("relative error of loss 1.0e-03 exceeds")
+
+
 def test_a_tile_is_like_real_frames() -> None:
     """A tile has the neighbours and cells that were measured on the paper's obstacle-free scene, within a tenth."""
     position = torch.from_numpy(positions(Workload(TILE_PARTICLES, 1), 0, 0.035))
@@ -156,7 +175,7 @@ def test_contenders_take_turns() -> None:
     [
         ({"cases": ["frames"]}, r"cases\[0\] must be one of frame, train"),
         ({"particles": [0]}, r"particles\[0\] must be at least 1"),
-        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32"),
+        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32, fp16"),
         ({"rounds": 0}, "rounds must be a finite number > 0"),
         ({"gns": {"kind": "hgn"}}, "gns.kind must be gns"),
         ({"mpm_frames": 2}, "mpm_frames must be at least 4"),

@@ -1,0 +1,137 @@
+"""The fast path on the bench: frames and training updates in CUDA graphs, checked like the plain ones.
+
+Shape legend: N particles of all scenes, S scenes.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+
+from hgn.config import NetworkConfig, TrainingConfig
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.path import kernel_precision
+from tools.bench.contenders import (
+    BOUNDS,
+    GRADIENT_BOUNDS,
+    PASS,
+    bench_network,
+    reference_acceleration,
+    reference_gradients,
+    relative_error,
+    verdict,
+)
+from tools.bench.states import Workload, batch_of, state_of
+from tools.bench.timing import Timed, once
+
+PATH_PRECISION = {"fp32": "highest", "tf32": "high", "fp16": "half"}
+FRAMES_AT_ONCE = 16  # so that a frame's launch hides behind the one before, as in a simulation
+UPDATES_AT_ONCE = 20
+OBSTACLE_CELL_SIZE = 1 / 64
+FIRST_MOMENT_SHARE = 0.1  # of Adam, of the gradient, after the first update
+
+
+class FastFrame:
+    """One frame of a simulation; what is timed puts the same state back before each."""
+
+    def __init__(self, precision: str, config: NetworkConfig, work: Workload, device: torch.device) -> None:
+        from hgn.runtime.fast import FastRollout  # loads Triton
+
+        self.device = device
+        network = bench_network(config, device)
+        assert isinstance(network, HierarchicalGraphNetwork)
+        self.network, self.state = network, state_of(work, config, device)
+        self.velocity_NV = self.state.velocity_NM3.flatten(1)
+        self.rollout = FastRollout(network, self.state, PATH_PRECISION[precision])
+        self.failure: str | None = None
+
+    def restore(self) -> None:
+        self.rollout.position_N3.copy_(self.state.position_N3)
+        self.rollout.velocity_NV.copy_(self.velocity_NV)
+
+    def run(self) -> None:
+        """FRAMES_AT_ONCE frames of the same state, each in a graph where there is a GPU."""
+        self.rollout.frame.zero_()
+        for _ in range(FRAMES_AT_ONCE):
+            self.restore()
+            if self.rollout.graph is None:
+                self.rollout.frame_launches()
+            else:
+                self.rollout.graph.replay()
+
+    def timed(self) -> Timed:
+        return Timed(self._sample)
+
+    def _sample(self) -> list[float]:
+        milliseconds = once(self.run, self.device) / FRAMES_AT_ONCE
+        if int(self.rollout.frame) != FRAMES_AT_ONCE:
+            self.failure = "frames were left out for lack of room"
+        return [milliseconds]
+
+    def check(self, precision: str) -> str:
+        """`pass`, or by how much the accelerations differ from float64."""
+        self.restore()
+        self.rollout.run(1)  # makes room where it needs more
+        found_N3 = self.rollout.velocity_NV[:, :3].double() - self.state.velocity_NM3[:, 0].double()
+        with torch.no_grad():
+            expected_N3 = reference_acceleration(self.network, self.state)
+        return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
+
+
+class FastTrain:
+    """One training update: batch, noise, jitter, grid, forward, backward, Adam."""
+
+    def __init__(self, precision: str, config: NetworkConfig, work: Workload, device: torch.device) -> None:
+        from hgn.kernels.update.op import DeviceEpisode  # loads Triton
+
+        self.device, self.precision = device, precision
+        self.batch = batch_of(work, config, device)
+        network = bench_network(config, device)
+        assert isinstance(network, HierarchicalGraphNetwork)
+        self.network = network
+        counts = list(self.batch.particles_S)
+        parts = zip(
+            self.batch.window_WN3.split(counts, dim=1),
+            self.batch.material_N.split(counts),
+            self.batch.seeds_S,
+            strict=True,
+        )
+        size = (work.domain_size,) * 3
+        self.samples = [
+            (DeviceEpisode(window_WN3.contiguous(), material_N.int(), None, size), 0, seed)
+            for window_WN3, material_N, seed in parts
+        ]
+        training = TrainingConfig()
+        self.updates = self._updates(training.noise_std, training.grid_jitter)
+        self.rates = [training.learning_rate] * UPDATES_AT_ONCE
+
+    def _updates(self, noise_std: float, grid_jitter: bool):  # type: ignore[no-untyped-def]
+        from hgn.kernels.update.op import Updates, UpdateSettings
+
+        return Updates(
+            copy.deepcopy(self.network),
+            UpdateSettings(len(self.samples), noise_std, grid_jitter, OBSTACLE_CELL_SIZE),
+            kernel_precision(PATH_PRECISION[self.precision], self.device),
+            torch.zeros(2, device=self.device),
+            torch.zeros(5, device=self.device),
+        )
+
+    def run(self) -> None:
+        self.updates.run([self.samples] * UPDATES_AT_ONCE, self.rates)
+
+    def timed(self) -> Timed:
+        return Timed(lambda: [once(self.run, self.device) / UPDATES_AT_ONCE])
+
+    def check(self, precision: str) -> str:
+        """`pass`, or by how much loss or gradients differ from float64, without noise and jitter."""
+        plain = self._updates(0.0, False)
+        plain.run([self.samples], [0.0])
+        expected_loss, expected = reference_gradients(self.network, self.batch)
+        first = verdict("loss", relative_error(plain.loss_sum[0].double(), expected_loss), BOUNDS[precision])
+        if first != PASS:
+            return first
+        found = [torch.zeros_like(parameter) for parameter in self.network.parameters()]
+        plain.packed.scatter(plain.first_moment / FIRST_MOMENT_SHARE, found)
+        gradient = torch.cat([tensor.flatten() for tensor in found]).double()
+        return verdict("gradient", relative_error(gradient, expected), GRADIENT_BOUNDS[precision])
