@@ -16,33 +16,29 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import uvicorn
 from anyio import to_thread
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from datagen.sendfile import FileRange, SendfileProtocol
 from datagen.supervisor import PoolState
 from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
 from hgn.data.storage import verify_file
 from hgn.schema import ConfigError
 
 _OPEN_PATHS = ("/healthz",)
+_GRACE_S = 5  # for answers that are being sent when the service is stopped; readers go on where they were cut
 _REMEDY = "delete it and run the generator again"
-
-
-class ShardResponse(FileResponse):
-    """A file in pieces large enough that reading them costs little beside sending them."""
-
-    chunk_size = 2**20
 
 
 @dataclass(frozen=True)
@@ -94,9 +90,8 @@ class Guard:
         async def counted(message: Message) -> None:
             if message["type"] == "http.response.start":
                 self._counters[f"code {message['status']}"] += 1
-            elif message["type"] == "http.response.body":
-                self._counters["bytes"] += len(message.get("body", b""))
             await send(message)
+            self._counters["bytes"] += len(message.get("body", b"")) + message.get("count", 0)
 
         if scope["type"] != "http":
             return
@@ -134,7 +129,6 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         path, etag = folder / entry.name, f'"{entry.sha256}"'
         try:
             await to_thread.run_sync(verify_file, path, entry.sha256, entry.bytes, _REMEDY)
-            status = await to_thread.run_sync(os.stat, path)
         except FileNotFoundError:
             return PlainTextResponse(f"{entry.name} is missing here; it must be generated again\n", 404)
         except ConfigError:
@@ -143,7 +137,7 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         headers = {"etag": etag, "cache-control": "private, no-cache"}
         if _unchanged(request, etag):
             return Response(status_code=304, headers=headers)
-        return ShardResponse(path, headers=headers, media_type="application/x-tar", stat_result=status)
+        return FileRange(path, entry.bytes, headers, "application/x-tar")
 
     async def progress(request: Request) -> Response:
         return JSONResponse(
@@ -174,6 +168,23 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
     )
     app.router.redirect_slashes = False
     return app
+
+
+def make_server(app: ASGIApp, connections: int) -> uvicorn.Server:
+    """Serves `app` to as many connections at once; more are told to come back."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http=SendfileProtocol,
+            lifespan="off",
+            ws="none",
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            limit_concurrency=connections,
+            timeout_graceful_shutdown=_GRACE_S,
+        )
+    )
 
 
 def _unchanged(request: Request, etag: str) -> bool:

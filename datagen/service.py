@@ -24,7 +24,6 @@ from hgn.data.storage import TOKEN_VARIABLE, dataset_token
 from hgn.schema import ConfigError, from_mapping, require
 
 _SERVICE_KEYS = ("host", "port", "connections")
-_GRACE_S = 5  # for answers that are being sent when the service is stopped; readers go on where they were cut
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
@@ -39,26 +38,13 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
         require_same_dataset(Manifest.load(folder).config, config, folder)
     token = dataset_token()
     with _listen(service, token) as listener, StopRequest() as stop:
-        # these load for a second, and the pool's processes, which import this file, need none of them
-        import uvicorn
-
-        from datagen.server import make_app
+        # this loads for a second, and the pool's processes, which import this file, do not need it
+        from datagen.server import make_app, make_server
 
         progress = make_progress(kind)
         with Supervisor(config, progress, backend) as supervisor:
             app = make_app(folder, token, lambda: supervisor.state)
-            server = uvicorn.Server(
-                uvicorn.Config(
-                    app,
-                    lifespan="off",
-                    ws="none",
-                    log_level="warning",
-                    access_log=False,
-                    server_header=False,
-                    limit_concurrency=service.connections,
-                    timeout_graceful_shutdown=_GRACE_S,
-                )
-            )
+            server = make_server(app, service.connections)
 
             def end() -> None:
                 server.should_exit = True

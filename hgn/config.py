@@ -467,6 +467,20 @@ class KillsConfig:
         require_non_negative(self, "kill_seed")
 
 
+@dataclass(frozen=True)
+class LoadConfig:
+    """`python -m tools.load`: who reads how much."""
+
+    readers: int = 8
+    files: int = 4
+    file_mb: int = 64
+    rounds: int = 9  # each reader takes all files once a round, from each server in turn
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "readers", "files", "file_mb", "rounds")
+
+
 def _bench_gns() -> NetworkConfig:
     return NetworkConfig(kind="gns", levels=1, message_passing_steps=10)
 

@@ -21,7 +21,7 @@ import pytest
 import uvicorn
 
 import hgn.data.storage
-from datagen.server import make_app
+from datagen.server import make_app, make_server
 from datagen.supervisor import PoolState
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
@@ -63,7 +63,7 @@ def serve(folder: Path) -> Iterator[Callable[..., str]]:
     def start(token: str | None = None, port: int = 0) -> str:
         listener = socket.create_server(("127.0.0.1", port))
         app = make_app(folder, token, PoolState)
-        server = uvicorn.Server(uvicorn.Config(app, lifespan="off", ws="none", log_level="error"))
+        server = make_server(app, connections=16)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         running.append((server, thread))
