@@ -6,6 +6,7 @@ scenes that reached the frame. Shape legend: T frames, N particles of a scene.
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -168,25 +169,39 @@ def as_json(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> bytes
 
 
 def _motion(trial: Trial, reference: Episode) -> dict[str, float]:
-    gravity_3 = np.asarray(reference.gravity, np.float64) / reference.frame_rate_hz**2
     result = {"momentum_error": momentum_error(trial.position_TN3, reference.position_TN3)}
     if trial.frame_count < 2:
         return result | {"energy_drift": 0.0, "energy_growth": 0.0}
-    energy_T = energies(trial.position_TN3, gravity_3)
-    reference_T = energies(np.asarray(reference.position_TN3[: trial.frame_count]), gravity_3)
+    gravity_3 = _gravity(reference)
+    energy_T, reference_T = energies(trial.position_TN3, gravity_3), _reference_energies(reference)
     scale = energy_scale(gravity_3, reference.domain_size)
-    drift, growth = np.abs(energy_T - reference_T).mean() / scale, (energy_T - reference_T[0]).max() / scale
+    drift = np.abs(energy_T - reference_T[: len(energy_T)]).mean() / scale
+    growth = (energy_T - reference_T[0]).max() / scale
     return result | {"energy_drift": float(drift), "energy_growth": float(max(growth, 0.0))}
 
 
 def _end(trial: Trial, reference: Episode) -> dict[str, float]:
-    obstacles = obstacles_of_episode(reference)
     last_N3 = trial.position_TN3[-1]
     return {
-        "penetration": inside_obstacles(last_N3, obstacles),
-        "reference_penetration": inside_obstacles(reference.position_TN3[trial.frame_count - 1], obstacles),
+        "penetration": inside_obstacles(last_N3, obstacles_of_episode(reference)),
+        "reference_penetration": _reference_penetration(reference, trial.frame_count - 1),
         "outside_domain": outside_domain(last_N3, reference.domain_size),
     }
+
+
+def _gravity(reference: Episode) -> np.ndarray:
+    return np.asarray(reference.gravity, np.float64) / reference.frame_rate_hz**2
+
+
+# The same for every contender.
+@functools.lru_cache(maxsize=256)
+def _reference_energies(reference: Episode) -> np.ndarray:
+    return energies(np.asarray(reference.position_TN3), _gravity(reference))
+
+
+@functools.lru_cache(maxsize=1024)
+def _reference_penetration(reference: Episode, frame: int) -> float:
+    return inside_obstacles(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
 
 
 def _sinkhorn(
