@@ -87,7 +87,7 @@ def _fit(
     data = DataInfo(store.manifest.config_hash, config.dataset.frame_rate_hz, config.scene.cell_size)
     _quieten_lightning()
     devices, nodes = layout(training)
-    path, text = _path(config, devices * nodes)
+    path, text = _path(config)
     if first_rank():
         print(text, file=sys.stderr)
     torch.set_float32_matmul_precision("highest" if training.precision == "highest" else "high")
@@ -108,7 +108,7 @@ def _fit(
         accelerator=training.accelerator,
         devices=devices,
         num_nodes=nodes,
-        strategy=gradient_averaging() if devices * nodes > 1 else "auto",
+        strategy=gradient_averaging(path) if devices * nodes > 1 else "auto",
         max_steps=training.maximum_updates,
         max_epochs=-1,
         callbacks=[SameStart(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
@@ -127,13 +127,11 @@ def _fit(
     return 0 if trainer.global_step >= training.maximum_updates else stop.exit_code
 
 
-def _path(config: TrainConfig, processes: int) -> tuple[str, str]:
+def _path(config: TrainConfig) -> tuple[str, str]:
     """`plain` or `fast`, and a line that says so."""
     training = config.training
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
     reason = why_not_fast(torch.device("cuda" if on_gpu else "cpu"), config.network)
-    if reason is None and processes > 1:
-        reason = f"it trains on one device, not {processes}"
     return choose_path("training.path", training.path, training.precision, reason)
 
 

@@ -20,6 +20,7 @@ from hgn.network.network import HierarchicalGraphNetwork
 from hgn.schema import to_mapping
 from hgn.training.checkpoint import SECTION, DataInfo, cursor_of_checkpoint, updates_of_checkpoint
 from hgn.training.noise import jittered_origin, perturbed_window
+from hgn.training.ranks import sum_over_ranks
 
 
 class TrainingModule(LightningModule):
@@ -73,6 +74,8 @@ class TrainingModule(LightningModule):
                 self.data.obstacle_cell_size,
                 self.loss_sum,
                 self.gradient_counters,
+                sum_over_ranks if self.trainer.world_size > 1 else None,
+                self.trainer.world_size,
             )
 
     def training_step(self, batch: Batch | Chunk, batch_index: int) -> torch.Tensor | None:

@@ -49,6 +49,7 @@ def test_rows_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     report = json.loads(path.read_text())
     assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
     rows = {case: [row for row in report["rows"] if row["case"] == case] for case in ("weak_scaling", "all_reduce")}
+    assert {row["path"] for row in rows["weak_scaling"]} == {"plain"}  # without a GPU
     found = [(row["devices"], row["averaged"], row["particle_spread"]) for row in rows["weak_scaling"]]
     assert found == [(1, False, 0), (1, False, 0.17), (2, False, 0), (2, True, 0), (2, True, 0.17)]
     assert all(row["check"] == "pass" and row["ms"] > 0 and row["efficiency"] > 0 for row in rows["weak_scaling"])
@@ -70,25 +71,47 @@ def alone(tmp_path: Path) -> Iterator[dist.ProcessGroup]:
     dist.destroy_process_group()
 
 
+def averaged(
+    group: dist.ProcessGroup, make: type[measure.PlainUpdates | measure.FastUpdates], config: ScalingConfig
+) -> measure.Contender:
+    device = torch.device("cpu")
+    updates = make(config, measure._batches(config, 0, 0.1, device), device)
+    found = measure.Contender("any", 1, True, 4, 0.1, updates)
+    measure._average(found, group)
+    return found
+
+
 def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pytest.MonkeyPatch) -> None:
     """Averages that are wrong, and weights that differ between ranks, are found, and get a reason instead of a time."""
     config = from_mapping(ScalingConfig, SMALL)
-    device = torch.device("cpu")
-    updates = measure.Updates(config, measure._batches(config, 0, 0.1, device), device)
-    assert measure._check_average(updates, alone, 4)[0] == "pass"
-    right = measure.allreduce_hook
+    contender = averaged(alone, measure.PlainUpdates, config)
+    assert contender.check == "pass" and len(contender.messages) == 1
+    right = dist.all_reduce
 
-    def wrong(group: dist.ProcessGroup, bucket: dist.GradBucket) -> torch.futures.Future[torch.Tensor]:
-        return right(group, bucket).then(lambda future: 1.01 * future.value())
+    def wrong_sum(tensor: torch.Tensor, group: dist.ProcessGroup, async_op: bool = False) -> dist.Work | None:
+        return right(tensor, group=group, async_op=True) if async_op else tensor.mul_(1.01)
 
-    monkeypatch.setattr(measure, "allreduce_hook", wrong)
-    reason, messages = measure._check_average(updates, alone, 4)
-    assert reason.startswith("relative error of averaged gradients 1.0e-02 exceeds 1e-03") and len(messages) == 1
-    contender = measure.Contender(1, 4, 0.1, updates)
+    with monkeypatch.context() as patch:
+        patch.setattr(dist, "all_reduce", wrong_sum)
+        wrong = averaged(alone, measure.PlainUpdates, config)
+    assert wrong.check.startswith("relative error of averaged gradients 9.9e-03 exceeds 1e-03")
     monkeypatch.setattr(dist, "broadcast", lambda tensor, *_, **__: tensor.add_(1e-3))
     measure._check_weights(contender, {1: alone}, 0)
     assert contender.check == "weights of rank 0 differ from those of rank 0 after the updates"
     assert measure._row(contender, config)["ms"] is None
+
+
+def test_the_fast_path_is_timed_alike(alone: dist.ProcessGroup) -> None:
+    """Its updates are those of the plain path on the same scenes: weights agree after them; averages are checked."""
+    small = {"network": {"width": 16, "levels": 1, "message_passing_steps": 1}, "particles": 6}
+    config = from_mapping(ScalingConfig, SMALL | small | {"scenes": 1, "batches": 1})
+    plain, fast = (averaged(alone, make, config) for make in (measure.PlainUpdates, measure.FastUpdates))
+    assert plain.check == fast.check == "pass"
+    assert plain.messages[0] <= fast.messages[0] < 2 * plain.messages[0]  # the kernels' layout has spare places
+    assert plain.update is not None and fast.update is not None
+    for contender in (plain, fast):
+        contender.update.run()
+    assert float(fast.update.weights().norm()) == pytest.approx(float(plain.update.weights().norm()), rel=1e-4)
 
 
 def test_all_reduce_against_closed_forms() -> None:
@@ -144,6 +167,7 @@ def test_fit_finds_the_link() -> None:
         ({"devices": 0}, "devices must be at least 1"),
         ({"device": "cuda:1"}, "device must be auto, cpu or cuda"),
         ({"batches": 0}, "batches must be at least 1"),
+        ({"paths": ["slow"]}, r"paths\[0\] must be plain or fast"),
         ({"message_mb": [0]}, r"message_mb\[0\] must be > 0"),
         ({"particle_spread": -1}, "particle_spread must be"),
         ({"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),

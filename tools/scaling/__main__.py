@@ -1,6 +1,6 @@
 """python -m tools.scaling [--json FILE]: weak scaling of training on this machine's devices, and a model of clusters.
 
-Prints no time of what fails its check. The JSON holds {"meta": provenance, "parts", "rows"}; a row's case is
+Prints no time of what fails its check. The JSON holds {"meta": provenance, "backward_seconds", "rows"}; a row's case is
 weak_scaling, all_reduce or model.
 """
 
@@ -22,7 +22,7 @@ from hgn.provenance import provenance
 from hgn.schema import ConfigError, from_mapping, to_mapping
 from tools.bench.contenders import PASS
 from tools.scaling.measure import measure
-from tools.scaling.model import Cluster, Link, Step, all_reduce_seconds, fit, update
+from tools.scaling.model import Cluster, Link, Step, Update, all_reduce_seconds, fit, update
 
 EXIT_RED = 1
 SIZES = tuple(2**power for power in range(11))  # 1 to 1,024 GPUs
@@ -42,13 +42,14 @@ def main(mapping: dict[str, Any]) -> int:
         found = json.loads((Path(folder) / "rows.json").read_text())
     rows = with_efficiency([{"case": "weak_scaling"} | row for row in found["updates"]])
     rows += predicted([{"case": "all_reduce"} | row for row in found["all_reduces"]], config.node_devices)
-    rows += model_rows(rows, found["parts"], config)
+    rows += model_rows(rows, found["backward_seconds"], config)
     print(table(rows))
     if config.json is not None:
         path = Path(config.json)
         path.parent.mkdir(parents=True, exist_ok=True)
         meta = provenance(device_type) | {"config": to_mapping(config)}
-        write_atomically(path, json.dumps({"meta": meta, "parts": found["parts"], "rows": rows}, indent=1).encode())
+        report = {"meta": meta, "backward_seconds": found["backward_seconds"], "rows": rows}
+        write_atomically(path, json.dumps(report, indent=1).encode())
     return 0 if all(row.get("check", PASS) == PASS for row in rows) else EXIT_RED
 
 
@@ -65,9 +66,9 @@ def devices(config: ScalingConfig) -> tuple[str, int]:
 
 def with_efficiency(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Adds each row's scenes per second and device, against one device alone with the same kind of scenes."""
-    alone = {row["particle_spread"]: row["ms"] for row in rows if row["devices"] == 1}
+    alone = {(row["path"], row["particle_spread"]): row["ms"] for row in rows if row["devices"] == 1}
     for row in rows:
-        base = alone.get(row["particle_spread"])
+        base = alone.get((row["path"], row["particle_spread"]))
         row["efficiency"] = base / row["ms"] if base and row["ms"] else None
     return rows
 
@@ -90,57 +91,69 @@ def fitted(rows: Sequence[dict[str, Any]], node_devices: int, between: Link) -> 
     return Cluster(max(node_devices, most), launch_s, inside, between)
 
 
-def model_rows(rows: list[dict[str, Any]], parts: dict[str, float], config: ScalingConfig) -> list[dict[str, Any]]:
-    """One row for each number of GPUs and each network; none without several devices to take the figures from."""
-    trained = [row for row in rows if row["case"] == "weak_scaling" and row["check"] == PASS]
-    single = next((row for row in trained if row["devices"] == 1 and row["particle_spread"] == 0), None)
-    sent = next((row["messages"] for row in trained if row["messages"]), None)
-    if single is None or sent is None:
-        return []
-    # Scenes of a batch are drawn apart from each other; seconds are taken to grow with particles.
-    spread = config.particle_spread / config.scenes**0.5
-    step = Step(single["ms"] / 1e3, parts["backward"], tuple(sent), spread)
-    scene_bytes = config.particles * (config.network.velocity_history + 2) * 12
+def model_rows(
+    rows: list[dict[str, Any]], backward_seconds: dict[str, float], config: ScalingConfig
+) -> list[dict[str, Any]]:
+    """One row for each path, network and number of GPUs; none without several devices to take the figures from."""
     found = []
-    for name, link in NETWORKS.items():
-        cluster = fitted(rows, config.node_devices, link)
-        for gpus in SIZES:
-            seen = update(step, gpus, cluster)
-            found.append(
-                {
-                    "case": "model",
-                    "network": name,
-                    "devices": gpus,
-                    "nodes": seen.nodes,
-                    "all_reduce_ms": 1e3 * seen.all_reduce_s,
-                    "not_hidden_ms": 1e3 * seen.not_hidden_s,
-                    "slowest_ms": 1e3 * seen.slowest_s,
-                    "ms": 1e3 * seen.seconds,
-                    "efficiency": seen.efficiency,
-                    "scenes_per_second": gpus * config.scenes / seen.seconds,
-                    "read_mb_per_second_and_node": config.scenes
-                    * min(gpus, cluster.node_gpus)
-                    * scene_bytes
-                    / seen.seconds
-                    / 1e6,
-                }
-            )
+    for path in config.paths:
+        trained = [row for row in rows if row["case"] == "weak_scaling" and row["path"] == path and row["ms"]]
+        alone = next((row for row in trained if row["devices"] == 1 and row["particle_spread"] == 0), None)
+        sent = next((row["messages"] for row in trained if row["messages"]), None)
+        if alone is None or sent is None:
+            continue
+        # Scenes of a batch are drawn apart from each other; seconds are taken to grow with particles.
+        spread = config.particle_spread / config.scenes**0.5
+        step = Step(alone["ms"] / 1e3, backward_seconds[path], tuple(sent), spread)
+        for name, link in NETWORKS.items():
+            cluster = fitted(rows, config.node_devices, link)
+            found += [_model_row(path, name, update(step, gpus, cluster), cluster, config) for gpus in SIZES]
     return found
+
+
+def _model_row(path: str, network: str, seen: Update, cluster: Cluster, config: ScalingConfig) -> dict[str, Any]:
+    scene_bytes = config.particles * (config.network.velocity_history + 2) * 12  # a window of float32 positions
+    read_bytes = config.scenes * min(seen.gpus, cluster.node_gpus) * scene_bytes
+    return {
+        "case": "model",
+        "path": path,
+        "network": network,
+        "devices": seen.gpus,
+        "nodes": seen.nodes,
+        "all_reduce_ms": 1e3 * seen.all_reduce_s,
+        "not_hidden_ms": 1e3 * seen.not_hidden_s,
+        "slowest_ms": 1e3 * seen.slowest_s,
+        "ms": 1e3 * seen.seconds,
+        "efficiency": seen.efficiency,
+        "scenes_per_second": seen.gpus * config.scenes / seen.seconds,
+        "read_mb_per_second_and_node": read_bytes / seen.seconds / 1e6,
+    }
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The figures for people, as Markdown."""
     lines = [
-        "| devices | scenes each | spread | messages | ms an update | quartiles | efficiency | check |",
-        "| --: | --: | --: | :-- | --: | --: | --: | :-- |",
+        "| path | devices | scenes each | spread | messages | ms an update | quartiles | efficiency | check |",
+        "| :-- | --: | --: | --: | :-- | --: | --: | --: | :-- |",
     ]
     for row in rows:
         if row["case"] == "weak_scaling":
-            sent = f"{len(row['messages'])}, up to {row['message_mb']:g} MB" if row["averaged"] else "none"
+            sent = f"{len(row['messages'])}, up to {max(row['messages']) / 1e6:.1f} MB" if row["averaged"] else "none"
             times = ("-", "-") if row["ms"] is None else (f"{row['ms']:.2f}", _range(row["ms_quartiles"]))
             share = "-" if row["efficiency"] is None else f"{row['efficiency']:.3f}"
             lines.append(
-                _line((row["devices"], row["scenes"], row["particle_spread"], sent, *times, share, row["check"]))
+                _line(
+                    (
+                        row["path"],
+                        row["devices"],
+                        row["scenes"],
+                        row["particle_spread"],
+                        sent,
+                        *times,
+                        share,
+                        row["check"],
+                    )
+                )
             )
     if any(row["case"] == "all_reduce" for row in rows):
         lines += ["", "| devices | bytes | all-reduce, ms | quartiles | model, ms |", "| --: | --: | --: | --: | --: |"]
@@ -158,11 +171,10 @@ def model_table(rows: list[dict[str, Any]]) -> str:
         "| read by a node, MB/s |",
         "| --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
-    for name in NETWORKS:
-        chosen = [row for row in rows if row["case"] == "model" and row["network"] == name]
-        if chosen:
-            lines.append(_line((f"*{name}*", *[""] * 8)))
-        for row in chosen:
+    for row in rows:
+        if row["case"] == "model":
+            if row["devices"] == 1:
+                lines.append(_line((f"*{row['path']}, {row['network']}*", *[""] * 8)))
             parts = [f"{row[key]:.2f}" for key in ("all_reduce_ms", "not_hidden_ms", "slowest_ms", "ms", "efficiency")]
             reading = f"{row['read_mb_per_second_and_node']:,.0f}"
             lines.append(_line((row["devices"], row["nodes"], *parts, f"{row['scenes_per_second']:,.0f}", reading)))

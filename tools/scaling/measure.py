@@ -1,7 +1,7 @@
 """The processes that are timed: one for each device, training together in different numbers, in turns.
 
-What is timed is the update of a training on several ranks: noise, jitter, forward, backward with the gradients'
-averages under way, the guard, Adam. Not in it: Lightning, log lines and the reading of data.
+What is timed is the update of a training on several ranks: noise, jitter, grid, forward, backward, the gradients'
+average, Adam. Not in it: Lightning, log lines and the reading of data.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from torch.nn.parallel import DistributedDataParallel
 
 from hgn.config import ScalingConfig, TrainingConfig
 from hgn.data.batch import Batch
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.path import kernel_precision, why_not_fast
 from hgn.training.checkpoint import DataInfo
 from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
@@ -45,19 +47,21 @@ PATIENCE = datetime.timedelta(minutes=2)
 
 @dataclass
 class Contender:
-    """Some of the devices training at the same time, together or (`message_mb` is None) each for itself."""
+    """Some of the devices training at the same time, together or each for itself."""
 
+    path: str  # plain or fast
     devices: int
-    message_mb: float | None
+    averaged: bool
+    message_mb: float | None  # of the plain path; the fast one sends all gradients at once
     spread: float  # of the particles of a scene
-    update: Updates | None = field(default=None, repr=False)  # none in the processes that take no part
+    update: PlainUpdates | FastUpdates | None = field(default=None, repr=False)  # none in processes that take no part
     check: str = PASS
     messages: list[int] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)  # of one update
 
 
-class Updates:
-    """Training updates of one rank on batches that lie on its device."""
+class PlainUpdates:
+    """Training updates of one rank on batches that lie on its device, with autograd."""
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
         self.batches, self.device = batches, device
@@ -69,9 +73,24 @@ class Updates:
         self.loss: nn.Module = _Loss(module)
         self.parameters = list(network.parameters())
 
-    def average(self, group: dist.ProcessGroup, message_mb: float) -> None:
-        """From now on gradients are averaged over the ranks of `group`."""
+    def average(self, group: dist.ProcessGroup, message_mb: float | None) -> list[int]:
+        """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
+        assert message_mb is not None
+        messages: list[int] = []
+
+        # torch reads annotations, and takes none for right but not those that are strings
+        def hook(state, bucket):  # type: ignore[no-untyped-def]
+            messages.append(bucket.buffer().nbytes)
+            return allreduce_hook(group, bucket)
+
+        probe = _averaged(copy.deepcopy(self.loss), group, message_mb, self.device)
+        probe.register_comm_hook(None, hook)
+        for _ in range(2):  # after the first pass the messages follow the order in which gradients came
+            messages.clear()
+            probe.zero_grad()
+            probe(self.batches[0]).backward()
         self.loss = _averaged(self.loss, group, message_mb, self.device)
+        return messages
 
     def run(self) -> None:
         """One update on each batch."""
@@ -81,15 +100,75 @@ class Updates:
             self.guard.check(self.parameters, self.optimizer)
             self.optimizer.step()
 
-    def parts(self) -> dict[str, float]:
-        """Seconds of an update's forward and backward passes, medians over the batches."""
-        forward, backward = [], []
-        losses: list[torch.Tensor] = []
+    def gradients(self) -> torch.Tensor:
+        """Those of the first batch, averaged if so."""
+        self.optimizer.zero_grad()
+        self.loss(self.batches[0]).backward()
+        return torch.cat([p.grad.flatten() for p in self.parameters if p.grad is not None])
+
+    def weights(self) -> torch.Tensor:
+        return torch.cat([p.detach().flatten() for p in self.parameters])
+
+    def backward_seconds(self) -> float:
+        """Seconds of an update's backward pass, the median over the batches."""
+        found = []
         for batch in self.batches:
             self.optimizer.zero_grad()
-            forward.append(once(partial(_append_loss, losses, self.loss, batch), self.device))
-            backward.append(once(losses.pop().backward, self.device))
-        return {"forward": float(np.median(forward)) / 1e3, "backward": float(np.median(backward)) / 1e3}
+            found.append(once(self.loss(batch).backward, self.device))
+        return float(np.median(found)) / 1e3
+
+
+class FastUpdates:
+    """The same with hgn.kernels.update, on episodes of one window each."""
+
+    def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
+        # Triton, which the plain path does without, is loaded here.
+        from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
+
+        training = TrainingConfig(batch_scenes=config.scenes)
+        network = bench_network(config.network, device)
+        assert isinstance(network, HierarchicalGraphNetwork)
+        settings = UpdateSettings(config.scenes, training.noise_std, training.grid_jitter, 1 / 64)
+        precision = kernel_precision(training.precision, device)
+        counters = torch.zeros(2, device=device), torch.zeros(5, device=device)
+        self.make = partial(Updates, network, settings, precision, *counters)
+        self.ours = self.make()
+        self.chunk = []
+        for batch in batches:
+            windows = batch.window_WN3.split(batch.particles_S, dim=1)
+            materials = batch.material_N.int().split(batch.particles_S)
+            rows = zip(windows, materials, batch.domain_S3.tolist(), batch.seeds_S, strict=True)
+            self.chunk.append([(DeviceEpisode(w.contiguous(), m.clone(), None, tuple(d)), 0, s) for w, m, d, s in rows])
+        self.rates = [training.learning_rate] * len(self.chunk)
+
+    def average(self, group: dist.ProcessGroup, message_mb: float | None) -> list[int]:
+        """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
+        messages: list[int] = []
+
+        def reduce(tensor: torch.Tensor) -> None:
+            messages[:] = [tensor.nbytes]
+            dist.all_reduce(tensor, group=group)
+
+        self.ours = self.make(reduce, dist.get_world_size(group))
+        self.gradients()
+        return messages
+
+    def run(self) -> None:
+        """One update on each batch."""
+        self.ours.run(self.chunk, self.rates)
+
+    def gradients(self) -> torch.Tensor:
+        """Those of the first batch, averaged if so; from Adam's first moment, which it moves by a tenth of them."""
+        before = self.ours.first_moment.clone()
+        self.ours.run(self.chunk[:1], [0.0])
+        return (self.ours.first_moment - 0.9 * before) * 10
+
+    def weights(self) -> torch.Tensor:
+        return self.ours.values
+
+    def backward_seconds(self) -> float:
+        """None of it hides a message: they leave when all gradients are there."""
+        return 0.0
 
 
 class _Loss(nn.Module):
@@ -101,10 +180,6 @@ class _Loss(nn.Module):
 
     def forward(self, batch: Batch) -> torch.Tensor:
         return self.module.loss(batch)
-
-
-def _append_loss(losses: list[torch.Tensor], loss: nn.Module, batch: Batch) -> None:
-    losses.append(loss(batch))
 
 
 def measure(rank: int, count: int, config: ScalingConfig, device_type: str, folder: Path) -> None:
@@ -124,30 +199,37 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         sizes = [size for size in (1, 2, 4, 8, 16, 32, 64) if size < count] + [count]
         groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
         batches = {spread: _batches(config, rank, spread, device) for spread in {0.0, config.particle_spread}}
-        contenders = [_prepared(c, config, rank, groups, batches, device) for c in _contenders(config, sizes)]
-        single = contenders[0].update
-        parts = single.parts() if single is not None and rank == 0 else None
+        contenders = [_prepared(c, config, rank, groups, batches, device) for c in _contenders(config, sizes, device)]
+        backward = {c.path: c.update.backward_seconds() for c in contenders if c.devices == 1 and c.update is not None}
         _alternate(contenders, config, rank)
         for contender in contenders:
             _check_weights(contender, groups, rank)
         rows = [row for size, group in groups.items() for row in _all_reduces(size, group, rank, device)]
         if rank == 0:
-            assert parts is not None
-            found = {"parts": parts, "updates": [_row(c, config) for c in contenders], "all_reduces": rows}
+            found = {
+                "backward_seconds": backward,
+                "updates": [_row(c, config) for c in contenders],
+                "all_reduces": rows,
+            }
             (folder / "rows.json").write_text(json.dumps(found))
         dist.barrier()
     finally:
         dist.destroy_process_group()
 
 
-def _contenders(config: ScalingConfig, sizes: list[int]) -> list[Contender]:
+def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -> list[Contender]:
     chosen = averaging_options()["bucket_cap_mb"]
     found = []
-    for size in sizes:
-        ways = [None] if size == 1 else [None, *dict.fromkeys([chosen, *config.message_mb])]
-        found += [Contender(size, way, 0.0) for way in ways]
-        if config.particle_spread > 0:
-            found.append(Contender(size, ways[0] if size == 1 else chosen, config.particle_spread))
+    for path in config.paths:
+        if path == "fast" and why_not_fast(device, config.network):
+            continue
+        sent = list(dict.fromkeys([chosen, *config.message_mb])) if path == "plain" else [None]
+        for size in sizes:
+            found.append(Contender(path, size, False, None, 0.0))
+            if size > 1:
+                found += [Contender(path, size, True, message_mb, 0.0) for message_mb in sent]
+            if config.particle_spread > 0:
+                found.append(Contender(path, size, size > 1, sent[0] if size > 1 else None, config.particle_spread))
     return found
 
 
@@ -172,52 +254,38 @@ def _prepared(
     device: torch.device,
 ) -> Contender:
     if rank < contender.devices:
-        contender.update = Updates(config, batches[contender.spread], device)
-        if contender.message_mb is not None:
-            group = groups[contender.devices]
-            contender.check, contender.messages = _check_average(contender.update, group, contender.message_mb)
-            contender.update.average(group, contender.message_mb)
+        made = PlainUpdates if contender.path == "plain" else FastUpdates
+        contender.update = made(config, batches[contender.spread], device)
+        if contender.averaged:
+            _average(contender, groups[contender.devices])
     _agree(contender)
     return contender
 
 
-def _averaged(loss: nn.Module, group: dist.ProcessGroup, message_mb: float, device: torch.device) -> nn.Module:
+def _averaged(
+    loss: nn.Module, group: dist.ProcessGroup, message_mb: float, device: torch.device
+) -> DistributedDataParallel:
     options: dict[str, Any] = averaging_options() | {"bucket_cap_mb": message_mb}
     here = [device] if device.type == "cuda" else None
     return DistributedDataParallel(loss, device_ids=here, process_group=group, **options)
 
 
-def _check_average(update: Updates, group: dist.ProcessGroup, message_mb: float) -> tuple[str, list[int]]:
-    """`pass`, or by how much averaged gradients differ from the mean of each rank's own; and the messages' bytes."""
-    plain, averaged = copy.deepcopy(update.loss), copy.deepcopy(update.loss)
-    plain(update.batches[0]).backward()
-    expected = _gradients(plain)
+def _average(contender: Contender, group: dist.ProcessGroup) -> None:
+    """Lets gradients be averaged, and checks them against the mean of each rank's own."""
+    assert contender.update is not None
+    expected = contender.update.gradients().clone()
     dist.all_reduce(expected, group=group)
     expected /= dist.get_world_size(group)
-    messages: list[int] = []
-
-    # torch reads annotations, and takes none for right but not those that are strings
-    def hook(state, bucket):  # type: ignore[no-untyped-def]
-        messages.append(bucket.buffer().nbytes)
-        return allreduce_hook(group, bucket)
-
-    averaged_loss = _averaged(averaged, group, message_mb, update.device)
-    assert isinstance(averaged_loss, DistributedDataParallel)
-    averaged_loss.register_comm_hook(None, hook)
-    for _ in range(2):  # after the first pass the messages follow the order in which gradients came
-        messages.clear()
-        averaged.zero_grad()
-        averaged_loss(update.batches[0]).backward()
-    error = float((_gradients(averaged) - expected).norm() / expected.norm())
+    contender.messages = contender.update.average(group, contender.message_mb)
+    error = float((contender.update.gradients() - expected).norm() / expected.norm())
     if not error <= GRADIENT_BOUND:
-        return f"relative error of averaged gradients {error:.1e} exceeds {GRADIENT_BOUND:.0e}", messages
-    return PASS, messages
+        contender.check = f"relative error of averaged gradients {error:.1e} exceeds {GRADIENT_BOUND:.0e}"
 
 
 def _check_weights(contender: Contender, groups: dict[int, dist.ProcessGroup], rank: int) -> None:
     """After the timed updates the weights must be the same, bit for bit, on all ranks."""
-    if contender.update is not None and contender.message_mb is not None:
-        weights = torch.cat([p.detach().flatten() for p in contender.update.parameters])
+    if contender.update is not None and contender.averaged:
+        weights = contender.update.weights()
         first = weights.clone()
         dist.broadcast(first, 0, group=groups[contender.devices])
         if contender.check == PASS and not torch.equal(weights, first):
@@ -255,7 +323,7 @@ def _seconds(contender: Contender, rank: int) -> float:
     if contender.update is not None:
         started = time.perf_counter()
         contender.update.run()
-        if contender.update.device.type == "cuda":
+        if torch.cuda.is_available():
             torch.cuda.synchronize()
         taken.fill_(time.perf_counter() - started)
     dist.all_reduce(taken, dist.ReduceOp.MAX)
@@ -283,11 +351,12 @@ def _all_reduce_often(values: torch.Tensor, group: dist.ProcessGroup) -> None:
 
 def _row(contender: Contender, config: ScalingConfig) -> dict[str, Any]:
     row: dict[str, Any] = {
+        "path": contender.path,
         "devices": contender.devices,
         "scenes": config.scenes,
         "particles": config.particles,
         "particle_spread": contender.spread,
-        "averaged": contender.message_mb is not None,
+        "averaged": contender.averaged,
         "message_mb": contender.message_mb,
         "messages": contender.messages,
         "check": contender.check,
@@ -297,7 +366,3 @@ def _row(contender: Contender, config: ScalingConfig) -> dict[str, Any]:
         low, middle, high = np.percentile(contender.milliseconds, (25, 50, 75)).tolist()
         row |= {"ms": middle, "ms_quartiles": [low, high], "samples": len(contender.milliseconds)}
     return row
-
-
-def _gradients(module: nn.Module) -> torch.Tensor:
-    return torch.cat([p.grad.flatten() for p in module.parameters() if p.grad is not None])
