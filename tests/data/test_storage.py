@@ -10,6 +10,7 @@ import json
 import multiprocessing
 import os
 import socket
+import sys
 import threading
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -23,6 +24,7 @@ import uvicorn
 import hgn.data.storage
 from datagen.server import make_app, make_server
 from datagen.supervisor import PoolState
+from hgn.command import run_command
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
@@ -292,6 +294,18 @@ def test_server_that_stays_away() -> None:
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     with pytest.raises(UnreachableError, match=r"no answer for 0 s .*: 'http://127.0.0.1:"):
         Manifest.load(url, patience_s=0.05)
+
+
+def test_command_without_its_server(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A command whose server stays away ends with one line that says what to do, and exit code 1."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    monkeypatch.setattr(sys, "argv", ["load"])
+    with pytest.raises(SystemExit, match="1"):
+        run_command(lambda mapping: Manifest.load(url, patience_s=0.01) and None, "load")
+    error = capsys.readouterr().err
+    assert error.startswith("error: no answer for 0 s (at last: ") and error.count("\n") == 1
+    assert error.endswith(f"{url}/manifest.json; see that its server runs and run the same command again to go on\n")
 
 
 def test_server_that_is_away_is_not_asked_at_once_again(

@@ -1,4 +1,5 @@
-"""Generates on a Ray cluster of two nodes on loopback and kills one of them midway; prints what happened as JSON.
+"""Generates on a Ray cluster of two nodes on loopback, kills one of them midway, and compares what comes out with a
+data set made in one process; prints it as JSON.
 
 Run as `python ray_program.py FOLDER`, with this folder on the path and BALLISTIC_FOLDER set.
 """
@@ -7,13 +8,19 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
+from pathlib import Path
 
+from ballistic_dataset import make_dataset
 from ray.cluster_utils import Cluster
 
 from datagen.generate import generate
 from datagen.progress import Progress
 from datagen.worker import Backend
 from hgn.config import DatagenConfig, DatasetConfig
+from hgn.data.manifest import Manifest
+from hgn.provenance import provenance
+from tools.kills import differences, equal_shards
 
 BALLISTIC = Backend(
     generate_scene="ballistic_solver:generate_scene",
@@ -46,7 +53,7 @@ def main(folder: str) -> None:
     second = cluster.add_node(num_cpus=2, object_store_memory=STORE_BYTES)
     try:
         dataset = DatasetConfig(
-            folder=folder,
+            folder=f"{folder}/shared",
             training_scenes=10,
             validation_scenes=2,
             test_scenes=0,
@@ -56,9 +63,20 @@ def main(folder: str) -> None:
         )
         killer = Killer(cluster, second)
         finished = generate(DatagenConfig(dataset=dataset), killer, lambda: False, BALLISTIC)
-        print(json.dumps({"finished": finished, "episodes": killer.episodes, "messages": killer.messages}))
     finally:
         cluster.shutdown()
+    peaceful, shared = Path(folder) / "peaceful", Path(folder) / "shared"
+    make_dataset(DatagenConfig(dataset=replace(dataset, folder=str(peaceful), pool="local", ray_address=None)))
+    report = {
+        "meta": provenance(),
+        "finished": finished,
+        "episodes": killer.episodes,
+        "messages": killer.messages,
+        "differences": differences(peaceful, shared),
+        "shards": len(Manifest.load(shared).shards),
+        "shards_bitwise_equal": equal_shards(peaceful, shared),
+    }
+    print(json.dumps(report))
 
 
 if __name__ == "__main__":

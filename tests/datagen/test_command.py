@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -225,6 +226,29 @@ def test_stopping_leaves_a_resumable_folder(
     assert code == 0 and Manifest.load(tmp_path / "made").complete, errors
     seeds = (control / "simulated.log").read_text().split()
     assert len(set(seeds)) == 4 and len(seeds) <= 5  # at most the one in flight twice
+
+
+def test_two_generators_at_once(
+    backend: object,
+    control: Path,
+    tmp_path: Path,
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+) -> None:
+    """The same command twice on one folder, at once: each scene is simulated and each shard published once, both end
+    with the whole data set, and it is bitwise the one that a single generator makes."""
+    whole = make_dataset(make_config(training_scenes=4, validation_scenes=2, test_scenes=0, frames=5))
+    (control / "simulated.log").unlink()
+    (control / "slow").touch()
+    arguments = (*SMALL, "out=shared", "scenes=4", "dataset.validation_scenes=2")
+    processes = [start(*arguments, cwd=tmp_path) for _ in range(2)]
+    for process in processes:
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 0 and "shared is complete: 4 train, 2 validation, 0 test episodes" in errors
+    seeds = (control / "simulated.log").read_text().split()
+    assert len(seeds) == len(set(seeds)) == 6
+    made = {shard.name: shard.sha256 for shard in Manifest.load(tmp_path / "shared").shards}
+    assert made == {shard.name: shard.sha256 for shard in Manifest.load(whole).shards}
 
 
 class Terminal(io.StringIO):

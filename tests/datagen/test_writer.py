@@ -336,6 +336,37 @@ def test_array_tasks_make_one_dataset(
     assert len(seeds) == len(set(seeds)) == 8
 
 
+@pytest.mark.parametrize("seconds", [0, 2**33])
+def test_no_clock_is_asked(
+    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, tmp_path: Path, seconds: int
+) -> None:
+    """Machines whose clocks stand in 1970 or far in the future, beside others', make the same data set: no time of a
+    file says whether it is whole, left behind or new."""
+    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
+
+    def turn_back(folder: Path) -> None:
+        for path in (*folder.rglob("*"), folder):
+            os.utime(path, (seconds, seconds))
+
+    with DatasetWriter(make_config()) as writer:
+        store = None
+        for index in range(2):
+            with DatasetWriter(make_config()) as other:
+                stage(other, "train", index)
+                (writer.folder / ".staging" / f".train-00000{index}.tar.77.partial").touch()
+                turn_back(writer.folder)
+                other.publish_next()
+                turn_back(writer.folder)
+            store = store or EpisodeStore(writer.folder, "train")
+            store.refresh()
+            writer.refresh()
+            assert len(store) == len(store.episodes[:]) == writer.done == index + 1
+    make_dataset(make_config())
+    turn_back(writer.folder)
+    assert hashes(make_dataset(make_config())) == hashes(whole)
+    assert not list(writer.folder.rglob("*.partial"))
+
+
 def test_manifest_is_rebuilt_from_the_shards(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
     """A lost manifest costs nothing: published shards are verified and listed again."""
     folder = make_dataset(make_config())
