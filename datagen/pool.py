@@ -170,7 +170,7 @@ class Pool:
         found, self._counted = self._writer.done - self._counted, self._writer.done
         if found > 0:
             self._progress.found(found)
-        if not self._writer.remaining() and not self._writer.complete and not self._said_waiting:
+        if not self._writer.holds and not self._writer.complete and not self._said_waiting:
             self._said_waiting = True
             self._progress.message("other generators make the rest; waiting for them")
 

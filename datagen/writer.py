@@ -125,6 +125,11 @@ class DatasetWriter:
         self._plan()
 
     @property
+    def holds(self) -> bool:
+        """Whether there are claimed shards that are not published yet."""
+        return bool(self._claimed)
+
+    @property
     def total(self) -> int:
         """How many episodes the share has."""
         return sum(len(shard.indices) for shard in self._share)
