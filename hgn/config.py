@@ -528,6 +528,7 @@ class ScalingConfig:
     particle_spread: float = 0.17  # standard deviation of a scene's particles, as a share of their mean
     batches: int = 8  # of each device; one sample is an update on each of them
     paths: tuple[str, ...] = ("plain", "fast")  # the fast one where there are GPUs
+    precision: str = "high"  # as for training; the plain path takes high for half
     message_mb: tuple[float, ...] = (25.0,)  # sizes of messages that are timed beside the one that training uses
     network: NetworkConfig = field(default_factory=NetworkConfig)
     node_devices: int = 8  # of the clusters that the model tells of
@@ -539,6 +540,7 @@ class ScalingConfig:
     def __post_init__(self) -> None:
         require_positive(self, "rounds", "seconds")
         require_non_negative(self, "particle_spread")
+        require_one_of(self, "precision", PRECISIONS)
         for name in ("scenes", "particles", "batches", "node_devices"):
             require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
         require(self.devices is None or self.devices >= 1, "devices", "at least 1", self.devices)

@@ -98,7 +98,7 @@ def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pyt
     monkeypatch.setattr(dist, "broadcast", lambda tensor, *_, **__: tensor.add_(1e-3))
     measure._check_weights(contender, {1: alone}, 0)
     assert contender.check == "weights of rank 0 differ from those of rank 0 after the updates"
-    assert measure._row(contender, config)["ms"] is None
+    assert measure._row(contender, config, torch.device("cpu"))["ms"] is None
 
 
 def test_the_fast_path_is_timed_alike(alone: dist.ProcessGroup) -> None:

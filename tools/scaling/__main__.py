@@ -133,8 +133,8 @@ def _model_row(path: str, network: str, seen: Update, cluster: Cluster, config: 
 def table(rows: list[dict[str, Any]]) -> str:
     """The figures for people, as Markdown."""
     lines = [
-        "| path | devices | scenes each | spread | messages | ms an update | quartiles | efficiency | check |",
-        "| :-- | --: | --: | --: | :-- | --: | --: | --: | :-- |",
+        "| path | precision | devices | scenes | spread | messages | update, ms | quartiles | efficiency | check |",
+        "| :-- | :-- | --: | --: | --: | :-- | --: | --: | --: | :-- |",
     ]
     for row in rows:
         if row["case"] == "weak_scaling":

@@ -31,7 +31,7 @@ from hgn.training.checkpoint import DataInfo
 from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
 from hgn.training.ranks import averaging_options
-from tools.bench.contenders import FRAME_RATE_HZ, MATMUL, PASS, bench_network
+from tools.bench.contenders import FRAME_RATE_HZ, PASS, bench_network
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.timing import once
 
@@ -129,7 +129,7 @@ class FastUpdates:
         network = bench_network(config.network, device)
         assert isinstance(network, HierarchicalGraphNetwork)
         settings = UpdateSettings(config.scenes, training.noise_std, training.grid_jitter, 1 / 64)
-        precision = kernel_precision(training.precision, device)
+        precision = kernel_precision(config.precision, device)
         counters = torch.zeros(2, device=device), torch.zeros(5, device=device)
         self.make = partial(Updates, network, settings, precision, *counters)
         self.ours = self.make()
@@ -189,7 +189,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         torch.cuda.set_device(device)
     else:
         torch.set_num_threads(max(1, (os.cpu_count() or 1) // count))
-    torch.set_float32_matmul_precision(MATMUL["tf32" if device.type == "cuda" else "fp32"])
+    torch.set_float32_matmul_precision(_plain_precision(config, device))
     # all processes talk through this group when nothing is timed; it leaves the devices alone
     dist.init_process_group(
         "gloo", init_method=f"file://{folder / 'store'}", rank=rank, world_size=count, timeout=PATIENCE
@@ -208,13 +208,18 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         if rank == 0:
             found = {
                 "backward_seconds": backward,
-                "updates": [_row(c, config) for c in contenders],
+                "updates": [_row(c, config, device) for c in contenders],
                 "all_reduces": rows,
             }
             (folder / "rows.json").write_text(json.dumps(found))
         dist.barrier()
     finally:
         dist.destroy_process_group()
+
+
+def _plain_precision(config: ScalingConfig, device: torch.device) -> str:
+    """The plain path has no half precision, and a CPU no TF32."""
+    return "high" if device.type == "cuda" and config.precision != "highest" else "highest"
 
 
 def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -> list[Contender]:
@@ -349,9 +354,11 @@ def _all_reduce_often(values: torch.Tensor, group: dist.ProcessGroup) -> None:
         dist.all_reduce(values, group=group)
 
 
-def _row(contender: Contender, config: ScalingConfig) -> dict[str, Any]:
+def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> dict[str, Any]:
+    plain = contender.path == "plain"
     row: dict[str, Any] = {
         "path": contender.path,
+        "precision": _plain_precision(config, device) if plain else config.precision,
         "devices": contender.devices,
         "scenes": config.scenes,
         "particles": config.particles,
