@@ -89,12 +89,12 @@ def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pyt
     right = dist.all_reduce
 
     def wrong_sum(tensor: torch.Tensor, group: dist.ProcessGroup, async_op: bool = False) -> dist.Work | None:
-        return right(tensor, group=group, async_op=True) if async_op else tensor.mul_(1.01)
+        return right(tensor, group=group, async_op=True) if async_op else tensor.mul_(1.1)
 
     with monkeypatch.context() as patch:
         patch.setattr(dist, "all_reduce", wrong_sum)
         wrong = averaged(alone, measure.PlainUpdates, config)
-    assert wrong.check.startswith("relative error of averaged gradients 9.9e-03 exceeds 1e-03")
+    assert wrong.check.startswith("relative error of averaged gradients 9.1e-02 exceeds 2e-02")
     monkeypatch.setattr(dist, "broadcast", lambda tensor, *_, **__: tensor.add_(1e-3))
     measure._check_weights(contender, {1: alone}, 0)
     assert contender.check == "weights of rank 0 differ from those of rank 0 after the updates"

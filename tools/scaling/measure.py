@@ -36,8 +36,8 @@ from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.timing import once
 
 # Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
-# order each time, which turns the activations that lie next to their kink.
-GRADIENT_BOUND = 1e-3
+# order each time, which turns the activations that lie next to their kink, and TF32 makes more of it.
+GRADIENT_BOUND = 2e-2
 ALL_REDUCE_BYTES = (4, 65_536, 1_048_576, 4_194_304, 16_777_216, 67_108_864)
 ALL_REDUCE_CALLS, ALL_REDUCE_SAMPLES = 10, 5
 WARM_UPDATES = 3
@@ -200,7 +200,8 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
         batches = {spread: _batches(config, rank, spread, device) for spread in {0.0, config.particle_spread}}
         contenders = [_prepared(c, config, rank, groups, batches, device) for c in _contenders(config, sizes, device)]
-        backward = {c.path: c.update.backward_seconds() for c in contenders if c.devices == 1 and c.update is not None}
+        alone = {c.path: c.update for c in contenders if c.devices == 1 and c.spread == 0}
+        backward = {path: update.backward_seconds() for path, update in alone.items() if update is not None}
         _alternate(contenders, config, rank)
         for contender in contenders:
             _check_weights(contender, groups, rank)
