@@ -200,6 +200,19 @@ class ServiceConfig:
 
 
 @dataclass(frozen=True)
+class UploadConfig:
+    """`python -m datagen.upload`: what is copied where."""
+
+    data: str  # folder of a data set
+    to: str  # URL
+    follow: bool = False  # go on while the data set grows, until it is complete
+    poll_s: float = 5.0  # between looks at it then
+
+    def __post_init__(self) -> None:
+        require_positive(self, "poll_s")
+
+
+@dataclass(frozen=True)
 class NetworkConfig:
     """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
 

@@ -74,6 +74,11 @@ def open_storage(folder: Path | str) -> Storage:
     return _Folder(Path(str(folder).removeprefix("file://")))
 
 
+def write_remote(url: str, name: str, source: Path | bytes) -> None:
+    """Writes a file, or bytes, to a data set's URL. Raises: ConfigError when that cannot be; UnreachableError."""
+    _remote(url.rstrip("/")).write(name, source)
+
+
 def dataset_token() -> str | None:
     """The token of $HGN_DATASET_TOKEN. Raises: ConfigError when it could not stand in a header."""
     token = os.environ.get(TOKEN_VARIABLE)
@@ -206,6 +211,26 @@ class _Remote:
                 break
         return path
 
+    def write(self, name: str, source: Path | bytes) -> None:
+        def put(path: str) -> None:
+            if isinstance(source, bytes):
+                self._files.pipe_file(path, source)
+            else:
+                self._files.put_file(str(source), path)
+
+        expected = len(source) if isinstance(source, bytes) else source.stat().st_size
+        try:
+            self._patiently(name, PATIENCE_S, put)
+            self._files.invalidate_cache()
+            found = self._files.info(f"{self._root}/{name}")["size"]
+        except (NotImplementedError, FileNotFoundError) as error:
+            raise ConfigError(
+                f"{self._url} must be a place to write to, got {type(error).__name__} for {name}; see that it exists, "
+                "and that its protocol knows writing"
+            ) from None
+        if found != expected:
+            raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {found}; copy it again")
+
     def _fetch(self, name: str, sha256: str, size: int, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _owned(path) as file:
@@ -280,7 +305,7 @@ def _transient(error: Exception, url: str) -> str | None:
     status = getattr(error, "status", None)
     if status in (401, 403) or isinstance(error, PermissionError):
         raise ConfigError(
-            f"{url} must be open to this reader, got refused; set {TOKEN_VARIABLE} to the service's token (an object "
+            f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token (an object "
             "store asks for its own credentials)"
         ) from None
     if status == 410:

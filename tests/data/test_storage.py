@@ -270,7 +270,7 @@ def test_token(folder: Path, serve: Callable[..., str], monkeypatch: pytest.Monk
         if token:
             monkeypatch.setenv(TOKEN_VARIABLE, token)
         hgn.data.storage._remote.cache_clear()
-        with pytest.raises(ConfigError, match="must be open to this reader, got refused; set HGN_DATASET_TOKEN"):
+        with pytest.raises(ConfigError, match="must be open to this program, got refused; set HGN_DATASET_TOKEN"):
             EpisodeStore(url, "train")
     monkeypatch.setenv(TOKEN_VARIABLE, TOKEN)
     hgn.data.storage._remote.cache_clear()

@@ -1,0 +1,104 @@
+"""`python -m datagen.upload data=data/obstacles to=s3://bucket/obstacles`: copies a data set to an object store.
+
+Training then reads it with `dataset.folder=s3://bucket/obstacles`. Shards go first and the manifest last, so that what
+is listed there is there whole; the same command again copies what is new. With `follow=true` it goes on while the data
+set grows, until that is complete.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import Any
+
+from datagen.generate import StopRequest
+from hgn.command import run_command
+from hgn.config import UploadConfig
+from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
+from hgn.data.storage import is_remote, open_storage, verify_file, write_remote
+from hgn.progress import bar
+from hgn.schema import ConfigError, from_mapping, require
+
+_LOOK_S = 0.2  # between looks for a signal
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Copies; the exit code is 0, or 128 + the signal that stopped it."""
+    config = from_mapping(UploadConfig, mapping)
+    require(is_remote(config.to), "to", "a URL", config.to, "as in to=s3://bucket/obstacles")
+    require(not is_remote(config.data), "data", "a folder of this machine", config.data)
+    with StopRequest() as stop:
+        target = Target(config.to)
+        while not stop.requested():
+            target.copy(Path(config.data), stop)
+            if not config.follow or target.complete:
+                break
+            until = time.monotonic() + config.poll_s
+            while time.monotonic() < until and not stop.requested():
+                time.sleep(_LOOK_S)
+    print(f"{config.to} holds {target.shards} shards" + (", the whole data set" if target.complete else ""))
+    return 0 if stop.signal is None else 128 + stop.signal
+
+
+class Target:
+    """A data set at a URL that can be written to: an object store, whose files appear whole or not at all."""
+
+    def __init__(self, url: str) -> None:
+        """Raises: ConfigError when what is there cannot be read; UnreachableError."""
+        self._url = url.rstrip("/")
+        self._manifest: Manifest | None = None
+        with contextlib.suppress(FileNotFoundError):
+            content = open_storage(self._url).manifest(MANIFEST_NAME)
+            self._manifest = Manifest.parse(content, f"{self._url}/{MANIFEST_NAME}")
+
+    @property
+    def shards(self) -> int:
+        """How many shards can be read there."""
+        return 0 if self._manifest is None else len(self._manifest.shards)
+
+    @property
+    def complete(self) -> bool:
+        """Whether that is the whole data set."""
+        return self._manifest is not None and self._manifest.complete
+
+    def copy(self, folder: Path, stop: StopRequest) -> None:
+        """Copies the shards that are not there yet, then the manifest; leaves that out when asked to stop before.
+
+        Raises: ConfigError when another data set is there, a shard here is altered, or nothing can be written;
+        UnreachableError.
+        """
+        try:
+            content = (folder / MANIFEST_NAME).read_bytes()
+        except FileNotFoundError:
+            raise ConfigError(f"data must be the folder of a data set, got {folder} without {MANIFEST_NAME}") from None
+        manifest = Manifest.parse(content, str(folder / MANIFEST_NAME))
+        new = self._missing(manifest)
+        with bar("copying", total=sum(shard.bytes for shard in new), unit="byte") as progress:
+            for shard in new:
+                if stop.requested():
+                    return
+                path = folder / shard.name
+                verify_file(path, shard.sha256, shard.bytes, "delete it and run the generator again")
+                write_remote(self._url, shard.name, path)
+                progress.update(shard.bytes)
+        if self._manifest != manifest:
+            write_remote(self._url, MANIFEST_NAME, content)  # as it was read: the file may have grown since
+            self._manifest = manifest
+
+    def _missing(self, manifest: Manifest) -> tuple[ShardEntry, ...]:
+        there = self._manifest
+        if there is None:
+            return manifest.shards
+        if there.config_hash != manifest.config_hash:
+            raise ConfigError(f"to must be empty or hold the same data set, got another one in {self._url}")
+        if there.shards != manifest.shards[: len(there.shards)]:
+            raise ConfigError(
+                f"to must hold shards that the data set here begins with, got others in {self._url}; was it generated "
+                "anew? choose another URL"
+            )
+        return manifest.shards[len(there.shards) :]
+
+
+if __name__ == "__main__":
+    run_command(main, "upload")

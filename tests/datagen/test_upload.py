@@ -1,0 +1,131 @@
+"""Data sets in object stores: what is listed there is there whole, whatever becomes of the copying."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+
+import hgn.data.storage
+from datagen.upload import main
+from hgn.command import run_command
+from hgn.config import DatagenConfig
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.data.storage import CACHE_VARIABLE
+from hgn.schema import ConfigError
+
+MakeConfig = Callable[..., DatagenConfig]
+MakeDataset = Callable[[DatagenConfig], Path]
+
+
+@pytest.fixture(autouse=True)
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """fsspec's memory as the object store, empty; and a cache of our own."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(hgn.data.storage, "_FIRST_PAUSE_S", 0.01)
+    files = fsspec.filesystem("memory")
+    files.store.clear()
+    return files
+
+
+def keys(folder: Path | str) -> list[str]:
+    return [episode.key for episode in EpisodeStore(folder, "train").episodes]
+
+
+def test_copy_is_the_data_set(make_config: MakeConfig, make_dataset: MakeDataset, capsys: Any) -> None:
+    """The copy reads like the folder; what comes later is added to it, and what is there is not sent again."""
+    folder = make_dataset(make_config(training_scenes=2))
+    assert main({"data": str(folder), "to": "memory://bucket/set"}) == 0
+    assert capsys.readouterr().out == "memory://bucket/set holds 5 shards, the whole data set\n"
+    assert Manifest.load("memory://bucket/set") == Manifest.load(folder)
+    assert keys("memory://bucket/set") == keys(folder) and len(keys(folder)) == 2
+    files = fsspec.filesystem("memory")
+    before = {name: file.modified for name, file in files.store.items()}
+    make_dataset(make_config())
+    assert main({"data": str(folder), "to": "memory://bucket/set/"}) == 0
+    assert keys("memory://bucket/set") == keys(folder) and len(keys(folder)) == 5
+    changed = {name for name, file in files.store.items() if before.get(name) != file.modified}
+    assert changed == {
+        f"/bucket/set/{name}" for name in ("manifest.json", "train-000002-000004.tar", "train-000004-000005.tar")
+    }
+
+
+def test_copying_that_is_cut_off(
+    make_config: MakeConfig, make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch, store: Any
+) -> None:
+    """Whatever copying ends at, nothing is listed that is not there; and the same command completes it."""
+    folder = make_dataset(make_config())
+    real = type(store).put_file
+    sent = 0
+
+    def cut(self: Any, path: str, target: str, **options: Any) -> None:
+        nonlocal sent
+        sent += 1
+        if sent == 4:
+            store.pipe_file(target, Path(path).read_bytes()[:1000])
+            raise KeyboardInterrupt
+        real(self, path, target, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(store), "put_file", cut)
+        with pytest.raises(KeyboardInterrupt):
+            main({"data": str(folder), "to": "memory://cut"})
+    assert not EpisodeStore.available("memory://cut")
+    assert main({"data": str(folder), "to": "memory://cut"}) == 0
+    assert keys("memory://cut") == keys(folder)
+
+
+def test_following_a_data_set_that_grows(
+    make_config: MakeConfig, make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With follow=true copying goes on until the data set is complete, or a signal ends it."""
+    monkeypatch.setattr("datagen.upload._LOOK_S", 0.01)
+    config = make_config()
+    folder = make_dataset(make_config(training_scenes=1))
+    manifest = Manifest.load(folder)
+    Manifest(manifest.config_hash, manifest.config, {"train": 5, "validation": 2, "test": 1}, 9, manifest.shards).save(
+        folder
+    )
+    follow = {"data": str(folder), "to": "memory://growing", "follow": True, "poll_s": 0.01}
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    assert main(follow) == 143 and len(keys("memory://growing")) == 1
+    growing = threading.Timer(0.1, make_dataset, (config,))
+    growing.start()
+    assert main(follow) == 0 and keys("memory://growing") == keys(folder) and len(keys(folder)) == 5
+    growing.join()
+
+
+def test_what_is_refused(
+    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another data set at the URL, one made anew, an altered shard, and places that cannot be written to."""
+    folder = make_dataset(make_config())
+    main({"data": str(folder), "to": "memory://there"})
+    other = make_dataset(make_config(folder=str(tmp_path / "other"), seed=7))
+    with pytest.raises(ConfigError, match="to must be empty or hold the same data set, got another one in memory://"):
+        main({"data": str(other), "to": "memory://there"})
+    anew = make_dataset(make_config(folder=str(tmp_path / "anew"), training_scenes=1))
+    with pytest.raises(ConfigError, match="to must hold shards that the data set here begins with, got others"):
+        main({"data": str(anew), "to": "memory://there"})
+    shard = folder / "train-000001-000002.tar"
+    shard.write_bytes(shard.read_bytes()[:-1] + b"?")
+    with pytest.raises(ConfigError, match=r"must have sha256 .* it was altered"):
+        main({"data": str(folder), "to": "memory://elsewhere"})
+    for mapping, message in (
+        ({"data": str(folder), "to": str(tmp_path)}, "to must be a URL, got"),
+        ({"data": "memory://there", "to": "memory://here"}, "data must be a folder of this machine, got 'memory:"),
+        ({"data": str(tmp_path), "to": "memory://here"}, "without manifest.json"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            main(mapping)
+    monkeypatch.setattr(sys, "argv", ["upload", f"data={folder}"])
+    with pytest.raises(SystemExit, match="2"):
+        run_command(main, "upload")
