@@ -7,6 +7,7 @@ machine, or of a Ray cluster (datagen/ray_crew.py).
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,10 +24,11 @@ from hgn.schema import ConfigError
 
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
 _LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
-GPU_SCENES_PER_LAUNCH = 64
-GPU_FIRST_LAUNCH = 2  # small, so that training can start early
+GPU_SCENES_PER_LAUNCH = 384
+GPU_NODES_PER_LAUNCH = 384 * 64**3  # of the grids of all scenes, about 30 bytes each
+GPU_FIRST_LAUNCH = 64  # that the makers soon have, so that training can start early; fewer are not done sooner
 _LAUNCH_GROWTH = 8  # from one launch to the next, up to the full size
-MAXIMUM_MAKERS = 8
+MAXIMUM_MAKERS = 32
 
 
 class Stopped(Exception):  # noqa: N818 - a request, not an error
@@ -49,12 +51,18 @@ def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int) -
     """One solver for two cores on a CPU; on GPUs one solver, with scene makers on the cores."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
-        launch = launch or GPU_SCENES_PER_LAUNCH
+        launch = launch or gpu_scenes_per_launch(config)
         makers = max(1, min(MAXIMUM_MAKERS, cpu_count - 1))
         return WorkerPlan(workers or 1, None, makers, launch, min(launch, GPU_FIRST_LAUNCH), gpus)
     solvers = workers or max(1, cpu_count // 2)
     threads = max(1, cpu_count // solvers)
     return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
+
+
+def gpu_scenes_per_launch(config: DatagenConfig) -> int:
+    """As many as give every part of a GPU work; fewer where their grids are large."""
+    nodes = math.prod(math.ceil(length / config.scene.cell_size) for length in config.scene.domain_size)
+    return max(1, min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes))
 
 
 def visible_gpus() -> tuple[str, ...]:
@@ -89,7 +97,7 @@ class LocalCrew:
         self._config, self._backend, self._plan = config, backend, plan
 
     def start_maker(self) -> Worker:
-        return start_maker(self._config.scene, self._backend)
+        return start_maker(self._config, self._backend)
 
     def start_solver(self, number: int) -> Worker:
         gpus = self._plan.gpus

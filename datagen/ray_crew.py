@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.plan import SceneTask
-from datagen.pool import GPU_FIRST_LAUNCH, GPU_SCENES_PER_LAUNCH, MAXIMUM_MAKERS, WorkerPlan
+from datagen.pool import GPU_FIRST_LAUNCH, MAXIMUM_MAKERS, WorkerPlan, gpu_scenes_per_launch
 from datagen.shard import pack_episode, stage_bytes
 from datagen.worker import Backend, MadeScene, Worker, error_message, failure_of, make_episode, make_scene
 from hgn.config import DatagenConfig
@@ -36,7 +36,7 @@ def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]]) ->
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     gpus = int(sum(node.get("GPU", 0) for node in nodes))
     if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
-        launch = launch or GPU_SCENES_PER_LAUNCH
+        launch = launch or gpu_scenes_per_launch(config)
         solvers, threads, first = workers or max(1, gpus), None, min(launch, GPU_FIRST_LAUNCH)
     else:
         cores = [int(node["CPU"]) for node in nodes if node.get("CPU", 0) >= 1]
@@ -148,7 +148,7 @@ class _Maker:
     """The actor that builds scenes."""
 
     def __init__(self, config: DatagenConfig, backend: Backend) -> None:
-        self._config, self._backend = config.scene, backend
+        self._config, self._backend = config, backend
 
     def ready(self) -> tuple[str, str]:
         return "ready", _node()
@@ -185,6 +185,7 @@ class _Solver:
             dataset.frames,
             dataset.frame_rate_hz,
             cpu_threads=self._threads,
+            colliders=[made.collider for made in batch],
         )
         answers: list[tuple[Any, ...]] = []
         for made, result in zip(batch, results, strict=True):

@@ -28,7 +28,7 @@ import numpy as np
 
 from datagen.plan import SceneTask
 from datagen.shard import stage_episode
-from hgn.config import DatagenConfig, SceneConfig
+from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash, physics_settings
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -36,6 +36,7 @@ from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
 _FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
+_STAGING_THREADS = 4
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -47,6 +48,7 @@ class Backend:
 
     generate_scene: str = "hgn.scene.random_scene:generate_scene"
     build_obstacle_grid: str = "hgn.scene.obstacle_grid:build_obstacle_grid"
+    build_collider: str = "datagen.mpm.collider:build_collider"
     simulate: str = "datagen.mpm.solver:simulate"
 
 
@@ -57,6 +59,7 @@ class MadeScene:
     task: SceneTask
     scene: Scene
     obstacle_grid: ObstacleGrid
+    collider: Any = None  # what the solver makes of the obstacles
 
 
 class Worker:
@@ -115,7 +118,7 @@ class LocalWorker(Worker):
         return f"its process ended with exit code {code}"
 
 
-def start_maker(config: SceneConfig, backend: Backend) -> LocalWorker:
+def start_maker(config: DatagenConfig, backend: Backend) -> LocalWorker:
     """A process that answers each SceneTask with a MadeScene, or a cause."""
     return LocalWorker(_make_scenes, config, backend)
 
@@ -176,22 +179,25 @@ def _errors_sent(send: _Sender) -> Iterator[None]:
         send(*error_message(error))
 
 
-def _make_scenes(connection: Connection, send: _Sender, config: SceneConfig, backend: Backend) -> None:
+def _make_scenes(connection: Connection, send: _Sender, config: DatagenConfig, backend: Backend) -> None:
     for task in _received(connection):
         send(*make_scene(task, config, backend))
         send("idle")
 
 
-def make_scene(task: SceneTask, config: SceneConfig, backend: Backend) -> tuple[Any, ...]:
+def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend) -> tuple[Any, ...]:
     """What a maker answers: ("made", MadeScene), or ("failed", key, cause)."""
     generate_scene = pkgutil.resolve_name(backend.generate_scene)
     build_obstacle_grid = pkgutil.resolve_name(backend.build_obstacle_grid)
+    build_collider = pkgutil.resolve_name(backend.build_collider)
     try:
-        scene = generate_scene(config, task.seed)
+        scene = generate_scene(config.scene, task.seed)
         grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size)
+        # here rather than in the solver, which would do it for one scene after another while its device waits
+        collider = build_collider(scene, config.mpm.collider_band_cells)
     except ConfigError as error:  # no room for the obstacles, say: another seed may do
         return "failed", task.key, str(error)
-    return "made", MadeScene(task, scene, grid)
+    return "made", MadeScene(task, scene, grid, collider)
 
 
 def _solve(
@@ -208,7 +214,7 @@ def _solve(
     dataset = config.dataset
     config_hash = identity_hash(dataset_identity(config))
     # one batch is staged while the next is simulated, so that a GPU does not wait for the disk
-    with ThreadPoolExecutor(max_workers=1) as stager:
+    with ThreadPoolExecutor(max_workers=_STAGING_THREADS) as stager:
         staging: list[Future[None]] = []
         for batch in _received(connection):
             results = simulate(
@@ -218,6 +224,7 @@ def _solve(
                 dataset.frame_rate_hz,
                 on_frame=_frame_reporter(send, len(batch)),
                 cpu_threads=threads,
+                colliders=[made.collider for made in batch],
             )
             for future in staging:
                 future.result()

@@ -99,8 +99,9 @@ class MpmConfig:
     wall_contact: str = "slip"  # or stick
     collider_band_cells: float = 1.5
     collider_friction: float = 0.0  # Coulomb coefficient; 0 separates without friction
+    collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
     device: str = "auto"  # or cpu, gpu
-    scenes_per_launch: int | None = None  # none: 1 on a CPU, 64 on a GPU
+    scenes_per_launch: int | None = None  # none: 1 on a CPU, 384 on a GPU
     maximum_substeps_per_frame: int = 20_000  # beyond it a scene is stopped and reported
 
     def __post_init__(self) -> None:

@@ -12,12 +12,12 @@ band holds on its outside too. Where two obstacles claim a node, the closest sur
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
+from datagen.mpm.sweep import Sweep, build_sweep, near_pairs
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
@@ -26,19 +26,19 @@ ONE_SIDED, BOTH_SIDES = 1, 2
 ON_SURFACE_CELLS = 0.05  # nearer than this, the direction to the surface is rounding
 BOTH_SIDES_CELLS = 0.5 + 1e-6
 CLOSED_BAND_CELLS = 0.5
-PAIRS_PER_CHUNK = 1_000_000  # (node, triangle) pairs held at once
 # squared area over fourth power of the longest edge, below which a triangle has no direction
 FLAT_TRIANGLE = 1e-20
 
 
 @dataclass(frozen=True, eq=False)
 class Collider:
-    """A scene's contact nodes, and which of its bodies are closed."""
+    """A scene's contact nodes, the triangles that none may cross, and which of its bodies are closed."""
 
     node_K3: np.ndarray  # int32, unique
     normal_K3: np.ndarray  # float32, unit length
     kind_K: np.ndarray  # uint8: ONE_SIDED or BOTH_SIDES
     closed: tuple[Obstacle, ...]
+    sweep: Sweep
 
     def count_inside(self, position_N3: np.ndarray) -> int:
         """How many of the particles lie inside a closed obstacle."""
@@ -57,8 +57,10 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
     """
     shape = tuple(round(length / scene.cell_size) for length in scene.domain_size)
     surface = _Surface(shape)
+    triangles = [np.zeros((0, 3, 3))]
     for index, obstacle in enumerate(scene.obstacles):
         triangle_F33 = _triangles(obstacle, index) / scene.cell_size
+        triangles.append(triangle_F33)
         if len(triangle_F33):
             own = _closed_contacts if obstacle.closed else _sheet_contacts
             surface.merge(own(obstacle, triangle_F33, band_cells, shape, scene.cell_size))
@@ -68,6 +70,7 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
         surface.normal[node],
         surface.kind[node],
         tuple(obstacle for obstacle in scene.obstacles if obstacle.closed and len(obstacle.triangle_F3)),
+        build_sweep(np.concatenate(triangles), shape),
     )
 
 
@@ -106,23 +109,6 @@ def _triangles(obstacle: Obstacle, index: int) -> np.ndarray:
     return corner[area_square > FLAT_TRIANGLE * longest_square**2]
 
 
-def _near_pairs(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Chunks of (node, triangle index): the nodes in each triangle's box widened by `band` cells."""
-    low = np.clip(np.ceil(triangle_F33.min(axis=1) - band), 0, np.array(shape)).astype(np.int64)
-    high = np.clip(np.floor(triangle_F33.max(axis=1) + band) + 1, 0, np.array(shape)).astype(np.int64)
-    size = np.maximum(high - low, 0)
-    count = size.prod(axis=1)
-    end = np.cumsum(count)
-    total = int(end[-1]) if len(end) else 0
-    for start in range(0, total, PAIRS_PER_CHUNK):
-        pair = np.arange(start, min(start + PAIRS_PER_CHUNK, total))
-        owner = np.searchsorted(end, pair, side="right")
-        place = pair - (end[owner] - count[owner])
-        size_y, size_z = size[owner, 1], size[owner, 2]
-        offset = np.stack([place // (size_y * size_z), place // size_z % size_y, place % size_z], axis=1)
-        yield low[owner] + offset, owner
-
-
 def _rasterise(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
     """Nodes within `band` cells of the triangles: flat index [P], distance [P], closest point [P, 3], triangle [P].
 
@@ -137,9 +123,9 @@ def _rasterise(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) ->
     radius = np.linalg.norm(triangle_F33 - centre[:, None], axis=2).max(axis=1)
     # a triangle counts at a node only if its sphere comes nearer than the nearest centre of all
     bound = np.full(count, band)
-    for node, triangle in _near_pairs(triangle_F33, band, shape):
+    for node, triangle in near_pairs(triangle_F33, band, shape):
         np.minimum.at(bound, np.ravel_multi_index(node.T, shape), np.linalg.norm(node - centre[triangle], axis=1))
-    for node, triangle in _near_pairs(triangle_F33, band, shape):
+    for node, triangle in near_pairs(triangle_F33, band, shape):
         flat = np.ravel_multi_index(node.T, shape)
         height = ((node - triangle_F33[triangle, 0]) * normal[triangle]).sum(axis=1)
         reach = np.linalg.norm(node - centre[triangle], axis=1) - radius[triangle]

@@ -1,7 +1,8 @@
 """The constitutive laws of one particle, for Taichi kernels: water, sand, snow (Taichi Elements' materials).
 
 Every law maps the trial deformation of a step to the new state and the Kirchhoff stress (stress times J, per
-initial volume, in pascals). State per particle: F (sand, snow), and one scalar, `volume`: J for water, the
+initial volume, in pascals). `law` holds a row of constants (layout.Constant) for each kind of material, and `row`
+is where the particle's begins. State per particle: F (sand, snow), and one scalar, `volume`: J for water, the
 volume correction v_c for sand (Tampubolon et al. 2017), the plastic volume ratio Jp for snow (Stomakhin et al.
 2013).
 """
@@ -23,18 +24,18 @@ def count_event(counter: ti.template(), scene: ti.i32, event: ti.template(), tim
 
 
 @ti.func
-def hardening(plastic_volume: ti.f32, constant: ti.template()) -> ti.f32:
+def hardening(plastic_volume: ti.f32, law: ti.template(), row: ti.i32) -> ti.f32:
     """exp(xi (1 - Jp)), capped."""
-    cap = constant[CONSTANT.maximum_hardening]
-    exponent = constant[CONSTANT.hardening] * (1.0 - plastic_volume)
+    cap = law[row + CONSTANT.maximum_hardening]
+    exponent = law[row + CONSTANT.hardening] * (1.0 - plastic_volume)
     return ti.min(ti.exp(ti.min(exponent, 80.0)), cap)
 
 
 @ti.func
-def water(volume: ti.f32, expansion: ti.f32, constant: ti.template(), counter: ti.template(), scene: ti.i32):
+def water(volume: ti.f32, expansion: ti.f32, law: ti.template(), row: ti.i32, counter: ti.template(), scene: ti.i32):
     """J (1 + dt tr C), floored; Kirchhoff pressure term lambda J (J - 1); present stiffness, Pa."""
-    bulk = constant[CONSTANT.bulk]
-    smallest = constant[CONSTANT.water_smallest_volume]
+    bulk = law[row + CONSTANT.bulk]
+    smallest = law[row + CONSTANT.water_smallest_volume]
     J = volume * (1.0 + expansion)
     if J < smallest:
         J = smallest
@@ -44,7 +45,7 @@ def water(volume: ti.f32, expansion: ti.f32, constant: ti.template(), counter: t
 
 
 @ti.func
-def _project_sand(log_strain, volume: ti.f32, constant: ti.template(), taichi_elements_sand: ti.template()):
+def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, taichi_elements_sand: ti.template()):
     """Drucker-Prager return mapping of the principal log strains: new ones, and the new volume correction.
 
     Tampubolon et al. 2017: v_c / 3 joins each log strain first, and v_c += log det F_trial - log det F_new.
@@ -60,10 +61,10 @@ def _project_sand(log_strain, volume: ti.f32, constant: ti.template(), taichi_el
     if trace >= 0.0:
         new_volume = trace
     else:
-        shear = constant[CONSTANT.shear]
-        bulk = constant[CONSTANT.bulk]
+        shear = law[row + CONSTANT.shear]
+        bulk = law[row + CONSTANT.bulk]
         size = deviator.norm() + 1e-20
-        excess = size + (3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * constant[CONSTANT.sand_alpha]
+        excess = size + (3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * law[row + CONSTANT.sand_alpha]
         # the mapping keeps the trace, so log det F takes up all of v_c, which ends at 0
         new_strain = strain - deviator * (ti.max(excess, 0.0) / size)
     return new_strain, new_volume
@@ -74,7 +75,8 @@ def solid(
     F,
     volume: ti.f32,
     material: ti.i32,
-    constant: ti.template(),
+    law: ti.template(),
+    row: ti.i32,
     counter: ti.template(),
     scene: ti.i32,
     sand: ti.template(),
@@ -82,9 +84,9 @@ def solid(
     taichi_elements_sand: ti.template(),
 ):
     """Sand and snow from the trial F: new F, new volume, Kirchhoff stress, present stiffness 3 lambda + 2 mu."""
-    shear = constant[CONSTANT.shear]
-    bulk = constant[CONSTANT.bulk]
-    smallest = constant[CONSTANT.smallest_singular_value]
+    shear = law[row + CONSTANT.shear]
+    bulk = law[row + CONSTANT.bulk]
+    smallest = law[row + CONSTANT.smallest_singular_value]
     U, sigma, V = svd3(F)
     floors = 0
     for i in ti.static(range(3)):
@@ -100,7 +102,7 @@ def solid(
     if ti.static(sand):
         if ti.static(not snow) or material == SAND:
             log_strain = ti.log(sigma)
-            strain, new_volume_ = _project_sand(log_strain, volume, constant, taichi_elements_sand)
+            strain, new_volume_ = _project_sand(log_strain, volume, law, row, taichi_elements_sand)
             new_volume = new_volume_
             for i in ti.static(range(3)):
                 if strain[i] != log_strain[i]:
@@ -109,11 +111,11 @@ def solid(
             stress = 2.0 * shear * strain + bulk * strain.sum()
     if ti.static(snow):
         if ti.static(not sand) or material == SNOW:
-            h = hardening(volume, constant)
+            h = hardening(volume, law, row)
             ratio = 1.0
             for i in ti.static(range(3)):
-                low = constant[CONSTANT.snow_smallest]
-                high = constant[CONSTANT.snow_largest]
+                low = law[row + CONSTANT.snow_smallest]
+                high = law[row + CONSTANT.snow_largest]
                 bounded = ti.min(ti.max(sigma[i], low), high)
                 if bounded != sigma[i]:
                     ratio *= sigma[i] / bounded
@@ -123,8 +125,8 @@ def solid(
             if new_volume < SMALLEST_PLASTIC_VOLUME or new_volume > LARGEST_PLASTIC_VOLUME:
                 new_volume = ti.min(ti.max(new_volume, SMALLEST_PLASTIC_VOLUME), LARGEST_PLASTIC_VOLUME)
                 count_event(counter, scene, COUNT.plastic_volume_bounds, 1)
-            new_h = hardening(new_volume, constant)
-            if new_h >= constant[CONSTANT.maximum_hardening]:
+            new_h = hardening(new_volume, law, row)
+            if new_h >= law[row + CONSTANT.maximum_hardening]:
                 count_event(counter, scene, COUNT.hardening_caps, 1)
             stiffness *= new_h
             J = new_sigma[0] * new_sigma[1] * new_sigma[2]

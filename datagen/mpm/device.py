@@ -64,6 +64,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             default_fp=ti.f32,
             default_ip=ti.i32,
             fast_math=False,  # it reorders sums by what stands beside them, and drops tests for NaN
+            cfg_optimization=False,  # three quarters of the time to compile, and LLVM does the same again
             log_level=ti.ERROR,
         )
     _started = Device("gpu", 1) if has_gpu else Device("cpu", threads)

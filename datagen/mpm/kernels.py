@@ -3,7 +3,7 @@
 APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018): a particle at x touches the nodes
 base .. base + 2 with base = floor(x / dx - 1/2); node I lies at I dx. Nodes are stored by blocks of 4 x 4 x 4,
 [scene, block, node in block], as (momentum or velocity, mass). Only blocks that a particle touches are cleared
-and updated. All particles have the same mass, which is the unit of mass.
+and updated. Masses are in units of a particle of the config's density.
 
 On a CPU each (scene, part) of the particles scatters into its own copy of the grid, one after another, and the
 copies are summed in order: no atomics, and the same result whatever the number of threads at work. On a GPU all
@@ -26,7 +26,8 @@ from datagen.mpm.layout import (
     VALUE,
     VARIANT,
 )
-from hgn.scene.material import SNOW, WATER
+from datagen.mpm.surface_kernel import meet_collider, stop_at_surface
+from hgn.scene.material import SAND, SNOW, WATER
 
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 
@@ -49,13 +50,21 @@ def _weights(fx):
 
 
 @ti.func
+def spline(distance: ti.f32) -> ti.f32:
+    """The same weight from the distance to a node, in (-1.5, 1.5) cells."""
+    away = ti.abs(distance)
+    outer = 1.5 - away
+    return 0.75 - away * away if away < 0.5 else 0.5 * outer * outer
+
+
+@ti.func
 def _node_of_axis(index, stride: ti.i32, local_stride: ti.i32):
     """The share of one axis in a node's position; shares of the three axes add up."""
     return (index >> 2) * stride + (index & 3) * local_stride
 
 
 @ti.func
-def _base(x, inverse_dx: ti.f32):
+def base_node(x, inverse_dx: ti.f32):
     return ti.floor(x * inverse_dx - 0.5, ti.i32)
 
 
@@ -65,13 +74,21 @@ def _not_finite(value) -> ti.i32:
 
 
 @ti.func
-def _raise_maximum(values: ti.template(), scene: ti.i32, entry: ti.template(), value: ti.f32):
-    if values[scene, entry] < value:
-        ti.atomic_max(values[scene, entry], value)
+def raise_maximum(counter: ti.template(), scene: ti.i32, entry: ti.template(), value: ti.f32):
+    """The maximum of a value > 0 and what is there, both by their bits (see layout.Count); NaN is left out."""
+    if value > 0.0:
+        bits = ti.cast(ti.bit_cast(value, ti.i32), ti.i64)
+        if counter[scene, entry] < bits:
+            ti.atomic_max(counter[scene, entry], bits)
 
 
 @ti.func
-def _choose_time_step(
+def _maximum(counter: ti.template(), scene: ti.i32, entry: ti.template()) -> ti.f32:
+    return ti.bit_cast(ti.cast(counter[scene, entry], ti.i32), ti.f32)
+
+
+@ti.func
+def choose_time_step(
     scene: ti.i32,
     scene_value: ti.template(),
     counter: ti.template(),
@@ -83,16 +100,19 @@ def _choose_time_step(
     remaining = scene_value[scene, VALUE.remaining]
     if remaining > 0.0 and counter[scene, COUNT.status] == STATUS.running:
         stiffness = ti.max(
-            scene_value[scene, VALUE.stiffness],
+            _maximum(counter, scene, COUNT.stiffness_bits),
             scene_value[scene, VALUE.least_stiffness],
-            1.0,
+            1e-3,
         )
-        speed_square = scene_value[scene, VALUE.speed_square]
+        speed_square = _maximum(counter, scene, COUNT.speed_square_bits)
+        scene_value[scene, VALUE.largest_speed_square] = ti.max(
+            scene_value[scene, VALUE.largest_speed_square], speed_square
+        )
         gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
         fixed = setting[SETTING.fixed_time_step]
         limit = fixed
         if fixed == 0.0:
-            limit = setting[SETTING.stability_fraction] * dx * ti.sqrt(setting[CONSTANT.density] / stiffness)
+            limit = setting[SETTING.stability_fraction] * dx / ti.sqrt(stiffness)
             # the fall within the step counts too
             speed = ti.sqrt(speed_square) + gravity.norm() * ti.min(limit, remaining)
             limit = ti.min(limit, setting[SETTING.speed_fraction] * dx / ti.max(speed, 1e-20))
@@ -117,19 +137,28 @@ def _choose_time_step(
             counter[scene, COUNT.frame_substeps] = ti.cast(done + 1, ti.i64)
             counter[scene, COUNT.substeps] += ti.cast(1, ti.i64)
             # maxima are gathered anew while the step runs
-            scene_value[scene, VALUE.stiffness] = 0.0
-            scene_value[scene, VALUE.speed_square] = 0.0
+            counter[scene, COUNT.stiffness_bits] = ti.cast(0, ti.i64)
+            counter[scene, COUNT.speed_square_bits] = ti.cast(0, ti.i64)
     scene_value[scene, VALUE.time_step] = step
 
 
 @ti.func
-def _mark(x, scene: ti.i32, inverse_dx: ti.f32, shape: ti.template(), block: ti.template()):
-    """Adds the blocks that the particle's nodes lie in, up to eight, to the list.
+def mark(
+    x,
+    scene: ti.i32,
+    inverse_dx: ti.f32,
+    shape: ti.template(),
+    block: ti.template(),
+    list_begin: ti.i32,
+    length: ti.template(),
+    length_at: ti.i32,
+):
+    """Adds the blocks that the particle's nodes lie in, up to eight, to a list.
 
-    `block` holds a flag for each block of all scenes, then the list of touched ones, then its length.
+    `block` holds a flag for each block of all scenes; from `list_begin` on the list of touched ones, whose length is
+    length[length_at]; and as many entries after each, its block's place along x, y, z in ten bits each.
     """
-    blocks = shape[SHAPE.all_blocks]
-    base = _base(x, inverse_dx)
+    base = base_node(x, inverse_dx)
     first = base >> 2
     last = (base + 2) >> 2
     for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
@@ -144,11 +173,13 @@ def _mark(x, scene: ti.i32, inverse_dx: ti.f32, shape: ti.template(), block: ti.
             index += (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
             if block[index] == 0:
                 if ti.atomic_max(block[index], 1) == 0:
-                    block[blocks + ti.atomic_add(block[2 * blocks], 1)] = index
+                    entry = list_begin + ti.atomic_add(length[length_at], 1)
+                    block[entry] = index
+                    block[entry + shape[SHAPE.all_blocks]] = (corner[0] << 20) | (corner[1] << 10) | corner[2]
 
 
 @ti.func
-def _node_places(base, first_node: ti.i32, shape: ti.template()):
+def node_places(base, first_node: ti.i32, shape: ti.template()):
     """Shares of x, y, z in the place of nodes base .. base + 2; the place is the sum of one of each."""
     stride_y = shape[SHAPE.blocks + 2] * BLOCK_NODES
     stride_x = shape[SHAPE.blocks + 1] * stride_y
@@ -158,6 +189,63 @@ def _node_places(base, first_node: ti.i32, shape: ti.template()):
         _node_of_axis(base[1] + offset, stride_y, BLOCK),
         _node_of_axis(base[2] + offset, BLOCK_NODES, 1),
     )
+
+
+@ti.func
+def respond(
+    C,
+    F,
+    volume: ti.f32,
+    material: ti.i32,
+    row: ti.i32,
+    step: ti.f32,
+    scene: ti.i32,
+    counter: ti.template(),
+    setting: ti.template(),
+    law: ti.template(),
+    variant: ti.template(),
+):
+    """The material's answer to a step of the gradient C.
+
+    Returns what the particle adds to the momentum around it, A = C - dt V0 (4 / dx²) stress / mass; its new F
+    (as it was for water) and volume; and its present (3 lambda + 2 mu) / density.
+    """
+    has_water = ti.static(bool(variant & VARIANT.water))
+    has_solid = ti.static(bool(variant & (VARIANT.sand | VARIANT.snow)))
+    inverse_dx = setting[SETTING.inverse_cell_size]
+    density = law[row + CONSTANT.density]
+    scale = -step * 4.0 * inverse_dx * inverse_dx / density  # V0 / mass = 1 / density
+    A = C
+    new_F = F
+    new_volume = volume
+    stiffness = 0.0
+    if ti.static(has_water):
+        if ti.static(not has_solid) or material == WATER:
+            J, pressure, water_stiffness = water(volume, step * C.trace(), law, row, counter, scene)
+            new_volume = J
+            stiffness = water_stiffness
+            for i in ti.static(range(3)):
+                A[i, i] += scale * pressure
+    if ti.static(has_solid):
+        if ti.static(not has_water) or material != WATER:
+            trial_F = F + step * (C @ F)
+            solid_F, solid_volume, stress, solid_stiffness = solid(
+                trial_F,
+                volume,
+                material,
+                law,
+                row,
+                counter,
+                scene,
+                ti.static(bool(variant & VARIANT.sand)),
+                ti.static(bool(variant & VARIANT.snow)),
+                ti.static(bool(variant & VARIANT.taichi_elements_sand)),
+            )
+            new_F = solid_F
+            new_volume = solid_volume
+            stiffness = solid_stiffness
+            A += scale * stress
+    return A, new_F, new_volume, stiffness / density
 
 
 @ti.func
@@ -172,56 +260,41 @@ def _particle_to_grid(
     deformation: ti.template(),
     volume: ti.template(),
     label: ti.template(),
+    law_row: ti.template(),
     node: ti.template(),
     scene_value: ti.template(),
     counter: ti.template(),
     setting: ti.template(),
+    law: ti.template(),
     shape: ti.template(),
     variant: ti.template(),
 ):
     """Updates the particle's deformation and adds its mass and momentum to its nodes in one copy of the grid."""
-    has_water = ti.static(bool(variant & VARIANT.water))
-    has_solid = ti.static(bool(variant & (VARIANT.sand | VARIANT.snow)))
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
     material = label[p] & 3
-    C = affine[p]
-    # -dt V0 (4 / dx^2) stress / mass, with V0 / mass = 1 / density
-    scale = -step * 4.0 * inverse_dx * inverse_dx / setting[CONSTANT.density]
-    A = C
-    if ti.static(has_water):
-        if ti.static(not has_solid) or material == WATER:
-            J, pressure, stiffness = water(volume[p], step * C.trace(), setting, counter, scene)
-            volume[p] = J
-            for i in ti.static(range(3)):
-                A[i, i] += scale * pressure
-            _raise_maximum(scene_value, scene, VALUE.stiffness, stiffness)
-    if ti.static(has_solid):
-        if ti.static(not has_water) or material != WATER:
+    row = 0
+    if ti.static(bool(variant & VARIANT.several_laws)):
+        row = law_row[p]
+    F = ti.Matrix.identity(ti.f32, 3)
+    if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
+        if ti.static(not variant & VARIANT.water) or material != WATER:
             F = deformation[p]
-            F += step * (C @ F)
-            new_F, new_volume, stress, stiffness = solid(
-                F,
-                volume[p],
-                material,
-                setting,
-                counter,
-                scene,
-                ti.static(bool(variant & VARIANT.sand)),
-                ti.static(bool(variant & VARIANT.snow)),
-                ti.static(bool(variant & VARIANT.taichi_elements_sand)),
-            )
+    A, new_F, new_volume, stiffness = respond(
+        affine[p], F, volume[p], material, row, step, scene, counter, setting, law, variant
+    )
+    volume[p] = new_volume
+    if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
+        if ti.static(not variant & VARIANT.water) or material != WATER:
             deformation[p] = new_F
-            volume[p] = new_volume
-            A += scale * stress
-            _raise_maximum(scene_value, scene, VALUE.stiffness, stiffness)
+    raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
 
     x = position[p] * inverse_dx
     base = ti.floor(x - 0.5, ti.i32)
     fx = x - ti.cast(base, ti.f32)
     w0, w1, w2 = _weights(fx)
     first_node = (copy + scene * shape[SHAPE.scene_blocks]) * BLOCK_NODES
-    index_x, index_y, index_z = _node_places(base, first_node, shape)
+    index_x, index_y, index_z = node_places(base, first_node, shape)
     w = ti.static((w0, w1, w2))
     A *= dx
     v = velocity[p] - A @ fx
@@ -232,6 +305,8 @@ def _particle_to_grid(
             weight = wxy * w[k][2]
             vxyz = ti.Vector([vxy[a] + A[a, 2] * k for a in range(3)])
             share = ti.Vector([weight * vxyz[0], weight * vxyz[1], weight * vxyz[2], weight])
+            if ti.static(bool(variant & VARIANT.several_laws)):
+                share *= law[row + CONSTANT.mass]
             target = index_x[i] + index_y[j] + index_z[k]
             if ti.static(bool(variant & VARIANT.atomic)):
                 ti.atomic_add(node[target], share)
@@ -241,24 +316,10 @@ def _particle_to_grid(
 
 
 @ti.func
-def _meet_collider(v, normal, both_sides: ti.i32, friction: ti.f32):
-    """Contact of a node: separation is free, approach keeps the tangential part less Coulomb friction."""
-    out = v
-    along = v.dot(normal)
-    if both_sides or along < 0.0:
-        tangential = v - along * normal
-        speed = tangential.norm()
-        keep = 1.0
-        if friction > 0.0:
-            keep = ti.max(0.0, 1.0 - friction * ti.abs(along) / ti.max(speed, 1e-20))
-        out = tangential * keep
-    return out
-
-
-@ti.func
-def _update_node(
+def update_node(
     place: ti.i32,
-    global_block: ti.i32,
+    scene: ti.i32,
+    corner: ti.i32,
     scene_value: ti.template(),
     setting: ti.template(),
     shape: ti.template(),
@@ -267,29 +328,28 @@ def _update_node(
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """Momentum to velocity; gravity, colliders and walls. What copies hold is summed in order."""
+    """Momentum to velocity; gravity, colliders and walls. What copies hold is summed in order.
+
+    `corner` is the block's place along x, y, z, in ten bits each.
+    """
     total = node[place]
     for part in ti.static(range(1, variant // VARIANT.parts)):
         total += node[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
     v = ti.Vector([0.0, 0.0, 0.0])
     if total[3] > SMALLEST_MASS:
-        blocks_y = shape[SHAPE.blocks + 1]
-        blocks_z = shape[SHAPE.blocks + 2]
-        scene = global_block // shape[SHAPE.scene_blocks]
-        block = global_block - scene * shape[SHAPE.scene_blocks]
         gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
         v = ti.Vector([total[0], total[1], total[2]]) / total[3] + scene_value[scene, VALUE.time_step] * gravity
         if ti.static(bool(variant & VARIANT.contact)):
             entry = contact[place]
             if entry >= 0:
-                v = _meet_collider(v, contact_normal[entry >> 1], entry & 1, setting[SETTING.friction])
+                v = meet_collider(v, contact_normal[entry >> 1], entry & 1, setting[SETTING.friction])
         # walls last: whatever a collider leaves, nothing leaves the domain
         local = place & (BLOCK_NODES - 1)
         index = ti.Vector(
             [
-                block // (blocks_y * blocks_z) * BLOCK + local // 16,
-                block // blocks_z % blocks_y * BLOCK + local // 4 % 4,
-                block % blocks_z * BLOCK + local % 4,
+                (corner >> 20) * BLOCK + (local >> 4),
+                ((corner >> 10) & 1023) * BLOCK + ((local >> 2) & 3),
+                (corner & 1023) * BLOCK + (local & 3),
             ]
         )
         wall_cells = shape[SHAPE.wall_cells]
@@ -307,28 +367,14 @@ def _update_node(
 
 
 @ti.func
-def _grid_to_particle(
-    p: ti.i32,
-    scene: ti.i32,
-    step: ti.f32,
-    position: ti.template(),
-    velocity: ti.template(),
-    affine: ti.template(),
-    node: ti.template(),
-    scene_value: ti.template(),
-    counter: ti.template(),
-    setting: ti.template(),
-    shape: ti.template(),
-):
-    """New velocity and its gradient, then advection; stops a scene that is not finite or leaves the domain."""
-    inverse_dx = setting[SETTING.inverse_cell_size]
-    x = position[p]
+def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template()):
+    """Velocity and its gradient at x, from the nodes around."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
     w0, w1, w2 = _weights(fx)
     w = ti.static((w0, w1, w2))
-    index_x, index_y, index_z = _node_places(base, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape)
+    index_x, index_y, index_z = node_places(base, first_node, shape)
     v = ti.Vector([0.0, 0.0, 0.0])
     gradient_x = ti.Vector([0.0, 0.0, 0.0])
     gradient_y = ti.Vector([0.0, 0.0, 0.0])
@@ -352,37 +398,92 @@ def _grid_to_particle(
         gradient_x += w[i][0] * (i - fx[0]) * plane
         gradient_y += w[i][0] * plane_y
         gradient_z += w[i][0] * plane_z
-    C = ti.Matrix.cols([gradient_x, gradient_y, gradient_z]) * (4.0 * inverse_dx)
-    x += step * v
-    speed_square = v.dot(v)
-    bad = _not_finite(speed_square) | _not_finite(x.sum()) | _not_finite(C.sum())
+    return v, ti.Matrix.cols([gradient_x, gradient_y, gradient_z]) * (4.0 * inverse_dx)
+
+
+@ti.func
+def move(
+    x,
+    v,
+    C,
+    step: ti.f32,
+    scene: ti.i32,
+    scene_value: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    variant: ti.template(),
+):
+    """The particle's new position and velocity; stops a scene that is not finite or leaves the domain. Also v² (0 if
+    so).
+    """
+    out = x + step * v
+    speed = v
+    if ti.static(bool(variant & VARIANT.sweep)):
+        cell = ti.floor(x * setting[SETTING.inverse_cell_size], ti.i32)
+        index_x, index_y, index_z = node_places(cell, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape)
+        list_at = contact[shape[SHAPE.all_blocks] * BLOCK_NODES + index_x[0] + index_y[0] + index_z[0]]
+        if list_at >= 0:
+            out, speed = stop_at_surface(x, out, v, list_at, scene, contact, contact_normal, counter, setting)
+    speed_square = speed.dot(speed)
+    bad = _not_finite(speed_square) | _not_finite(out.sum()) | _not_finite(C.sum())
     outside = 0
     clamps = 0
     for axis in ti.static(range(3)):
         low = setting[SETTING.low + axis]
         high = setting[SETTING.high + axis]
-        if not (x[axis] >= 0.0 and x[axis] <= setting[SETTING.size + axis]):
+        if not (out[axis] >= 0.0 and out[axis] <= setting[SETTING.size + axis]):
             outside = 1
-        if not x[axis] >= low:
-            x[axis] = low
+        if not out[axis] >= low:
+            out[axis] = low
             clamps = 1
-        if not x[axis] <= high:
-            x[axis] = high
+        if not out[axis] <= high:
+            out[axis] = high
             clamps = 1
     if bad:
         counter[scene, COUNT.status] = ti.cast(STATUS.not_finite, ti.i64)
         scene_value[scene, VALUE.remaining] = 0.0
+        speed_square = 0.0
     elif outside:
         # a value that is not finite is the better cause to report
         if counter[scene, COUNT.status] != STATUS.not_finite:
             counter[scene, COUNT.status] = ti.cast(STATUS.left_domain, ti.i64)
         scene_value[scene, VALUE.remaining] = 0.0
+        speed_square = 0.0
     else:
         count_event(counter, scene, COUNT.position_clamps, clamps)
-        _raise_maximum(scene_value, scene, VALUE.speed_square, speed_square)
-        _raise_maximum(scene_value, scene, VALUE.largest_speed_square, speed_square)
-    position[p] = x
-    velocity[p] = v
+    return out, speed, speed_square
+
+
+@ti.func
+def _grid_to_particle(
+    p: ti.i32,
+    scene: ti.i32,
+    step: ti.f32,
+    position: ti.template(),
+    velocity: ti.template(),
+    affine: ti.template(),
+    node: ti.template(),
+    scene_value: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    variant: ti.template(),
+):
+    """New velocity and its gradient, then advection."""
+    x = position[p]
+    first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
+    v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
+    moved, speed, speed_square = move(
+        x, v, C, step, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
+    )
+    raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
+    position[p] = moved
+    velocity[p] = speed
     affine[p] = C
 
 
@@ -394,9 +495,11 @@ def substep(
     deformation: Matrices,
     volume: Scalars,
     label: Integers,
+    law_row: Integers,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
     setting: Scalars,
+    law: Scalars,
     shape: Integers,
     node: Nodes,
     block: Integers,
@@ -408,20 +511,23 @@ def substep(
 
     Order: time step, mark and clear blocks, particles to grid (deformation, plasticity, stress), gravity,
     colliders, walls, grid to particles, advection. `label` holds scene * 4 + material of each particle, `node`
-    [parts * scenes * blocks * 64] holds a copy of the grid for each part, `contact` twice the index of each
-    node's normal plus 1 where motion is stopped both ways, or -1.
+    [parts * scenes * blocks * 64] holds a copy of the grid for each part. `contact` begins with twice the index of
+    each node's normal plus 1 where motion is stopped both ways, or -1; then comes, for each cell, where its list of
+    triangles begins in `contact` itself, or -1; then those lists, each headed by its length. An entry is the place in
+    `contact_normal` of the triangle's four vectors.
     """
     for scene in range(scene_value.shape[0]):
-        _choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
+        choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
         if scene == 0:
-            block[2 * shape[SHAPE.all_blocks]] = 0
+            block[3 * shape[SHAPE.all_blocks]] = 0
 
     for p in range(position.shape[0]):
         scene = label[p] >> 2
         if scene_value[scene, VALUE.time_step] > 0.0:
-            _mark(position[p], scene, setting[SETTING.inverse_cell_size], shape, block)
+            blocks = shape[SHAPE.all_blocks]
+            mark(position[p], scene, setting[SETTING.inverse_cell_size], shape, block, blocks, block, 3 * blocks)
 
-    for n in range(block[2 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
+    for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
         blocks = shape[SHAPE.all_blocks]
         place = block[blocks + (n >> 6)] * BLOCK_NODES + (n & 63)
         for part in ti.static(range(variant // VARIANT.parts)):
@@ -433,8 +539,8 @@ def substep(
             step = scene_value[scene, VALUE.time_step]
             if step > 0.0:
                 _particle_to_grid(
-                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, node, scene_value,
-                    counter, setting, shape, variant,
+                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, law_row, node,
+                    scene_value, counter, setting, law, shape, variant,
                 )  # fmt: skip
     else:
         for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
@@ -445,24 +551,39 @@ def substep(
                 copy = (task - scene * parts) * shape[SHAPE.all_blocks]
                 for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
                     _particle_to_grid(
-                        p, copy, scene, step, position, velocity, affine, deformation, volume, label, node,
-                        scene_value, counter, setting, shape, variant,
+                        p, copy, scene, step, position, velocity, affine, deformation, volume, label, law_row, node,
+                        scene_value, counter, setting, law, shape, variant,
                     )  # fmt: skip
 
-    for n in range(block[2 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
+    for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
         global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
         if n & 63 == 0:
             block[global_block] = 0
-        _update_node(
-            global_block * BLOCK_NODES + (n & 63), global_block, scene_value, setting, shape, node, contact,
-            contact_normal, variant,
+        update_node(
+            global_block * BLOCK_NODES + (n & 63), global_block // shape[SHAPE.scene_blocks],
+            block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value, setting, shape, node, contact, contact_normal,
+            variant,
         )  # fmt: skip
 
     for p in range(position.shape[0]):
         scene = label[p] >> 2
         step = scene_value[scene, VALUE.time_step]
         if step > 0.0:
-            _grid_to_particle(p, scene, step, position, velocity, affine, node, scene_value, counter, setting, shape)
+            _grid_to_particle(
+                p, scene, step, position, velocity, affine, node, scene_value, counter, setting, shape, contact,
+                contact_normal, variant,
+            )  # fmt: skip
+
+
+@ti.func
+def initial_stiffness(material: ti.i32, law: ti.template(), row: ti.i32) -> ti.f32:
+    """(3 lambda + 2 mu) / density of a particle at rest shape."""
+    stiffness = 3.0 * law[row + CONSTANT.bulk]
+    if material != WATER:
+        stiffness += 2.0 * law[row + CONSTANT.shear]
+        if material == SNOW:
+            stiffness *= hardening(1.0, law, row)
+    return stiffness / law[row + CONSTANT.density]
 
 
 @ti.kernel
@@ -472,8 +593,9 @@ def start(
     deformation: Matrices,
     volume: Scalars,
     label: Integers,
-    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    setting: Scalars,
+    law_row: Integers,
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    law: Scalars,
 ):
     """Particles at rest shape, and the maxima that the first time step needs."""
     for p in range(velocity.shape[0]):
@@ -482,18 +604,10 @@ def start(
         affine[p] = ti.Matrix.zero(ti.f32, 3, 3)
         if p < deformation.shape[0]:
             deformation[p] = ti.Matrix.identity(ti.f32, 3)
-        volume[p] = 1.0
-        stiffness = 3.0 * setting[CONSTANT.bulk]
-        if material != WATER:
-            stiffness += 2.0 * setting[CONSTANT.shear]
-            if material == SNOW:
-                stiffness *= hardening(1.0, setting)
-            else:
-                volume[p] = 0.0
-        _raise_maximum(scene_value, scene, VALUE.stiffness, stiffness)
+        volume[p] = 0.0 if material == SAND else 1.0
+        raise_maximum(counter, scene, COUNT.stiffness_bits, initial_stiffness(material, law, law_row[p]))
         speed_square = velocity[p].dot(velocity[p])
-        _raise_maximum(scene_value, scene, VALUE.speed_square, speed_square)
-        _raise_maximum(scene_value, scene, VALUE.largest_speed_square, speed_square)
+        raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
 
 
 @ti.kernel
@@ -507,3 +621,10 @@ def begin_frame(
         counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
         if counter[scene, COUNT.status] == STATUS.running:
             scene_value[scene, VALUE.remaining] = frame_s
+
+
+@ti.kernel
+def place(target: Integers, where: Integers, value: Integers):
+    """target[where] = value."""
+    for i in range(where.shape[0]):
+        target[where[i]] = value[i]

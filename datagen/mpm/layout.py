@@ -16,7 +16,7 @@ BLOCK_NODES = BLOCK**3
 
 
 class Constant(NamedTuple):
-    """Positions of the laws' constants in the array that kernels read."""
+    """Positions of the laws' constants in a row of the array that kernels read."""
 
     shear: int = 0  # mu, Pa
     bulk: int = 1  # Lamé's lambda, Pa
@@ -28,7 +28,8 @@ class Constant(NamedTuple):
     maximum_hardening: int = 7
     water_smallest_volume: int = 8
     smallest_singular_value: int = 9
-    length: int = 10
+    mass: int = 10  # of a particle, in units of the config's
+    length: int = 11
 
 
 class Count(NamedTuple):
@@ -40,12 +41,17 @@ class Count(NamedTuple):
     hardening_caps: int = 3
     plastic_volume_bounds: int = 4
     position_clamps: int = 5
-    status: int = 6
-    frame_substeps: int = 7  # taken in the present frame
-    length: int = 8
+    surface_projections: int = 6
+    status: int = 7
+    frame_substeps: int = 8  # taken in the present frame
+    # Maxima of the last step, the bits of a float32 that is not negative: such bits are ordered like the numbers, and
+    # a GPU has no maximum of floats that many threads may take at once.
+    stiffness_bits: int = 9  # of (3 lambda + 2 mu) / density, m²/s²
+    speed_square_bits: int = 10
+    length: int = 11
 
 
-REPORTED = Count._fields[:6]
+REPORTED = Count._fields[:7]
 
 
 class SceneValue(NamedTuple):
@@ -54,13 +60,11 @@ class SceneValue(NamedTuple):
     remaining: int = 0  # of the frame, s
     time_step: int = 1  # of the present substep, s; 0 while the scene idles
     smallest_time_step: int = 2
-    stiffness: int = 3  # largest 3 lambda + 2 mu that changes from step to step, Pa
-    least_stiffness: int = 4  # of the materials whose stiffness is constant, Pa
-    speed_square: int = 5  # largest
-    gravity: int = 6  # 6, 7, 8
-    substeps_ahead: int = 9  # estimated, after the present one
-    largest_speed_square: int = 10
-    length: int = 11
+    least_stiffness: int = 3  # of the materials at rest whose stiffness never falls below, m²/s²
+    gravity: int = 4  # 4, 5, 6
+    substeps_ahead: int = 7  # estimated, after the present one
+    largest_speed_square: int = 8  # of the steps before the present one
+    length: int = 9
 
 
 class Status(NamedTuple):
@@ -71,19 +75,19 @@ class Status(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Positions in the float32 settings of a launch, after those of Constant."""
+    """Positions in the float32 settings of a launch."""
 
-    cell_size: int = 10
-    inverse_cell_size: int = 11
-    fixed_time_step: int = 12  # s; 0 for the adaptive rule
-    fixed_substeps: int = 13  # a frame, where the time step is fixed
-    stability_fraction: int = 14
-    speed_fraction: int = 15
-    friction: int = 16
-    low: int = 17  # 17, 18, 19: smallest coordinates of a particle
-    high: int = 20  # 20, 21, 22: largest
-    size: int = 23  # 23, 24, 25: of the domain
-    length: int = 26
+    cell_size: int = 0
+    inverse_cell_size: int = 1
+    fixed_time_step: int = 2  # s; 0 for the adaptive rule
+    fixed_substeps: int = 3  # a frame, where the time step is fixed
+    stability_fraction: int = 4
+    speed_fraction: int = 5
+    friction: int = 6
+    low: int = 7  # 7, 8, 9: smallest coordinates of a particle
+    high: int = 10  # 10, 11, 12: largest
+    size: int = 13  # 13, 14, 15: of the domain
+    length: int = 16
 
 
 class Shape(NamedTuple):
@@ -108,11 +112,48 @@ class Variant(NamedTuple):
     contact: int = 8
     taichi_elements_sand: int = 16
     atomic: int = 32  # a GPU's way to add up; else in parts, one after another
-    parts: int = 64  # times the number of parts
+    several_laws: int = 64  # particles of one kind differ in their constants
+    sweep: int = 128  # particles are stopped at triangles
+    stiffening_water: int = 256
+    parts: int = 512  # times the number of parts
+
+
+class Field(NamedTuple):
+    """Positions of a particle's numbers in the state of the team kernel, stored field by field."""
+
+    position: int = 0
+    velocity: int = 3
+    affine: int = 6
+    volume: int = 15
+    fluid: int = 16  # fields of particles without a deformation gradient
+    deformation: int = 16
+    solid: int = 25  # fields of particles with one
+
+
+class Tag(NamedTuple):
+    """Positions of a particle's integers in the team kernel."""
+
+    material: int = 0
+    law_row: int = 1
+    origin: int = 2  # its index within the scene as given
+    length: int = 3
+
+
+class Live(NamedTuple):
+    """Positions in the int32 state of a scene that its team shares."""
+
+    cells: int = 0  # occupied, in this step
+    blocks: int = 1  # touched, in this step
+    cursor: int = 2  # particles that have a place in the order
+    copy: int = 3  # which of the two copies of the particles is the present one
+    ordered: int = 4  # 1 once there is an order to copy by
+    frames: int = 5  # completed
+    length: int = 6
 
 
 CONSTANT, COUNT, VALUE, STATUS = Constant(), Count(), SceneValue(), Status()
 SETTING, SHAPE, VARIANT = Setting(), Shape(), Variant()
+FIELD, TAG, LIVE = Field(), Tag(), Live()
 
 
 def lame_parameters(config: MpmConfig) -> tuple[float, float]:
@@ -129,13 +170,14 @@ def sand_alpha(config: MpmConfig) -> float:
     return float(np.sqrt(2 / 3) * 2 * sine / (3 - sine))
 
 
-def constants(config: MpmConfig) -> np.ndarray:
-    """The array that the laws read, float32 [Constant.length]."""
+def constants(config: MpmConfig, unit_density: float | None = None) -> np.ndarray:
+    """A row of what the laws read, float32 [Constant.length]; masses are in units of `unit_density`."""
     shear, bulk = lame_parameters(config)
     out = np.zeros(CONSTANT.length, np.float32)
     out[CONSTANT.shear] = shear
     out[CONSTANT.bulk] = bulk
     out[CONSTANT.density] = config.density_kg_m3
+    out[CONSTANT.mass] = config.density_kg_m3 / (unit_density or config.density_kg_m3)
     out[CONSTANT.sand_alpha] = sand_alpha(config)
     out[CONSTANT.hardening] = config.snow_hardening
     out[CONSTANT.snow_smallest] = 1 - config.snow_critical_compression

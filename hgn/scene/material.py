@@ -6,6 +6,14 @@ from hgn.schema import ConfigError
 
 MATERIALS: tuple[str, ...] = ("water", "sand", "snow")
 WATER, SAND, SNOW = range(3)
+# what particles of one material may differ in, by the names that MpmConfig gives the defaults
+MATERIAL_PARAMETERS: tuple[str, ...] = (
+    "youngs_modulus_pa",
+    "poisson_ratio",
+    "density_kg_m3",
+    "sand_friction_angle_deg",
+    "snow_hardening",
+)
 
 
 def material_index(name: str, field: str = "material") -> int:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hgn.scene.material import MATERIALS
+from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS
 from hgn.schema import ConfigError
 
 
@@ -41,6 +41,8 @@ class Scene:
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
     seed: int = 0  # of the obstacle surface samples
     specification: dict[str, Any] = field(default_factory=dict)  # JSON-able: how the scene was made
+    # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS), where they differ from the solver's settings
+    material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = len(self.position_N3)
@@ -55,6 +57,11 @@ class Scene:
             bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(axis=1))
             if len(bad):
                 raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
+        for name, value in self.material_parameters.items():
+            if name not in MATERIAL_PARAMETERS:
+                raise ConfigError(f"material_parameters must be among {', '.join(MATERIAL_PARAMETERS)}, got {name!r}")
+            if value.shape != (count,):
+                raise ConfigError(f"material_parameters[{name}] must have shape {(count,)}, got {value.shape}")
         if count and int(self.material_N.max()) >= len(MATERIALS):
             raise ConfigError(f"material_N must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
 

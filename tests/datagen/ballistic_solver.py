@@ -70,6 +70,7 @@ def simulate(
     frame_rate_hz: float,
     on_frame: Callable[[int], None] | None = None,
     cpu_threads: int | None = None,
+    colliders: Sequence[object] | None = None,
 ) -> list[Simulated | SceneFailure]:
     results: list[Simulated | SceneFailure] = []
     for scene in scenes:

@@ -15,7 +15,7 @@ from datagen.pool import LocalCrew, Pool, Stopped, WorkerPlan, plan_workers, vis
 from datagen.progress import Progress
 from datagen.worker import Backend
 from datagen.writer import DatasetWriter
-from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
+from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.schema import ConfigError
@@ -200,9 +200,11 @@ def test_worker_plans() -> None:
     default = DatagenConfig()
     assert plan_workers(default, (), 8) == WorkerPlan(4, 2, 1, 1, 1)
     assert plan_workers(default, (), 1) == WorkerPlan(1, 1, 1, 1, 1)
-    assert plan_workers(default, ("0",), 8) == WorkerPlan(1, None, 7, 64, 2, ("0",))
+    assert plan_workers(default, ("0",), 8) == WorkerPlan(1, None, 7, 384, 64, ("0",))
     assert plan_workers(DatagenConfig(mpm=MpmConfig(device="cpu")), ("0",), 4).threads == 2
     many = DatagenConfig(dataset=DatasetConfig(workers=3), mpm=MpmConfig(scenes_per_launch=2))
+    large = DatagenConfig(scene=SceneConfig(domain_size=(4.0, 1.0, 4.0)))
+    assert plan_workers(large, ("0",), 8).scenes_per_launch == 24
     assert plan_workers(many, (), 8) == WorkerPlan(3, 2, 1, 2, 2)
     assert plan_workers(many, ("4", "5"), 8) == WorkerPlan(3, None, 7, 2, 2, ("4", "5"))
 

@@ -19,7 +19,7 @@ def update_solids(
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2), taichi_elements_sand: ti.template(),
 ):  # fmt: skip
     for n in range(F.shape[0]):
-        f, v, s, k = solid(F[n], volume[n], material, constant, counter, 0, True, True, taichi_elements_sand)
+        f, v, s, k = solid(F[n], volume[n], material, constant, 0, counter, 0, True, True, taichi_elements_sand)
         F[n] = f
         volume[n] = v
         stress[n] = s
@@ -32,7 +32,7 @@ def update_water(
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
 ):  # fmt: skip
     for n in range(volume.shape[0]):
-        v, p, _stiffness = water(volume[n], expansion[n], constant, counter, 0)
+        v, p, _stiffness = water(volume[n], expansion[n], constant, 0, counter, 0)
         volume[n] = v
         pressure[n] = p
 

@@ -1,0 +1,365 @@
+"""What all ways to run a batch of scenes share: its device arrays, the loop over frames, failures and counters.
+
+Shape legend: T frames, N particles of a scene, P particles of all scenes, B scenes, K constants.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from datagen.mpm.collider import BOTH_SIDES, Collider
+from datagen.mpm.layout import (
+    BLOCK,
+    BLOCK_NODES,
+    CONSTANT,
+    COUNT,
+    REPORTED,
+    SETTING,
+    SHAPE,
+    STATUS,
+    VALUE,
+    VARIANT,
+    constants,
+)
+from hgn.config import MpmConfig
+from hgn.scene.material import MATERIAL_PARAMETERS, SAND, SNOW, WATER
+from hgn.scene.scene import Scene
+from hgn.schema import ConfigError
+
+import datagen.mpm.device  # noqa: F401  # isort: skip  # keeps Taichi's banner off stdout
+import taichi as ti  # isort: skip
+
+from datagen.mpm import kernels  # isort: skip
+from datagen.mpm.surface_kernel import TRIANGLE_VECTORS  # isort: skip
+
+MAXIMUM_BLOCKS = 1024  # along an axis: kernels keep ten bits of it
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """One scene's trajectory."""
+
+    position_TN3: np.ndarray  # float32, domain units; frame 0 is the initial state, bitwise
+    counters: dict[str, Any]  # JSON-able: substeps, smallest_time_step_s, floors hit
+
+
+@dataclass(frozen=True)
+class SceneFailure:
+    """A scene that was stopped; the others of its batch went on, unaffected."""
+
+    cause: str
+
+
+def no_counters() -> dict[str, Any]:
+    counters: dict[str, Any] = dict.fromkeys(REPORTED, 0)
+    counters["smallest_time_step_s"] = None
+    counters["largest_speed"] = 0.0
+    counters["particles_inside_obstacles_at_start"] = 0
+    counters["particles_inside_obstacles_at_end"] = 0
+    return counters
+
+
+def particle_bounds(scene: Scene, config: MpmConfig) -> tuple[np.ndarray, np.ndarray]:
+    """The smallest and largest coordinates that particles may have, float32 [3] each, domain units.
+
+    Beyond them all nodes of a particle are wall nodes, or lie outside the grid.
+    """
+    nodes = np.array([round(length / scene.cell_size) for length in scene.domain_size])
+    low = np.full(3, (config.wall_cells - 1.5) * scene.cell_size)
+    high = np.minimum(nodes - config.wall_cells + 0.5, nodes - 1.5) * scene.cell_size
+    # a rounding inside, so that the scaled coordinate cannot round to the next base node
+    return (low * (1 + 1e-6)).astype(np.float32), (high * (1 - 1e-6)).astype(np.float32)
+
+
+def fixed_substeps(config: MpmConfig, frame_rate_hz: float) -> int:
+    """Substeps a frame of a fixed time step: as many as it takes to reach the frame's end."""
+    return max(1, math.ceil(1 / (frame_rate_hz * config.fixed_time_step_s) - 1e-6))
+
+
+def material_laws(scenes: Sequence[Scene], config: MpmConfig) -> tuple[np.ndarray, np.ndarray]:
+    """The different rows of constants, float32 [rows, K], and the row of each particle, int32 [N of all scenes].
+
+    What a scene's material_parameters leave open is the config's. The first row is the config's own.
+    Raises: ConfigError for a value that MpmConfig refuses.
+    """
+    own = {name: np.float32(getattr(config, name)) for name in MATERIAL_PARAMETERS}
+    columns = [
+        np.concatenate(
+            [
+                np.asarray(scene.material_parameters.get(name, np.full(scene.particle_count, own[name])), np.float32)
+                for scene in scenes
+            ]
+        )
+        for name in MATERIAL_PARAMETERS
+    ]
+    given, row = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
+    laws = [constants(config, config.density_kg_m3)]
+    rows = np.zeros(len(given), np.int32)
+    for index, values in enumerate(given):
+        changed: dict[str, Any] = {
+            name: float(value) for name, value in zip(MATERIAL_PARAMETERS, values, strict=True) if value != own[name]
+        }
+        if changed:
+            rows[index] = len(laws)
+            laws.append(constants(dataclasses.replace(config, **changed), config.density_kg_m3))
+    return np.stack(laws), rows[row.reshape(-1)]
+
+
+class Launch:
+    """The device arrays of one batch of scenes, each with at least one particle, and the loop over frames.
+
+    A subclass holds the particles and says in `_advance` how frames are run.
+    """
+
+    parts = 1  # bounds that each scene's particles are cut at
+    copies = 1  # of the grid
+
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        colliders: Sequence[Collider],
+        config: MpmConfig,
+        node_counts: tuple[int, int, int],
+        frame_rate_hz: float,
+    ) -> None:
+        self.scenes, self.colliders, self.config, self.node_counts = scenes, colliders, config, node_counts
+        self.frame_s = 1 / frame_rate_hz
+        if config.time_step == "fixed":
+            self.frame_s = fixed_substeps(config, frame_rate_hz) * config.fixed_time_step_s
+        self.particle_begin = np.concatenate([[0], np.cumsum([scene.particle_count for scene in scenes])])
+        self.particles = int(self.particle_begin[-1])
+        self.blocks = tuple(-(-count // BLOCK) for count in node_counts)
+        self.all_blocks = len(scenes) * math.prod(self.blocks)
+        if max(self.blocks) > MAXIMUM_BLOCKS:
+            raise ConfigError(
+                f"domain_size must be at most {MAXIMUM_BLOCKS * BLOCK} cells a side, got {max(node_counts)}; enlarge "
+                "cell_size"
+            )
+        nodes = self.all_blocks * BLOCK_NODES * self.copies
+        if max(nodes, self.particles) >= 2**31:
+            raise ConfigError(
+                f"a batch must hold less than 2^31 nodes and particles, got {nodes} nodes of {len(scenes)} scenes and "
+                f"{self.particles} particles; lower scenes_per_launch"
+            )
+        label = np.concatenate(
+            [4 * index + np.asarray(scene.material_N, np.int32) for index, scene in enumerate(scenes)]
+        )
+        laws, row = material_laws(scenes, config)
+        self.present = [bool((label % 4 == kind).any()) for kind in (WATER, SAND, SNOW)]
+        has_contact = any(len(collider.node_K3) for collider in colliders)
+        has_sweep = config.collider_projection and any(len(collider.sweep.cell_K3) for collider in colliders)
+        self.variant = (
+            VARIANT.water * self.present[WATER]
+            + VARIANT.sand * self.present[SAND]
+            + VARIANT.snow * self.present[SNOW]
+            + VARIANT.contact * has_contact
+            + VARIANT.sweep * has_sweep
+            + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
+            + VARIANT.several_laws * (len(laws) > 1)
+            + VARIANT.parts * self.copies
+        )
+        self.label = device_array(label.astype(np.int32))
+        self.law_row = device_array(row * CONSTANT.length)
+        self.law = device_array(laws.ravel())
+        self.setting = device_array(self._settings(frame_rate_hz))
+        self.scene_value = device_array(self._scene_values(laws, row))
+        self.counter = device_array(np.zeros((len(scenes), COUNT.length), np.int64))
+        self.shape = device_array(self._shape())
+        self.node = ti.Vector.ndarray(4, ti.f32, nodes)
+        places, values, vectors = [], [], [np.zeros((1, 3), np.float32)]
+        length = 1
+        if has_contact or has_sweep:
+            length = self.all_blocks * BLOCK_NODES
+            place, value, normal = self._contacts()
+            places, values, vectors = [place], [value], [normal]
+        if has_sweep:
+            place, value, triangle, length = self._sweeps(len(vectors[0]))
+            places, values, vectors = [*places, place], [*values, value], [*vectors, triangle]
+        self.contact = ti.ndarray(ti.i32, length)
+        self.contact.fill(-1)
+        if places and len(np.concatenate(places)):
+            kernels.place(self.contact, device_array(np.concatenate(places)), device_array(np.concatenate(values)))
+        self.contact_normal = device_vectors(np.concatenate(vectors))
+
+    def _vector_arrays(self) -> list[Any]:
+        return [self.node, self.contact_normal]
+
+    def release(self) -> None:
+        """Gives the device memory back: Taichi 1.7.4 frees scalar arrays by itself, but not those of vectors."""
+        program = ti.lang.impl.get_runtime().prog
+        for array in self._vector_arrays():
+            program.delete_ndarray(array.arr)
+
+    def _scene_values(self, laws: np.ndarray, row: np.ndarray) -> np.ndarray:
+        value = np.zeros((len(self.scenes), VALUE.length), np.float32)
+        value[:, VALUE.smallest_time_step] = np.inf
+        shear, bulk = laws[:, CONSTANT.shear], laws[:, CONSTANT.bulk]
+        # per kind and row; hardening may take all stiffness from snow
+        least = np.stack([3 * bulk, 3 * bulk + 2 * shear, 0 * bulk]) / laws[:, CONSTANT.density]
+        for index, scene in enumerate(self.scenes):
+            own = slice(self.particle_begin[index], self.particle_begin[index + 1])
+            value[index, VALUE.gravity : VALUE.gravity + 3] = scene.gravity
+            value[index, VALUE.least_stiffness] = least[scene.material_N, row[own]].max()
+        return value
+
+    def _shape(self) -> np.ndarray:
+        """The int32 shape that kernels read, with the bounds of the parts that each scene's particles fall into."""
+        begin = [
+            start + (stop - start) * part // self.parts
+            for start, stop in zip(self.particle_begin[:-1], self.particle_begin[1:], strict=True)
+            for part in range(self.parts)
+        ]
+        shape = np.zeros(SHAPE.part_begin, np.int32)
+        shape[SHAPE.nodes : SHAPE.nodes + 3] = self.node_counts
+        shape[SHAPE.blocks : SHAPE.blocks + 3] = self.blocks
+        shape[SHAPE.scene_blocks] = math.prod(self.blocks)
+        shape[SHAPE.all_blocks] = self.all_blocks
+        shape[SHAPE.wall_cells] = self.config.wall_cells
+        shape[SHAPE.sticky_walls] = self.config.wall_contact == "stick"
+        shape[SHAPE.maximum_substeps] = self.config.maximum_substeps_per_frame
+        return np.concatenate([shape, np.array([*begin, self.particles], np.int32)])
+
+    def _settings(self, frame_rate_hz: float) -> np.ndarray:
+        config, cell_size = self.config, self.scenes[0].cell_size
+        low, high = particle_bounds(self.scenes[0], config)
+        setting = np.zeros(SETTING.length, np.float32)
+        setting[SETTING.cell_size] = cell_size
+        setting[SETTING.inverse_cell_size] = 1 / cell_size
+        if config.time_step == "fixed":
+            setting[SETTING.fixed_time_step] = config.fixed_time_step_s
+            setting[SETTING.fixed_substeps] = fixed_substeps(config, frame_rate_hz)
+        setting[SETTING.stability_fraction] = config.stability_fraction
+        setting[SETTING.speed_fraction] = config.speed_fraction
+        setting[SETTING.friction] = config.collider_friction
+        setting[SETTING.low : SETTING.low + 3] = low
+        setting[SETTING.high : SETTING.high + 3] = high
+        setting[SETTING.size : SETTING.size + 3] = self.scenes[0].domain_size
+        return setting
+
+    def _contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places of contact nodes; twice the index of each one's normal, plus 1 where both sides stop; normals."""
+        scene_nodes = math.prod(self.blocks) * BLOCK_NODES
+        places, values = [], []
+        first = 0
+        for index, collider in enumerate(self.colliders):
+            place = self._places(collider.node_K3)
+            places.append(index * scene_nodes + place)
+            values.append(2 * np.arange(first, first + len(place)) + (collider.kind_K == BOTH_SIDES))
+            first += len(place)
+        normal = np.concatenate([collider.normal_K3 for collider in self.colliders])
+        return np.concatenate(places).astype(np.int32), np.concatenate(values).astype(np.int32), normal
+
+    def _places(self, node_K3: np.ndarray) -> np.ndarray:
+        """Where nodes lie within a scene's arrays of nodes, int64 [K]."""
+        block, local = np.divmod(node_K3.astype(np.int64), BLOCK)
+        place = (block[:, 0] * self.blocks[1] + block[:, 1]) * self.blocks[2] + block[:, 2]
+        return place * BLOCK_NODES + (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
+
+    def _sweeps(self, first_vector: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+        """Entries of the contact array for the swept test (see kernels.substep): places, values; the triangles'
+        vectors; the array's length.
+        """
+        all_nodes = self.all_blocks * BLOCK_NODES
+        places, values, vectors = [], [], []
+        end = 2 * all_nodes
+        for index, collider in enumerate(self.colliders):
+            sweep = collider.sweep
+            count = np.diff(np.append(sweep.begin_K, len(sweep.triangle_L)))
+            head = end + sweep.begin_K + np.arange(len(count))  # each list is headed by its length
+            places.append(all_nodes + index * (all_nodes // len(self.scenes)) + self._places(sweep.cell_K3))
+            values.append(head)
+            places.append(head)
+            values.append(count)
+            places.append(end + np.arange(len(sweep.triangle_L)) + np.repeat(np.arange(len(count)), count) + 1)
+            values.append(first_vector + TRIANGLE_VECTORS * sweep.triangle_L.astype(np.int64))
+            vectors.append(sweep.triangle_F43.reshape(-1, 3))
+            first_vector += TRIANGLE_VECTORS * len(sweep.triangle_F43)
+            end += len(count) + len(sweep.triangle_L)
+        if end >= 2**31:
+            raise ConfigError(
+                f"a batch must hold less than 2^31 nodes, cells and lists of triangles, got {end}; lower "
+                "scenes_per_launch, or turn collider_projection off"
+            )
+        return (
+            np.concatenate(places).astype(np.int32), np.concatenate(values).astype(np.int32),
+            np.concatenate(vectors), end,
+        )  # fmt: skip
+
+    def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Runs `frames` frames; gives, a few at a time, positions [frames, P, 3] and how many of all the frames so
+        far each scene has completed [B].
+        """
+        raise NotImplementedError
+
+    def run(self, frames: int, on_frame: Callable[[int], None] | None) -> list[Simulated | SceneFailure]:
+        """The frames of each scene, the initial state among them, or why it was stopped."""
+        trajectory = [np.empty((frames, scene.particle_count, 3), np.float32) for scene in self.scenes]
+        for rows, scene in zip(trajectory, self.scenes, strict=True):
+            rows[0] = scene.position_N3
+        if on_frame is not None:
+            on_frame(0)
+        present, completed = 1, np.zeros(len(self.scenes), np.int64)
+        for position, completed in self._advance(frames - 1):
+            for rows, begin in zip(trajectory, self.particle_begin, strict=False):
+                rows[present : present + len(position)] = position[:, begin : begin + rows.shape[1]]
+            for frame in range(present, present + len(position)):
+                if on_frame is not None:
+                    on_frame(frame)
+            present += len(position)
+            if (completed < present - 1).all():
+                break
+        status = self.counter.to_numpy()[:, COUNT.status]
+        counters = self._counters()
+        for index, (own, collider) in enumerate(zip(counters, self.colliders, strict=True)):
+            for when, frame in (("start", 0), ("end", -1)):
+                if status[index] == STATUS.running:
+                    own[f"particles_inside_obstacles_at_{when}"] = collider.count_inside(trajectory[index][frame])
+        return [
+            Simulated(trajectory[index], counters[index])
+            if status[index] == STATUS.running
+            else SceneFailure(self._cause(int(status[index]), int(completed[index]) + 1))
+            for index in range(len(self.scenes))
+        ]
+
+    def _cause(self, status: int, frame: int) -> str:
+        if status == STATUS.not_finite:
+            rule = "a particle's position, velocity or velocity gradient is no longer finite"
+        elif status == STATUS.left_domain:
+            rule = "a particle left the domain"
+        else:
+            limit = self.config.maximum_substeps_per_frame
+            rule = f"the frame needs more than maximum_substeps_per_frame = {limit} substeps"
+        return f"frame {frame}: {rule}"
+
+    def _counters(self) -> list[dict[str, Any]]:
+        counter, value = self.counter.to_numpy(), self.scene_value.to_numpy()
+        out = []
+        for index in range(len(self.scenes)):
+            counters = no_counters()
+            for name in REPORTED:
+                counters[name] = int(counter[index, getattr(COUNT, name)])
+            smallest = float(value[index, VALUE.smallest_time_step])
+            counters["smallest_time_step_s"] = smallest if math.isfinite(smallest) else None
+            last = counter[index, COUNT.speed_square_bits].astype(np.int32).view(np.float32)
+            counters["largest_speed"] = float(math.sqrt(max(value[index, VALUE.largest_speed_square], last)))
+            out.append(counters)
+        return out
+
+
+def device_array(values: np.ndarray) -> ti.ScalarNdarray:
+    types = {"float32": ti.f32, "int32": ti.i32, "int64": ti.i64, "uint8": ti.u8}
+    out = ti.ndarray(types[values.dtype.name], values.shape)
+    out.from_numpy(np.ascontiguousarray(values))
+    return out
+
+
+def device_vectors(values_N3: np.ndarray) -> ti.VectorNdarray:
+    out = ti.Vector.ndarray(3, ti.f32, len(values_N3))
+    out.from_numpy(np.ascontiguousarray(values_N3, np.float32))
+    return out

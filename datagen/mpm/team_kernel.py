@@ -1,0 +1,443 @@
+"""Frames of explicit MLS-MPM in one launch, a team of threads for each scene: the fast way on a GPU.
+
+The method is that of datagen.mpm.kernels, of whose parts it is made. What differs is who works: a scene of a few
+thousand particles needs hundreds of steps a frame, each of a few microseconds' work, so one thread block runs a
+scene by itself, step after step, without a launch or a look at other scenes in between. Scenes share nothing, so
+each takes its own steps, and hundreds of them fill the device.
+
+Within a step particles are put in order by cell (a counting sort over the occupied cells alone), and the sums to
+the grid are taken by cell: nine threads hold the 27 nodes that a cell's particles touch, add up all particles of the
+cell, and then add each node's sum once. That leaves one atomic sum a node and cell instead of one a particle.
+
+State is stored by field, `state[copy, field, particle]`: at each frame the particles are copied from one copy to
+the other in the order of their cells, so that neighbours in space stay neighbours in memory.
+
+With one thread a team it runs on a CPU too; the tests check it there against the other kernel.
+"""
+
+import taichi as ti
+
+from datagen.mpm.kernels import (
+    Integers,
+    Nodes,
+    Scalars,
+    Vectors,
+    base_node,
+    choose_time_step,
+    initial_stiffness,
+    interpolate,
+    mark,
+    move,
+    node_places,
+    raise_maximum,
+    respond,
+    spline,
+    update_node,
+)
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, FIELD, LIVE, SETTING, SHAPE, STATUS, TAG, VALUE, VARIANT
+from hgn.scene.material import SAND
+
+LANES = 9  # threads that share a cell; each holds the three nodes of one x and y
+
+
+@ti.func
+def _wait(threads: ti.template()):
+    """Until the whole team is here, and sees what each has written."""
+    if ti.static(threads > 1):
+        ti.simt.block.sync()
+
+
+@ti.func
+def _vector(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
+    return ti.Vector([state[place + (field + i) * stride] for i in range(3)])
+
+
+@ti.func
+def _matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
+    return ti.Matrix([[state[place + (field + 3 * i + j) * stride] for j in range(3)] for i in range(3)])
+
+
+@ti.func
+def _put_vector(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
+    for i in ti.static(range(3)):
+        state[place + (field + i) * stride] = value[i]
+
+
+@ti.func
+def _put_matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        state[place + (field + 3 * i + j) * stride] = value[i, j]
+
+
+@ti.func
+def _cell(x, scene: ti.i32, setting: ti.template(), shape: ti.template()):
+    """Where the cell of a particle lies in the arrays of nodes: at its base node."""
+    base = base_node(x, setting[SETTING.inverse_cell_size])
+    index_x, index_y, index_z = node_places(base, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape)
+    return index_x[0] + index_y[0] + index_z[0]
+
+
+@ti.func
+def _reorder(
+    lane: ti.i32,
+    first: ti.i32,
+    count: ti.i32,
+    copy: ti.i32,
+    stride: ti.i32,
+    state: ti.template(),
+    tag: ti.template(),
+    order: ti.template(),
+    fields: ti.template(),
+    threads: ti.template(),
+):
+    """Copies the particles to the other copy, in the order of the last step's cells."""
+    s = lane
+    while s < count:
+        source = copy * fields * stride + first + order[first + s]
+        target = (1 - copy) * fields * stride + first + s
+        for field in range(fields):
+            state[target + field * stride] = state[source + field * stride]
+        source_tag = copy * TAG.length * stride + first + order[first + s]
+        target_tag = (1 - copy) * TAG.length * stride + first + s
+        for i in ti.static(range(TAG.length)):
+            tag[target_tag + i * stride] = tag[source_tag + i * stride]
+        s += threads
+
+
+@ti.func
+def _strain_and_sort(
+    lane: ti.i32,
+    scene: ti.i32,
+    first: ti.i32,
+    count: ti.i32,
+    particles: ti.i32,
+    tags: ti.i32,
+    stride: ti.i32,
+    step: ti.f32,
+    state: ti.template(),
+    tag: ti.template(),
+    rank: ti.template(),
+    cell_count: ti.template(),
+    cell_list: ti.template(),
+    block: ti.template(),
+    live: ti.template(),
+    scene_value: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    law: ti.template(),
+    shape: ti.template(),
+    variant: ti.template(),
+    threads: ti.template(),
+):
+    """The materials' answer of each particle (left in place of C), and its rank among the particles of its cell."""
+    solid = ti.static(bool(variant & (VARIANT.sand | VARIANT.snow)))
+    largest = 0.0
+    p = lane
+    while p < count:
+        place = particles + p
+        x = _vector(state, place, stride, FIELD.position)
+        cell = _cell(x, scene, setting, shape)
+        rank_here = ti.atomic_add(cell_count[cell], 1)
+        rank[first + p] = rank_here
+        if rank_here == 0:
+            cell_list[first + ti.atomic_add(live[scene * LIVE.length + LIVE.cells], 1)] = cell
+            mark(
+                x, scene, setting[SETTING.inverse_cell_size], shape, block,
+                shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks], live,
+                scene * LIVE.length + LIVE.blocks,
+            )  # fmt: skip
+        C = _matrix(state, place, stride, FIELD.affine)
+        F = ti.Matrix.identity(ti.f32, 3)
+        material = tag[tags + TAG.material * stride + p]
+        row = tag[tags + TAG.law_row * stride + p]
+        if ti.static(solid):
+            F = _matrix(state, place, stride, FIELD.deformation)
+        A, new_F, volume, stiffness = respond(
+            C, F, state[place + FIELD.volume * stride], material, row, step, scene, counter, setting, law, variant
+        )
+        _put_matrix(state, place, stride, FIELD.affine, A)
+        if ti.static(solid):
+            _put_matrix(state, place, stride, FIELD.deformation, new_F)
+        state[place + FIELD.volume * stride] = volume
+        largest = ti.max(largest, stiffness)
+        p += threads
+    raise_maximum(counter, scene, COUNT.stiffness_bits, largest)
+
+
+@ti.func
+def _scatter(
+    lane: ti.i32,
+    scene: ti.i32,
+    first: ti.i32,
+    particles: ti.i32,
+    tags: ti.i32,
+    stride: ti.i32,
+    state: ti.template(),
+    tag: ti.template(),
+    order: ti.template(),
+    cell_begin: ti.template(),
+    live: ti.template(),
+    node: ti.template(),
+    setting: ti.template(),
+    law: ti.template(),
+    shape: ti.template(),
+    variant: ti.template(),
+    threads: ti.template(),
+):
+    """Adds mass and momentum of each cell's particles to its 27 nodes."""
+    dx = setting[SETTING.cell_size]
+    inverse_dx = setting[SETTING.inverse_cell_size]
+    tasks = live[scene * LIVE.length + LIVE.cells] * LANES
+    task = lane
+    while task < tasks:
+        entry = task // LANES
+        slot = task - entry * LANES
+        offset_x = slot // 3
+        offset_y = slot - 3 * offset_x
+        sum_0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        sum_1 = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        sum_2 = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        base = ti.Vector([0, 0, 0])
+        s = cell_begin[2 * (first + entry)]
+        end = s + cell_begin[2 * (first + entry) + 1]
+        while s < end:
+            p = order[first + s]
+            place = particles + p
+            scaled = _vector(state, place, stride, FIELD.position) * inverse_dx
+            base = ti.floor(scaled - 0.5, ti.i32)  # the same for all of them
+            away = ti.cast(base, ti.f32) - scaled
+            away_x = away[0] + ti.cast(offset_x, ti.f32)
+            away_y = away[1] + ti.cast(offset_y, ti.f32)
+            weight = spline(away_x) * spline(away_y)
+            if ti.static(bool(variant & VARIANT.several_laws)):
+                weight *= law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
+            A = _matrix(state, place, stride, FIELD.affine) * dx
+            up = ti.Vector([A[0, 2], A[1, 2], A[2, 2]])
+            v_0 = _vector(state, place, stride, FIELD.velocity) + A @ ti.Vector([away_x, away_y, away[2]])
+            v_1 = v_0 + up
+            v_2 = v_1 + up
+            weight_0 = weight * spline(away[2])
+            weight_1 = weight * spline(away[2] + 1.0)
+            weight_2 = weight * spline(away[2] + 2.0)
+            sum_0 += weight_0 * ti.Vector([v_0[0], v_0[1], v_0[2], 1.0])
+            sum_1 += weight_1 * ti.Vector([v_1[0], v_1[1], v_1[2], 1.0])
+            sum_2 += weight_2 * ti.Vector([v_2[0], v_2[1], v_2[2], 1.0])
+            s += 1
+        index_x, index_y, index_z = node_places(
+            base + ti.Vector([offset_x, offset_y, 0]), scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape
+        )
+        column = index_x[0] + index_y[0]
+        ti.atomic_add(node[column + index_z[0]], sum_0)
+        ti.atomic_add(node[column + index_z[1]], sum_1)
+        ti.atomic_add(node[column + index_z[2]], sum_2)
+        task += threads
+
+
+@ti.func
+def _gather(
+    lane: ti.i32,
+    scene: ti.i32,
+    first: ti.i32,
+    count: ti.i32,
+    particles: ti.i32,
+    stride: ti.i32,
+    step: ti.f32,
+    state: ti.template(),
+    order: ti.template(),
+    node: ti.template(),
+    scene_value: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    variant: ti.template(),
+    threads: ti.template(),
+):
+    """New velocity, gradient and position of each particle."""
+    first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
+    largest = 0.0
+    s = lane
+    while s < count:
+        place = particles + order[first + s]
+        x = _vector(state, place, stride, FIELD.position)
+        v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
+        moved, speed, speed_square = move(
+            x, v, C, step, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
+        )
+        _put_vector(state, place, stride, FIELD.position, moved)
+        _put_vector(state, place, stride, FIELD.velocity, speed)
+        _put_matrix(state, place, stride, FIELD.affine, C)
+        largest = ti.max(largest, speed_square)
+        s += threads
+    raise_maximum(counter, scene, COUNT.speed_square_bits, largest)
+
+
+@ti.kernel
+def advance(
+    frames: ti.i32,
+    frame_s: ti.f32,
+    state: Scalars,
+    tag: Integers,
+    rank: Integers,
+    order: Integers,
+    cell_count: Integers,
+    cell_list: Integers,
+    cell_begin: Integers,
+    block: Integers,
+    live: Integers,
+    node: Nodes,
+    turn: Integers,
+    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    setting: Scalars,
+    law: Scalars,
+    shape: Integers,
+    contact: Integers,
+    contact_normal: Vectors,
+    output: Scalars,
+    variant: ti.template(),
+    threads: ti.template(),
+):
+    """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
+
+    Arrays, with P particles and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, order,
+    cell_list [P] and cell_begin [2 P] are work space; cell_count [G] and the flags in block [3 * G / 64] are zero
+    between steps; turn [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
+    """
+    ti.loop_config(block_dim=threads)
+    for thread in range(turn.shape[0] * threads):
+        fields = ti.static(FIELD.solid if variant & (VARIANT.sand | VARIANT.snow) else FIELD.fluid)
+        scene = turn[thread // threads]
+        lane = thread % threads
+        first = shape[SHAPE.part_begin + scene]
+        count = shape[SHAPE.part_begin + scene + 1] - first
+        stride = rank.shape[0]
+        own = scene * LIVE.length
+        for frame in range(frames):
+            copy = live[own + LIVE.copy]
+            if live[own + LIVE.ordered] == 1:
+                _reorder(lane, first, count, copy, stride, state, tag, order, fields, threads)
+                copy = 1 - copy
+            _wait(threads)
+            particles = copy * fields * stride + first
+            tags = copy * TAG.length * stride + first
+            if lane == 0:
+                live[own + LIVE.copy] = copy
+                live[own + LIVE.ordered] = 1
+                counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
+                if counter[scene, COUNT.status] == STATUS.running:
+                    scene_value[scene, VALUE.remaining] = frame_s
+            # without this the compiler joins what one thread does before and inside the loop, and its team would
+            # wait for it at another barrier
+            _wait(threads)
+            going = 1
+            while going == 1:
+                if lane == 0:
+                    live[own + LIVE.cells] = 0
+                    live[own + LIVE.blocks] = 0
+                    live[own + LIVE.cursor] = 0
+                    choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
+                _wait(threads)
+                step = scene_value[scene, VALUE.time_step]
+                if step > 0.0:
+                    _strain_and_sort(
+                        lane, scene, first, count, particles, tags, stride, step, state, tag, rank, cell_count,
+                        cell_list, block, live, scene_value, counter, setting, law, shape, variant, threads,
+                    )  # fmt: skip
+                    _wait(threads)
+                    blocks = live[own + LIVE.blocks]
+                    block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
+                    cells = live[own + LIVE.cells]
+                    c = lane
+                    while c < cells:
+                        cell = cell_list[first + c]
+                        length = cell_count[cell]
+                        begin = ti.atomic_add(live[own + LIVE.cursor], length)
+                        cell_begin[2 * (first + c)] = begin
+                        cell_begin[2 * (first + c) + 1] = length
+                        cell_count[cell] = begin
+                        c += threads
+                    n = lane
+                    while n < blocks * BLOCK_NODES:
+                        node[block[block_list + n // BLOCK_NODES] * BLOCK_NODES + n % BLOCK_NODES] = ti.Vector(
+                            [0.0, 0.0, 0.0, 0.0]
+                        )
+                        n += threads
+                    _wait(threads)
+                    p = lane
+                    while p < count:
+                        cell = _cell(_vector(state, particles + p, stride, FIELD.position), scene, setting, shape)
+                        order[first + cell_count[cell] + rank[first + p]] = p
+                        p += threads
+                    _wait(threads)
+                    _scatter(
+                        lane, scene, first, particles, tags, stride, state, tag, order, cell_begin, live, node, setting,
+                        law, shape, variant, threads,
+                    )  # fmt: skip
+                    _wait(threads)
+                    n = lane
+                    while n < blocks * BLOCK_NODES:
+                        touched = block[block_list + n // BLOCK_NODES]
+                        if n % BLOCK_NODES == 0:
+                            block[touched] = 0
+                        update_node(
+                            touched * BLOCK_NODES + n % BLOCK_NODES, scene,
+                            block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES], scene_value, setting,
+                            shape, node, contact, contact_normal, variant,
+                        )  # fmt: skip
+                        n += threads
+                    c = lane
+                    while c < cells:
+                        cell_count[cell_list[first + c]] = 0
+                        c += threads
+                    _wait(threads)
+                    _gather(
+                        lane, scene, first, count, particles, stride, step, state, order, node, scene_value, counter,
+                        setting, shape, contact, contact_normal, variant, threads,
+                    )  # fmt: skip
+                    _wait(threads)
+                else:
+                    going = 0
+            if lane == 0 and counter[scene, COUNT.status] == STATUS.running:
+                live[own + LIVE.frames] += 1
+            p = lane
+            while p < count:
+                target = frame * stride + first + tag[tags + TAG.origin * stride + p]
+                for axis in ti.static(range(3)):
+                    output[3 * target + axis] = state[particles + p + (FIELD.position + axis) * stride]
+                p += threads
+            _wait(threads)
+
+
+@ti.kernel
+def start_team(
+    state: Scalars,
+    tag: Integers,
+    position: Scalars,
+    velocity: Scalars,
+    label: Integers,
+    law_row: Integers,
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    law: Scalars,
+    fields: ti.template(),
+):
+    """Particles at rest shape in the first copy, and the maxima that the first time step needs."""
+    for p in range(label.shape[0]):
+        stride = label.shape[0]
+        scene = label[p] >> 2
+        material = label[p] & 3
+        speed_square = 0.0
+        for field in range(fields):
+            state[p + field * stride] = 0.0
+        for axis in ti.static(range(3)):
+            state[p + (FIELD.position + axis) * stride] = position[3 * p + axis]
+            state[p + (FIELD.velocity + axis) * stride] = velocity[3 * p + axis]
+            speed_square += velocity[3 * p + axis] ** 2
+            if ti.static(fields == FIELD.solid):
+                state[p + (FIELD.deformation + 4 * axis) * stride] = 1.0
+        state[p + FIELD.volume * stride] = 0.0 if material == SAND else 1.0
+        tag[p + TAG.material * stride] = material
+        tag[p + TAG.law_row * stride] = law_row[p]
+        raise_maximum(counter, scene, COUNT.stiffness_bits, initial_stiffness(material, law, law_row[p]))
+        raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)

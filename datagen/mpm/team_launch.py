@@ -1,0 +1,80 @@
+"""Whole frames of all scenes a launch, a team of GPU threads for each scene: the way for many scenes at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from datagen.mpm.launch import Launch, device_array
+from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, TAG
+from hgn.scene.material import SAND, SNOW
+
+import taichi as ti  # isort: skip
+
+from datagen.mpm import team_kernel  # isort: skip
+
+LAUNCH_SECONDS = 1.0  # aimed at: one launch runs as many frames as fit in
+MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
+PAUSE = 0.8  # of the time that a launch is expected to take
+
+
+class TeamLaunch(Launch):
+    """Particles in one array, field by field, in two copies."""
+
+    def __init__(self, threads: int, *batch: Any) -> None:
+        super().__init__(*batch)
+        self.threads = threads
+        fields = FIELD.solid if self.present[SAND] or self.present[SNOW] else FIELD.fluid
+        self.state = ti.ndarray(ti.f32, 2 * fields * self.particles)
+        tag = np.zeros((2, TAG.length, self.particles), np.int32)
+        tag[0, TAG.origin] = np.concatenate([np.arange(scene.particle_count) for scene in self.scenes])
+        self.tag = device_array(tag.ravel())
+        self.rank, self.order, self.cell_list = (ti.ndarray(ti.i32, self.particles) for _ in range(3))
+        self.cell_begin = ti.ndarray(ti.i32, 2 * self.particles)
+        self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
+        self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
+        for array in (self.cell_count, self.block):
+            array.fill(0)
+        self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))
+        team_kernel.start_team(
+            self.state, self.tag, *(
+                device_array(np.concatenate([getattr(scene, name) for scene in self.scenes]).astype(np.float32).ravel())
+                for name in ("position_N3", "velocity_N3")
+            ), self.label, self.law_row, self.counter, self.law, fields,
+        )  # fmt: skip
+
+    def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        most = max(1, MAXIMUM_OUTPUT_BYTES // (12 * self.particles))
+        done, size, substeps, expected = 0, 1, np.zeros(len(self.scenes), np.int64), 0.0
+        self._launch(0)  # compiles
+        work = np.array([scene.particle_count for scene in self.scenes])
+        while done < frames:
+            size = min(size, most, frames - done)
+            begin = time.perf_counter()
+            # long scenes first, so that none is left alone at the end
+            output = self._launch(size, np.argsort(-work, kind="stable"))
+            # Taichi holds the interpreter's lock while it waits for the device: other threads run before that
+            time.sleep(PAUSE * min(expected * size, LAUNCH_SECONDS))
+            position = output.to_numpy().reshape(size, self.particles, 3)
+            seconds = time.perf_counter() - begin
+            total = self.counter.to_numpy()[:, COUNT.substeps]
+            work, substeps = (total - substeps) * np.diff(self.particle_begin), total
+            done += size
+            yield position, self.live.to_numpy().reshape(-1, LIVE.length)[:, LIVE.frames].astype(np.int64)
+            expected = seconds / size
+            size = max(1, min(2 * size, int(LAUNCH_SECONDS / expected)))
+
+    def _launch(self, frames: int, turn: np.ndarray | None = None) -> ti.ScalarNdarray:
+        """Starts that many frames of the scenes, in the order given; the positions once the device is done."""
+        output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
+        turn = np.arange(len(self.scenes)) if turn is None else turn
+        team_kernel.advance(
+            frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.cell_count, self.cell_list,
+            self.cell_begin, self.block, self.live, self.node, device_array(turn.astype(np.int32)), self.scene_value,
+            self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, output, self.variant,
+            self.threads,
+        )  # fmt: skip
+        return output

@@ -1,0 +1,48 @@
+"""Whole frames in one launch, a team for each scene: the same physics as one launch a substep.
+
+A GPU runs it with hundreds of threads a team; here a team has one.
+"""
+
+import numpy as np
+
+from datagen.mpm.solver import SceneFailure, Simulated, simulate
+from hgn.config import MpmConfig
+from hgn.scene.scene import Obstacle, Scene
+
+CELL = 1 / 16
+CONFIG = MpmConfig(device="cpu")
+SHEET = Obstacle(
+    "sheet", np.array([[0.0, 0.3, 0], [1, 0.3, 0], [1, 0.3, 1], [0, 0.3, 1]]),
+    np.array([[0, 1, 2], [0, 2, 3]], np.int32), False,
+)  # fmt: skip
+
+
+def mixed(count: int, seed: int, velocity: tuple, **scene) -> Scene:
+    position = np.random.default_rng(seed).uniform((0.3, 0.4, 0.3), (0.5, 0.6, 0.5), (count, 3)).astype(np.float32)
+    return Scene(
+        position, np.tile(np.float32(velocity), (count, 1)), (np.arange(count) % 3).astype(np.uint8),
+        (SHEET,), cell_size=CELL, **scene,
+    )  # fmt: skip
+
+
+def test_teams_agree_with_the_other_launch() -> None:
+    """Scenes of other sizes, densities and obstacles beside them: one frame agrees to 1e-6, ten to 1e-3 of the
+    domain, in the order given; frames come one by one, and a scene that fails leaves the others as they were.
+    """
+    heavy = {"density_kg_m3": np.linspace(500, 2000, 90, dtype=np.float32)}
+    scenes = [mixed(120, 0, (0, -3, 0)), mixed(90, 1, (1, -1, 0), material_parameters=heavy), mixed(1, 2, (0, 0, 0))]
+    frames: list[int] = []
+    expected = simulate(scenes, CONFIG, 11, 60.0)
+    found = simulate([*scenes, mixed(40, 3, (0, 1e6, 0))], CONFIG, 11, 60.0, frames.append, team_threads=1)
+    assert frames == list(range(11))
+    failed = found.pop()
+    assert isinstance(failed, SceneFailure) and failed.cause.startswith("frame 1: ")
+    for scene, one, other in zip(scenes, expected, found, strict=True):
+        assert isinstance(one, Simulated) and isinstance(other, Simulated)
+        assert np.array_equal(other.position_TN3[0], scene.position_N3)
+        assert np.abs(one.position_TN3[1] - other.position_TN3[1]).max() < 1e-6
+        assert np.abs(one.position_TN3 - other.position_TN3).max() < 1e-3
+        assert one.counters["substeps"] == other.counters["substeps"]
+    alone = simulate(scenes[:1], CONFIG, 11, 60.0, team_threads=1)[0]
+    assert isinstance(alone, Simulated)
+    assert np.abs(alone.position_TN3 - found[0].position_TN3).max() < 1e-3
