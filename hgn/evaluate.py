@@ -40,8 +40,6 @@ def main(mapping: dict[str, Any]) -> int:
     device = choose_device(config.device)
     network, info = load_weights(Path(config.weights), device)
     path, text = choose_path("path", config.path, config.precision, why_not_fast(device, network.config))
-    if config.rollout_frames >= 2:
-        print(text, file=sys.stderr)
     torch.set_float32_matmul_precision("highest" if config.precision == "highest" else "high")
     store = EpisodeStore(config.data, config.split)
     if not len(store):
@@ -50,6 +48,7 @@ def main(mapping: dict[str, Any]) -> int:
     require_frame_rate(info, episodes[0].frame_rate_hz)
     rows = one_step_rows(network, episodes, config)
     if config.rollout_frames >= 2:
+        print(text, file=sys.stderr)
         simulator = Simulator(network, info.frame_rate_hz, path, config.precision)
         rows.append(rollout_row(simulator, episodes, config.rollout_frames))
     print(table(rows, config, len(episodes)))
