@@ -546,6 +546,8 @@ class ScalingConfig:
     message_mb: tuple[float, ...] = (25.0,)  # sizes of messages that are timed beside the one that training uses
     network: NetworkConfig = field(default_factory=NetworkConfig)
     node_devices: int = 8  # of the clusters that the model tells of
+    update_ms: float | None = None  # of one device alone: the model of that, and nothing is measured
+    backward_ms: float = 0.0  # of these; 0: all gradients leave at the end, as on the fast path
     rounds: int = 20  # samples of each contender
     seconds: float = 30.0  # at most for all contenders, once three rounds are done
     device: str = "auto"
@@ -553,8 +555,11 @@ class ScalingConfig:
 
     def __post_init__(self) -> None:
         require_positive(self, "rounds", "seconds")
-        require_non_negative(self, "particle_spread")
+        require_non_negative(self, "particle_spread", "backward_ms")
         require_one_of(self, "precision", PRECISIONS)
+        if self.update_ms is not None:
+            require_positive(self, "update_ms")
+            require(self.backward_ms <= self.update_ms, "backward_ms", "at most update_ms", self.backward_ms)
         for name in ("scenes", "particles", "batches", "node_devices"):
             require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
         require(self.devices is None or self.devices >= 1, "devices", "at least 1", self.devices)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 from hgn.config import ScalingConfig
 from hgn.schema import ConfigError, from_mapping
 from tools.scaling import measure
-from tools.scaling.__main__ import SIZES, main, model_table
+from tools.scaling.__main__ import NODE_LAUNCH_S, NODE_LINK, SIZES, given_rows, main, model_table
 from tools.scaling.model import (
     Cluster,
     Link,
@@ -60,7 +61,33 @@ def test_rows_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     model = [row for row in report["rows"] if row["case"] == "model"]
     assert [row["devices"] for row in model] == 2 * list(SIZES)
     printed = capsys.readouterr().out
+    assert "| plain | highest | 2 | 2 | 0.17 | 1, up to 0.0 MB |" in printed
     assert model_table(report["rows"]) in printed and "| 1024 | 128 |" in printed
+
+
+def test_a_given_update_is_not_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With update_ms the model alone is printed, of the network's gradients in messages as training sends them."""
+    path = tmp_path / "model.json"
+    assert main({"update_ms": 120.0, "backward_ms": 70.0, "json": str(path)}) == 0
+    rows = json.loads(path.read_text())["rows"]
+    assert capsys.readouterr().out == model_table(rows) + "\n"
+    one, two = rows[:2]
+    assert (one["ms"], one["all_reduce_ms"], one["efficiency"]) == (120.0, 0, 1)
+    gradients = 4 * 3_501_747
+    four_messages = 4 * (NODE_LAUNCH_S + 2 * NODE_LINK.latency_s) + gradients / NODE_LINK.bytes_per_second
+    assert two["all_reduce_ms"] == pytest.approx(1e3 * four_messages)
+    assert main({"update_ms": 6.5}) == 0  # all gradients at the end: one message, not hidden
+    assert "| 2 | 1 | 0.07 | 0.07 |" in capsys.readouterr().out
+
+
+def test_the_page_shows_what_the_model_says() -> None:
+    """The tables of jobs/SCALING.md are those that its commands print."""
+    page = (Path(__file__).parents[2] / "jobs" / "SCALING.md").read_text()
+    commands = re.findall(r"python -m tools\.scaling (update_ms=.*)", page)
+    assert len(commands) == 2
+    for command in commands:
+        values = {key: float(value) for key, value in (pair.split("=") for pair in command.split())}
+        assert model_table(given_rows(ScalingConfig(**values))) in page
 
 
 @pytest.fixture
@@ -167,6 +194,8 @@ def test_fit_finds_the_link() -> None:
         ({"devices": 0}, "devices must be at least 1"),
         ({"device": "cuda:1"}, "device must be auto, cpu or cuda"),
         ({"batches": 0}, "batches must be at least 1"),
+        ({"update_ms": 0}, "update_ms must be"),
+        ({"update_ms": 5, "backward_ms": 6}, "backward_ms must be at most update_ms, got 6"),
         ({"paths": ["slow"]}, r"paths\[0\] must be plain or fast"),
         ({"message_mb": [0]}, r"message_mb\[0\] must be > 0"),
         ({"particle_spread": -1}, "particle_spread must be"),

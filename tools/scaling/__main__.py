@@ -1,7 +1,8 @@
 """python -m tools.scaling [--json FILE]: weak scaling of training on this machine's devices, and a model of clusters.
 
-Prints no time of what fails its check. The JSON holds {"meta": provenance, "backward_seconds", "rows"}; a row's case is
-weak_scaling, all_reduce or model.
+With update_ms=... it measures nothing: the model of an update that takes so long. Prints no time of what fails its
+check. The JSON holds {"meta": provenance, "backward_seconds", "rows"}; a row's case is weak_scaling, all_reduce or
+model.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +20,18 @@ import torch.multiprocessing
 from hgn.command import run_command
 from hgn.config import ScalingConfig
 from hgn.files import write_atomically
+from hgn.network.build import build_network
 from hgn.provenance import provenance
 from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.training.ranks import MESSAGE_MB
 from tools.bench.contenders import PASS
 from tools.scaling.measure import measure
 from tools.scaling.model import Cluster, Link, Step, Update, all_reduce_seconds, fit, update
 
 EXIT_RED = 1
 SIZES = tuple(2**power for power in range(11))  # 1 to 1,024 GPUs
+# The GPUs of a node where none are measured: 18 NVLinks of an H100 or H200 carry 450 GB/s each way.
+NODE_LAUNCH_S, NODE_LINK = 15e-6, Link(latency_s=3e-6, bytes_per_second=300e9)
 # What networks give one GPU in practice: 400 Gb/s for each of them, and 100 Gb/s for a node of eight.
 NETWORKS = {
     "400 Gb/s a GPU": Link(latency_s=10e-6, bytes_per_second=40e9),
@@ -36,6 +42,11 @@ NETWORKS = {
 def main(mapping: dict[str, Any]) -> int:
     """Prints tables, and writes JSON where asked to; the exit code is 1 where a check is red."""
     config = from_mapping(ScalingConfig, mapping)
+    if config.update_ms is not None:
+        rows = given_rows(config)
+        print(model_table(rows))
+        _write(config, "cpu", {"rows": rows})
+        return 0
     device_type, count = devices(config)
     with tempfile.TemporaryDirectory() as folder:
         torch.multiprocessing.spawn(measure, (count, config, device_type, Path(folder)), nprocs=count)
@@ -44,13 +55,16 @@ def main(mapping: dict[str, Any]) -> int:
     rows += predicted([{"case": "all_reduce"} | row for row in found["all_reduces"]], config.node_devices)
     rows += model_rows(rows, found["backward_seconds"], config)
     print(table(rows))
+    _write(config, device_type, {"backward_seconds": found["backward_seconds"], "rows": rows})
+    return 0 if all(row.get("check", PASS) == PASS for row in rows) else EXIT_RED
+
+
+def _write(config: ScalingConfig, device_type: str, found: dict[str, Any]) -> None:
     if config.json is not None:
         path = Path(config.json)
         path.parent.mkdir(parents=True, exist_ok=True)
         meta = provenance(device_type) | {"config": to_mapping(config)}
-        report = {"meta": meta, "backward_seconds": found["backward_seconds"], "rows": rows}
-        write_atomically(path, json.dumps(report, indent=1).encode())
-    return 0 if all(row.get("check", PASS) == PASS for row in rows) else EXIT_RED
+        write_atomically(path, json.dumps({"meta": meta} | found, indent=1).encode())
 
 
 def devices(config: ScalingConfig) -> tuple[str, int]:
@@ -77,18 +91,18 @@ def predicted(rows: list[dict[str, Any]], node_devices: int) -> list[dict[str, A
     """Adds what the model says of each all-reduce, once it is fitted to some of them."""
     if not rows:
         return rows
-    cluster = fitted(rows, node_devices, Link(0.0, 1.0))
+    cluster = fitted(rows, node_devices)
     for row in rows:
         row["model_ms"] = 1e3 * all_reduce_seconds(row["bytes"], row["devices"], cluster)
     return rows
 
 
-def fitted(rows: Sequence[dict[str, Any]], node_devices: int, between: Link) -> Cluster:
-    """A cluster of nodes like this machine."""
+def fitted(rows: Sequence[dict[str, Any]], node_devices: int) -> Cluster:
+    """A node like this machine, with at least as many devices."""
     measured = [(row["devices"], row["bytes"], row["ms"] / 1e3) for row in rows if row["case"] == "all_reduce"]
     launch_s, inside = fit(measured)
     most = max(devices for devices, _, _ in measured)
-    return Cluster(max(node_devices, most), launch_s, inside, between)
+    return Cluster(max(node_devices, most), launch_s, inside, inside)
 
 
 def model_rows(
@@ -100,14 +114,34 @@ def model_rows(
         trained = [row for row in rows if row["case"] == "weak_scaling" and row["path"] == path and row["ms"]]
         alone = next((row for row in trained if row["devices"] == 1 and row["particle_spread"] == 0), None)
         sent = next((row["messages"] for row in trained if row["messages"]), None)
-        if alone is None or sent is None:
-            continue
-        # Scenes of a batch are drawn apart from each other; seconds are taken to grow with particles.
-        spread = config.particle_spread / config.scenes**0.5
-        step = Step(alone["ms"] / 1e3, backward_seconds[path], tuple(sent), spread)
-        for name, link in NETWORKS.items():
-            cluster = fitted(rows, config.node_devices, link)
-            found += [_model_row(path, name, update(step, gpus, cluster), cluster, config) for gpus in SIZES]
+        if alone is not None and sent is not None:
+            step = Step(alone["ms"] / 1e3, backward_seconds[path], tuple(sent), _spread(config))
+            found += _rows_of(step, path, fitted(rows, config.node_devices), config)
+    return found
+
+
+def given_rows(config: ScalingConfig) -> list[dict[str, Any]]:
+    """The same for an update of `update_ms` and `backward_ms`, on a node that is assumed."""
+    assert config.update_ms is not None
+    gradient_bytes = 4 * sum(parameter.numel() for parameter in build_network(config.network).parameters())
+    limit = MESSAGE_MB * 2**20 if config.backward_ms else gradient_bytes
+    whole, rest = divmod(gradient_bytes, limit)
+    messages = (limit,) * whole + ((rest,) if rest else ())
+    step = Step(config.update_ms / 1e3, config.backward_ms / 1e3, messages, _spread(config))
+    cluster = Cluster(config.node_devices, NODE_LAUNCH_S, NODE_LINK, NODE_LINK)
+    return _rows_of(step, "given", cluster, config)
+
+
+def _spread(config: ScalingConfig) -> float:
+    # Scenes of a batch are drawn apart from each other; seconds are taken to grow with particles.
+    return config.particle_spread / config.scenes**0.5
+
+
+def _rows_of(step: Step, path: str, node: Cluster, config: ScalingConfig) -> list[dict[str, Any]]:
+    found = []
+    for name, link in NETWORKS.items():
+        cluster = replace(node, between=link)
+        found += [_model_row(path, name, update(step, gpus, cluster), cluster, config) for gpus in SIZES]
     return found
 
 
@@ -141,20 +175,8 @@ def table(rows: list[dict[str, Any]]) -> str:
             sent = f"{len(row['messages'])}, up to {max(row['messages']) / 1e6:.1f} MB" if row["averaged"] else "none"
             times = ("-", "-") if row["ms"] is None else (f"{row['ms']:.2f}", _range(row["ms_quartiles"]))
             share = "-" if row["efficiency"] is None else f"{row['efficiency']:.3f}"
-            lines.append(
-                _line(
-                    (
-                        row["path"],
-                        row["devices"],
-                        row["scenes"],
-                        row["particle_spread"],
-                        sent,
-                        *times,
-                        share,
-                        row["check"],
-                    )
-                )
-            )
+            work = (row[key] for key in ("path", "precision", "devices", "scenes", "particle_spread"))
+            lines.append(_line((*work, sent, *times, share, row["check"])))
     if any(row["case"] == "all_reduce" for row in rows):
         lines += ["", "| devices | bytes | all-reduce, ms | quartiles | model, ms |", "| --: | --: | --: | --: | --: |"]
     for row in rows:
