@@ -32,6 +32,7 @@ from tools.stability.row import Row, table
 from tools.trial import FrameClock, Trial, network_trials
 
 PART = "network"
+FAR_DOMAINS = 100.0  # how far the guard's case throws particles
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -117,10 +118,12 @@ def energy_growth(trial: Trial, scene: InitialState, frame_rate_hz: float) -> fl
 
 
 def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
-    """A network with a weight that is not finite: the runtime must stop at the first frame."""
+    """A network with a weight that explodes: the runtime must stop at the first frame."""
     broken = copy.deepcopy(simulator.network)
     with torch.no_grad():
-        dict(broken.named_parameters())["decode.second.bias"][0] = math.nan
+        # Not NaN: paths that are compared with each other before they run could not agree on that.
+        thrown = FAR_DOMAINS * max(config.scene.domain_size) / broken.normaliser.acceleration_std[0]
+        dict(broken.named_parameters())["decode.second.bias"][0] = thrown
     only = StabilityNetworkConfig(config.weights, cases=("single",), frames=4, scene=config.scene)
     scenes: Sequence[InitialState] = [
         InitialState.of_scene(scene) for case in cases(only, broken.config) for scene in case.scenes
@@ -131,7 +134,7 @@ def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
     beyond = next((trial.cause for trial in trials if trial.cause is not None), "the runtime did not say so")
     frames = max(trial.frame_count for trial in trials)
     guard = {"guard": "raised" if caught else "missed"}
-    return Row("a weight that is not finite", predicted=1, measured=frames, held=caught, beyond=beyond, more=guard)
+    return Row("a weight that explodes", predicted=1, measured=frames, held=caught, beyond=beyond, more=guard)
 
 
 if __name__ == "__main__":
