@@ -10,7 +10,7 @@ import sys
 
 from hgn.command import EXIT_INPUT, run_command
 
-PARTS = ("network",)
+PARTS = ("network", "solver")
 
 
 def run() -> None:

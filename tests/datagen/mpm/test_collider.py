@@ -1,19 +1,28 @@
 """Mesh obstacles: contact nodes of sheets and bodies, odd meshes, and nothing leaks."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from datagen.mpm.collider import BOTH_SIDES, build_collider
 from datagen.mpm.solver import Simulated, simulate
 from hgn.config import MpmConfig
-from hgn.scene.distance import closest_points
+from hgn.scene.distance import closest_points, contains
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError
 
 CELL = 1 / 16
 QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 CONFIG = MpmConfig(device="cpu")
+
+NO_NODES = {
+    "node_K3": np.zeros((0, 3), np.int32),
+    "normal_K3": np.zeros((0, 3), np.float32),
+    "kind_K": np.zeros(0, np.uint8),
+}
 
 
 def sheet(y: float, low: float = -0.2, high: float = 1.2) -> Obstacle:
@@ -177,3 +186,22 @@ def test_friction_brakes() -> None:
         moved.append((outcome.position_TN3[-1] - outcome.position_TN3[0])[:, 0].mean())
     assert moved[0] == pytest.approx(2 * 9 / 60, rel=0.05)
     assert moved[1] < 0.95 * moved[0]
+
+
+def test_swept_test_alone_holds() -> None:
+    """Without contact at the nodes particles pass a sheet and a cone; the swept test lets none pass, and counts."""
+    cone = shape_obstacle("cone", 0.5, (0.5, 0.4, 0.5))
+    scenes = [dropped(material, 0.68, 6, body) for material in range(3) for body in (sheet(5.3 * CELL), cone)]
+    for projection in (False, True):
+        config = MpmConfig(device="cpu", collider_band_cells=0.0, collider_projection=projection)
+        colliders = [dataclasses.replace(build_collider(scene, 0.0), **NO_NODES) for scene in scenes]
+        passed, counted = [], []
+        for scene, outcome in zip(scenes, simulate(scenes, config, 13, 60.0, colliders=colliders), strict=True):
+            assert isinstance(outcome, Simulated), outcome
+            counted.append(outcome.counters["surface_projections"])
+            path = outcome.position_TN3.reshape(-1, 3)
+            passed.append(contains(path, cone).sum() if scene.obstacles[0].closed else (path[:, 1] < 5.3 * CELL).sum())
+        if projection:
+            assert passed == [0] * len(scenes) and min(counted) > 0
+        else:
+            assert min(passed) > 0 and counted == [0] * len(scenes)

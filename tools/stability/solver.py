@@ -1,0 +1,91 @@
+"""python -m tools.stability solver [--json FILE] [picture=FILE]: what the solver bears, up to where, and beyond.
+
+Rows: the largest stable step against the formula, stiffness, speed of impact, convergence of the default step, leaks
+through obstacles, a long run. They run at the default cell size on a GPU or a CPU; minutes on the one, an hour on
+the other unless the table of leaks is cut short.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hgn.config import MpmConfig
+from hgn.files import write_atomically
+from hgn.progress import bar
+from hgn.provenance import provenance
+from hgn.schema import from_mapping, require, require_one_of, require_positive, to_mapping
+from tools.stability.row import Row, table
+from tools.stability.solver_leak import leaks
+from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
+from tools.stability.solver_steps import Point, draw, largest_steps
+
+PART = "solver"
+CASES = ("steps", "stiffness", "impact", "convergence", "leak", "long")
+
+
+@dataclass(frozen=True)
+class StabilitySolverConfig:
+    """`python -m tools.stability solver`: what is tried."""
+
+    cases: tuple[str, ...] | None = None
+    device: str = "auto"
+    leak_seconds: float = 5.0
+    leak_block_cells: float = 4.0
+    picture: str | None = None
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "leak_seconds", "leak_block_cells")
+        require_one_of(self, "device", ("auto", "cpu", "gpu"))
+        for i, name in enumerate(self.cases or ()):
+            require(name in CASES, f"cases[{i}]", f"one of {', '.join(CASES)}", name)
+        drawn = self.picture is None or self.cases is None or "steps" in self.cases
+        require(drawn, "picture", "left out without the case steps", self.picture)
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table, and writes JSON and the picture where asked to; what does not hold is a finding: exit code 0."""
+    config = from_mapping(StabilitySolverConfig, mapping)
+    mpm = MpmConfig(device=config.device)
+    points: list[Point] = []
+    parts: dict[str, Callable[[], list[Row]]] = {
+        "steps": lambda: _steps(mpm, points),
+        "stiffness": lambda: stiffnesses(mpm),
+        "impact": lambda: impacts(mpm),
+        "convergence": lambda: convergence(mpm),
+        "leak": lambda: leaks(mpm, config.leak_seconds, config.leak_block_cells),
+        "long": lambda: long_run(mpm),
+    }
+    rows: list[Row] = []
+    wanted = [name for name in CASES if name in (config.cases or CASES)]
+    with bar("cases", total=len(wanted), unit="case") as progress:
+        for name in wanted:
+            rows += parts[name]()
+            progress.update()
+    print(table(rows))
+    if config.json is not None:
+        meta = provenance(_torch_device(config.device)) | {"config": to_mapping(config), "solver": to_mapping(mpm)}
+        steps = [point.mapping() for point in points]
+        report = {"meta": meta, "rows": [row.mapping(PART) for row in rows], "steps": steps}
+        file = Path(config.json)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
+    if config.picture is not None:
+        draw(points, mpm, Path(config.picture))
+    return 0
+
+
+def _steps(mpm: MpmConfig, points: list[Point]) -> list[Row]:
+    rows, found = largest_steps(mpm)
+    points += found
+    return rows
+
+
+def _torch_device(device: str) -> str:
+    from datagen.mpm.device import initialise
+
+    return "cuda" if initialise(device).kind == "gpu" else "cpu"
