@@ -94,7 +94,7 @@ def _fit(
     seed_everything(training.seed, verbose=False)
     module = TrainingModule(build_network(config.network), training, data, path)
     module.set_statistics(store.statistics())
-    feed = Feed(store, config.network, training, chunks=path == "fast")
+    feed = Feed(store, config.network, training, chunks=path == "fast", interrupted=lambda: stop.requested)
     if checkpoint is not None:
         feed.cursor = checkpoint[1]
     _write_run_files(config, run)

@@ -35,6 +35,7 @@ _AWAY_S = 10.0
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
+_without_patience = threading.Event()
 # (path, size, modification time, sha256) of the files that this process has verified
 _verified: set[tuple[str, int, int, str]] = set()
 
@@ -77,6 +78,16 @@ def open_storage(folder: Path | str) -> Storage:
 def write_remote(url: str, name: str, source: Path | bytes) -> None:
     """Writes a file, or bytes, to a data set's URL. Raises: ConfigError when that cannot be; UnreachableError."""
     _remote(url.rstrip("/")).write(name, source)
+
+
+@contextlib.contextmanager
+def without_patience() -> Iterator[None]:
+    """While it is entered no thread of this process waits for a server that does not answer: nobody needs it now."""
+    _without_patience.set()
+    try:
+        yield
+    finally:
+        _without_patience.clear()
 
 
 def dataset_token() -> str | None:
@@ -286,13 +297,13 @@ class _Remote:
                 cause = _transient(error, f"{self._url}/{name}")
                 if cause is None:
                     raise
-                if time.monotonic() - begin + pause > patience_s:
+                if time.monotonic() - begin + pause > patience_s or _without_patience.is_set():
                     raise UnreachableError(f"{self._url}/{name}", patience_s, cause) from error
                 if not said and pause > 1:
                     said = True
                     print(f"{self._url} does not answer ({cause}); trying for {patience_s:.0f} s", file=sys.stderr)
                 # no two readers come back at the same moment
-                time.sleep(pause * random.uniform(0.5, 1.0))
+                _without_patience.wait(pause * random.uniform(0.5, 1.0))
                 pause = min(2 * pause, _LONGEST_PAUSE_S)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
 import torch
@@ -17,11 +17,13 @@ from hgn.data.batch import Batch, make_batch
 from hgn.data.chunk import Chunk, whole_episode
 from hgn.data.order import Cursor, Sample, SampleOrder
 from hgn.data.reader import EpisodeStore
+from hgn.data.storage import without_patience
 from hgn.schema import ConfigError
 
 T = TypeVar("T")
 SHARED_FOLDER_PATIENCE_S = 300.0
 BATCHES_AHEAD = 2
+LOOK_S = 1.0  # between looks for a signal while there is no batch
 UPDATES_AT_ONCE = 64  # in a chunk, at most
 
 
@@ -35,8 +37,9 @@ class Feed(LightningDataModule):
         training: TrainingConfig,
         batches_ahead: int = BATCHES_AHEAD,
         chunks: bool = False,
+        interrupted: Callable[[], bool] = lambda: False,
     ) -> None:
-        """With `chunks` it hands out Chunk instead of Batch."""
+        """With `chunks` it hands out Chunk instead of Batch. Once `interrupted`, it ends instead of waiting long."""
         super().__init__()
         assert batches_ahead >= 0
         self.store = store
@@ -44,6 +47,7 @@ class Feed(LightningDataModule):
         self.training = training
         self.batches_ahead = batches_ahead  # read while another is trained on; 0: read when asked for
         self.hands_out_chunks = chunks
+        self.interrupted = interrupted
         self.cursor = Cursor()  # where to begin; set from the checkpoint on a resume
         self.waited_s = 0.0  # time that the training has waited for a batch
 
@@ -94,15 +98,33 @@ class Feed(LightningDataModule):
 
     def _ahead(self, draw: Callable[[], tuple[Any, Cursor]], read: Callable[[Any, Cursor], T]) -> Iterator[T]:
         # The order may have to ask other ranks, so it stays in this thread; reading runs ahead in another.
-        with ThreadPoolExecutor(1) as executor:
+        executor = ThreadPoolExecutor(1)
+        try:
             waiting: deque[Future[T]] = deque()
             while True:
                 started = time.monotonic()
                 while len(waiting) <= self.batches_ahead:
                     waiting.append(executor.submit(read, *draw()))
-                item = waiting.popleft().result()
+                item = waiting.popleft()
+                while not wait([item], timeout=LOOK_S).done:
+                    if self._ends():
+                        return
                 self.waited_s += time.monotonic() - started
-                yield item
+                yield item.result()
+        finally:
+            with without_patience():
+                executor.shutdown(cancel_futures=True)
+
+    def _ends(self) -> bool:
+        """Whether the training ends here for want of data. Alone: other ranks would wait for this one's gradients."""
+        trainer = self.trainer
+        if trainer is None:
+            return self.interrupted()
+        # Lightning's own handler is in place until the first update begins
+        if trainer.world_size > 1 or not (self.interrupted() or trainer.received_sigterm):
+            return False
+        trainer.should_stop = True
+        return True
 
     def _published(self, epoch: int) -> list[int]:
         """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""

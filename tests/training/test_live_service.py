@@ -12,16 +12,19 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import fsspec
 import pytest
 from training.runs import metrics, train_mapping
 
 import hgn.data.storage
+import hgn.training.feed
 from datagen.plan import scene_seed
 from hgn import train
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import CACHE_VARIABLE, TOKEN_VARIABLE
+from hgn.scene.episode import Episode
 from hgn.training.checkpoint import read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -118,6 +121,51 @@ def test_service_restarted_midway(
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] >= lines[-1]["update"]
     cached = {path.stem for path in (tmp_path / "cache" / "shards").glob("*.tar")}
     assert cached >= {shard.sha256 for shard in EpisodeStore(service.folder, "train").manifest.shards_of("train")}
+
+
+def test_stopped_while_its_service_is_away(
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """SIGTERM that finds a training waiting for a server that is gone ends it at once, after a checkpoint of all that
+    was trained on; the same command goes on there."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(hgn.training.feed, "LOOK_S", 0.05)
+    make_dataset(make_config())
+    files = fsspec.filesystem("memory")
+    for path in (tmp_path / "data").glob("*.*"):
+        files.pipe(f"/leaving/{path.name}", path.read_bytes())
+    real, opened, asked = EpisodeStore._open, [], []
+
+    def gone(*arguments: object, **options: object) -> bytes:
+        asked.append(1)
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise ConnectionResetError("gone")
+
+    def open_episode(store: EpisodeStore, index: int) -> Episode:
+        opened.append(index)
+        if len(opened) == 12:
+            files.cat_file = gone
+            store._opened.clear()
+            store._maps.clear()
+            for shard in (tmp_path / "cache").rglob("*.tar"):
+                shard.unlink()
+        return real(store, index)
+
+    config = make_config(folder="memory://leaving")
+    monkeypatch.setattr(EpisodeStore, "fetch_ahead", lambda store: None)
+    monkeypatch.setattr(EpisodeStore, "_open", open_episode)
+    try:
+        assert train.main(train_mapping(config, tmp_path / "run", monitor_every=100)) == 128 + signal.SIGTERM
+    finally:
+        files.__dict__.pop("cat_file", None)
+    monkeypatch.undo()
+    stopped = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["hgn"]["updates"]
+    assert asked and 0 < stopped <= 5  # of 2 samples each
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    assert train.main(train_mapping(config, tmp_path / "run", monitor_every=100)) == 0
 
 
 def updates(run: Path) -> int:
