@@ -85,6 +85,18 @@ class EpisodeStore:
             self._append(shard)
         return len(now) > len(known)
 
+    def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
+        """Whether these episodes can be read without waiting longer for a server; their shards are brought here.
+
+        Raises: ConfigError when a shard is missing or altered.
+        """
+        for shard in {shard.name: shard for shard, _ in (self._located[index] for index in indices)}.values():
+            try:
+                open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, patience_s)
+            except UnreachableError:
+                return False
+        return True
+
     def fetch_ahead(self) -> None:
         """Begins to bring the shards known by now to this machine, one after the other, beside their use.
 

@@ -10,11 +10,15 @@ from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 
 
-def first_episodes(store: EpisodeStore, count: int, known: int | None = None) -> list[Episode]:
-    """The episodes of lowest index among the first `known` published (all of them if absent)."""
+def first_indices(store: EpisodeStore, count: int, known: int | None = None) -> list[int]:
+    """Where in the store the episodes of lowest index among the first `known` published (all of them if absent) are."""
     entries = store.entries[:known]
-    ranked = sorted(range(len(entries)), key=lambda i: entries[i].index)
-    return [store.episodes[i] for i in ranked[:count]]
+    return sorted(range(len(entries)), key=lambda i: entries[i].index)[:count]
+
+
+def first_episodes(store: EpisodeStore, count: int, known: int | None = None) -> list[Episode]:
+    """These episodes."""
+    return [store.episodes[i] for i in first_indices(store, count, known)]
 
 
 def find_episode(folder: Path | str, key: str) -> Episode:

@@ -55,7 +55,7 @@ class Storage(Protocol):
         """The manifest's bytes. Raises: FileNotFoundError; UnreachableError; ConfigError (no access)."""
         ...
 
-    def shard(self, name: str, sha256: str, size: int) -> Path:
+    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
         """The path of a shard on this machine, verified. Raises: ConfigError; UnreachableError; OSError."""
         ...
 
@@ -142,7 +142,7 @@ class _Folder:
     def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
         return (self._folder / name).read_bytes()
 
-    def shard(self, name: str, sha256: str, size: int) -> Path:
+    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
         path = self._folder / name
         try:
             verify_file(path, sha256, size, "delete it and run the generator again")
@@ -183,30 +183,23 @@ class _Remote:
 
     def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
         with self._lock:
-            if not patience_s and time.monotonic() < self._away[0]:
-                raise UnreachableError(f"{self._url}/{name}", patience_s, self._away[1])
+            self._require_not_away(name, patience_s)
             options: dict[str, Any] = {}
             if self._http and self._known is not None:
                 options["headers"] = {"If-None-Match": self._known[1]}
-            try:
-                content = self._patiently(name, patience_s, lambda path: self._files.cat_file(path, **options))
-            except UnreachableError as error:
-                # a machine that is switched off costs _CONNECT_S at each asking
-                self._away = time.monotonic() + _AWAY_S, error.cause
-                raise
-            self._away = 0.0, ""
+            content = self._patiently(name, patience_s, lambda path: self._files.cat_file(path, **options))
             if not content and self._known is not None:  # not modified
                 return self._known[0]
             self._known = content, f'"{hashlib.sha256(content).hexdigest()}"'
             return content
 
-    def shard(self, name: str, sha256: str, size: int) -> Path:
+    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
         path = cache_folder() / f"{sha256}.tar"
         remedy = "it is fetched again"
         for again in (True, False):
             if not path.exists():
                 try:
-                    self._fetch(name, sha256, size, path)
+                    self._fetch(name, sha256, size, path, patience_s)
                 except FileNotFoundError:
                     raise ConfigError(
                         f"{self._url}/{name} is listed in the manifest but missing; run the generator again"
@@ -242,16 +235,17 @@ class _Remote:
         if found != expected:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {found}; copy it again")
 
-    def _fetch(self, name: str, sha256: str, size: int, path: Path) -> None:
+    def _fetch(self, name: str, sha256: str, size: int, path: Path, patience_s: float) -> None:
+        self._require_not_away(name, patience_s)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _owned(path) as file:
+        with _owned(path, f"{self._url}/{name}", patience_s) as file:
             if file is None:
                 return
             # what a process that ended had fetched is gone on with, unless the disk did not keep it
             for resume in (True, False):
                 if not resume:
                     file.truncate(0)
-                if self._fill(file, name, size) == sha256:
+                if self._fill(file, name, size, patience_s) == sha256:
                     break
             else:
                 raise ConfigError(
@@ -263,7 +257,7 @@ class _Remote:
         status = path.stat()
         _verified.add((str(path.resolve()), status.st_size, status.st_mtime_ns, sha256))
 
-    def _fill(self, file: io.BufferedRandom, name: str, size: int) -> str:
+    def _fill(self, file: io.BufferedRandom, name: str, size: int, patience_s: float) -> str:
         """Appends what is missing and returns the sha256 of the whole."""
         if os.fstat(file.fileno()).st_size > size:
             file.truncate(0)
@@ -272,7 +266,7 @@ class _Remote:
         have = file.seek(0, os.SEEK_END)
         while have < size:
             stop = min(have + _CHUNK_BYTES, size)
-            data = self._patiently(name, PATIENCE_S, _read_range(self._files, have, stop))
+            data = self._patiently(name, patience_s, _read_range(self._files, have, stop))
             if len(data) == size > stop - have:  # from a server without ranges
                 data = data[have:]
             elif len(data) != stop - have:
@@ -285,12 +279,18 @@ class _Remote:
         file.flush()
         return digest.hexdigest()
 
+    def _require_not_away(self, name: str, patience_s: float) -> None:
+        if not patience_s and time.monotonic() < self._away[0]:
+            raise UnreachableError(f"{self._url}/{name}", patience_s, self._away[1])
+
     def _patiently(self, name: str, patience_s: float, read: Callable[[str], T]) -> T:
         """Reads, again and again while the server is away. Raises: as `Storage.manifest`."""
         begin, pause, said = time.monotonic(), _FIRST_PAUSE_S, False
         while True:
             try:
-                return read(f"{self._root}/{name}")
+                found = read(f"{self._root}/{name}")
+                self._away = 0.0, ""
+                return found
             except FileNotFoundError:
                 raise
             except Exception as error:
@@ -298,6 +298,8 @@ class _Remote:
                 if cause is None:
                     raise
                 if time.monotonic() - begin + pause > patience_s or _without_patience.is_set():
+                    # a machine that is switched off costs _CONNECT_S at each asking
+                    self._away = time.monotonic() + _AWAY_S, cause
                     raise UnreachableError(f"{self._url}/{name}", patience_s, cause) from error
                 if not said and pause > 1:
                     said = True
@@ -334,15 +336,19 @@ def _transient(error: Exception, url: str) -> str | None:
 
 
 @contextlib.contextmanager
-def _owned(path: Path) -> Iterator[io.BufferedRandom | None]:
+def _owned(path: Path, url: str, patience_s: float) -> Iterator[io.BufferedRandom | None]:
     """The partial file of `path`, for this process alone and with what others had written; none when `path` is there.
 
     The kernel frees a process's hold when it ends, so the next one goes on.
+    Raises: UnreachableError when another one has it and there is no patience to wait.
     """
     partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
     while True:
         with partial.open("a+b") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if patience_s else fcntl.LOCK_NB))
+            except BlockingIOError:
+                raise UnreachableError(url, patience_s, "it is being fetched") from None
             if not _is_same(file, partial):
                 continue  # whoever had it before has given it its name
             if path.exists():

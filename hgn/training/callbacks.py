@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from tqdm import tqdm
 
 from hgn.data.reader import EpisodeStore
-from hgn.data.select import first_episodes
+from hgn.data.select import first_indices
+from hgn.data.storage import PATIENCE_S
 from hgn.files import TEMPORARY_SUFFIX, sync_folder, temporary_path
 from hgn.picture import rollout_of_episode
 from hgn.progress import bar
@@ -107,10 +109,13 @@ class Monitor(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, TrainingModule)
         if not self._interrupted(trainer):
-            self.measure(trainer, pl_module)
+            self.measure(trainer, pl_module, PATIENCE_S)
 
-    def measure(self, trainer: Trainer, module: TrainingModule) -> None:
-        """All ranks share the one-step frames; rank 0 does the rollouts. Ends early on a stop request."""
+    def measure(self, trainer: Trainer, module: TrainingModule, patience_s: float = 0.0) -> None:
+        """All ranks share the one-step frames; rank 0 does the rollouts. Ends early on a stop request.
+
+        Where a server has scenes that are not here yet and does not answer, measures nothing and says so.
+        """
         if self._measured_update == trainer.global_step:
             return
         self._measured_update = trainer.global_step
@@ -118,10 +123,18 @@ class Monitor(Callback):
         network.eval()
         started = time.monotonic()
         self.stores["validation"].refresh()
-        scenes = {
-            split: first_episodes(store, config.monitor_scenes, agreed_count(store, trainer))
+        chosen = {
+            split: first_indices(store, config.monitor_scenes, agreed_count(store, trainer))
             for split, store in self.stores.items()
         }
+        here = all(store.within_reach(chosen[split], patience_s) for split, store in self.stores.items())
+        if not trainer.strategy.reduce_boolean_decision(here, all=True):
+            network.train()
+            if trainer.is_global_zero:
+                text = "the scenes to measure on are not all here, and their server does not send them now"
+                print(f"nothing is measured at update {trainer.global_step}: {text}", file=sys.stderr)
+            return
+        scenes = {split: [store.episodes[i] for i in chosen[split]] for split, store in self.stores.items()}
         values: dict[str, float] = {}
         for split, episodes in scenes.items():
             if not episodes or self._interrupted(trainer):

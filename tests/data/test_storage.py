@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import fcntl
 import functools
 import http.server
 import json
@@ -320,6 +321,21 @@ def test_server_that_is_away_is_not_asked_at_once_again(
     files = open_storage(url)._files  # type: ignore[attr-defined]
     monkeypatch.setattr(files, "cat_file", lambda *a, **k: pytest.fail("it was asked"))
     assert not store.refresh() and same_episodes(store.of_split("validation"), EpisodeStore(folder, "validation"))
+
+
+def test_what_is_within_reach(folder: Path, serve: Callable[..., str], cache: Path) -> None:
+    """Who would rather go on than wait asks first: a server that is away, or a shard that another process is fetching,
+    is no; what is here, or comes at once, is yes."""
+    url = serve()
+    store = EpisodeStore(url, "train")
+    assert store.within_reach([0, 1], patience_s=0)
+    third = store.manifest.shards_of("train")[2]
+    with (cache / f".{third.sha256}.tar.partial").open("wb") as partial:
+        fcntl.flock(partial, fcntl.LOCK_EX)
+        assert not store.within_reach([2], patience_s=0)
+    serve.stop()  # type: ignore[attr-defined]
+    assert store.within_reach([0, 1], patience_s=0) and not store.within_reach([1, 4], patience_s=0)
+    assert EpisodeStore(folder, "train").within_reach(range(5), patience_s=0)
 
 
 def test_full_disk(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
