@@ -39,7 +39,9 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(EvaluateConfig, mapping)
     device = choose_device(config.device)
     network, info = load_weights(Path(config.weights), device)
-    path, text = choose_path("path", config.path, config.precision, why_not_fast(device, network.config))
+    path, text = choose_path(
+        "path", config.path, config.precision, why_not_fast(device, network.config, config.precision)
+    )
     torch.set_float32_matmul_precision("highest" if config.precision == "highest" else "high")
     store = EpisodeStore(config.data, config.split)
     if not len(store):

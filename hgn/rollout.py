@@ -56,7 +56,9 @@ def rollout(config: RolloutConfig) -> Path:
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": config.episode}
     _require_cell_size(info, cell_size)
-    chosen, text = choose_path("path", config.path, config.precision, why_not_fast(device, network.config))
+    chosen, text = choose_path(
+        "path", config.path, config.precision, why_not_fast(device, network.config, config.precision)
+    )
     print(text, file=sys.stderr)
     torch.set_float32_matmul_precision("highest" if config.precision == "highest" else "high")
     simulator = Simulator(network, info.frame_rate_hz, chosen, config.precision)

@@ -131,7 +131,7 @@ def _path(config: TrainConfig) -> tuple[str, str]:
     """`plain` or `fast`, and a line that says so."""
     training = config.training
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
-    reason = why_not_fast(torch.device("cuda" if on_gpu else "cpu"), config.network)
+    reason = why_not_fast(torch.device("cuda" if on_gpu else "cpu"), config.network, training.precision)
     return choose_path("training.path", training.path, training.precision, reason)
 
 

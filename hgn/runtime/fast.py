@@ -21,10 +21,13 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import kernel_precision
+from hgn.schema import ConfigError
 
 LOOK_FRAMES = 32
 MARGIN_CELLS = 4
 GROWTH = 2.0
+OUTPUT_BOUND = 0.05  # relative error of the norm
+CHECKED_PARTICLES = 50_000  # at most; the plain network needs memory
 INTEGRATE_BLOCK = 256
 
 
@@ -115,6 +118,23 @@ class FastRollout:
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             self.frame_launches()
         return graph
+
+    def require_agreement(self, network: HierarchicalGraphNetwork, state: ParticleState) -> None:
+        """Compares the first output with the plain network's, as `state` and all kernels still stand at the start.
+
+        Both round; kernels that are wrong differ by far more. Raises: ConfigError.
+        """
+        if self.graph is None:
+            self._network_pass()
+        found_N3 = self.engine.output[:, :3]
+        with torch.no_grad():
+            expected_N3 = network.normalised_acceleration(state)
+        error, size = float((found_N3 - expected_N3).norm()), float(expected_N3.norm())
+        if not error <= OUTPUT_BOUND * size:  # NaN fails
+            raise ConfigError(
+                f"path must be plain on this machine, got fast: its output differs by {error / max(size, 1e-30):.1e} "
+                f"from the plain network's (at most {OUTPUT_BOUND}); set path=plain, and report device and versions"
+            )
 
     def frame_launches(self) -> None:
         """All launches of one frame: what the graph holds."""

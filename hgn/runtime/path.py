@@ -16,9 +16,10 @@ from hgn.schema import ConfigError
 KERNEL_PRECISION = {"highest": "tf32x3", "high": "tf32", "half": "half"}
 FAST_WIDTHS = (16, 32, 64, 128)
 FAST_LEVELS = 8
+HIGHEST_WIDTH = 64  # wider matrices in three parts each do not fit into an H100's shared memory
 
 
-def why_not_fast(device: torch.device, config: NetworkConfig) -> str | None:
+def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "high") -> str | None:
     """What keeps the fast path from running, in words; none if nothing does."""
     if config.kind != "hgn":
         return f"it computes hgn networks, not {config.kind}"
@@ -28,6 +29,8 @@ def why_not_fast(device: torch.device, config: NetworkConfig) -> str | None:
         return "it needs the package triton"
     if config.width not in FAST_WIDTHS:
         return f"network.width must be one of {', '.join(map(str, FAST_WIDTHS))} for it, not {config.width}"
+    if precision == "highest" and config.width > HIGHEST_WIDTH:
+        return f"with precision highest it computes widths up to {HIGHEST_WIDTH}, not {config.width}"
     if config.levels > FAST_LEVELS:
         return f"network.levels must be at most {FAST_LEVELS} for it, not {config.levels}"
     return None

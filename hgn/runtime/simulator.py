@@ -162,12 +162,15 @@ class Simulator:
 
     def _fast_rollout(self, state: ParticleState, frames: int, on_frame: Callable[[int], None] | None) -> np.ndarray:
         # Triton, which the plain path does without, is loaded here.
-        from hgn.runtime.fast import FastRollout, LeftDomainError
+        from hgn.runtime.fast import CHECKED_PARTICLES, FastRollout, LeftDomainError
 
         assert isinstance(self.network, HierarchicalGraphNetwork)
         first_1N3 = state.position_N3[None].cpu().numpy()
         try:
-            later_TN3 = FastRollout(self.network, state, self.precision).run(frames - 1, on_frame)
+            rollout = FastRollout(self.network, state, self.precision)
+            if len(state.position_N3) <= CHECKED_PARTICLES:
+                rollout.require_agreement(self.network, state)
+            later_TN3 = rollout.run(frames - 1, on_frame)
         except LeftDomainError as error:
             raise DivergenceError(error.frame, _left(error.lost, len(state.position_N3))) from None
         return np.concatenate([first_1N3, later_TN3])

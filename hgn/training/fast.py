@@ -16,6 +16,7 @@ from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import kernel_precision
+from hgn.training.agreement import require_agreement
 
 DATA_SHARE = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
 
@@ -43,14 +44,19 @@ class FastTraining:
         self.updates = Updates(network, settings, precision, loss_sum, counters, reduce, ranks)
         self._read_moments()
         self._episodes: dict[int, DeviceEpisode] = {}
+        self.agreement: tuple[float, float] | None = None  # with the plain network, see hgn.training.agreement
 
     def run(self, chunk: Chunk, rates: list[float]) -> None:
         """Makes an update for each entry of the chunk, at these learning rates.
 
-        Raises: ConfigError when positions are not finite.
+        Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong here.
         """
         for index, episode in chunk.episodes.items():
             self._episodes[index] = self._placed(episode)
+        if self.agreement is None:
+            first = chunk.samples[0]
+            self.updates.predict([(self._episodes[s.episode], s.frame, s.seed) for s in first])
+            self.agreement = require_agreement(self.updates, [chunk.episodes[s.episode] for s in first])
         self.updates.run([[(self._episodes[s.episode], s.frame, s.seed) for s in u] for u in chunk.samples], rates)
         self._write_back()
 

@@ -5,6 +5,8 @@ Shape legend: N particles of all scenes of a batch.
 
 from __future__ import annotations
 
+import math
+import sys
 from typing import Any
 
 import torch
@@ -91,7 +93,12 @@ class TrainingModule(LightningModule):
 
     def _train_chunk(self, chunk: Chunk) -> None:
         first, count = self.global_step, len(chunk.samples)
+        new = self._fast.agreement is None
         self._fast.run(chunk, [self._rate(first + k) for k in range(count)])
+        if new and self.trainer.is_global_zero:
+            outputs, gradients = self._fast.agreement
+            text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"
+            print(f"fast path: {text if math.isfinite(outputs) else 'batch too large to check'}", file=sys.stderr)
         self.cursor = chunk.cursor
         # what an optimiser's and a scheduler's step leave behind, `count` times
         progress = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress

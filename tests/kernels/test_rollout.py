@@ -11,6 +11,7 @@ from network.states import network_of, random_grid
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.fast import FastRollout
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.schema import ConfigError
 
 GRAVITY = (0.0, -9.8, 0.0)
 
@@ -27,16 +28,16 @@ def scene(particles: int, seed: int = 0) -> InitialState:
     )
 
 
-def network() -> HierarchicalGraphNetwork:
-    return network_of(torch.float32, width=16, levels=2, message_passing_steps=1).to(device())
+def network(levels: int = 1) -> HierarchicalGraphNetwork:
+    return network_of(torch.float32, width=16, levels=levels, message_passing_steps=1).to(device())
 
 
 def test_frames_are_those_of_the_plain_loop() -> None:
     """Two scenes at once move as in the plain simulator, frame by frame, and each frame is announced once."""
     scenes, seen = [scene(5), scene(3, 1)], []
-    expected = Simulator(network(), 60.0).rollout(scenes, 4)
-    found = Simulator(network(), 60.0, "fast", "highest").rollout(scenes, 4, seen.append)
-    assert seen == [1, 2, 3]
+    expected = Simulator(network(2), 60.0).rollout(scenes, 3)
+    found = Simulator(network(2), 60.0, "fast", "highest").rollout(scenes, 3, seen.append)
+    assert seen == [1, 2]
     for path_TN3, expected_TN3 in zip(found, expected, strict=True):
         assert path_TN3.shape == expected_TN3.shape and path_TN3.dtype == np.float32
         np.testing.assert_allclose(path_TN3, expected_TN3, rtol=0, atol=1e-6)
@@ -48,8 +49,8 @@ def test_overflow_loses_nothing() -> None:
     with torch.no_grad():
         spreading.normaliser.acceleration_std.fill_(0.03)
     state = Simulator(spreading, 60.0).start([scene(5)])
-    roomy = FastRollout(spreading, state, "highest", (64, 64))
-    tight = FastRollout(spreading, state, "highest", (16, 16))
+    roomy = FastRollout(spreading, state, "highest", (64,))
+    tight = FastRollout(spreading, state, "highest", (16,))
     expected = roomy.run(3)
     found = np.concatenate([tight.run(1), tight.run(2)])
     assert tight.growths > 0 and roomy.growths == 0
@@ -68,3 +69,16 @@ def test_divergence_names_the_frame() -> None:
             Simulator(wild, 60.0, path).rollout([scene(4)], 4)
         messages.append(str(caught.value))
     assert messages[0] == messages[1] and "4 of 4 particles" in messages[0]
+
+
+def test_wrong_kernels_are_refused() -> None:
+    """A rollout whose first output is not the plain network's is refused before it moves anything."""
+    plain = network()
+    state = Simulator(plain, 60.0).start([scene(5)])
+    rollout = FastRollout(plain, state, "highest")
+    rollout.require_agreement(plain, state)
+    other = network()
+    with torch.no_grad():
+        next(other.decode.parameters()).mul_(1.5)
+    with pytest.raises(ConfigError, match="path must be plain on this machine"):
+        rollout.require_agreement(other, state)

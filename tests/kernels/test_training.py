@@ -50,7 +50,7 @@ def test_fast_training_is_the_plain_one(
     """Without noise and jitter both paths make the same updates: every count and log line is there, weights and
     moments agree; a training may change path at any checkpoint, and ends where the others do."""
     if device().type == "cpu":
-        monkeypatch.setattr(train, "why_not_fast", lambda device, config: None)  # kernels run in the interpreter
+        monkeypatch.setattr(train, "why_not_fast", lambda *_: None)  # kernels run in the interpreter
     same = {"noise_std": 0.0, "grid_jitter": False}
     ends = {}
     for name, parts in {
@@ -145,4 +145,5 @@ def test_why_the_fast_path_does_not_run() -> None:
     assert "not cpu" in str(why_not_fast(torch.device("cpu"), hgn))
     assert "not gns" in str(why_not_fast(gpu, NetworkConfig(kind="gns", levels=1)))
     assert "not 48" in str(why_not_fast(gpu, NetworkConfig(width=48)))
+    assert "widths up to 64, not 128" in str(why_not_fast(gpu, hgn, "highest"))
     assert "at most 8" in str(why_not_fast(gpu, NetworkConfig(levels=9)))

@@ -9,11 +9,14 @@ import torch
 from kernels.engines import device
 from network.states import network_of, random_grid
 
+from hgn.data.chunk import WholeEpisode
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
 from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
+from hgn.schema import ConfigError
+from hgn.training.agreement import require_agreement
 
 HISTORY = 5
 CELL_SIZE = 1 / 64
@@ -144,3 +147,26 @@ def test_noise_and_jitter() -> None:
     wanted = (window[-1] - window[-2]) - first["velocity_NV"][:400, :3]
     expected = network.float().normaliser.normalise_acceleration(wanted)
     torch.testing.assert_close(first["target_N3"][:400], expected, rtol=0, atol=1e-3)
+
+
+def test_wrong_kernels_are_refused() -> None:
+    """Before the first update outputs and gradients are compared with the plain network's on the noisy, jittered batch:
+    they agree to rounding, and kernels that compute another network are refused with the remedy."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
+    made, grids = episode(1, 5, True)
+    still, _ = episode(2, 3, False)
+    updates = updates_of(network, 2, (64,), noise_std=1e-3, grid_jitter=True)
+    none = torch.zeros(0, 3)
+    cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
+    episodes = [
+        WholeEpisode(each.position_TN3, each.material_N, *obstacles, each.domain_size)
+        for each, obstacles in ((made, cells), (still, (none.int(), none)))
+    ]
+    samples = [(made, 1, 3), (still, 0, 4)]
+    updates.predict(samples)
+    assert max(require_agreement(updates, episodes)) < 1e-3
+    updates.values.mul_(1.3)
+    updates.engine.refresh()
+    updates.predict(samples)
+    with pytest.raises(ConfigError, match=r"training.path must be plain on this machine.*set training.path=plain"):
+        require_agreement(updates, episodes)

@@ -24,7 +24,7 @@ from hgn.provenance import provenance
 from hgn.runtime.path import why_not_fast
 from hgn.schema import from_mapping, to_mapping
 from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, Train, checked_workload
-from tools.bench.fast import FastFrame, FastTrain
+from tools.bench.fast import PATH_PRECISION, FastFrame, FastTrain
 from tools.bench.public_gns import PublicFrame, PublicTrain
 from tools.bench.states import TILE_PARTICLES, Workload
 from tools.bench.timing import Timed, alternate
@@ -163,14 +163,14 @@ def _maker(
     frame = case.endswith("frame")
     if config.public_gns is not None and case in PUBLIC_GNS_CASES:
         return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
-    if case in ("frame", "train") and why_not_fast(device, config.network) is None:
+    if case in ("frame", "train") and why_not_fast(device, config.network, PATH_PRECISION[precision]) is None:
         return functools.partial(FastFrame if frame else FastTrain, precision), "fast"
     return Frame if frame else Train, None if "gns" in case else "plain"
 
 
 def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tuple[str, ...]) -> list[str]:
     """Those of `cases` that are asked for and mean something; half precision is the fast path's alone."""
-    fast = why_not_fast(device, config.network) is None
+    fast = why_not_fast(device, config.network, PATH_PRECISION[precision]) is None
     wanted = config.cases or tuple(
         case
         for case in BENCH_CASES

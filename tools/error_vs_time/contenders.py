@@ -59,7 +59,7 @@ class NetworkContender:
         require_frame_rate(info, frame_rate_hz)
         config = info.network
         self.device, self.precision = device, PRECISIONS[precision]
-        self.path, _ = choose_path("path", path, self.precision, why_not_fast(device, config))
+        self.path, _ = choose_path("path", path, self.precision, why_not_fast(device, config, self.precision))
         with self.matmul():
             self.simulator = Simulator(self.network, info.frame_rate_hz, self.path, self.precision)
         self.row: dict[str, Any] = {

@@ -227,7 +227,7 @@ def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -
     chosen = averaging_options()["bucket_cap_mb"]
     found = []
     for path in config.paths:
-        if path == "fast" and why_not_fast(device, config.network):
+        if path == "fast" and why_not_fast(device, config.network, config.precision):
             continue
         sent = list(dict.fromkeys([chosen, *config.message_mb])) if path == "plain" else [None]
         for size in sizes:

@@ -111,11 +111,7 @@ class Updates:
 
         Raises: ConfigError when positions are not finite.
         """
-        assert len(chunk) == len(rates)
-        particles = self._upload(chunk, rates)
-        if particles > self.particles or not self._inside(self._reach):
-            self.particles = max(self.particles, 16 * math.ceil(particles / 16))
-            self._build()
+        self._prepare(chunk, rates)
         done = 0
         while True:
             for _ in range(len(chunk) - done):
@@ -124,6 +120,26 @@ class Updates:
             if done == len(chunk):
                 return
             self._make_room(status, needed)
+
+    def predict(self, samples: Sequence[tuple[DeviceEpisode, int, int]]) -> None:
+        """Assembles the batch of one update and leaves the network's output of it in `engine.output`."""
+        self._prepare([samples], [0.0])
+        while True:
+            self._assemble()
+            self._grid()
+            self.engine.forward()
+            status, *needed = torch.cat([self.grid.status, self.grid.needed_L]).tolist()
+            if status == 0:
+                return
+            self._make_room(status, needed)
+
+    def _prepare(self, chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]], rates: Sequence[float]) -> None:
+        """Uploads what is to be computed, and makes room."""
+        assert len(chunk) == len(rates)
+        particles = self._upload(chunk, rates)
+        if particles > self.particles or not self._inside(self._reach):
+            self.particles = max(self.particles, 16 * math.ceil(particles / 16))
+            self._build()
 
     def _upload(self, chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]], rates: Sequence[float]) -> int:
         """Writes the chunk's tables; the most particles of an update."""

@@ -1,0 +1,90 @@
+"""Whether the fast path's kernels, as compiled for this machine, compute what the plain network computes.
+
+Compared on the first update's own batch, before anything is trained: outputs, and the gradients of a random weighting
+of them. Both paths round, and rounding turns the activations next to their kink, so the bounds are wide; kernels that
+are wrong miss them by far. Shape legend: N particles of all scenes, S scenes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from hgn.data.chunk import WholeEpisode
+from hgn.kernels.update.op import Updates
+from hgn.network.features import ParticleState
+from hgn.network.keys import pack
+from hgn.network.obstacles import ObstacleCells
+from hgn.schema import ConfigError
+
+OUTPUT_BOUND, GRADIENT_BOUND = 0.05, 0.3  # relative errors of the norm
+CHECKED_PARTICLES = 200_000  # at most; the plain network needs memory
+
+
+def require_agreement(updates: Updates, episodes: Sequence[WholeEpisode]) -> tuple[float, float]:
+    """Relative errors of outputs and of all gradients on the batch that `updates` holds, of these episodes.
+
+    Too large a batch is not checked: NaN. Raises: ConfigError when one of them exceeds its bound.
+    """
+    network, engine, count = updates.network, updates.engine, int(updates.particle_count)
+    if count > CHECKED_PARTICLES:
+        return math.nan, math.nan
+    state, origin_S3 = _state(updates, episodes, count)
+    generator = torch.Generator().manual_seed(0)
+    weight_N3 = torch.randn(count, 3, generator=generator).to(updates.device) * updates.share_N[:count, None]
+    output_N3 = network.normalised_acceleration(state, origin_S3)
+    parameters = list(network.parameters())
+    expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
+    output_error = _relative(engine.output[:count, :3], output_N3.detach())
+    engine.output_gradient[:count].zero_()
+    engine.output_gradient[:count, :3] = weight_N3 / engine.unscale
+    engine.backward()
+    found = [torch.zeros_like(parameter) for parameter in parameters]
+    updates.packed.scatter(engine.totals[: updates.packed.size], found)
+    gradient_error = _relative(
+        torch.cat([tensor.flatten() for tensor in found]),
+        torch.cat(
+            [(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, expected, strict=True)]
+        ),
+    )
+    if not (output_error <= OUTPUT_BOUND and gradient_error <= GRADIENT_BOUND):  # NaN fails
+        raise ConfigError(
+            f"training.path must be plain on this machine, got fast: its outputs differ by {output_error:.1e} from the "
+            f"plain network's (at most {OUTPUT_BOUND}), its gradients by {gradient_error:.1e} (at most "
+            f"{GRADIENT_BOUND}); set training.path=plain, and report device and versions"
+        )
+    if updates.device.type == "cuda":
+        del output_N3, expected
+        torch.cuda.empty_cache()  # what is free decides where episodes are kept
+    return output_error, gradient_error
+
+
+def _state(updates: Updates, episodes: Sequence[WholeEpisode], count: int) -> tuple[ParticleState, torch.Tensor]:
+    """The batch as the plain network reads it, noise and jitter included."""
+    config = updates.config
+    keys, normals = [], []
+    for scene, episode in enumerate(episodes):
+        cells = episode.obstacle_cell_K3.long()
+        keys.append(pack(torch.full((len(cells),), scene), cells))
+        normals.append(episode.obstacle_normal_K3)
+    obstacles = None
+    if config.obstacle_features and any(len(key) for key in keys):
+        cell_size = updates.settings.obstacle_cell_size
+        obstacles = ObstacleCells(torch.cat(keys), torch.cat(normals), cell_size).to(updates.device)
+    state = ParticleState(
+        updates.position_N3[:count],
+        updates.velocity_NV[:count].view(count, config.velocity_history, 3),
+        updates.material_N[:count].long(),
+        updates.scene_N[:count].long(),
+        updates.domain_S3,
+        obstacles,
+    )
+    return state, updates.origin_S3
+
+
+def _relative(found: torch.Tensor, expected: torch.Tensor) -> float:
+    size = float(expected.norm())
+    difference = float((found - expected).norm())
+    return difference / size if size > 0 else difference
