@@ -265,6 +265,10 @@ def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_has
         gravity=made.scene.gravity,
         frame_rate_hz=config.dataset.frame_rate_hz,
         seed=made.task.seed,
+        material_parameters={
+            name: np.where(np.isnan(value), getattr(config.mpm, name), value).astype(np.float32)
+            for name, value in made.scene.material_parameters.items()
+        },
         specification=made.scene.specification,
         solver={
             "settings": physics_settings(config),

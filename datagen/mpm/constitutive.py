@@ -32,8 +32,20 @@ def hardening(plastic_volume: ti.f32, law: ti.template(), row: ti.i32) -> ti.f32
 
 
 @ti.func
-def water(volume: ti.f32, expansion: ti.f32, law: ti.template(), row: ti.i32, counter: ti.template(), scene: ti.i32):
-    """J (1 + dt tr C), floored; Kirchhoff pressure term lambda J (J - 1); present stiffness, Pa."""
+def water(
+    volume: ti.f32,
+    expansion: ti.f32,
+    law: ti.template(),
+    row: ti.i32,
+    counter: ti.template(),
+    scene: ti.i32,
+    stiffening: ti.template(),
+):
+    """J (1 + dt tr C), floored; Kirchhoff pressure term; present stiffness, Pa.
+
+    The term is lambda J (J - 1), as in Taichi Elements, or with `stiffening` that of the pressure
+    lambda / 7 (J^-7 - 1) (Cole 1948), which withstands any compression.
+    """
     bulk = law[row + CONSTANT.bulk]
     smallest = law[row + CONSTANT.water_smallest_volume]
     J = volume * (1.0 + expansion)
@@ -41,7 +53,14 @@ def water(volume: ti.f32, expansion: ti.f32, law: ti.template(), row: ti.i32, co
         J = smallest
         count_event(counter, scene, COUNT.water_volume_floors, 1)
     # d(tau) / d(log J) is lambda J (2 J - 1): stretched water is stiffer than water at rest
-    return J, bulk * J * (J - 1.0), 3.0 * bulk * ti.max(1.0, J * (2.0 * J - 1.0))
+    stress = bulk * J * (J - 1.0)
+    stiffness = J * (2.0 * J - 1.0)
+    if ti.static(stiffening):
+        power = 1.0 / (J * J * J)
+        power *= power
+        stress = bulk * (J - power) / 7.0
+        stiffness = (J + 6.0 * power) / 7.0
+    return J, stress, 3.0 * bulk * ti.max(1.0, stiffness)
 
 
 @ti.func

@@ -221,7 +221,9 @@ def respond(
     stiffness = 0.0
     if ti.static(has_water):
         if ti.static(not has_solid) or material == WATER:
-            J, pressure, water_stiffness = water(volume, step * C.trace(), law, row, counter, scene)
+            J, pressure, water_stiffness = water(
+                volume, step * C.trace(), law, row, counter, scene, ti.static(bool(variant & VARIANT.stiffening_water))
+            )
             new_volume = J
             stiffness = water_stiffness
             for i in ti.static(range(3)):

@@ -85,7 +85,8 @@ def fixed_substeps(config: MpmConfig, frame_rate_hz: float) -> int:
 def material_laws(scenes: Sequence[Scene], config: MpmConfig) -> tuple[np.ndarray, np.ndarray]:
     """The different rows of constants, float32 [rows, K], and the row of each particle, int32 [N of all scenes].
 
-    What a scene's material_parameters leave open is the config's. The first row is the config's own.
+    What a scene's material_parameters leave open (a name, or NaN for a particle) is the config's. The first row is
+    the config's own.
     Raises: ConfigError for a value that MpmConfig refuses.
     """
     own = {name: np.float32(getattr(config, name)) for name in MATERIAL_PARAMETERS}
@@ -98,7 +99,9 @@ def material_laws(scenes: Sequence[Scene], config: MpmConfig) -> tuple[np.ndarra
         )
         for name in MATERIAL_PARAMETERS
     ]
-    given, row = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
+    values = np.stack(columns, axis=1)
+    values = np.where(np.isnan(values), np.array([own[name] for name in MATERIAL_PARAMETERS], np.float32), values)
+    given, row = np.unique(values, axis=0, return_inverse=True)
     laws = [constants(config, config.density_kg_m3)]
     rows = np.zeros(len(given), np.int32)
     for index, values in enumerate(given):
@@ -161,6 +164,7 @@ class Launch:
             + VARIANT.contact * has_contact
             + VARIANT.sweep * has_sweep
             + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
+            + VARIANT.stiffening_water * (config.water_equation == "stiffening")
             + VARIANT.several_laws * (len(laws) > 1)
             + VARIANT.parts * self.copies
         )

@@ -41,7 +41,8 @@ class Scene:
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
     seed: int = 0  # of the obstacle surface samples
     specification: dict[str, Any] = field(default_factory=dict)  # JSON-able: how the scene was made
-    # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS), where they differ from the solver's settings
+    # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS), where they differ from the solver's settings;
+    # NaN where they do not
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

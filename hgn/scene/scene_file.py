@@ -8,14 +8,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
-from hgn.config import OBSTACLE_SHAPES
+from hgn.config import OBSTACLE_SHAPES, MpmConfig
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
-from hgn.scene.material import MATERIALS, material_index
+from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.mesh import load_mesh
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
@@ -66,8 +67,15 @@ class GroupEntry:
     position: Vector  # of the centre
     material: str
     velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
+    # of its material in the solver; what is left out is as the solver's settings have it
+    youngs_modulus_pa: float | None = None
+    poisson_ratio: float | None = None
+    density_kg_m3: float | None = None
+    sand_friction_angle_deg: float | None = None
+    snow_hardening: float | None = None
 
     def __post_init__(self) -> None:
+        MpmConfig(**self.parameters)  # refuses what the solver cannot bear
         require(self.shape in GROUP_SHAPES, "shape", f"one of {', '.join(GROUP_SHAPES)}", self.shape)
         if isinstance(self.size, tuple) != (self.shape == "box"):
             rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
@@ -77,6 +85,12 @@ class GroupEntry:
         material_index(self.material)
         _require_finite("position", self.position)
         _require_finite("velocity", self.velocity)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The constants of the material that are given, by name."""
+        given = {name: getattr(self, name) for name in MATERIAL_PARAMETERS}
+        return {name: value for name, value in given.items() if value is not None}
 
     @property
     def edges(self) -> Vector:
@@ -159,8 +173,18 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         cell_size=file.cell_size,
         gravity=file.gravity,
         seed=file.seed,
+        material_parameters=_material_parameters(file.groups, counts),
         specification={"kind": "file", **to_mapping(file), "particle_counts": counts},
     )
+
+
+def _material_parameters(groups: tuple[GroupEntry, ...], counts: list[int]) -> dict[str, np.ndarray]:
+    """What any group gives, per particle, float32 [N]; NaN where its group leaves it open."""
+    names = [name for name in MATERIAL_PARAMETERS if any(name in group.parameters for group in groups)]
+    return {
+        name: np.repeat(np.array([group.parameters.get(name, np.nan) for group in groups], np.float32), counts)
+        for name in names
+    }
 
 
 def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:

@@ -179,3 +179,16 @@ def test_missing_and_broken_files(tmp_path):
     path.write_bytes(b"\xff\xfe\xfa")
     with pytest.raises(ConfigError, match=r"scene\.yaml must be a YAML file"):
         load_scene(path)
+
+
+def test_material_parameters_of_groups(tmp_path):
+    """A group may differ in its material's constants; particles of other groups hold NaN, the solver's own setting."""
+    stiff = CUBE | {"material": "sand", "position": [0.3, 0.5, 0.5], "youngs_modulus_pa": 5e6, "density_kg_m3": 1600.0}
+    scene = load_scene(write(tmp_path, {"groups": [CUBE, stiff]}))
+    assert sorted(scene.material_parameters) == ["density_kg_m3", "youngs_modulus_pa"]
+    modulus = scene.material_parameters["youngs_modulus_pa"]
+    assert np.isnan(modulus[scene.material_N == WATER]).all()
+    assert (modulus[scene.material_N == SAND] == 5e6).all()
+    assert load_scene(write(tmp_path, {"groups": [CUBE]})).material_parameters == {}
+    with pytest.raises(ConfigError, match=r"groups\[0\].*density_kg_m3 must be"):
+        load_scene(write(tmp_path, {"groups": [CUBE | {"density_kg_m3": -1.0}]}))

@@ -29,12 +29,13 @@ def update_solids(
 @ti.kernel
 def update_water(
     volume: Scalars, expansion: Scalars, pressure: Scalars, constant: Scalars,
-    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), stiffness: Scalars, stiffening: ti.template(),
 ):  # fmt: skip
     for n in range(volume.shape[0]):
-        v, p, _stiffness = water(volume[n], expansion[n], constant, 0, counter, 0)
+        v, p, k = water(volume[n], expansion[n], constant, 0, counter, 0, stiffening)
         volume[n] = v
         pressure[n] = p
+        stiffness[n] = k
 
 
 def scalars(values) -> ti.ScalarNdarray:
@@ -147,11 +148,26 @@ def test_water() -> None:
     _, bulk = lame_parameters(config)
     J, expansion = np.array([1.0, 0.9, 1.2, 0.15, 1.0]), np.array([1e-3, -0.2, 0.1, -0.5, -3.0])
     volume, pressure, counter = scalars(J), scalars(np.zeros(5)), counters()
-    update_water(volume, scalars(expansion), pressure, scalars(constants(config)), counter)
+    update_water(volume, scalars(expansion), pressure, scalars(constants(config)), counter, scalars(J), False)
     new_J = np.maximum(J * (1 + expansion), 0.1)
     close(volume.to_numpy(), new_J, 1e-6)
     close(pressure.to_numpy(), bulk * new_J * (new_J - 1), 1e-6)
     assert counter.to_numpy()[0, COUNT.water_volume_floors] == 2
+
+
+def test_stiffening_water() -> None:
+    """tau = -J lambda / 7 (J^-7 - 1), its stiffness 3 d(tau) / d(log J): near J = 1 both are those of linear water."""
+    config = MpmConfig()
+    _, bulk = lame_parameters(config)
+    J = np.array([1.0, 0.999, 0.8, 0.5, 1.1])
+    volume, pressure, stiffness = scalars(J), scalars(np.zeros(5)), scalars(np.zeros(5))
+    update_water(volume, scalars(np.zeros(5)), pressure, scalars(constants(config)), counters(), stiffness, True)
+    tau = -J * bulk / 7 * (J**-7.0 - 1)
+    close(pressure.to_numpy()[1:], tau[1:], 1e-4)
+    close(pressure.to_numpy()[1:2], bulk * J[1:2] * (J[1:2] - 1), 6e-3)
+    step = 1e-6
+    slope = -bulk / 7 * (((J * (1 + step)) ** -6.0 - J * (1 + step)) - (J**-6.0 - J)) / step
+    close(stiffness.to_numpy(), 3 * np.maximum(bulk, slope), 1e-4)
 
 
 @pytest.mark.parametrize("material", [SAND, SNOW])

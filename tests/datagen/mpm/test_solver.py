@@ -1,5 +1,6 @@
 """The solver against closed forms, conservation laws and its own promises about batches and failures."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -123,6 +124,51 @@ def test_impact_at_ten_metres_per_second(material: int, count: int) -> None:
     assert (outcome.position_TN3 <= high).all()
     assert outcome.counters["position_clamps"] == 0
     assert outcome.counters["largest_speed"] < 15
+
+
+def test_stiffening_water_bears_thirty_metres_per_second() -> None:
+    """At 30 m/s linear water is pressed to its floor; stiffening water is not, and both stay finite and inside."""
+    scene = block(WATER, (0.4, 0.3, 0.4), (0.55, 0.45, 0.55), (0, -30, 0))
+    floors = []
+    for equation in ("linear", "stiffening"):
+        config = MpmConfig(device="cpu", water_equation=equation)
+        outcome = simulate([scene], config, 7, 60.0)[0]
+        assert isinstance(outcome, Simulated), outcome
+        low, high = particle_bounds(scene, config)
+        assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+        floors.append(outcome.counters["water_volume_floors"])
+    assert floors[0] > 0 and floors[1] == 0
+
+
+def test_a_million_particles_in_one_cell() -> None:
+    """A cell as full as memory allows: a frame passes, finite, and nothing is lost."""
+    position = np.random.default_rng(0).uniform(8 * CELL, 9 * CELL, (1_000_000, 3)).astype(np.float32)
+    scene = Scene(position, np.zeros_like(position), np.full(len(position), WATER, np.uint8), cell_size=CELL)
+    outcome = simulate([scene], MpmConfig(device="cpu", stability_fraction=1.0), 2, 60.0)[0]
+    assert isinstance(outcome, Simulated), outcome
+    assert np.isfinite(outcome.position_TN3[-1]).all()
+    fall = (outcome.position_TN3[-1] - outcome.position_TN3[0])[:, 1].mean()
+    # eight steps of a symplectic scheme fall further by an eighth
+    assert fall == pytest.approx(-9.8 / 60**2 / 2, rel=0.15)
+
+
+def test_materials_a_thousand_times_as_stiff_beside_each_other() -> None:
+    """Particles may differ in stiffness and density by 1000:1 and 3:1: an impact stays finite, inside and bounded."""
+    scene = block(SNOW, (0.4, 0.25, 0.4), (0.6, 0.4, 0.6), (0, -3, 0))
+    hard = scene.position_N3[:, 0] > 0.5
+    parameters = {
+        "youngs_modulus_pa": np.where(hard, np.float32(1e8), np.float32(1e5)),
+        "density_kg_m3": np.where(hard, np.float32(3000), np.float32(np.nan)),
+    }
+    soft = block(SNOW, (0.4, 0.25, 0.4), (0.6, 0.4, 0.6), (0, -3, 0))
+    outcome = simulate([dataclasses.replace(scene, material_parameters=parameters)], ADAPTIVE, 4, 60.0)[0]
+    plain = simulate([soft], ADAPTIVE, 4, 60.0)[0]
+    assert isinstance(outcome, Simulated) and isinstance(plain, Simulated), outcome
+    assert np.isfinite(outcome.position_TN3).all() and outcome.counters["largest_speed"] < 10
+    assert outcome.counters["substeps"] > 2 * plain.counters["substeps"]
+    with pytest.raises(ConfigError, match="youngs_modulus_pa"):
+        bad = {"youngs_modulus_pa": np.full(scene.particle_count, -1, np.float32)}
+        simulate([dataclasses.replace(scene, material_parameters=bad)], ADAPTIVE, 2, 60.0)
 
 
 def test_snow_impact_is_converged() -> None:
