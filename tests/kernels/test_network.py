@@ -12,7 +12,7 @@ from network.states import network_of, random_state
 from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
 
-SEVERAL = (7, 1, 4)  # particles of three scenes
+SEVERAL = (5, 1, 3)  # particles of three scenes
 gpu = pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
 
 

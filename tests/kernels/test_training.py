@@ -38,7 +38,7 @@ def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[Data
 
 
 def run_mapping(config: DatagenConfig, run: Path, **training: Any) -> dict[str, Any]:
-    values = {"maximum_updates": 4, "log_every": 2, "checkpoint_every": 3, "monitor_every": 3, "monitor_scenes": 1}
+    values = {"maximum_updates": 4, "log_every": 4, "checkpoint_every": 4, "monitor_every": 4, "monitor_scenes": 1}
     values |= {"path": "fast", "precision": "highest", "monitor_frame_stride": 3, "accelerator": "auto"} | training
     mapping = train_mapping(config, run, **values)
     return mapping | {"network": NETWORK}
@@ -56,7 +56,7 @@ def test_fast_training_is_the_plain_one(
     for name, parts in {
         "plain": [("plain", 4)],
         "fast": [("fast", 4)],
-        "mixed": [("fast", 1), ("plain", 2), ("fast", 4)],
+        "mixed": [("plain", 1), ("fast", 2), ("plain", 4)],
     }.items():
         for path, updates in parts:
             with monkeypatch.context() as patch:
@@ -77,7 +77,7 @@ def test_fast_training_is_the_plain_one(
             assert float(states["state"][parameter]["step"]) == float(state["step"]) == 4
             torch.testing.assert_close(states["state"][parameter]["exp_avg"], state["exp_avg"], rtol=1e-2, atol=1e-6)
     plain, fast = ([record for record in metrics(tmp_path / name) if "loss" in record] for name in ("plain", "fast"))
-    assert [record["update"] for record in fast] == [record["update"] for record in plain] == [2, 4]
+    assert [record["update"] for record in fast] == [record["update"] for record in plain] == [4]
     for found, expected in zip(fast, plain, strict=True):
         assert found["learning_rate"] == expected["learning_rate"] and found["skipped_updates"] == 0
         assert found["loss"] == pytest.approx(expected["loss"], rel=1e-4)
@@ -86,7 +86,7 @@ def test_fast_training_is_the_plain_one(
         [record["one_step/validation"] for record in metrics(tmp_path / name) if "one_step/validation" in record]
         for name in ("plain", "fast")
     ]
-    assert len(monitored[0]) == 2 and monitored[1] == pytest.approx(monitored[0], rel=1e-3)
+    assert len(monitored[0]) == 1 and monitored[1] == pytest.approx(monitored[0], rel=1e-3)
 
 
 def stop_at(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
