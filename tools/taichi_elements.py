@@ -1,0 +1,159 @@
+"""python -m tools.taichi_elements folder=COPY [--json FILE]: our faithful mode beside Taichi Elements itself, on a CPU.
+
+Cubes of each material alone and of all three, dropped on the floor from the same places, at the same step. Both sum in
+no common order and the motion is chaotic, so the first frame is compared particle by particle and the run by centre of
+mass, height and spread. Times are of whole frames, compilation left out, one solver after the other.
+Shape legend: T frames, N particles.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hgn.command import run_command
+from hgn.config import MpmConfig
+from hgn.files import write_atomically
+from hgn.provenance import provenance
+from hgn.scene.material import MATERIALS
+from hgn.scene.scene import Scene
+from hgn.schema import ConfigError, from_mapping, require, require_positive, to_mapping
+
+FRAME_S = 1 / 60
+STEP_S = 0.02 / 64  # Taichi Elements' longest at 64 cells a side
+FLOOR = 3 / 64
+FIRST_FRAME, CENTRE, SHAPE = 1e-4, 0.01, 0.05  # bounds: domain units, domain units, relative
+WARM_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class TaichiElementsConfig:
+    """`python -m tools.taichi_elements`: what is compared."""
+
+    folder: str
+    frames: int = 100
+    threads: int = 2
+    size: float = 0.08
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "threads", "size")
+        require(self.frames > WARM_FRAMES + 1, "frames", f"more than {WARM_FRAMES + 1}", self.frames)
+        require(self.size <= 0.2, "size", "at most 0.2", self.size)
+        if not (Path(self.folder) / "engine" / "mpm_solver.py").is_file():
+            raise ConfigError(f"folder must hold a copy of Taichi Elements (engine/mpm_solver.py), got {self.folder}")
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table, and writes JSON where asked to; what does not hold is a finding, and the exit code is 0."""
+    config = from_mapping(TaichiElementsConfig, mapping)
+    rows = [compare(name, scene, config) for name, scene in cases(config.size)]
+    heads = ("first frame", "centre", "height", "spread", "ms", "TE ms")
+    print(f"{'case':<8} {'particles':>9} {heads[0]:>12} " + " ".join(f"{head:>8}" for head in heads[1:]) + "  held")
+    for row in rows:
+        print(
+            f"{row['case']:<8} {row['particles']:>9} {row['first_frame']:>12.2g} {row['centre']:>8.2g} "
+            f"{row['height']:>8.2g} {row['spread']:>8.2g} {row['ms']:>8.1f} {row['taichi_elements_ms']:>8.1f}  "
+            f"{'yes' if row['held'] else 'NO'}"
+        )
+    if config.json is not None:
+        meta = provenance("cpu") | {"config": to_mapping(config)}
+        file = Path(config.json)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, json.dumps({"meta": meta, "rows": rows}, indent=1).encode())
+    return 0
+
+
+def cases(size: float) -> list[tuple[str, Scene]]:
+    """A cube of each material, and three beside each other."""
+    single = [_cubes([kind], [(0.5, 0.2, 0.5)], size) for kind in range(3)]
+    mixed = _cubes([0, 1, 2], [(0.45, 0.15, 0.5), (0.5, 0.3, 0.5), (0.55, 0.45, 0.5)], size)
+    return [*zip(MATERIALS, single, strict=True), ("mixed", mixed)]
+
+
+def taichi_elements_substeps() -> int:
+    """How often it steps in a frame: the time left is counted down in floats, and its rest may ask for one more."""
+    whole = int(FRAME_S / STEP_S) + 1
+    left, taken = FRAME_S, 0
+    while left > 0:
+        left -= FRAME_S / whole
+        taken += 1
+    return taken
+
+
+def compare(name: str, scene: Scene, config: TaichiElementsConfig) -> dict[str, Any]:
+    """A row: differences of the two trajectories, and times of a frame."""
+    theirs, their_s = _run_theirs(scene, config)
+    ours, our_s = _run_ours(scene, config)
+    one, other = ours.astype(np.float64), theirs.astype(np.float64)
+    height = [np.quantile(path[:, :, 1], 0.95, axis=1) - FLOOR for path in (one, other)]
+    spread = [path[:, :, ::2].std(axis=1).mean(axis=1) for path in (one, other)]
+    row: dict[str, Any] = {
+        "case": name,
+        "particles": scene.particle_count,
+        "first_frame": float(np.abs(one[1] - other[1]).max()),
+        "centre": float(np.linalg.norm(one.mean(axis=1) - other.mean(axis=1), axis=1).max()),
+        "height": float(np.abs(height[0] / height[1] - 1).max()),
+        "spread": float(np.abs(spread[0] / spread[1] - 1).max()),
+        "ms": 1e3 * our_s,
+        "taichi_elements_ms": 1e3 * their_s,
+        "time_ratio": our_s / their_s,
+        "substeps": taichi_elements_substeps(),
+    }
+    row["held"] = bool(
+        row["first_frame"] <= FIRST_FRAME
+        and row["centre"] <= CENTRE
+        and row["height"] <= SHAPE
+        and row["spread"] <= SHAPE
+    )
+    return row
+
+
+def _cubes(kinds: list[int], centres: list[tuple[float, float, float]], size: float) -> Scene:
+    count = int(8 * (64 * size) ** 3 + 1)
+    generator = np.random.default_rng(0)
+    position = np.concatenate([generator.uniform(-size / 2, size / 2, (count, 3)) + centre for centre in centres])
+    return Scene(
+        position.astype(np.float32), np.zeros((len(position), 3), np.float32),
+        np.repeat(np.array(kinds, np.uint8), count),
+    )  # fmt: skip
+
+
+def _run_theirs(scene: Scene, config: TaichiElementsConfig) -> tuple[np.ndarray, float]:
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        np.savez(
+            source, position_N3=scene.position_N3, velocity_N3=scene.velocity_N3, material_N=scene.material_N,
+            frames=config.frames, frame_s=FRAME_S,
+        )  # fmt: skip
+        command = [sys.executable, "-m", "datagen.mpm.taichi_elements", config.folder, source, target]
+        subprocess.run([*map(str, command), str(config.threads)], check=True)
+        found = np.load(target)
+        return found["position_TN3"], float(np.median(found["seconds_T"][WARM_FRAMES:]))
+
+
+def _run_ours(scene: Scene, config: TaichiElementsConfig) -> tuple[np.ndarray, float]:
+    from datagen.mpm.solver import SceneFailure, simulate
+
+    step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
+    mpm = MpmConfig(device="cpu", time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements")
+    rate = 1 / (taichi_elements_substeps() * step)
+    ends: list[float] = []
+    (outcome,) = simulate(
+        [scene], mpm, config.frames, rate, lambda _: ends.append(time.perf_counter()), cpu_threads=config.threads
+    )
+    if isinstance(outcome, SceneFailure):
+        raise ConfigError(f"our solver stopped where Taichi Elements did not: {outcome.cause}")
+    return outcome.position_TN3, float(np.median(np.diff(ends)[WARM_FRAMES:]))
+
+
+if __name__ == "__main__":
+    run_command(main, "taichi_elements")
