@@ -35,7 +35,7 @@ def test_report(copy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 
 
 def test_cases_and_steps(copy: str) -> None:
-    """A paper's cube has 1,074 particles, the mixed case three of them; Taichi Elements takes 54 or 55 steps a frame."""
+    """A cube has 1,074 particles, the mixed case three of them; Taichi Elements takes 54 or 55 steps a frame."""
     assert [scene.particle_count for _, scene in cases(0.08)] == [1074, 1074, 1074, 3222]
     assert taichi_elements_substeps() in (54, 55)
     with pytest.raises(ConfigError, match="folder must hold a copy"):
