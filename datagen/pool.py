@@ -26,8 +26,8 @@ _WAIT_SECONDS = 0.2  # at most until a stop request is seen
 _LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
 GPU_SCENES_PER_LAUNCH = 384
 GPU_NODES_PER_LAUNCH = 384 * 64**3  # of the grids of all scenes, about 30 bytes each
-GPU_FIRST_LAUNCH = 64  # that the makers soon have, so that training can start early; fewer are not done sooner
-_LAUNCH_GROWTH = 8  # from one launch to the next, up to the full size
+GPU_FIRST_LAUNCH = 2  # small, so that training can start early: such a launch has the whole GPU for each substep
+_LAUNCH_GROWTH = 32  # from one launch to the next, up to the full size
 MAXIMUM_MAKERS = 32
 
 

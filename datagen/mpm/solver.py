@@ -23,6 +23,7 @@ from hgn.schema import ConfigError, require
 # a scene of more fills a GPU better by itself
 TEAM_PARTICLES = 50_000
 TEAM_THREADS = 512
+TEAM_SCENES = 16  # fewer are done sooner where each has the whole GPU, a launch a substep
 CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
 
 __all__ = ["SceneFailure", "Simulated", "fixed_substeps", "initialise", "particle_bounds", "simulate"]
@@ -94,7 +95,8 @@ def simulate(
 
 
 def _team_threads(device: Device, scenes: Sequence[Scene]) -> int:
-    if device.kind == "cpu" or max(scene.particle_count for scene in scenes) > TEAM_PARTICLES:
+    most = max(scene.particle_count for scene in scenes)
+    if device.kind == "cpu" or len(scenes) < TEAM_SCENES or most > TEAM_PARTICLES:
         return 0
     return TEAM_THREADS
 
