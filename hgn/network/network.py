@@ -17,6 +17,8 @@ from hgn.network.fcn import FCN
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 
+PARTICLES_AT_ONCE = 512  # of eight pairs each; at width 128 a block is 2 MB
+
 
 class MessagePassing(nn.Module):
     """Steps 2, 4, …: M iterations on the cells of one level (paper fig. 5), weights unshared."""
@@ -87,9 +89,11 @@ class HierarchicalGraphNetwork(ParticleNetwork):
 
         network = self.particle_to_cell
         hidden_NH = network.project(0, particle_NW) - network.project(1, grid.fraction_N3) + network.first.bias
-        message_N8W = network.finish(hidden_NH[:, None] + network.project(1, corner_83))
-        fine = grid.levels[0]
-        cell_CW = _scatter(message_N8W * grid.weight_N8[..., None], grid.cell_N8, fine.cell_count)
+        corner_8H = network.project(1, corner_83)
+        cell_CW = particle_NW.new_zeros(grid.levels[0].cell_count, particle_NW.shape[1])
+        for block in _pair_blocks(particle_NW):
+            message_N8W = network.finish(hidden_NH[block, None] + corner_8H) * grid.weight_N8[block, :, None]
+            cell_CW.index_add_(0, grid.cell_N8[block].flatten(), message_N8W.flatten(0, 1))
 
         kept: list[torch.Tensor] = []
         for i, level in enumerate(grid.levels):
@@ -112,10 +116,20 @@ class HierarchicalGraphNetwork(ParticleNetwork):
 
         network = self.cell_to_particle
         hidden_NH = network.project(1, particle_NW) + network.project(2, grid.fraction_N3) + network.first.bias
-        hidden_N8H = network.project(0, cell_CW)[grid.cell_N8] + hidden_NH[:, None]
-        message_N8W = network.finish(hidden_N8H - network.project(2, corner_83))
-        change_NW = (message_N8W * grid.weight_N8[..., None]).sum(1)
-        return self.decode(particle_NW + change_NW)
+        cell_CH, corner_8H = network.project(0, cell_CW), network.project(2, corner_83)
+        changes = []
+        for block in _pair_blocks(particle_NW):
+            message_N8W = network.finish(cell_CH[grid.cell_N8[block]] + hidden_NH[block, None] - corner_8H)
+            changes.append((message_N8W * grid.weight_N8[block, :, None]).sum(1))
+        return self.decode(particle_NW + torch.cat(changes))
+
+
+def _pair_blocks(particle_NW: torch.Tensor) -> list[slice]:
+    """Runs of particles whose pairs stay in a CPU's cache; all at once on a GPU, and where gradients keep the pairs."""
+    count = len(particle_NW)
+    if particle_NW.device.type != "cpu" or torch.is_grad_enabled() or count == 0:
+        return [slice(0, count)]
+    return [slice(first, first + PARTICLES_AT_ONCE) for first in range(0, count, PARTICLES_AT_ONCE)]
 
 
 def _scatter(value: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tensor:
