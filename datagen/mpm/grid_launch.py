@@ -14,7 +14,7 @@ from hgn.scene.material import SAND, SNOW
 
 import taichi as ti  # isort: skip
 
-from datagen.mpm import kernels  # isort: skip
+from datagen.mpm import grid_kernel  # isort: skip
 
 MAXIMUM_PARTS = 4  # copies of the grid on a CPU, one a thread
 SUBSTEPS_PER_CHECK = 64  # at most; on a GPU each check waits for the device
@@ -35,7 +35,7 @@ class GridLaunch(Launch):
         self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, self.particles if solid else 1)
         self.volume = ti.ndarray(ti.f32, self.particles)
         self.block = device_array(np.zeros(3 * self.all_blocks + 1, np.int32))
-        kernels.start(
+        grid_kernel.start(
             self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter,
             self.law,
         )  # fmt: skip
@@ -46,7 +46,7 @@ class GridLaunch(Launch):
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         completed = np.zeros(len(self.scenes), np.int64)
         for _ in range(frames):
-            kernels.begin_frame(self.frame_s, self.scene_value, self.counter)
+            grid_kernel.begin_frame(self.frame_s, self.scene_value, self.counter)
             self._run_frame()
             completed += self.counter.to_numpy()[:, COUNT.status] == STATUS.running
             yield self.position.to_numpy()[None], completed
@@ -56,7 +56,7 @@ class GridLaunch(Launch):
         pending = 1
         while pending:
             for _ in range(min(pending, SUBSTEPS_PER_CHECK)):
-                kernels.substep(
+                grid_kernel.substep(
                     self.position, self.velocity, self.affine, self.deformation, self.volume, self.label,
                     self.law_row, self.scene_value, self.counter, self.setting, self.law, self.shape, self.node,
                     self.block, self.contact, self.contact_normal, self.variant,

@@ -35,8 +35,7 @@ from hgn.schema import ConfigError
 import datagen.mpm.device  # noqa: F401  # isort: skip  # keeps Taichi's banner off stdout
 import taichi as ti  # isort: skip
 
-from datagen.mpm import kernels  # isort: skip
-from datagen.mpm.surface_kernel import TRIANGLE_VECTORS  # isort: skip
+from datagen.mpm.surface_kernel import TRIANGLE_VECTORS, place_contacts  # isort: skip
 
 MAXIMUM_BLOCKS = 1024  # along an axis: kernels keep ten bits of it
 
@@ -188,7 +187,7 @@ class Launch:
         self.contact = ti.ndarray(ti.i32, length)
         self.contact.fill(-1)
         if places and len(np.concatenate(places)):
-            kernels.place(self.contact, device_array(np.concatenate(places)), device_array(np.concatenate(values)))
+            place_contacts(self.contact, device_array(np.concatenate(places)), device_array(np.concatenate(values)))
         self.contact_normal = device_vectors(np.concatenate(vectors))
 
     def _vector_arrays(self) -> list[Any]:
@@ -266,7 +265,7 @@ class Launch:
         return place * BLOCK_NODES + (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
 
     def _sweeps(self, first_vector: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-        """Entries of the contact array for the swept test (see kernels.substep): places, values; the triangles'
+        """Entries of the contact array for the swept test (see grid_kernel.substep): places, values; the triangles'
         vectors; the array's length.
         """
         all_nodes = self.all_blocks * BLOCK_NODES

@@ -94,3 +94,14 @@ def stop_at_surface(
         else:
             attempt = 2
     return moved, speed
+
+
+@ti.kernel
+def place_contacts(
+    contact: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    where: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    value: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """contact[where] = value."""
+    for i in range(where.shape[0]):
+        contact[where[i]] = value[i]

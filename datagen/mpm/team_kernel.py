@@ -1,6 +1,6 @@
 """Frames of explicit MLS-MPM in one launch, a team of threads for each scene: the fast way on a GPU.
 
-The method is that of datagen.mpm.kernels, of whose parts it is made. What differs is who works: a scene of a few
+The method is that of datagen.mpm.mls_mpm, of whose parts it is made. What differs is who works: a scene of a few
 thousand particles needs hundreds of steps a frame, each of a few microseconds' work, so one thread block runs a
 scene by itself, step after step, without a launch or a look at other scenes in between. Scenes share nothing, so
 each takes its own steps, and hundreds of them fill the device.
@@ -17,7 +17,8 @@ With one thread a team it runs on a CPU too; the tests check it there against th
 
 import taichi as ti
 
-from datagen.mpm.kernels import (
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, FIELD, LIVE, SETTING, SHAPE, STATUS, TAG, VALUE, VARIANT
+from datagen.mpm.mls_mpm import (
     Integers,
     Nodes,
     Scalars,
@@ -34,7 +35,6 @@ from datagen.mpm.kernels import (
     spline,
     update_node,
 )
-from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, FIELD, LIVE, SETTING, SHAPE, STATUS, TAG, VALUE, VARIANT
 from hgn.scene.material import SAND
 
 LANES = 9  # threads that share a cell; each holds the three nodes of one x and y

@@ -1,0 +1,250 @@
+"""One substep of explicit MLS-MPM for a batch of scenes, as a single Taichi kernel.
+
+The method is that of datagen.mpm.mls_mpm. On a CPU each (scene, part) of the particles scatters into its own copy of
+the grid, one after another, and the copies are summed in order: no atomics, and the same result whatever the number
+of threads at work. On a GPU all particles scatter at once into one copy with atomics.
+"""
+
+import taichi as ti
+
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT
+from datagen.mpm.mls_mpm import (
+    Integers,
+    Matrices,
+    Nodes,
+    Scalars,
+    Vectors,
+    choose_time_step,
+    initial_stiffness,
+    interpolate,
+    mark,
+    move,
+    node_places,
+    raise_maximum,
+    respond,
+    update_node,
+    weights,
+)
+from hgn.scene.material import SAND, WATER
+
+
+@ti.func
+def _particle_to_grid(
+    p: ti.i32,
+    copy: ti.i32,
+    scene: ti.i32,
+    step: ti.f32,
+    position: ti.template(),
+    velocity: ti.template(),
+    affine: ti.template(),
+    deformation: ti.template(),
+    volume: ti.template(),
+    label: ti.template(),
+    law_row: ti.template(),
+    node: ti.template(),
+    scene_value: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    law: ti.template(),
+    shape: ti.template(),
+    variant: ti.template(),
+):
+    """Updates the particle's deformation and adds its mass and momentum to its nodes in one copy of the grid."""
+    dx = setting[SETTING.cell_size]
+    inverse_dx = setting[SETTING.inverse_cell_size]
+    material = label[p] & 3
+    row = 0
+    if ti.static(bool(variant & VARIANT.several_laws)):
+        row = law_row[p]
+    F = ti.Matrix.identity(ti.f32, 3)
+    if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
+        if ti.static(not variant & VARIANT.water) or material != WATER:
+            F = deformation[p]
+    A, new_F, new_volume, stiffness = respond(
+        affine[p], F, volume[p], material, row, step, scene, counter, setting, law, variant
+    )
+    volume[p] = new_volume
+    if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
+        if ti.static(not variant & VARIANT.water) or material != WATER:
+            deformation[p] = new_F
+    raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
+
+    x = position[p] * inverse_dx
+    base = ti.floor(x - 0.5, ti.i32)
+    fx = x - ti.cast(base, ti.f32)
+    w0, w1, w2 = weights(fx)
+    first_node = (copy + scene * shape[SHAPE.scene_blocks]) * BLOCK_NODES
+    index_x, index_y, index_z = node_places(base, first_node, shape)
+    w = ti.static((w0, w1, w2))
+    A *= dx
+    v = velocity[p] - A @ fx
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        wxy = w[i][0] * w[j][1]
+        vxy = ti.Vector([v[a] + A[a, 0] * i + A[a, 1] * j for a in range(3)])
+        for k in ti.static(range(3)):
+            weight = wxy * w[k][2]
+            vxyz = ti.Vector([vxy[a] + A[a, 2] * k for a in range(3)])
+            share = ti.Vector([weight * vxyz[0], weight * vxyz[1], weight * vxyz[2], weight])
+            if ti.static(bool(variant & VARIANT.several_laws)):
+                share *= law[row + CONSTANT.mass]
+            target = index_x[i] + index_y[j] + index_z[k]
+            if ti.static(bool(variant & VARIANT.atomic)):
+                ti.atomic_add(node[target], share)
+            else:
+                old = node[target]
+                node[target] = old + share
+
+
+@ti.func
+def _grid_to_particle(
+    p: ti.i32,
+    scene: ti.i32,
+    step: ti.f32,
+    position: ti.template(),
+    velocity: ti.template(),
+    affine: ti.template(),
+    node: ti.template(),
+    scene_value: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    variant: ti.template(),
+):
+    """New velocity and its gradient, then advection."""
+    x = position[p]
+    first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
+    v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
+    moved, speed, speed_square = move(
+        x, v, C, step, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
+    )
+    raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
+    position[p] = moved
+    velocity[p] = speed
+    affine[p] = C
+
+
+@ti.kernel
+def substep(
+    position: Vectors,
+    velocity: Vectors,
+    affine: Matrices,
+    deformation: Matrices,
+    volume: Scalars,
+    label: Integers,
+    law_row: Integers,
+    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    setting: Scalars,
+    law: Scalars,
+    shape: Integers,
+    node: Nodes,
+    block: Integers,
+    contact: Integers,
+    contact_normal: Vectors,
+    variant: ti.template(),
+):
+    """Advances every scene that has time left by one substep of its own length.
+
+    Order: time step, mark and clear blocks, particles to grid (deformation, plasticity, stress), gravity,
+    colliders, walls, grid to particles, advection. `label` holds scene * 4 + material of each particle, `node`
+    [parts * scenes * blocks * 64] holds a copy of the grid for each part. `contact` begins with twice the index of
+    each node's normal plus 1 where motion is stopped both ways, or -1; then comes, for each cell, where its list of
+    triangles begins in `contact` itself, or -1; then those lists, each headed by its length. An entry is the place in
+    `contact_normal` of the triangle's four vectors.
+    """
+    for scene in range(scene_value.shape[0]):
+        choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
+        if scene == 0:
+            block[3 * shape[SHAPE.all_blocks]] = 0
+
+    for p in range(position.shape[0]):
+        scene = label[p] >> 2
+        if scene_value[scene, VALUE.time_step] > 0.0:
+            blocks = shape[SHAPE.all_blocks]
+            mark(position[p], scene, setting[SETTING.inverse_cell_size], shape, block, blocks, block, 3 * blocks)
+
+    for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
+        blocks = shape[SHAPE.all_blocks]
+        place = block[blocks + (n >> 6)] * BLOCK_NODES + (n & 63)
+        for part in ti.static(range(variant // VARIANT.parts)):
+            node[place + part * blocks * BLOCK_NODES] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+
+    if ti.static(bool(variant & VARIANT.atomic)):
+        for p in range(position.shape[0]):
+            scene = label[p] >> 2
+            step = scene_value[scene, VALUE.time_step]
+            if step > 0.0:
+                _particle_to_grid(
+                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, law_row, node,
+                    scene_value, counter, setting, law, shape, variant,
+                )  # fmt: skip
+    else:
+        for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
+            parts = ti.static(variant // VARIANT.parts)
+            scene = task // parts
+            step = scene_value[scene, VALUE.time_step]
+            if step > 0.0:
+                copy = (task - scene * parts) * shape[SHAPE.all_blocks]
+                for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
+                    _particle_to_grid(
+                        p, copy, scene, step, position, velocity, affine, deformation, volume, label, law_row, node,
+                        scene_value, counter, setting, law, shape, variant,
+                    )  # fmt: skip
+
+    for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
+        global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
+        if n & 63 == 0:
+            block[global_block] = 0
+        update_node(
+            global_block * BLOCK_NODES + (n & 63), global_block // shape[SHAPE.scene_blocks],
+            block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value, setting, shape, node, contact, contact_normal,
+            variant,
+        )  # fmt: skip
+
+    for p in range(position.shape[0]):
+        scene = label[p] >> 2
+        step = scene_value[scene, VALUE.time_step]
+        if step > 0.0:
+            _grid_to_particle(
+                p, scene, step, position, velocity, affine, node, scene_value, counter, setting, shape, contact,
+                contact_normal, variant,
+            )  # fmt: skip
+
+
+@ti.kernel
+def start(
+    velocity: Vectors,
+    affine: Matrices,
+    deformation: Matrices,
+    volume: Scalars,
+    label: Integers,
+    law_row: Integers,
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    law: Scalars,
+):
+    """Particles at rest shape, and the maxima that the first time step needs."""
+    for p in range(velocity.shape[0]):
+        scene = label[p] >> 2
+        material = label[p] & 3
+        affine[p] = ti.Matrix.zero(ti.f32, 3, 3)
+        if p < deformation.shape[0]:
+            deformation[p] = ti.Matrix.identity(ti.f32, 3)
+        volume[p] = 0.0 if material == SAND else 1.0
+        raise_maximum(counter, scene, COUNT.stiffness_bits, initial_stiffness(material, law, law_row[p]))
+        speed_square = velocity[p].dot(velocity[p])
+        raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
+
+
+@ti.kernel
+def begin_frame(
+    frame_s: ti.f32,
+    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+):
+    """Gives every running scene a frame's time."""
+    for scene in range(scene_value.shape[0]):
+        counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
+        if counter[scene, COUNT.status] == STATUS.running:
+            scene_value[scene, VALUE.remaining] = frame_s
