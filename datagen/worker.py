@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -62,24 +63,24 @@ class MadeScene:
     collider: Any = None  # what the solver makes of the obstacles
 
 
-class Worker:
+class Worker(ABC):
     """The pool's end of a worker, wherever it runs."""
 
     def __init__(self) -> None:
         self.idle = False
         self.tasks: dict[str, SceneTask | MadeScene] = {}  # what it has and has not answered for, by key
 
+    @abstractmethod
     def give(self, message: object) -> None:
         """Sends work. A worker that has died meanwhile is noticed at the next receive."""
-        raise NotImplementedError
 
+    @abstractmethod
     def kill(self) -> None:
         """Ends it at once."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cause_of_death(self) -> str:
         """Why a worker that no longer answers has ended."""
-        raise NotImplementedError
 
     def blamable(self) -> bool:
         """Whether what it was working on may have been its end; not where its whole machine went away."""

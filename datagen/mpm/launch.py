@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -113,7 +114,7 @@ def material_laws(scenes: Sequence[Scene], config: MpmConfig) -> tuple[np.ndarra
     return np.stack(laws), rows[row.reshape(-1)]
 
 
-class Launch:
+class Launch(ABC):
     """The device arrays of one batch of scenes, each with at least one particle, and the loop over frames.
 
     A subclass holds the particles and says in `_advance` how frames are run.
@@ -294,11 +295,11 @@ class Launch:
             np.concatenate(vectors), end,
         )  # fmt: skip
 
+    @abstractmethod
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Runs `frames` frames; gives, a few at a time, positions [frames, P, 3] and how many of all the frames so
         far each scene has completed [B].
         """
-        raise NotImplementedError
 
     def run(self, frames: int, on_frame: Callable[[int], None] | None) -> list[Simulated | SceneFailure]:
         """The frames of each scene, the initial state among them, or why it was stopped."""
