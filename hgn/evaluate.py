@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from hgn.command import run_command
 from hgn.config import EvaluateConfig
@@ -19,7 +18,7 @@ from hgn.files import write_atomically
 from hgn.network.base import ParticleNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
-from hgn.runtime.path import choose_path, why_not_fast
+from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
@@ -39,10 +38,8 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(EvaluateConfig, mapping)
     device = choose_device(config.device)
     network, info = load_weights(Path(config.weights), device)
-    path, text = choose_path(
-        "path", config.path, config.precision, why_not_fast(device, network.config, config.precision)
-    )
-    torch.set_float32_matmul_precision("highest" if config.precision == "highest" else "high")
+    path, text = path_on(device, network.config, config.path, config.precision)
+    set_matmul_precision(config.precision)
     store = EpisodeStore(config.data, config.split)
     if not len(store):
         raise ConfigError(f"data must hold episodes of the split {config.split}, got none in {config.data}")

@@ -7,14 +7,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from hgn.command import run_command
 from hgn.config import RolloutConfig
 from hgn.data.select import find_episode
 from hgn.device import choose_device
 from hgn.progress import bar
-from hgn.runtime.path import choose_path, why_not_fast
+from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, load_weights, require_frame_rate
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
@@ -56,11 +54,9 @@ def rollout(config: RolloutConfig) -> Path:
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": config.episode}
     _require_cell_size(info, cell_size)
-    chosen, text = choose_path(
-        "path", config.path, config.precision, why_not_fast(device, network.config, config.precision)
-    )
+    chosen, text = path_on(device, network.config, config.path, config.precision)
     print(text, file=sys.stderr)
-    torch.set_float32_matmul_precision("highest" if config.precision == "highest" else "high")
+    set_matmul_precision(config.precision)
     simulator = Simulator(network, info.frame_rate_hz, chosen, config.precision)
     with bar("simulating", total=frames - 1, unit="frame") as progress:
         try:

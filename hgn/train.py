@@ -28,7 +28,7 @@ from hgn.files import write_atomically
 from hgn.network.build import build_network
 from hgn.progress import bar
 from hgn.provenance import provenance
-from hgn.runtime.path import choose_path, why_not_fast
+from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.schema import ConfigError, from_mapping, to_mapping
 from hgn.training.checkpoint import DataInfo, check_checkpoint, cursor_of_checkpoint, read_checkpoint
 from hgn.training.generator import Generator
@@ -90,7 +90,7 @@ def _fit(
     path, text = _path(config)
     if first_rank():
         print(text, file=sys.stderr)
-    torch.set_float32_matmul_precision("highest" if training.precision == "highest" else "high")
+    set_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
     module = TrainingModule(build_network(config.network), training, data, path)
     module.set_statistics(store.statistics())
@@ -131,8 +131,8 @@ def _path(config: TrainConfig) -> tuple[str, str]:
     """`plain` or `fast`, and a line that says so."""
     training = config.training
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
-    reason = why_not_fast(torch.device("cuda" if on_gpu else "cpu"), config.network, training.precision)
-    return choose_path("training.path", training.path, training.precision, reason)
+    device = torch.device("cuda" if on_gpu else "cpu")
+    return path_on(device, config.network, training.path, training.precision, "training.path")
 
 
 def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Cursor]:

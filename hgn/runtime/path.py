@@ -52,6 +52,18 @@ def choose_path(field: str, path: str, precision: str, reason: str | None) -> tu
     return chosen, f"{field.rpartition('.')[0] or 'runtime'} path: {chosen}{because}, precision {precision}"
 
 
+def path_on(
+    device: torch.device, network: NetworkConfig, path: str, precision: str, field: str = "path"
+) -> tuple[str, str]:
+    """What choose_path answers for a network on a device."""
+    return choose_path(field, path, precision, why_not_fast(device, network, precision))
+
+
+def set_matmul_precision(precision: str) -> None:
+    """PyTorch's own float32 products: full with `highest`, one TF32 product on a GPU with `high` and `half`."""
+    torch.set_float32_matmul_precision("highest" if precision == "highest" else "high")
+
+
 def kernel_precision(precision: str, device: torch.device) -> str:
     """What the kernels call `highest`, `high` or `half`; without a GPU float32 needs no detour."""
     name = KERNEL_PRECISION[precision]

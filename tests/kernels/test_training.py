@@ -50,7 +50,7 @@ def test_fast_training_is_the_plain_one(
     """Without noise and jitter both paths make the same updates: every count and log line is there, weights and
     moments agree; a training may change path at any checkpoint, and ends where the others do."""
     if device().type == "cpu":
-        monkeypatch.setattr(train, "why_not_fast", lambda *_: None)  # kernels run in the interpreter
+        monkeypatch.setattr("hgn.runtime.path.why_not_fast", lambda *_: None)  # kernels run in the interpreter
     same = {"noise_std": 0.0, "grid_jitter": False}
     ends = {}
     for name, parts in {

@@ -18,7 +18,7 @@ import torch
 from hgn.config import MpmConfig, NetworkConfig
 from hgn.data.batch import Batch, make_batch
 from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.path import choose_path, why_not_fast
+from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
@@ -59,7 +59,7 @@ class NetworkContender:
         require_frame_rate(info, frame_rate_hz)
         config = info.network
         self.device, self.precision = device, PRECISIONS[precision]
-        self.path, _ = choose_path("path", path, self.precision, why_not_fast(device, config, self.precision))
+        self.path, _ = path_on(device, config, path, self.precision)
         with self.matmul():
             self.simulator = Simulator(self.network, info.frame_rate_hz, self.path, self.precision)
         self.row: dict[str, Any] = {
@@ -76,7 +76,7 @@ class NetworkContender:
     @contextmanager
     def matmul(self) -> Iterator[None]:
         before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision("highest" if self.precision == "highest" else "high")
+        set_matmul_precision(self.precision)
         try:
             yield
         finally:

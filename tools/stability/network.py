@@ -22,7 +22,7 @@ from hgn.device import choose_device
 from hgn.files import write_atomically
 from hgn.progress import bar
 from hgn.provenance import provenance
-from hgn.runtime.path import choose_path, why_not_fast
+from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights
 from hgn.schema import from_mapping, to_mapping
@@ -40,11 +40,9 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(StabilityNetworkConfig, mapping)
     device = choose_device(config.device)
     network, info = load_weights(Path(config.weights), device)
-    path, text = choose_path(
-        "path", config.path, config.precision, why_not_fast(device, network.config, config.precision)
-    )
+    path, text = path_on(device, network.config, config.path, config.precision)
     print(text, file=sys.stderr)
-    torch.set_float32_matmul_precision("highest" if config.precision == "highest" else "high")
+    set_matmul_precision(config.precision)
     simulator = Simulator(network, info.frame_rate_hz, path, config.precision)
     rows = []
     made = list(cases(config, network.config))
