@@ -20,13 +20,12 @@ from hgn.kernels.rollout.kernel import DIVERGED, advance, integrate
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.agreement import OUTPUT_BOUND, relative_error
 from hgn.runtime.path import kernel_precision
 from hgn.schema import ConfigError
 
 LOOK_FRAMES = 32
-MARGIN_CELLS = 4
 GROWTH = 2.0
-OUTPUT_BOUND = 0.05  # relative error of the norm
 CHECKED_PARTICLES = 50_000  # at most; the plain network needs memory
 INTEGRATE_BLOCK = 256
 
@@ -87,7 +86,7 @@ class FastRollout:
         size = self.domain_S3.amax(0).cpu()
         lower, upper = torch.minimum(box[0], torch.zeros(3)), torch.maximum(box[1], size)
         config = self.config
-        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels, MARGIN_CELLS)
+        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
 
     def _build(self, capacities: tuple[int, ...]) -> None:
         config, window = self.config, self._window()
@@ -128,11 +127,10 @@ class FastRollout:
             self._network_pass()
         found_N3 = self.engine.output[:, :3]
         with torch.no_grad():
-            expected_N3 = network.normalised_acceleration(state)
-        error, size = float((found_N3 - expected_N3).norm()), float(expected_N3.norm())
-        if not error <= OUTPUT_BOUND * size:  # NaN fails
+            error = relative_error(found_N3, network.normalised_acceleration(state))
+        if not error <= OUTPUT_BOUND:  # NaN fails
             raise ConfigError(
-                f"path must be plain on this machine, got fast: its output differs by {error / max(size, 1e-30):.1e} "
+                f"path must be plain on this machine, got fast: its output differs by {error:.1e} "
                 f"from the plain network's (at most {OUTPUT_BOUND}); set path=plain, and report device and versions"
             )
 

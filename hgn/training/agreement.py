@@ -17,9 +17,10 @@ from hgn.kernels.update.op import Updates
 from hgn.network.features import ParticleState
 from hgn.network.keys import pack
 from hgn.network.obstacles import ObstacleCells
+from hgn.runtime.agreement import OUTPUT_BOUND, relative_error
 from hgn.schema import ConfigError
 
-OUTPUT_BOUND, GRADIENT_BOUND = 0.05, 0.3  # relative errors of the norm
+GRADIENT_BOUND = 0.3  # relative error of the norm
 CHECKED_PARTICLES = 200_000  # at most; the plain network needs memory
 
 
@@ -37,13 +38,13 @@ def require_agreement(updates: Updates, episodes: Sequence[WholeEpisode]) -> tup
     output_N3 = network.normalised_acceleration(state, origin_S3)
     parameters = list(network.parameters())
     expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
-    output_error = _relative(engine.output[:count, :3], output_N3.detach())
+    output_error = relative_error(engine.output[:count, :3], output_N3.detach())
     engine.output_gradient[:count].zero_()
     engine.output_gradient[:count, :3] = weight_N3 / engine.unscale
     engine.backward()
     found = [torch.zeros_like(parameter) for parameter in parameters]
     updates.packed.scatter(engine.totals[: updates.packed.size], found)
-    gradient_error = _relative(
+    gradient_error = relative_error(
         torch.cat([tensor.flatten() for tensor in found]),
         torch.cat(
             [(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, expected, strict=True)]
@@ -82,9 +83,3 @@ def _state(updates: Updates, episodes: Sequence[WholeEpisode], count: int) -> tu
         obstacles,
     )
     return state, updates.origin_S3
-
-
-def _relative(found: torch.Tensor, expected: torch.Tensor) -> float:
-    size = float(expected.norm())
-    difference = float((found - expected).norm())
-    return difference / size if size > 0 else difference

@@ -11,6 +11,7 @@ from network.states import network_of, random_state
 
 from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.agreement import relative_error
 
 SEVERAL = (5, 1, 3)  # particles of three scenes
 gpu = pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
@@ -24,11 +25,6 @@ def reference(
     found = torch.autograd.grad((output * weight_N3).sum(), list(network.parameters()), allow_unused=True)
     pairs = zip(network.parameters(), found, strict=True)
     return output.detach(), [torch.zeros_like(p) if gradient is None else gradient for p, gradient in pairs]
-
-
-def relative(found: torch.Tensor, expected: torch.Tensor) -> float:
-    difference, size = (found.double() - expected).norm(), expected.norm()
-    return float(difference / size) if size > 0 else float(difference)
 
 
 def flat(tensors: list[torch.Tensor]) -> torch.Tensor:
@@ -57,7 +53,11 @@ def compare(
     engine.backward()
     each = gradients(engine, network)
     pairs = zip(each, expected, strict=True)
-    return relative(found, output), relative(flat(each), flat(expected)), [relative(a, b) for a, b in pairs]
+    return (
+        relative_error(found, output),
+        relative_error(flat(each), flat(expected)),
+        [relative_error(a, b) for a, b in pairs],
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_half_precision_keeps_small_gradients() -> None:
     engine.output_gradient[:5, :3] = 1.0
     engine.backward()
     _, expected = reference(network, state, origin_S3, torch.full((5, 3), weight, dtype=torch.float64))
-    assert relative(flat(gradients(engine, network)), flat(expected)) < 5e-2
+    assert relative_error(flat(gradients(engine, network)), flat(expected)) < 5e-2
 
 
 def test_cells_on_the_border_of_the_grid() -> None:
@@ -103,7 +103,7 @@ def test_cells_on_the_border_of_the_grid() -> None:
     origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
     engine = engine_of(network, state, "ieee" if device().type == "cpu" else "tf32x3", (64, 32))
     found = run_forward(engine, network, state, origin_S3)
-    assert relative(found, network.normalised_acceleration(state, origin_S3).detach()) < 1e-5
+    assert relative_error(found, network.normalised_acceleration(state, origin_S3).detach()) < 1e-5
 
 
 def test_without_obstacles_nothing_is_looked_up() -> None:
@@ -167,4 +167,4 @@ def plain_tf32_errors(network: HierarchicalGraphNetwork, state: ParticleState) -
         _, found = reference(single, moved, origin_S3.float().to(where), weight_N3.float().to(where))
     finally:
         torch.set_float32_matmul_precision(before)
-    return relative(flat(found), flat(expected))
+    return relative_error(flat(found), flat(expected))

@@ -7,7 +7,6 @@ on one scene of a tile, by the same code.
 from __future__ import annotations
 
 import copy
-import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,6 +22,7 @@ from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import build_hierarchy
 from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.agreement import relative_error
 from hgn.runtime.simulator import Simulator
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
@@ -219,9 +219,3 @@ def verdict(what: str, error: float, bound: float) -> str:
 
 def _gradient(parameter: torch.Tensor) -> torch.Tensor:
     return torch.zeros_like(parameter).flatten() if parameter.grad is None else parameter.grad.flatten()
-
-
-def relative_error(found: torch.Tensor, expected: torch.Tensor) -> float:
-    """Of the norm; NaN where nothing is expected."""
-    size = float(expected.norm())
-    return float((found - expected).norm()) / size if size > 0 else math.nan

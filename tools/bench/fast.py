@@ -11,6 +11,7 @@ import torch
 
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.agreement import relative_error
 from hgn.runtime.path import kernel_precision
 from tools.bench.contenders import (
     BOUNDS,
@@ -19,7 +20,6 @@ from tools.bench.contenders import (
     bench_network,
     reference_acceleration,
     reference_gradients,
-    relative_error,
     verdict,
 )
 from tools.bench.states import Workload, batch_of, state_of

@@ -28,9 +28,10 @@ from hgn.data.batch import Batch
 from hgn.network.fcn import FCN
 from hgn.network.gns import GraphNetworkSimulator, InteractionStep
 from hgn.network.neighbours import neighbour_list
+from hgn.runtime.agreement import relative_error
 from hgn.schema import ConfigError, require
 from hgn.training.noise import perturbed_window
-from tools.bench.contenders import BOUNDS, bench_network, reference_output, relative_error, verdict
+from tools.bench.contenders import BOUNDS, bench_network, reference_output, verdict
 from tools.bench.states import Workload, batch_of
 from tools.bench.timing import Timed, once
 

@@ -26,6 +26,7 @@ from torch.nn.parallel import DistributedDataParallel
 from hgn.config import ScalingConfig, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.agreement import relative_error
 from hgn.runtime.path import kernel_precision, why_not_fast
 from hgn.training.checkpoint import DataInfo
 from hgn.training.gradients import GradientGuard
@@ -283,7 +284,7 @@ def _average(contender: Contender, group: dist.ProcessGroup) -> None:
     dist.all_reduce(expected, group=group)
     expected /= dist.get_world_size(group)
     contender.messages = contender.update.average(group, contender.message_mb)
-    error = float((contender.update.gradients() - expected).norm() / expected.norm())
+    error = relative_error(contender.update.gradients(), expected)
     if not error <= GRADIENT_BOUND:
         contender.check = f"relative error of averaged gradients {error:.1e} exceeds {GRADIENT_BOUND:.0e}"
 

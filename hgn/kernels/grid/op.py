@@ -18,6 +18,7 @@ from hgn.network.obstacles import ObstacleCells
 
 MARK_BLOCK = 128
 FILL_BLOCK = 1024
+MARGIN_CELLS = 4  # of a window, around what it must hold
 OBSTACLE_COLUMNS = 4
 OVERFLOW = 1
 OUT_OF_WINDOW = 2
@@ -36,7 +37,7 @@ class Window:
 
     @staticmethod
     def around(
-        lower_3: Sequence[float], upper_3: Sequence[float], cell_size: float, levels: int, margin: int
+        lower_3: Sequence[float], upper_3: Sequence[float], cell_size: float, levels: int, margin: int = MARGIN_CELLS
     ) -> Window:
         """Holds every cell within `margin` cells of a box given in domain units."""
         unit = 1 << (levels - 1)

@@ -24,7 +24,6 @@ from hgn.network.network import HierarchicalGraphNetwork
 from hgn.schema import ConfigError
 
 SAMPLE_COLUMNS = 9
-MARGIN_CELLS = 4
 GROWTH = 1.25
 BLOCK = 128
 FLAT_BLOCK = 1024
@@ -285,7 +284,7 @@ class Updates:
 
     def _window(self) -> Window:
         config, (lower, upper) = self.config, self._reach
-        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels, MARGIN_CELLS)
+        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
 
     def _inside(self, reach: tuple[torch.Tensor, torch.Tensor]) -> bool:
         return bool((self._built_reach[0] <= reach[0]).all() and (self._built_reach[1] >= reach[1]).all())
