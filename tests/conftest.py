@@ -1,10 +1,11 @@
-"""Data sets made with the ballistic stand-in for the solver."""
+"""Data sets made with the ballistic stand-in for the solver, and the process put right after every test."""
 
 from __future__ import annotations
 
 import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,15 @@ BALLISTIC = Backend(
     build_obstacle_grid="ballistic_solver:build_obstacle_grid",
     simulate="ballistic_solver:simulate",
 )
+
+
+@pytest.fixture(autouse=True)
+def keep_signal_handlers() -> Iterator[None]:
+    """Commands that a test runs in this process leave theirs behind."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture

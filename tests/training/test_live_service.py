@@ -31,14 +31,6 @@ ROOT = Path(__file__).resolve().parents[2]
 SCENES = 5
 
 
-@pytest.fixture(autouse=True)
-def keep_signal_handlers() -> Iterator[None]:
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-
-
 class Service:
     """The ballistic service in processes of its own, always on the same port."""
 
