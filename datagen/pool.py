@@ -24,9 +24,9 @@ from hgn.schema import ConfigError
 
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
 _LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
-GPU_SCENES_PER_LAUNCH = 384
-GPU_NODES_PER_LAUNCH = 384 * 64**3  # of the grids of all scenes, about 30 bytes each
-GPU_FIRST_LAUNCH = 2  # small, so that training can start early: such a launch has the whole GPU for each substep
+GPU_SCENES_PER_LAUNCH = 832  # an H100 runs 264 at a time: two teams on each of its processors
+GPU_NODES_PER_LAUNCH = GPU_SCENES_PER_LAUNCH * 64**3  # of the grids of all scenes, about 30 bytes each
+GPU_FIRST_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
 _LAUNCH_GROWTH = 32  # from one launch to the next, up to the full size
 MAXIMUM_MAKERS = 32
 
@@ -53,7 +53,7 @@ def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int) -
     if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
         launch = launch or gpu_scenes_per_launch(config)
         makers = max(1, min(MAXIMUM_MAKERS, cpu_count - 1))
-        return WorkerPlan(workers or 1, None, makers, launch, min(launch, GPU_FIRST_LAUNCH), gpus)
+        return WorkerPlan(workers or 1, None, makers, launch, gpu_first_launch(config, launch), gpus)
     solvers = workers or max(1, cpu_count // 2)
     threads = max(1, cpu_count // solvers)
     return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
@@ -63,6 +63,11 @@ def gpu_scenes_per_launch(config: DatagenConfig) -> int:
     """As many as give every part of a GPU work; fewer where their grids are large."""
     nodes = math.prod(math.ceil(length / config.scene.cell_size) for length in config.scene.domain_size)
     return max(1, min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes))
+
+
+def gpu_first_launch(config: DatagenConfig, launch: int) -> int:
+    """Few scenes where something waits for the first episodes; all that a launch holds are done sooner together."""
+    return min(launch, GPU_FIRST_LAUNCH) if config.dataset.early_episodes else launch
 
 
 def visible_gpus() -> tuple[str, ...]:

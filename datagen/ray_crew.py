@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.plan import SceneTask
-from datagen.pool import GPU_FIRST_LAUNCH, MAXIMUM_MAKERS, WorkerPlan, gpu_scenes_per_launch
+from datagen.pool import MAXIMUM_MAKERS, WorkerPlan, gpu_first_launch, gpu_scenes_per_launch
 from datagen.shard import pack_episode, stage_bytes
 from datagen.worker import Backend, MadeScene, Worker, error_message, failure_of, make_episode, make_scene
 from hgn.config import DatagenConfig
@@ -37,7 +37,7 @@ def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]]) ->
     gpus = int(sum(node.get("GPU", 0) for node in nodes))
     if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
         launch = launch or gpu_scenes_per_launch(config)
-        solvers, threads, first = workers or max(1, gpus), None, min(launch, GPU_FIRST_LAUNCH)
+        solvers, threads, first = workers or max(1, gpus), None, gpu_first_launch(config, launch)
     else:
         cores = [int(node["CPU"]) for node in nodes if node.get("CPU", 0) >= 1]
         threads = min(_SOLVER_THREADS, *cores) if cores else 1

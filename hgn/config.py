@@ -88,7 +88,7 @@ class MpmConfig:
     snow_hardening: float = 10.0
     snow_critical_compression: float = 0.025
     snow_critical_stretch: float = 0.0045
-    snow_maximum_hardening: float = 100.0  # bound on exp(hardening * (1 - Jp)); hits are counted
+    snow_maximum_hardening: float = 20.0  # bound on exp(hardening * (1 - Jp)); hits are counted
     water_equation: str = "linear"  # pressure lambda (1 - J); or stiffening: lambda / 7 (J^-7 - 1)
     water_minimum_volume_ratio: float = 0.1  # floor on J; hits are counted
     minimum_singular_value: float = 0.05  # floor on the singular values of F; hits are counted
@@ -102,7 +102,7 @@ class MpmConfig:
     collider_friction: float = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
     device: str = "auto"  # or cpu, gpu
-    scenes_per_launch: int | None = None  # none: 1 on a CPU, 384 on a GPU
+    scenes_per_launch: int | None = None  # none: 1 on a CPU, 832 on a GPU
     maximum_substeps_per_frame: int = 20_000  # beyond it a scene is stopped and reported
 
     def __post_init__(self) -> None:
@@ -153,6 +153,7 @@ class DatasetConfig:
     frames: int = 300
     frame_rate_hz: float = 60.0
     seed: int = 0
+    early_episodes: bool = False  # a GPU begins with few scenes, because training waits for them
     episodes_per_shard: int = 8  # the first training shards are smaller, so that training can start early
     workers: int | None = None  # none: one on a GPU, one per two cores on a CPU
     maximum_attempts: int = 3  # per scene before it is quarantined and replaced

@@ -46,14 +46,6 @@ def weights(fx):
 
 
 @ti.func
-def spline(distance: ti.f32) -> ti.f32:
-    """The same weight from the distance to a node, in (-1.5, 1.5) cells."""
-    away = ti.abs(distance)
-    outer = 1.5 - away
-    return 0.75 - away * away if away < 0.5 else 0.5 * outer * outer
-
-
-@ti.func
 def _node_of_axis(index, stride: ti.i32, local_stride: ti.i32):
     """The share of one axis in a node's position; shares of the three axes add up."""
     return (index >> 2) * stride + (index & 3) * local_stride

@@ -22,7 +22,7 @@ from hgn.schema import ConfigError, require
 
 # a scene of more fills a GPU better by itself
 TEAM_PARTICLES = 50_000
-TEAM_THREADS = 512
+TEAM_THREADS = 256  # two teams fit on a processor then, with 128 registers a thread
 TEAM_SCENES = 16  # fewer are done sooner where each has the whole GPU, a launch a substep
 CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
 

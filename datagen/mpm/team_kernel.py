@@ -17,7 +17,20 @@ With one thread a team it runs on a CPU too; the tests check it there against th
 
 import taichi as ti
 
-from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, FIELD, LIVE, SETTING, SHAPE, STATUS, TAG, VALUE, VARIANT
+from datagen.mpm.layout import (
+    BLOCK_NODES,
+    CONSTANT,
+    COUNT,
+    FIELD,
+    LIVE,
+    PACKED,
+    SETTING,
+    SHAPE,
+    STATUS,
+    TAG,
+    VALUE,
+    VARIANT,
+)
 from datagen.mpm.mls_mpm import (
     Integers,
     Nodes,
@@ -32,8 +45,8 @@ from datagen.mpm.mls_mpm import (
     node_places,
     raise_maximum,
     respond,
-    spline,
     update_node,
+    weights,
 )
 from hgn.scene.material import SAND
 
@@ -165,28 +178,75 @@ def _strain_and_sort(
 
 
 @ti.func
-def _scatter(
+def _pack(
     lane: ti.i32,
     scene: ti.i32,
     first: ti.i32,
+    count: ti.i32,
     particles: ti.i32,
     tags: ti.i32,
     stride: ti.i32,
     state: ti.template(),
     tag: ti.template(),
+    rank: ti.template(),
     order: ti.template(),
-    cell_begin: ti.template(),
-    live: ti.template(),
-    node: ti.template(),
+    packed: ti.template(),
+    cell_count: ti.template(),
     setting: ti.template(),
     law: ti.template(),
     shape: ti.template(),
     variant: ti.template(),
     threads: ti.template(),
 ):
-    """Adds mass and momentum of each cell's particles to its 27 nodes."""
+    """The order of the particles by cell, and in that order what each gives to its nodes: nine threads read it."""
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
+    p = lane
+    while p < count:
+        place = particles + p
+        x = _vector(state, place, stride, FIELD.position)
+        s = first + cell_count[_cell(x, scene, setting, shape)] + rank[first + p]
+        order[s] = p
+        base = base_node(x, inverse_dx)
+        fx = x * inverse_dx - ti.cast(base, ti.f32)
+        w0, w1, w2 = weights(fx)
+        if ti.static(bool(variant & VARIANT.several_laws)):
+            mass = law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
+            w0[0] *= mass
+            w1[0] *= mass
+            w2[0] *= mass
+        A = _matrix(state, place, stride, FIELD.affine) * dx
+        corner = _vector(state, place, stride, FIELD.velocity) - A @ fx
+        at = s * PACKED.length
+        for axis in ti.static(range(3)):
+            packed[at + PACKED.weight + 3 * axis] = w0[axis]
+            packed[at + PACKED.weight + 3 * axis + 1] = w1[axis]
+            packed[at + PACKED.weight + 3 * axis + 2] = w2[axis]
+            packed[at + PACKED.velocity + axis] = corner[axis]
+            packed[at + PACKED.base + axis] = ti.cast(base[axis], ti.f32)
+            for j in ti.static(range(3)):
+                packed[at + PACKED.step + 3 * j + axis] = A[axis, j]
+        p += threads
+
+
+@ti.func
+def _packed_vector(packed: ti.template(), at: ti.i32):
+    return ti.Vector([packed[at], packed[at + 1], packed[at + 2]])
+
+
+@ti.func
+def _scatter(
+    lane: ti.i32,
+    scene: ti.i32,
+    first: ti.i32,
+    packed: ti.template(),
+    cell_begin: ti.template(),
+    live: ti.template(),
+    node: ti.template(),
+    shape: ti.template(),
+    threads: ti.template(),
+):
+    """Adds mass and momentum of each cell's particles to its 27 nodes."""
     tasks = live[scene * LIVE.length + LIVE.cells] * LANES
     task = lane
     while task < tasks:
@@ -194,35 +254,31 @@ def _scatter(
         slot = task - entry * LANES
         offset_x = slot // 3
         offset_y = slot - 3 * offset_x
+        along_x = ti.cast(offset_x, ti.f32)
+        along_y = ti.cast(offset_y, ti.f32)
         sum_0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
         sum_1 = ti.Vector([0.0, 0.0, 0.0, 0.0])
         sum_2 = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        base = ti.Vector([0, 0, 0])
-        s = cell_begin[2 * (first + entry)]
-        end = s + cell_begin[2 * (first + entry) + 1]
-        while s < end:
-            p = order[first + s]
-            place = particles + p
-            scaled = _vector(state, place, stride, FIELD.position) * inverse_dx
-            base = ti.floor(scaled - 0.5, ti.i32)  # the same for all of them
-            away = ti.cast(base, ti.f32) - scaled
-            away_x = away[0] + ti.cast(offset_x, ti.f32)
-            away_y = away[1] + ti.cast(offset_y, ti.f32)
-            weight = spline(away_x) * spline(away_y)
-            if ti.static(bool(variant & VARIANT.several_laws)):
-                weight *= law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
-            A = _matrix(state, place, stride, FIELD.affine) * dx
-            up = ti.Vector([A[0, 2], A[1, 2], A[2, 2]])
-            v_0 = _vector(state, place, stride, FIELD.velocity) + A @ ti.Vector([away_x, away_y, away[2]])
+        at = (first + cell_begin[2 * (first + entry)]) * PACKED.length
+        base = ti.cast(_packed_vector(packed, at + PACKED.base), ti.i32)  # the same for all of them
+        end = at + cell_begin[2 * (first + entry) + 1] * PACKED.length
+        while at < end:
+            weight = packed[at + PACKED.weight + offset_x] * packed[at + PACKED.weight + 3 + offset_y]
+            up = _packed_vector(packed, at + PACKED.step + 6)
+            v_0 = (
+                _packed_vector(packed, at + PACKED.velocity)
+                + along_x * _packed_vector(packed, at + PACKED.step)
+                + along_y * _packed_vector(packed, at + PACKED.step + 3)
+            )
             v_1 = v_0 + up
             v_2 = v_1 + up
-            weight_0 = weight * spline(away[2])
-            weight_1 = weight * spline(away[2] + 1.0)
-            weight_2 = weight * spline(away[2] + 2.0)
+            weight_0 = weight * packed[at + PACKED.weight + 6]
+            weight_1 = weight * packed[at + PACKED.weight + 7]
+            weight_2 = weight * packed[at + PACKED.weight + 8]
             sum_0 += weight_0 * ti.Vector([v_0[0], v_0[1], v_0[2], 1.0])
             sum_1 += weight_1 * ti.Vector([v_1[0], v_1[1], v_1[2], 1.0])
             sum_2 += weight_2 * ti.Vector([v_2[0], v_2[1], v_2[2], 1.0])
-            s += 1
+            at += PACKED.length
         index_x, index_y, index_z = node_places(
             base + ti.Vector([offset_x, offset_y, 0]), scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape
         )
@@ -281,6 +337,7 @@ def advance(
     tag: Integers,
     rank: Integers,
     order: Integers,
+    packed: Scalars,
     cell_count: Integers,
     cell_list: Integers,
     cell_begin: Integers,
@@ -302,8 +359,9 @@ def advance(
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
     Arrays, with P particles and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, order,
-    cell_list [P] and cell_begin [2 P] are work space; cell_count [G] and the flags in block [3 * G / 64] are zero
-    between steps; turn [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
+    cell_list [P], cell_begin [2 P] and packed [24 P] are work space; cell_count [G] and the flags in block
+    [3 * G / 64] are zero between steps; turn [scenes] says which scene comes when (long ones first). A scene that
+    failed keeps still.
     """
     ti.loop_config(block_dim=threads)
     for thread in range(turn.shape[0] * threads):
@@ -365,16 +423,12 @@ def advance(
                         )
                         n += threads
                     _wait(threads)
-                    p = lane
-                    while p < count:
-                        cell = _cell(_vector(state, particles + p, stride, FIELD.position), scene, setting, shape)
-                        order[first + cell_count[cell] + rank[first + p]] = p
-                        p += threads
-                    _wait(threads)
-                    _scatter(
-                        lane, scene, first, particles, tags, stride, state, tag, order, cell_begin, live, node, setting,
-                        law, shape, variant, threads,
+                    _pack(
+                        lane, scene, first, count, particles, tags, stride, state, tag, rank, order, packed, cell_count,
+                        setting, law, shape, variant, threads,
                     )  # fmt: skip
+                    _wait(threads)
+                    _scatter(lane, scene, first, packed, cell_begin, live, node, shape, threads)
                     _wait(threads)
                     n = lane
                     while n < blocks * BLOCK_NODES:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from datagen.mpm.launch import Launch, device_array
-from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, TAG
+from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, PACKED, TAG
 from hgn.scene.material import SAND, SNOW
 
 import taichi as ti  # isort: skip
@@ -33,6 +33,7 @@ class TeamLaunch(Launch):
         tag[0, TAG.origin] = np.concatenate([np.arange(scene.particle_count) for scene in self.scenes])
         self.tag = device_array(tag.ravel())
         self.rank, self.order, self.cell_list = (ti.ndarray(ti.i32, self.particles) for _ in range(3))
+        self.packed = ti.ndarray(ti.f32, PACKED.length * self.particles)
         self.cell_begin = ti.ndarray(ti.i32, 2 * self.particles)
         self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
@@ -72,9 +73,9 @@ class TeamLaunch(Launch):
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
         turn = np.arange(len(self.scenes)) if turn is None else turn
         team_kernel.advance(
-            frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.cell_count, self.cell_list,
-            self.cell_begin, self.block, self.live, self.node, device_array(turn.astype(np.int32)), self.scene_value,
-            self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, output, self.variant,
-            self.threads,
+            frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.packed, self.cell_count,
+            self.cell_list, self.cell_begin, self.block, self.live, self.node, device_array(turn.astype(np.int32)),
+            self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal,
+            output, self.variant, self.threads,
         )  # fmt: skip
         return output

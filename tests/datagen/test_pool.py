@@ -200,11 +200,13 @@ def test_worker_plans() -> None:
     default = DatagenConfig()
     assert plan_workers(default, (), 8) == WorkerPlan(4, 2, 1, 1, 1)
     assert plan_workers(default, (), 1) == WorkerPlan(1, 1, 1, 1, 1)
-    assert plan_workers(default, ("0",), 8) == WorkerPlan(1, None, 7, 384, 2, ("0",))
+    assert plan_workers(default, ("0",), 8) == WorkerPlan(1, None, 7, 832, 832, ("0",))
     assert plan_workers(DatagenConfig(mpm=MpmConfig(device="cpu")), ("0",), 4).threads == 2
     many = DatagenConfig(dataset=DatasetConfig(workers=3), mpm=MpmConfig(scenes_per_launch=2))
     large = DatagenConfig(scene=SceneConfig(domain_size=(4.0, 1.0, 4.0)))
-    assert plan_workers(large, ("0",), 8).scenes_per_launch == 24
+    assert plan_workers(large, ("0",), 8).scenes_per_launch == 52
+    early = DatagenConfig(dataset=DatasetConfig(early_episodes=True))
+    assert plan_workers(early, ("0",), 8) == WorkerPlan(1, None, 7, 832, 2, ("0",))
     assert plan_workers(many, (), 8) == WorkerPlan(3, 2, 1, 2, 2)
     assert plan_workers(many, ("4", "5"), 8) == WorkerPlan(3, None, 7, 2, 2, ("4", "5"))
 

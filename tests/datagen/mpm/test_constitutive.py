@@ -85,7 +85,7 @@ def test_snow(spread: float) -> None:
     bounded = np.clip(sigma, 0.975, 1.0045)
     new_Jp = Jp * (sigma / bounded).prod(axis=1)
     new_F = compose(U, bounded, Vt)
-    h = np.minimum(np.exp(10 * (1 - Jp)), 100)[:, None, None]
+    h = np.minimum(np.exp(10 * (1 - Jp)), MpmConfig().snow_maximum_hardening)[:, None, None]
     J = bounded.prod(axis=1)[:, None, None]
     stress = 2 * shear * h * (new_F - U @ Vt) @ np.swapaxes(new_F, 1, 2) + bulk * h * J * (J - 1) * np.eye(3)
 
@@ -94,9 +94,9 @@ def test_snow(spread: float) -> None:
     close(got_Jp, new_Jp, 2e-6)
     # the stress is a difference of numbers near 1, so its error is a rounding of 2 mu h
     assert (np.abs(got_stress - stress) / (2 * shear * h)).max() < 2e-6
-    new_h = np.minimum(np.exp(10 * (1 - new_Jp)), 100)
+    new_h = np.minimum(np.exp(10 * (1 - new_Jp)), MpmConfig().snow_maximum_hardening)
     close(stiffness / new_h, np.full(500, 3 * bulk + 2 * shear), 5e-5)
-    assert counter[COUNT.hardening_caps] == (np.exp(10 * (1 - new_Jp)) >= 100).sum()
+    assert counter[COUNT.hardening_caps] == (np.exp(10 * (1 - new_Jp)) >= MpmConfig().snow_maximum_hardening).sum()
 
 
 @pytest.mark.parametrize("correction", ["tampubolon", "taichi_elements"])
