@@ -19,6 +19,7 @@ PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
 PLAIN_CASES = ("plain_frame", "plain_train")
 BENCH_CASES = ("frame", "train", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
 BENCH_PRECISIONS = ("fp32", "tf32", "fp16")
+SYMMETRIES = ("none", "gravity")
 PATHS = ("auto", "plain", "fast")
 PRECISIONS = ("highest", "high", "half")
 
@@ -287,6 +288,7 @@ class TrainingConfig:
     final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
     grid_jitter: bool = True
+    symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
     seed: int = 0
     accelerator: str = "auto"  # or cpu, gpu
     devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
@@ -321,6 +323,7 @@ class TrainingConfig:
             "monitor_particles_per_batch",
         )
         require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames")
+        require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
         require_one_of(self, "precision", PRECISIONS)
         require_one_of(self, "path", PATHS)

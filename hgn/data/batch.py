@@ -18,6 +18,7 @@ from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.scene.rollout_file import episode_surface
+from hgn.scene.symmetry import Symmetry, scene_symmetries
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +33,9 @@ class Batch:
     gravity_S3: torch.Tensor  # domain units per frame squared
     obstacles: ObstacleCells | None
     surface: SurfaceParticles | None  # where the network sees obstacles as particles
-    seeds_S: tuple[int, ...]  # of noise and jitter
+    seeds_S: tuple[int, ...]  # of noise, jitter and symmetry
     cursor: Cursor | None = None  # the order's state once this batch is trained on
+    symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene: what training may show instead of it
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
         names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
@@ -91,4 +93,5 @@ def make_batch(
         surface=SurfaceParticles.of([episode_surface(e) for e in episodes]) if network.obstacle_particles else None,
         seeds_S=tuple(seeds) if seeds is not None else (0,) * len(episodes),
         cursor=cursor,
+        symmetries_S=tuple(scene_symmetries(e.gravity, e.domain_size, e.obstacle_grid.cell_size) for e in episodes),
     )

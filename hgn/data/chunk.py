@@ -15,6 +15,7 @@ from hgn.data.order import Cursor, Sample
 from hgn.network.features import material_rows
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_positions
+from hgn.scene.symmetry import Symmetry, scene_symmetries
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +27,7 @@ class WholeEpisode:
     obstacle_cell_K3: torch.Tensor  # int32; empty where the network sees none
     obstacle_normal_K3: torch.Tensor
     domain_size: tuple[float, float, float]
+    symmetries: tuple[Symmetry, ...] = ()  # what training may show instead of the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,4 +55,5 @@ def whole_episode(episode: Episode, network: NetworkConfig) -> WholeEpisode:
         torch.from_numpy(np.array(grid.cell_K3[:seen], np.int32)),
         torch.from_numpy(np.array(grid.normal_K3[:seen], np.float32)),
         episode.domain_size,
+        scene_symmetries(episode.gravity, episode.domain_size, grid.cell_size),
     )

@@ -30,7 +30,7 @@ class Sample:
 
     episode: int
     frame: int
-    seed: int  # of its noise and grid jitter
+    seed: int  # of its noise, grid jitter and symmetry
 
 
 def epoch_permutation(seed: int, epoch: int, sample_count: int) -> np.ndarray:

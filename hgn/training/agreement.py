@@ -18,21 +18,25 @@ from hgn.network.features import ParticleState
 from hgn.network.keys import pack
 from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.agreement import OUTPUT_BOUND, relative_error
+from hgn.scene.symmetry import Symmetry
 from hgn.schema import ConfigError
+from hgn.training.symmetry import obstacles_under
 
 GRADIENT_BOUND = 0.3  # relative error of the norm
 CHECKED_PARTICLES = 200_000  # at most; the plain network needs memory
 
 
-def require_agreement(updates: Updates, episodes: Sequence[WholeEpisode]) -> tuple[float, float]:
-    """Relative errors of outputs and of all gradients on the batch that `updates` holds, of these episodes.
+def require_agreement(
+    updates: Updates, episodes: Sequence[WholeEpisode], symmetries: Sequence[Symmetry] | None = None
+) -> tuple[float, float]:
+    """Relative errors of outputs and of all gradients on the batch that `updates` holds, of these episodes' images.
 
     Too large a batch is not checked: NaN. Raises: ConfigError when one of them exceeds its bound.
     """
     network, engine, count = updates.network, updates.engine, int(updates.particle_count)
     if count > CHECKED_PARTICLES:
         return math.nan, math.nan
-    state, origin_S3 = _state(updates, episodes, count)
+    state, origin_S3 = _state(updates, episodes, symmetries, count)
     generator = torch.Generator().manual_seed(0)
     weight_N3 = torch.randn(count, 3, generator=generator).to(updates.device) * updates.share_N[:count, None]
     output_N3 = network.normalised_acceleration(state, origin_S3)
@@ -62,7 +66,9 @@ def require_agreement(updates: Updates, episodes: Sequence[WholeEpisode]) -> tup
     return output_error, gradient_error
 
 
-def _state(updates: Updates, episodes: Sequence[WholeEpisode], count: int) -> tuple[ParticleState, torch.Tensor]:
+def _state(
+    updates: Updates, episodes: Sequence[WholeEpisode], symmetries: Sequence[Symmetry] | None, count: int
+) -> tuple[ParticleState, torch.Tensor]:
     """The batch as the plain network reads it, noise and jitter included."""
     config = updates.config
     keys, normals = [], []
@@ -73,7 +79,10 @@ def _state(updates: Updates, episodes: Sequence[WholeEpisode], count: int) -> tu
     obstacles = None
     if config.obstacle_features and any(len(key) for key in keys):
         cell_size = updates.settings.obstacle_cell_size
-        obstacles = ObstacleCells(torch.cat(keys), torch.cat(normals), cell_size).to(updates.device)
+        obstacles = ObstacleCells(torch.cat(keys), torch.cat(normals), cell_size)
+        if symmetries is not None:
+            obstacles = obstacles_under(obstacles, symmetries)
+        obstacles = obstacles.to(updates.device)
     state = ParticleState(
         updates.position_N3[:count],
         updates.velocity_NV[:count].view(count, config.velocity_history, 3),

@@ -16,6 +16,7 @@ from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import kernel_precision
+from hgn.scene.symmetry import drawn_symmetry
 from hgn.training.agreement import require_agreement
 
 DATA_SHARE = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
@@ -38,7 +39,10 @@ class FastTraining:
         """loss_sum [2] and counters [5] are added to, as hgn.kernels.update.kernel.finish_update says."""
         self.network, self.optimizer = network, optimizer
         self.device = next(network.parameters()).device
-        settings = UpdateSettings(training.batch_scenes, training.noise_std, training.grid_jitter, obstacle_cell_size)
+        self.symmetric = training.symmetry != "none"
+        settings = UpdateSettings(
+            training.batch_scenes, training.noise_std, training.grid_jitter, obstacle_cell_size, self.symmetric
+        )
         precision = kernel_precision(training.precision, self.device)
         self._take_over()
         self.updates = Updates(network, settings, precision, loss_sum, counters, reduce, ranks)
@@ -56,7 +60,11 @@ class FastTraining:
         if self.agreement is None:
             first = chunk.samples[0]
             self.updates.predict([(self._episodes[s.episode], s.frame, s.seed) for s in first])
-            self.agreement = require_agreement(self.updates, [chunk.episodes[s.episode] for s in first])
+            episodes = [chunk.episodes[s.episode] for s in first]
+            shown = None
+            if self.symmetric:
+                shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
+            self.agreement = require_agreement(self.updates, episodes, shown)
         self.updates.run([[(self._episodes[s.episode], s.frame, s.seed) for s in u] for u in chunk.samples], rates)
         self._write_back()
 
@@ -69,7 +77,8 @@ class FastTraining:
             position_TN3 = position_TN3.to(self.device) if fits else position_TN3.pin_memory()
         cells, normals = episode.obstacle_cell_K3, episode.obstacle_normal_K3
         obstacles = ObstacleHash.of(cells, normals).to(self.device) if len(cells) else None
-        return DeviceEpisode(position_TN3, episode.material_N.to(self.device), obstacles, episode.domain_size)
+        material_N = episode.material_N.to(self.device)
+        return DeviceEpisode(position_TN3, material_N, obstacles, episode.domain_size, episode.symmetries)
 
     def _take_over(self) -> None:
         """Makes parameters and moments views of flat buffers, so that one launch copies all of them."""

@@ -23,6 +23,7 @@ from hgn.schema import to_mapping
 from hgn.training.checkpoint import SECTION, DataInfo, cursor_of_checkpoint, updates_of_checkpoint
 from hgn.training.noise import jittered_origin, perturbed_window
 from hgn.training.ranks import sum_over_ranks
+from hgn.training.symmetry import drawn_symmetries, under_symmetries
 
 
 class TrainingModule(LightningModule):
@@ -55,6 +56,8 @@ class TrainingModule(LightningModule):
     def loss(self, batch: Batch) -> torch.Tensor:
         """Mean squared error of the normalised acceleration: over axes, over particles, over scenes."""
         config = self.training_config
+        if config.symmetry != "none":
+            batch = under_symmetries(batch, drawn_symmetries(batch))
         window_WN3 = perturbed_window(batch, config.noise_std)
         origin_S3 = jittered_origin(batch, self.network.config.cell_size) if config.grid_jitter else None
         target_N3 = self.network.normaliser.normalise_acceleration(batch.acceleration(window_WN3))

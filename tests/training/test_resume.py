@@ -222,12 +222,14 @@ def assert_same(found: Any, expected: Any, where: str = "") -> None:
 
 def test_resume_equals_no_interruption(data: DatagenConfig, stop_at: Callable[[int | None], None]) -> None:
     """Interrupted at any updates, once or several times, a training ends where an uninterrupted one does, bit by bit:
-    weights, both moments, learning rate and order; noise and jitter come from the samples' seeds, so they agree too."""
+    weights, both moments, learning rate and order; noise, jitter and symmetries come from the samples' seeds, so they
+    agree too."""
 
     def trained(run: Path, stops: Sequence[int]) -> dict[str, Any]:
         for stop in (*stops, None):
             stop_at(stop)
-            assert train.main(train_mapping(data, run, maximum_updates=UPDATES, monitor_every=1000)) == 0
+            mapping = train_mapping(data, run, maximum_updates=UPDATES, monitor_every=1000, symmetry="gravity")
+            assert train.main(mapping) == 0
             updates = read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"]
             assert updates == (UPDATES if stop is None else stop)
         return read_checkpoint(run / "checkpoints" / "last.ckpt")

@@ -4,8 +4,8 @@ All levels of all scenes lie in one array of slots: a window of cells around the
 level so that neighbours need no bounds check. Shape legend: N particles, C cells of a level, L levels.
 Row of the geometry table of a level: first slot, slots, cells of the window in y and z with borders, slots of a
 scene, capacity, first cell in tables, window cells in x with borders.
-Row of the obstacle table of a scene, int64: addresses of its hash buckets (0: no obstacle), keys and normals, and the
-mask of the buckets.
+Row of the obstacle table of a scene, int64: addresses of its hash buckets (0: no obstacle), keys and normals, the
+mask of the buckets, and the symmetry that it is seen under (hgn.scene.symmetry.Symmetry.code).
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import triton
 import triton.language as tl
 
 GEOMETRY_COLUMNS = tl.constexpr(8)
-OBSTACLE_COLUMNS = tl.constexpr(4)
+OBSTACLE_COLUMNS = tl.constexpr(5)
 OVERFLOW = tl.constexpr(1)  # more active cells than capacity
 OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
+CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
 
 
 @triton.jit
@@ -187,6 +188,21 @@ def _find_obstacle(x, y, z, line, live):
 
 
 @triton.jit
+def _before_mirror(cell, symmetry, axis: tl.constexpr):
+    """A cell's coordinate, in floats, from before the symmetry mirrored this axis."""
+    part = symmetry >> CODE_BITS * axis
+    last = (part >> 3 & 131071).to(tl.float32) - 1
+    return tl.where((part >> 2 & 1) == 1, last - cell, cell)
+
+
+@triton.jit
+def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
+    """That of the image's coordinates x, y, z which comes from this axis of the scene."""
+    z_or_y = tl.where((symmetry >> CODE_BITS & 3) == axis, y, z)
+    return tl.where((symmetry & 3) == axis, x, z_or_y)
+
+
+@triton.jit
 def prepare_particles(
     position,
     velocity,
@@ -213,11 +229,13 @@ def prepare_particles(
     HISTORY: tl.constexpr,
     NORMALS: tl.constexpr,
     OBSTACLES: tl.constexpr,
+    SYMMETRY: tl.constexpr,
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES]; its 8 cells,
-    their weights, and its fraction. Without OBSTACLES nothing is looked up and the normals stay zero."""
+    their weights, and its fraction. Without OBSTACLES nothing is looked up and the normals stay zero; with SYMMETRY the
+    particles are an image of the scene that the obstacle table is of: looked up there, normals brought back."""
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -268,20 +286,35 @@ def prepare_particles(
         ox = tl.floor(tl.div_rn(ox, obstacle_cell_size))
         oy = tl.floor(tl.div_rn(oy, obstacle_cell_size))
         oz = tl.floor(tl.div_rn(oz, obstacle_cell_size))
+        line = obstacle_table + scene * OBSTACLE_COLUMNS
+        if SYMMETRY:
+            symmetry = tl.load(line + OBSTACLE_COLUMNS - 1, mask=live, other=0)
+            ix = _before_mirror(ox, symmetry, 0)
+            iy = _before_mirror(oy, symmetry, 1)
+            iz = _before_mirror(oz, symmetry, 2)
+            ox = _from_axis(ix, iy, iz, symmetry, 0)
+            oy = _from_axis(ix, iy, iz, symmetry, 1)
+            oz = _from_axis(ix, iy, iz, symmetry, 2)
         near = live & (tl.abs(ox) < 65536.0) & (tl.abs(oy) < 65536.0) & (tl.abs(oz) < 65536.0)
         ox = tl.where(near, ox, 0.0).to(tl.int64)
         oy = tl.where(near, oy, 0.0).to(tl.int64)
         oz = tl.where(near, oz, 0.0).to(tl.int64)
-        line = obstacle_table + scene * OBSTACLE_COLUMNS
         near = near & (tl.load(line, mask=near, other=0) != 0)
         found = _find_obstacle(ox, oy, oz, line, near)
         is_normal = (column >= 3 * HISTORY) & (column < WALLS)
         entry_normal = tl.load(line + 2, mask=near, other=0).to(tl.pointer_type(tl.float32))
+        if SYMMETRY:
+            part = symmetry[:, None] >> (axis * CODE_BITS).to(tl.int64)[None, :]
+            normal_axis = part & 3
+        else:
+            normal_axis = axis[None, :]
         normal = tl.load(
-            (entry_normal + found * 3)[:, None] + axis[None, :],
+            (entry_normal + found * 3)[:, None] + normal_axis,
             mask=(found >= 0)[:, None] & is_normal[None, :],
             other=0.0,
         )
+        if SYMMETRY:
+            normal = tl.where((part >> 2 & 1) == 1, -normal, normal)
         value += normal
     is_wall = (column >= WALLS) & (column < WALLS + 6)
     place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)

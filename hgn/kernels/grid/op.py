@@ -19,7 +19,7 @@ from hgn.network.obstacles import ObstacleCells
 MARK_BLOCK = 128
 FILL_BLOCK = 1024
 MARGIN_CELLS = 4  # of a window, around what it must hold
-OBSTACLE_COLUMNS = 4
+OBSTACLE_COLUMNS = 5
 OVERFLOW = 1
 OUT_OF_WINDOW = 2
 NOT_FINITE = 4  # set by whoever integrates or updates
@@ -80,9 +80,9 @@ class ObstacleHash:
         return ObstacleHash(self.bucket_B.to(device), self.key_K.to(device), self.normal_K3.to(device))
 
     def row(self) -> list[int]:
-        """This scene's row of an obstacle table; valid as long as this object lives."""
+        """This scene's row of an obstacle table, the symmetry not set; valid as long as this object lives."""
         pointers = [self.bucket_B.data_ptr(), self.key_K.data_ptr(), self.normal_K3.data_ptr()]
-        return [*pointers, len(self.bucket_B) - 2]
+        return [*pointers, len(self.bucket_B) - 2, 0]
 
 
 class ObstacleTable:
@@ -91,7 +91,7 @@ class ObstacleTable:
     def __init__(self, hashes: Sequence[ObstacleHash | None], cell_size: float, device: torch.device) -> None:
         self._hashes = [entry.to(device) if entry is not None else None for entry in hashes]
         rows = [entry.row() if entry is not None else [0] * OBSTACLE_COLUMNS for entry in self._hashes]
-        self.row_S4 = torch.tensor(rows, dtype=torch.int64, device=device)
+        self.row_S5 = torch.tensor(rows, dtype=torch.int64, device=device)
         self.cell_size = cell_size
 
     @staticmethod
@@ -219,8 +219,12 @@ class DeviceGrid:
         history: int,
         normals: bool,
         wall_maximum: float,
+        symmetry: bool = False,
     ) -> None:
-        """Features and cells of every particle; without `obstacles` normals are zero, and nothing is looked up."""
+        """Features and cells of every particle; without `obstacles` normals are zero, and nothing is looked up.
+
+        With `symmetry` the obstacles are seen under the symmetries in their rows.
+        """
         kernel.prepare_particles[(triton.cdiv(self.particles, 32),)](
             position,
             velocity,
@@ -235,7 +239,7 @@ class DeviceGrid:
             self.rank,
             mean_3,
             std_3,
-            obstacles.row_S4 if obstacles else self.counts_L,
+            obstacles.row_S5 if obstacles else self.counts_L,
             obstacles.cell_size if obstacles else 1.0,
             self.feature_NF,
             self.cell_N8,
@@ -247,6 +251,7 @@ class DeviceGrid:
             HISTORY=history,
             NORMALS=int(normals),
             OBSTACLES=normals and obstacles is not None,
+            SYMMETRY=symmetry,
             FEATURES=self.features,
             BLOCK=32,
         )

@@ -1,7 +1,8 @@
 """What a training step needs around the network: assembling a batch, loss, Adam, bookkeeping; all on the device.
 
 Row of the sample table, int64, one for each scene of each update: address of the window's first frame of positions,
-particles, first row in the batch, seed, address of the materials (int32), and the scene's row of the obstacle table.
+particles, first row in the batch, seed, address of the materials (int32), and the scene's row of the obstacle table,
+whose last column is the symmetry that the scene is shown under.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -10,8 +11,9 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-SAMPLE_COLUMNS = tl.constexpr(9)
-OBSTACLE_COLUMNS = tl.constexpr(4)
+SAMPLE_COLUMNS = tl.constexpr(10)
+OBSTACLE_COLUMNS = tl.constexpr(5)
+CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
 REPEAT = tl.constexpr(8)  # another rank must repeat the update
 AGAIN = tl.constexpr(11)  # overflow, out of the window, or REPEAT: the same update again, with more room
@@ -40,13 +42,16 @@ def assemble_batch(
     noise_step,
     jitter,
     scenes,
+    obstacle_cell_size,
     HISTORY: tl.constexpr,
+    SYMMETRY: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow.
 
     The target is v_true^{n+1} - v_noisy^n, normalised. Grid origins are uniform in [-jitter, 0]. Noise and jitter are
-    Philox numbers of the sample's seed: they depend on nothing else.
+    Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY the window is the image of the
+    stored one; velocities come from the stored positions, for mirrored ones are rounded.
     """
     table = samples + tl.load(update).to(tl.int64) * scenes * SAMPLE_COLUMNS
     domains = sample_domain + tl.load(update) * scenes * 3
@@ -85,22 +90,36 @@ def assemble_batch(
     tl.store(share_of + row, 1.0 / (scenes * particles.to(tl.float32)), mask=live)
     first = address.to(tl.pointer_type(tl.float32)) + own * 3
     frame = particles * 3
+    if SYMMETRY:
+        symmetry = tl.load(line + SAMPLE_COLUMNS - 1, mask=live, other=0)
     for axis in tl.static_range(3):
+        column = first + axis
+        if SYMMETRY:
+            part = symmetry >> CODE_BITS * axis
+            column = first + (part & 3)
+            mirrored = (part >> 2 & 1) == 1
         walk = tl.zeros((BLOCK,), tl.float32)
         moved = tl.zeros((BLOCK,), tl.float32)
-        before = tl.load(first + axis, mask=live, other=0.0)
+        before = tl.load(column, mask=live, other=0.0)
         v = walk
         for k in tl.static_range(HISTORY):
             walk += noise_step * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
             moved += walk
-            now = tl.load(first + (k + 1) * frame + axis, mask=live, other=0.0)
-            v = now - before + walk
+            now = tl.load(column + (k + 1) * frame, mask=live, other=0.0)
+            step = now - before
+            if SYMMETRY:
+                step = tl.where(mirrored, -step, step)
+            v = step + walk
             before = now
             # newest first
             tl.store(velocity + row * (3 * HISTORY) + 3 * (HISTORY - 1 - k) + axis, v, mask=live)
-        after = tl.load(first + (HISTORY + 1) * frame + axis, mask=live, other=0.0)
+        step = tl.load(column + (HISTORY + 1) * frame, mask=live, other=0.0) - before
+        if SYMMETRY:
+            step = tl.where(mirrored, -step, step)
+            mirror_sum = (part >> 3 & 131071).to(tl.float32) * obstacle_cell_size
+            before = tl.where(mirrored, mirror_sum - before, before)
         tl.store(position + row * 3 + axis, before + moved, mask=live)
-        acceleration = after - before - v
+        acceleration = step - v
         scaled = (acceleration - tl.load(mean + axis)) / tl.load(std + axis)
         tl.store(target + row * 3 + axis, scaled, mask=live)
 

@@ -21,9 +21,10 @@ from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, Obs
 from hgn.kernels.packing import pack_network
 from hgn.kernels.update import kernel
 from hgn.network.network import HierarchicalGraphNetwork
+from hgn.scene.symmetry import Symmetry, drawn_symmetry
 from hgn.schema import ConfigError
 
-SAMPLE_COLUMNS = 9
+SAMPLE_COLUMNS = 10
 GROWTH = 1.25
 BLOCK = 128
 FLAT_BLOCK = 1024
@@ -41,6 +42,7 @@ class DeviceEpisode:
     material_N: torch.Tensor  # int32, index into the network's materials
     obstacles: ObstacleHash | None
     domain_size: tuple[float, float, float]
+    symmetries: tuple[Symmetry, ...] = ()  # of which one is drawn for each sample, where that is asked
 
     @property
     def particles(self) -> int:
@@ -55,6 +57,7 @@ class UpdateSettings:
     noise_std: float
     grid_jitter: bool
     obstacle_cell_size: float
+    symmetry: bool = False
 
 
 class Updates:
@@ -93,7 +96,8 @@ class Updates:
         self.origin_S3, self.domain_S3 = torch.zeros(scenes, 3, device=device), torch.ones(scenes, 3, device=device)
         sees = self.config.obstacle_features
         self.obstacles = ObstacleTable([None] * scenes, settings.obstacle_cell_size, device) if sees else None
-        self._obstacle_row = self.obstacles.row_S4 if self.obstacles else self.origin_S3.new_zeros((scenes, 4)).long()
+        none_S5 = torch.zeros(scenes, OBSTACLE_COLUMNS, dtype=torch.int64, device=device)
+        self._obstacle_row = self.obstacles.row_S5 if self.obstacles else none_S5
         self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.capacities = capacities
@@ -152,6 +156,8 @@ class Updates:
                 count = episode.particles
                 at = episode.position_TN3.data_ptr() + frame * count * 12
                 row = episode.obstacles.row() if episode.obstacles is not None else [0] * OBSTACLE_COLUMNS
+                if self.settings.symmetry:
+                    row[-1] = drawn_symmetry(episode.symmetries, seed).code
                 table[k, s] = [at, count, first, seed, episode.material_N.data_ptr(), *row]
                 domain[k, s] = episode.domain_size
                 first += count
@@ -257,7 +263,9 @@ class Updates:
             settings.noise_std / math.sqrt(config.velocity_history),
             config.cell_size if settings.grid_jitter else 0.0,
             settings.scenes,
+            settings.obstacle_cell_size,
             HISTORY=config.velocity_history,
+            SYMMETRY=settings.symmetry,
             BLOCK=BLOCK,
         )
 
@@ -278,6 +286,7 @@ class Updates:
             config.velocity_history,
             config.obstacle_features,
             config.wall_distance_cells * config.cell_size,
+            self.settings.symmetry,
         )
 
     # room

@@ -1,0 +1,65 @@
+"""Symmetry augmentation on the plain path: a batch as each scene's symmetry shows it, on the batch's device.
+
+Shape legend: W window frames, N particles, K obstacle cells, P surface particles of all scenes, S scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from hgn.data.batch import Batch
+from hgn.network.keys import pack, unpack
+from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.scene.symmetry import Symmetry, drawn_symmetry
+
+
+def drawn_symmetries(batch: Batch) -> list[Symmetry]:
+    """A symmetry of each scene, drawn from its sample's seed."""
+    return [drawn_symmetry(own, seed) for own, seed in zip(batch.symmetries_S, batch.seeds_S, strict=True)]
+
+
+def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
+    """A copy of the batch with the scenes' images in it; gravity and domain are their own images."""
+    obstacles, surface = batch.obstacles, batch.surface
+    if surface is not None:
+        surface = SurfaceParticles(_points(surface.position_P3, surface.scene_P, symmetries), surface.scene_P)
+    return replace(
+        batch,
+        window_WN3=_points(batch.window_WN3, batch.scene_N, symmetries),
+        obstacles=obstacles and obstacles_under(obstacles, symmetries),
+        surface=surface,
+    )
+
+
+def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) -> ObstacleCells:
+    """Cells and normals of the images. Mirrored, cell k becomes n - 2 - k, where the solver has n nodes.
+
+    A particle exactly on a face belongs to the cell above it in the image too, as in any scene.
+    """
+    scene_K, cell_K3 = unpack(obstacles.key_K)
+    source_K3, mirrored_K3 = _axes(symmetries, scene_K)
+    last_S3 = torch.tensor([s.cells for s in symmetries], device=scene_K.device) - 1
+    cell_K3 = cell_K3.gather(-1, source_K3)
+    key_K = pack(scene_K, torch.where(mirrored_K3, last_S3[scene_K] - cell_K3, cell_K3))
+    normal_K3 = obstacles.normal_K3.gather(-1, source_K3)
+    normal_K3 = torch.where(mirrored_K3, -normal_K3, normal_K3)
+    order_K = torch.argsort(key_K)
+    return ObstacleCells(key_K[order_K], normal_K3[order_K], obstacles.cell_size)
+
+
+def _points(point_N3: torch.Tensor, scene_N: torch.Tensor, symmetries: Sequence[Symmetry]) -> torch.Tensor:
+    """The images of positions […, N, 3]."""
+    source_N3, mirrored_N3 = _axes(symmetries, scene_N)
+    sum_S3 = torch.tensor([s.mirror_sum for s in symmetries], dtype=torch.float64).to(point_N3)
+    point_N3 = point_N3.gather(-1, source_N3.expand(point_N3.shape))
+    return torch.where(mirrored_N3, sum_S3[scene_N] - point_N3, point_N3)
+
+
+def _axes(symmetries: Sequence[Symmetry], scene_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where each coordinate comes from, and whether it is mirrored, [N, 3]."""
+    source_S3 = torch.tensor([s.source for s in symmetries], device=scene_N.device)
+    mirrored_S3 = torch.tensor([s.mirrored for s in symmetries], device=scene_N.device)
+    return source_S3[scene_N], mirrored_S3[scene_N]

@@ -1,0 +1,107 @@
+"""Symmetry augmentation on the fast path against the plain one."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from kernels.engines import device, gradients
+from kernels.test_network import flat
+from kernels.test_update import HISTORY, parameters_of, updates_of
+from network.states import network_of
+from training.test_symmetry import CELL_SIZE, EIGHT, doubled, scene_with_obstacles, seeds_of
+
+from hgn.config import TrainingConfig
+from hgn.data.batch import make_batch
+from hgn.data.chunk import Chunk, whole_episode
+from hgn.data.order import Cursor, Sample
+from hgn.kernels.grid.op import ObstacleHash
+from hgn.kernels.update.op import DeviceEpisode
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.agreement import relative_error
+from hgn.scene.episode import Episode
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.training.fast import FastTraining
+from hgn.training.symmetry import under_symmetries
+
+FRAME = 6
+
+
+def small_network() -> HierarchicalGraphNetwork:
+    return network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
+
+
+def on_device(network: HierarchicalGraphNetwork, made: Episode) -> DeviceEpisode:
+    whole = whole_episode(made, network.config)
+    hashed = ObstacleHash.of(whole.obstacle_cell_K3, whole.obstacle_normal_K3).to(device())
+    obstacles = hashed if len(whole.obstacle_cell_K3) else None
+    position, material = whole.position_TN3.to(device()), whole.material_N.to(device())
+    return DeviceEpisode(position, material, obstacles, whole.domain_size, whole.symmetries)
+
+
+def test_an_update_of_all_eight_is_the_plain_one() -> None:
+    """An update of eight scenes, each under another symmetry, one without obstacles: positions, velocities, targets,
+    normals, loss and gradients are those of the plain path in float64, and the check of the kernels passes."""
+    network = small_network()
+    episodes = [scene_with_obstacles(i, 2 + i) for i in range(8)]
+    bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+    episodes[2] = replace(episodes[2], obstacle_grid=bare)
+    seeds = seeds_of(EIGHT)
+    batch = under_symmetries(doubled(make_batch([(e, FRAME) for e in episodes], network.config, seeds)), EIGHT)
+    state = batch.state()
+    target = network.normaliser.normalise_acceleration(batch.acceleration())
+    loss = batch.mean_over_scenes((network.normalised_acceleration(state) - target).square().mean(-1))
+    expected = flat(list(torch.autograd.grad(loss, list(network.parameters()))))
+
+    trained = copy.deepcopy(network).float().to(device())
+    training = TrainingConfig(batch_scenes=8, noise_std=0.0, grid_jitter=False, symmetry="gravity", precision="highest")
+    loss_sum, counters = torch.zeros(2, device=device()), torch.zeros(5, device=device())
+    optimizer = torch.optim.Adam(trained.parameters())
+    fast = FastTraining(trained, optimizer, training, CELL_SIZE, loss_sum, counters)
+    samples = tuple(Sample(i, FRAME, seed) for i, seed in enumerate(seeds))
+    wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}
+    fast.run(Chunk((samples,), wholes, Cursor()), [0.0])
+    updates, count, width = fast.updates, len(state.position_N3), 3 * HISTORY
+    assert fast.agreement is not None and max(fast.agreement) < 1e-3
+    near = {"rtol": 0, "atol": 1e-7}
+    torch.testing.assert_close(updates.position_N3[:count].cpu().double(), state.position_N3, **near)
+    torch.testing.assert_close(updates.velocity_NV[:count].cpu().double(), state.velocity_NM3.flatten(1), **near)
+    torch.testing.assert_close(updates.target_N3[:count].cpu().double(), target, rtol=0, atol=1e-4)
+    assert state.obstacles is not None
+    normal = state.obstacles.normals(state.position_N3, state.scene_N)
+    assert normal.abs().sum(-1).gt(0).sum() > 10
+    assert torch.equal(updates.grid.feature_NF[:count, width : width + 3].cpu().double(), normal)
+    assert float(loss_sum[0]) == pytest.approx(float(loss.detach()), rel=1e-5)
+    assert relative_error(flat(gradients(updates.engine, network)), expected) < 1e-4
+
+
+def test_without_symmetry_nothing_changes() -> None:
+    """With noise and jitter, an update under identities is bitwise the one without symmetries, which ignores them."""
+    network = small_network()
+    ends = []
+    for symmetry, known in ((False, EIGHT), (True, EIGHT[:1])):
+        made = replace(on_device(network, scene_with_obstacles(1, 5)), symmetries=known)
+        updates = updates_of(network, 1, (256,), noise_std=1e-3, grid_jitter=True, symmetry=symmetry)
+        updates.run([[(made, FRAME, 3)]], [1e-3])
+        ends.append((parameters_of(updates), updates.loss_sum.cpu(), updates.first_moment.cpu()))
+    for found, expected in zip(*ends, strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_noise_and_jitter_are_those_without() -> None:
+    """A sample's noise and grid origin are drawn in the image: they do not depend on the symmetry."""
+    network = small_network()
+    made = replace(on_device(network, scene_with_obstacles(1, 5)), obstacles=None)
+    drawn = []
+    for known in (EIGHT[:1], EIGHT[6:7]):
+        noise = []
+        for noise_std in (1e-3, 0.0):
+            updates = updates_of(network, 1, (256,), noise_std=noise_std, grid_jitter=True, symmetry=True)
+            updates.predict([(replace(made, symmetries=known), FRAME, 3)])
+            noise.append((updates.velocity_NV[:5].cpu().clone(), updates.origin_S3.cpu().clone()))
+        drawn.append((noise[0][0] - noise[1][0], noise[0][1]))
+    torch.testing.assert_close(drawn[0][0], drawn[1][0], rtol=0, atol=1e-9)
+    assert torch.equal(drawn[0][1], drawn[1][1]) and drawn[0][0].std() > 1e-4

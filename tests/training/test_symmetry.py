@@ -1,0 +1,182 @@
+"""Symmetry augmentation on the plain path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from network.states import gns_of, network_of, random_grid
+from scene.test_symmetry import matrix_of
+from training.test_noise import episode
+
+from hgn.config import TrainingConfig
+from hgn.data.batch import Batch, make_batch
+from hgn.network.base import ParticleNetwork
+from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.scene.episode import Episode
+from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
+from hgn.scene.scene import Obstacle
+from hgn.scene.symmetry import Symmetry, drawn_symmetry, scene_symmetries
+from hgn.schema import ConfigError
+from hgn.training.checkpoint import DataInfo
+from hgn.training.module import TrainingModule
+from hgn.training.symmetry import drawn_symmetries, obstacles_under, under_symmetries
+
+CELL_SIZE = 1 / 64
+EIGHT = scene_symmetries((0.0, -9.8, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
+CENTRE = np.full(3, 63 / 128)  # of the solver's nodes
+
+
+def scene_with_obstacles(seed: int, particles: int = 12, cells: int = 4_000) -> Episode:
+    """Particles in the middle of random obstacle cells, as random as their motion."""
+    made, grid = episode(particles, seed=seed), random_grid(seed, cells)
+    middle = 0.25 + 0.02 * np.random.default_rng(seed).normal(size=(1, particles, 3))
+    position = (made.position_TN3 - made.position_TN3[:1] + middle).astype(np.float32)
+    return replace(made, position_TN3=position, obstacle_grid=grid)
+
+
+def seeds_of(symmetries: Sequence[Symmetry]) -> tuple[int, ...]:
+    """A seed for each, that draws it, of different noise."""
+    found, seed = [], 100
+    for symmetry in symmetries:
+        seed += 1
+        while drawn_symmetry(EIGHT, seed) != symmetry:
+            seed += 1
+        found.append(seed)
+    return tuple(found)
+
+
+def doubled(batch: Batch) -> Batch:
+    return replace(batch, window_WN3=batch.window_WN3.double(), domain_S3=batch.domain_S3.double())
+
+
+def by_hand(batch: Batch, episodes: Sequence[Episode], symmetries: Sequence[Symmetry]) -> Batch:
+    """The batch of the images, each scene multiplied by its matrix about the centre of the solver's nodes."""
+    windows, grids, points = [], [], []
+    parts = batch.window_WN3.numpy().astype(np.float64)
+    for scene, (made, symmetry) in enumerate(zip(episodes, symmetries, strict=True)):
+        matrix = matrix_of(symmetry)
+        windows.append((parts[:, batch.scene_N.numpy() == scene] - CENTRE) @ matrix.T + CENTRE)
+        centre = (made.obstacle_grid.cell_K3 + 0.5) * CELL_SIZE
+        cell = np.floor(((centre - CENTRE) @ matrix.T + CENTRE) / CELL_SIZE).astype(np.int32)
+        order = np.lexsort(cell.T[::-1])
+        normal = (made.obstacle_grid.normal_K3 @ matrix.T).astype(np.float32)
+        grids.append(ObstacleGrid(CELL_SIZE, cell[order], normal[order]))
+        if batch.surface is not None:
+            own = batch.surface.position_P3[batch.surface.scene_P == scene].numpy()
+            points.append((own - CENTRE) @ matrix.T + CENTRE)
+    return replace(
+        batch,
+        window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
+        obstacles=ObstacleCells.of(grids) if batch.obstacles is not None else None,
+        surface=SurfaceParticles.of(points) if batch.surface is not None else None,
+    )
+
+
+def loss_and_gradients(network: ParticleNetwork, batch: Batch, symmetry: str) -> tuple[float, torch.Tensor]:
+    module = TrainingModule(network, TrainingConfig(symmetry=symmetry), DataInfo("", 60.0, CELL_SIZE))
+    loss = module.loss(batch)
+    found = torch.autograd.grad(loss, list(network.parameters()), allow_unused=True)
+    return float(loss.detach()), torch.cat([g.flatten() for g in found if g is not None])
+
+
+@pytest.mark.parametrize(
+    ("network", "shown"),
+    [
+        (network_of(levels=2, message_passing_steps=1), EIGHT),
+        (gns_of(message_passing_steps=1, cell_size=0.05), EIGHT[5:7]),
+        (gns_of(kind="gns_particles", message_passing_steps=1, cell_size=0.05), EIGHT[5:7]),
+    ],
+    ids=["hgn", "gns", "gns_particles"],
+)
+def test_training_sees_the_image(network: ParticleNetwork, shown: Sequence[Symmetry]) -> None:
+    """With noise and grid jitter, loss and gradients of a batch whose samples draw each of the symmetries are those of
+    the batch of images made by hand, to 1e-6 (positions of float32) or better; and not those of the batch itself."""
+    cells = 200 if network.config.obstacle_particles else 4_000  # sampling surfaces takes time
+    episodes = [scene_with_obstacles(i, cells=cells) for i in range(len(shown))]
+    batch = doubled(make_batch([(e, 6) for e in episodes], network.config, seeds_of(shown)))
+    assert drawn_symmetries(batch) == list(shown)
+    loss, gradient = loss_and_gradients(network, batch, "gravity")
+    expected_loss, expected = loss_and_gradients(network, by_hand(batch, episodes, shown), "none")
+    bound = 1e-6 if network.config.obstacle_particles else 1e-10  # surface points are float32
+    assert loss == pytest.approx(expected_loss, rel=bound)
+    assert float((gradient - expected).norm() / expected.norm()) < bound
+    other_loss, other = loss_and_gradients(network, batch, "none")
+    assert abs(other_loss - loss) > 1e-4 * loss and float((gradient - other).norm() / expected.norm()) > 1e-3
+
+
+def test_particles_meet_the_same_obstacles() -> None:
+    """Each particle's normal in the image is the image of its normal, and those of a scene's cells exist; velocities
+    and target accelerations are images too."""
+    episodes = [scene_with_obstacles(i, 200) for i in range(8)]
+    batch = doubled(make_batch([(e, 6) for e in episodes], network_of().config, seeds_of(EIGHT)))
+    image = under_symmetries(batch, EIGHT)
+    assert batch.obstacles is not None and image.obstacles is not None
+    matrix_N33 = torch.tensor(np.array([matrix_of(s) for s in EIGHT]))[batch.scene_N]
+
+    def turned(vector_N3: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("nij,nj->ni", matrix_N33, vector_N3)
+
+    before = batch.obstacles.normals(batch.window_WN3[-2], batch.scene_N)
+    assert before.abs().sum(-1).gt(0).float().mean() > 0.1
+    assert torch.equal(image.obstacles.normals(image.window_WN3[-2], image.scene_N), turned(before))
+    for k in range(5):
+        velocity = image.state().velocity_NM3[:, k]
+        torch.testing.assert_close(velocity, turned(batch.state().velocity_NM3[:, k]), rtol=0, atol=1e-15)
+    torch.testing.assert_close(image.acceleration(), turned(batch.acceleration()), rtol=0, atol=1e-15)
+    assert torch.equal(image.gravity_S3, batch.gravity_S3) and torch.equal(image.domain_S3, batch.domain_S3)
+
+
+def test_cells_are_those_of_the_mirrored_mesh() -> None:
+    """Three axis-aligned sheets give in the image the cells and normals that their mirrored meshes give."""
+    low, high, at = 10.5 * CELL_SIZE, 20.5 * CELL_SIZE, np.array([30.3, 40.8, 50.4]) * CELL_SIZE
+    corner = np.array([(low, low), (high, low), (high, high), (low, high)])
+    sheets = [np.insert(corner, axis, at[axis], axis=1) for axis in range(3)]
+    triangle = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+    def grid(symmetry: Symmetry) -> ObstacleGrid:
+        moved = [(sheet - CENTRE) @ matrix_of(symmetry).T + CENTRE for sheet in sheets]
+        return build_obstacle_grid([Obstacle("sheet", v, triangle, False) for v in moved], CELL_SIZE, 3)
+
+    original = grid(EIGHT[0])
+    found = obstacles_under(ObstacleCells.of([original] * 8), EIGHT)
+    expected = ObstacleCells.of([grid(symmetry) for symmetry in EIGHT])
+    assert expected is not None and torch.equal(found.key_K, expected.key_K)
+    torch.testing.assert_close(found.normal_K3, expected.normal_K3, rtol=0, atol=1e-6)
+
+
+def test_a_particle_on_a_face_takes_the_cell_above_in_the_image() -> None:
+    """At 10 cells exactly, mirrored to 53, a particle sees what lies in the image's cell 53: the scene's cell 9."""
+    (mirror,) = (s for s in EIGHT if s.source == (0, 1, 2) and s.mirrored == (True, False, False))
+    cell = np.array([[9, 5, 5], [10, 5, 5]], np.int32)
+    normal = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], np.float32)
+    cells = ObstacleCells.of([ObstacleGrid(CELL_SIZE, cell, normal)])
+    assert cells is not None
+    point, scene = torch.tensor([[53, 5.5, 5.5]], dtype=torch.float64) * CELL_SIZE, torch.zeros(1, dtype=torch.long)
+    assert obstacles_under(cells, [mirror]).normals(point, scene).tolist() == [[-1.0, 0.0, 0.0]]
+
+
+def test_symmetries_belong_to_samples_and_data_stay() -> None:
+    """What a sample is shown as depends on its seed alone, and the identity, as none, changes no bit."""
+    episodes = [scene_with_obstacles(i) for i in range(3)]
+    config = network_of().config
+    together = make_batch([(e, 6) for e in episodes], config, (7, 8, 9))
+    alone = make_batch([(episodes[1], 6)], config, (8,))
+    assert drawn_symmetries(together)[1] == drawn_symmetries(alone)[0]
+    before = together.window_WN3.clone()
+    under_symmetries(together, [EIGHT[7]] * 3)
+    assert torch.equal(together.window_WN3, before)
+    same = under_symmetries(together, [EIGHT[0]] * 3)
+    assert torch.equal(same.window_WN3, before)
+    assert same.obstacles is not None and together.obstacles is not None
+    assert torch.equal(same.obstacles.key_K, together.obstacles.key_K)
+    assert torch.equal(same.obstacles.normal_K3, together.obstacles.normal_K3)
+
+
+def test_unknown_symmetry_is_refused() -> None:
+    """Another word is refused with the choices."""
+    with pytest.raises(ConfigError, match="symmetry must be one of none, gravity, got 'square'"):
+        TrainingConfig(symmetry="square")
