@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from hgn.config import EvaluateConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.select import first_episodes
 from hgn.device import choose_device
-from hgn.files import write_atomically
+from hgn.files import write_json
 from hgn.network.base import ParticleNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
@@ -53,9 +52,7 @@ def main(mapping: dict[str, Any]) -> int:
     print(table(rows, config, len(episodes)))
     if config.json is not None:
         report = {"meta": provenance(device) | {"weights": config.weights, "updates": info.updates}, "rows": rows}
-        file = Path(config.json)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps(report, indent=1).encode())
+        write_json(config.json, report)
     return 0
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 TEMPORARY_SUFFIX = ".partial"
 
@@ -50,6 +52,16 @@ def write_atomically(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         temporary.replace(path)
     sync_folder(path.parent)
+
+
+def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
+    """Writes `value` for people and programs to read, whole or not at all; makes the folder where it is missing.
+
+    Raises: OSError as write_atomically does; ValueError for a number that JSON does not know, unless `allow_nan`.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps(value, indent=1, allow_nan=allow_nan).encode() + b"\n")
 
 
 def sync_folder(folder: Path) -> None:

@@ -14,7 +14,7 @@ import yaml
 
 from hgn.command import run_command
 from hgn.config import CurvesConfig
-from hgn.files import write_atomically
+from hgn.files import write_atomically, write_json
 from hgn.schema import ConfigError, from_mapping
 
 ROW_KEYS = ("update", "time", "loss", "learning_rate", "updates_per_second", "scenes_per_second", "gpu_memory_gb")
@@ -27,9 +27,8 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(CurvesConfig, mapping)
     run, out = Path(config.run), Path(config.out)
     records, settings = read_run(run)
-    out.parent.mkdir(parents=True, exist_ok=True)
     report = {"meta": settings.get("provenance", {}) | {"config": settings}, "rows": measurements(records)}
-    write_atomically(out.with_suffix(".json"), json.dumps(report, indent=1).encode())
+    write_json(out.with_suffix(".json"), report)
     write_atomically(out.with_suffix(".png"), draw(records, settings))
     print(out.with_suffix(".png"))
     print(out.with_suffix(".json"))

@@ -7,7 +7,6 @@ frames of the first, bitwise. Worth a run on a new cluster's file system. Linux 
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -27,7 +26,7 @@ from hgn.config import KillsConfig
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import verify_file
-from hgn.files import TEMPORARY_SUFFIX, write_atomically
+from hgn.files import TEMPORARY_SUFFIX, write_json
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.scene.episode import Episode
@@ -85,9 +84,7 @@ def main(mapping: dict[str, Any]) -> int:
     if kills_config.json is not None:
         meta = provenance() | {"config": to_mapping(config) | {"kills": to_mapping(kills_config)}}
         report = {"meta": meta, "summary": summary, "rows": [asdict(kill) for kill in kills]}
-        path = Path(kills_config.json)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, json.dumps(report, indent=1).encode() + b"\n")
+        write_json(kills_config.json, report)
     return EXIT_RED if found else 0
 
 

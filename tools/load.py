@@ -11,7 +11,6 @@ import functools
 import hashlib
 import http.client
 import http.server
-import json
 import multiprocessing
 import os
 import socket
@@ -29,7 +28,7 @@ from hgn.config import LoadConfig
 from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.statistics import merge_statistics
 from hgn.data.storage import file_sha256
-from hgn.files import write_atomically
+from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.schema import from_mapping, to_mapping
@@ -78,10 +77,8 @@ def main(mapping: dict[str, Any]) -> None:
         speed, low, high = (row[key] / 1e9 for key in ("bytes_per_second", "slowest", "fastest"))
         print(f"{row['way']:31} {speed:5.2f} GB/s ({low:.2f} to {high:.2f})  {row['ratio']:.2f} of the plain one")
     if config.json is not None:
-        path = Path(config.json)
-        path.parent.mkdir(parents=True, exist_ok=True)
         meta = provenance() | {"cpus": os.cpu_count(), "config": to_mapping(config)}
-        write_atomically(path, json.dumps({"meta": meta, "rows": rows}, indent=1).encode() + b"\n")
+        write_json(config.json, {"meta": meta, "rows": rows})
 
 
 def make_files(folder: Path, config: LoadConfig) -> Manifest:

@@ -6,18 +6,16 @@ one of each material, above a sheet, so that the kernels hold every branch. The 
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hgn.command import run_command
 from hgn.config import MpmConfig
-from hgn.files import write_atomically
+from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.scene.material import MATERIALS, SAND, SNOW, WATER
@@ -73,9 +71,7 @@ def main(mapping: dict[str, Any]) -> int:
         )
     if config.json is not None:
         meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": to_mapping(config)}
-        file = Path(config.json)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps({"meta": meta, "rows": rows}, indent=1).encode())
+        write_json(config.json, {"meta": meta, "rows": rows})
     return 0
 
 

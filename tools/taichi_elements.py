@@ -8,7 +8,6 @@ Shape legend: T frames, N particles.
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -21,7 +20,7 @@ import numpy as np
 
 from hgn.command import run_command
 from hgn.config import MpmConfig
-from hgn.files import write_atomically
+from hgn.files import write_json
 from hgn.provenance import provenance
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Scene
@@ -67,9 +66,7 @@ def main(mapping: dict[str, Any]) -> int:
         )
     if config.json is not None:
         meta = provenance("cpu") | {"config": to_mapping(config)}
-        file = Path(config.json)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps({"meta": meta, "rows": rows}, indent=1).encode())
+        write_json(config.json, {"meta": meta, "rows": rows})
     return 0
 
 

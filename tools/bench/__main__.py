@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import gc
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ import torch
 from hgn.command import run_command
 from hgn.config import BENCH_CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
 from hgn.device import choose_device
-from hgn.files import write_atomically
+from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.runtime.path import why_not_fast
@@ -66,10 +65,8 @@ def main(mapping: dict[str, Any]) -> int:
             progress.update()
     print(table(rows))
     if config.json is not None:
-        path = Path(config.json)
-        path.parent.mkdir(parents=True, exist_ok=True)
         meta = provenance(device) | {"config": to_mapping(config)}
-        write_atomically(path, json.dumps({"meta": meta, "rows": rows}, indent=1).encode())
+        write_json(config.json, {"meta": meta, "rows": rows})
     return 0 if all(row["check"] in (PASS, OUT_OF_MEMORY) for row in rows) else EXIT_RED
 
 

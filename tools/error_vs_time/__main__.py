@@ -20,14 +20,14 @@ from hgn.config import MpmConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.select import first_episodes
 from hgn.device import choose_device
-from hgn.files import write_atomically
+from hgn.files import write_atomically, write_json
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from tools.error_vs_time.contenders import Contender, NetworkContender, SolverContender, TrivialContender
 from tools.error_vs_time.plot import CONVENTION, draw_frames, draw_pareto
-from tools.error_vs_time.score import as_json, pay_back, score, table, time_in_turns
+from tools.error_vs_time.score import pay_back, report, score, table, time_in_turns
 from tools.error_vs_time.settings import PRECISIONS, ErrorVsTimeConfig
 from tools.trial import other_grid, solver_scene, solver_trials
 
@@ -79,7 +79,7 @@ def main(mapping: dict[str, Any]) -> int:
     print(table(rows))
     out = Path(config.out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(Path(config.json or f"{out}.json"), as_json(meta, rows))
+    write_json(config.json or f"{out}.json", report(meta, rows), allow_nan=False)
     write_atomically(Path(f"{out}.png"), draw_pareto(rows, meta))
     write_atomically(Path(f"{out}_frames.png"), draw_frames(rows, curves, meta))
     print(f"{out}.png {out}_frames.png {config.json or f'{out}.json'}")

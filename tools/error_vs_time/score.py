@@ -7,7 +7,6 @@ scenes that reached the frame. Shape legend: T frames, N particles of a scene.
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -163,9 +162,9 @@ def label(row: Mapping[str, Any]) -> str:
     return f"{row['system'].upper().replace('_', ' ')} {size}, {row['path']} {row['precision']} ({row['weights']})"
 
 
-def as_json(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """The report; numbers that are none are null, for JSON knows no NaN."""
-    return json.dumps({"meta": meta, "rows": _plain(list(rows))}, indent=1, allow_nan=False).encode()
+def report(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What the report's JSON holds; numbers that are none are null, for JSON knows no NaN."""
+    return {"meta": meta, "rows": _plain(list(rows))}
 
 
 def _motion(trial: Trial, reference: Episode) -> dict[str, float]:

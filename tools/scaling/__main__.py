@@ -19,7 +19,7 @@ import torch.multiprocessing
 
 from hgn.command import run_command
 from hgn.config import ScalingConfig
-from hgn.files import write_atomically
+from hgn.files import write_json
 from hgn.network.build import build_network
 from hgn.provenance import provenance
 from hgn.schema import ConfigError, from_mapping, to_mapping
@@ -61,10 +61,8 @@ def main(mapping: dict[str, Any]) -> int:
 
 def _write(config: ScalingConfig, device_type: str, found: dict[str, Any]) -> None:
     if config.json is not None:
-        path = Path(config.json)
-        path.parent.mkdir(parents=True, exist_ok=True)
         meta = provenance(device_type) | {"config": to_mapping(config)}
-        write_atomically(path, json.dumps({"meta": meta} | found, indent=1).encode())
+        write_json(config.json, {"meta": meta} | found)
 
 
 def devices(config: ScalingConfig) -> tuple[str, int]:

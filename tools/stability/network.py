@@ -7,7 +7,6 @@ without energy from nowhere. Where a rollout fails, the runtime must have said s
 from __future__ import annotations
 
 import copy
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ import torch
 
 from hgn.command import run_command
 from hgn.device import choose_device
-from hgn.files import write_atomically
+from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.runtime.path import path_on, set_matmul_precision
@@ -57,9 +56,7 @@ def main(mapping: dict[str, Any]) -> int:
         meta = provenance(device) | {"config": to_mapping(config), "weights": Path(config.weights).name}
         meta |= {"updates": info.updates, "path": path, "network": to_mapping(info.network)}
         report = {"meta": meta, "rows": [row.mapping(PART) for row in rows]}
-        file = Path(config.json)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
+        write_json(config.json, report, allow_nan=False)
     return 0
 
 

@@ -7,14 +7,13 @@ the other unless the table of leaks is cut short.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hgn.config import MpmConfig
-from hgn.files import write_atomically
+from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.schema import from_mapping, require, require_one_of, require_positive, to_mapping
@@ -71,9 +70,7 @@ def main(mapping: dict[str, Any]) -> int:
         meta = provenance(_torch_device(config.device)) | {"config": to_mapping(config), "solver": to_mapping(mpm)}
         steps = [point.mapping() for point in points]
         report = {"meta": meta, "rows": [row.mapping(PART) for row in rows], "steps": steps}
-        file = Path(config.json)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(file, json.dumps(report, indent=1, allow_nan=False).encode())
+        write_json(config.json, report, allow_nan=False)
     if config.picture is not None:
         draw(points, mpm, Path(config.picture))
     return 0
