@@ -24,12 +24,6 @@ from datagen.worker import Backend
 from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 
-BALLISTIC = Backend(
-    generate_scene="ballistic_solver:generate_scene",
-    build_obstacle_grid="ballistic_solver:build_obstacle_grid",
-    simulate="ballistic_solver:simulate",
-)
-
 
 @pytest.fixture(autouse=True)
 def keep_signal_handlers() -> Iterator[None]:
@@ -45,7 +39,7 @@ def backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Backend:
     folder = tmp_path / "control"
     folder.mkdir()
     monkeypatch.setenv(ballistic_solver.FOLDER_VARIABLE, str(folder))
-    return BALLISTIC
+    return ballistic_solver.BALLISTIC
 
 
 @pytest.fixture

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from functools import partial
 
-from datagen.__main__ import main
-from datagen.worker import Backend
-from hgn.command import run_command
+from ballistic_solver import BALLISTIC
 
-BALLISTIC = Backend(
-    generate_scene="ballistic_solver:generate_scene",
-    build_obstacle_grid="ballistic_solver:build_obstacle_grid",
-    simulate="ballistic_solver:simulate",
-)
+from datagen.__main__ import main
+from hgn.command import run_command
 
 if __name__ == "__main__":
     run_command(partial(main, backend=BALLISTIC), "datagen")

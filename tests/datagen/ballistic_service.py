@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from ballistic_command import BALLISTIC
+from ballistic_solver import BALLISTIC
 
 from datagen.service import main
 from hgn.command import run_command

@@ -17,12 +17,18 @@ from typing import Any
 
 import numpy as np
 
+from datagen.worker import Backend
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
 FOLDER_VARIABLE = "BALLISTIC_FOLDER"
+BALLISTIC = Backend(
+    generate_scene="ballistic_solver:generate_scene",
+    build_obstacle_grid="ballistic_solver:build_obstacle_grid",
+    simulate="ballistic_solver:simulate",
+)
 
 
 @dataclass(frozen=True, eq=False)

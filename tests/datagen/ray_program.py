@@ -12,21 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from ballistic_dataset import make_dataset
+from ballistic_solver import BALLISTIC
 from ray.cluster_utils import Cluster
 
 from datagen.generate import generate
 from datagen.progress import Progress
-from datagen.worker import Backend
 from hgn.config import DatagenConfig, DatasetConfig
 from hgn.data.manifest import Manifest
 from hgn.provenance import provenance
 from tools.kills import differences, equal_shards
 
-BALLISTIC = Backend(
-    generate_scene="ballistic_solver:generate_scene",
-    build_obstacle_grid="ballistic_solver:build_obstacle_grid",
-    simulate="ballistic_solver:simulate",
-)
 STORE_BYTES = 80 * 2**20
 
 

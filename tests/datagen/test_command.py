@@ -9,12 +9,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
+from processes import processes_of_session, wait_until
 
 from datagen.__main__ import main
 from datagen.progress import BarProgress, JsonProgress
@@ -180,26 +180,6 @@ def test_json_progress(backend: object, tmp_path: Path) -> None:
     assert [event["revision"] for event in events if event["event"] == "shard"] == [1, 2, 3, 4]
 
 
-def processes_of_session(session: int) -> list[int]:
-    """The processes of a session that are still running (Linux)."""
-    running = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-        if int(fields[3]) == session and fields[0] != "Z":
-            running.append(int(path.parent.name))
-    return running
-
-
-def wait_until(condition: object, seconds: float = 30.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():  # type: ignore[operator]
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.05)
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_stopping_leaves_a_resumable_folder(
@@ -216,7 +196,7 @@ def test_stopping_leaves_a_resumable_folder(
         os.kill(process.pid, number)
     _, errors = process.communicate(timeout=30)
     assert process.returncode == code
-    wait_until(lambda: processes_of_session(process.pid) == [])
+    wait_until(lambda: not processes_of_session(process.pid))
     if number != signal.SIGKILL:
         assert "episodes are kept in made: run the same command to go on" in errors
         assert "Traceback" not in errors

@@ -10,13 +10,13 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import pytest
+from processes import processes_of_session, wait_until
 
 import datagen.supervisor
 from datagen.progress import Progress
@@ -200,13 +200,6 @@ class Recorder(Progress):
         self.messages.append(text)
 
 
-def wait_until(condition: Callable[[], object], seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
-
-
 def children(process: int) -> list[int]:
     tasks = Path(f"/proc/{process}/task").glob("*/children")
     return [int(child) for path in tasks for child in path.read_text().split()]
@@ -340,15 +333,7 @@ def test_stopping_leaves_a_resumable_folder(backend: Backend, control: Path, tmp
     wait_until(lambda: "published" in (tmp_path / "log").read_text())
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
-    wait_until(lambda: not [p for p in Path("/proc").glob("[0-9]*/stat") if _in_session(p, process.pid)])
+    wait_until(lambda: not processes_of_session(process.pid))
     folder = tmp_path / "made"
     assert not list(folder.rglob("*.partial"))
     assert Manifest.load(folder).revision >= 1 and not Manifest.load(folder).complete
-
-
-def _in_session(stat: Path, session: int) -> bool:
-    try:
-        fields = stat.read_text().rpartition(")")[2].split()
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return int(fields[3]) == session and fields[0] != "Z"

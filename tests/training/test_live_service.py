@@ -8,12 +8,12 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import fsspec
 import pytest
+from processes import wait_until
 from training.runs import metrics, train_mapping
 
 import hgn.data.storage
@@ -165,10 +165,3 @@ def updates(run: Path) -> int:
         return int(metrics(run)[-1]["update"])
     except (FileNotFoundError, IndexError):
         return 0
-
-
-def wait_until(condition: Callable[[], object], seconds: float = 90.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
