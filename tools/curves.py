@@ -5,7 +5,6 @@ The JSON holds {"meta": provenance of the run and of the figure, "rows": [...]},
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from hgn.command import run_command
 from hgn.config import CurvesConfig
 from hgn.files import write_atomically, write_json
 from hgn.schema import ConfigError, from_mapping
+from tools.figure import as_png, new_figure
 
 ROW_KEYS = ("update", "time", "loss", "learning_rate", "updates_per_second", "scenes_per_second", "gpu_memory_gb")
 ROW_PREFIXES = ("one_step", "trivial", "rollout", "monitor")
@@ -65,12 +65,7 @@ def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
 
 def draw(records: list[dict[str, float]], settings: dict[str, Any]) -> bytes:
     """Loss and one-step errors over updates, the trivial predictors as lines, and rollout errors; PNG bytes."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, (left, middle, right) = pyplot.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
+    figure, ((left, middle, right),) = new_figure(1, 3, (15, 4.5))
     _plot(left, records, "loss", "training loss (noisy input)", "0.4")
     left.set_ylabel("MSE of normalised acceleration")
     for split, color in (("training", "tab:blue"), ("validation", "tab:orange")):
@@ -100,10 +95,7 @@ def draw(records: list[dict[str, float]], settings: dict[str, Any]) -> bytes:
         f"{str(where.get('date', ''))[:10]}",
         fontsize=10,
     )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    pyplot.close(figure)
-    return buffer.getvalue()
+    return as_png(figure)
 
 
 def _plot(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from tools.error_vs_time.score import label
+from tools.figure import as_png, new_figure
 
 CONVENTION = "squared errors: sum over axes, mean over particles and scenes, frame units"
 STYLES = {"hgn": ("o", "tab:blue"), "gns": ("^", "tab:orange"), "gns_particles": ("v", "tab:red"), "mpm": ("s", "0.35")}
@@ -103,24 +103,15 @@ def _short(row: Mapping[str, Any]) -> str:
 
 
 def _figure(panels: int, width: float = 5.5) -> tuple[Any, Sequence[Any]]:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     columns = min(panels, 3)
     lines = -(-panels // columns)
-    figure, axes = pyplot.subplots(
-        lines, columns, figsize=(width * columns, 4.5 * lines + 0.6), layout="constrained", squeeze=False
-    )
+    figure, axes = new_figure(lines, columns, (width * columns, 4.5 * lines + 0.6))
     for extra in axes.flat[panels:]:
         extra.axis("off")
     return figure, list(axes.flat[:panels])
 
 
 def _png(figure: Any, meta: Mapping[str, Any], title: str) -> bytes:
-    from matplotlib import pyplot
-
     versions = meta["versions"]
     figure.suptitle(
         f"{title}: {meta['scenes']} {meta['split']} scenes of {meta['data']}, {meta['device']}, "
@@ -129,7 +120,4 @@ def _png(figure: Any, meta: Mapping[str, Any], title: str) -> bytes:
         fontsize=7,
         wrap=True,
     )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
-    pyplot.close(figure)
-    return buffer.getvalue()
+    return as_png(figure, dpi=130)

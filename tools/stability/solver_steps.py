@@ -9,7 +9,6 @@ elastic solid; sand and snow themselves are measured as blocks pressed into a co
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from hgn.config import MpmConfig
 from hgn.files import write_atomically
 from hgn.scene.material import SAND, SNOW, WATER
 from hgn.scene.scene import Scene
+from tools.figure import as_png, new_figure
 from tools.stability.row import Row
 from tools.stability.solver_scenes import CELL, block, particles
 
@@ -128,14 +128,9 @@ def _corner(material: int, speed: float) -> list[Scene]:
 
 def draw(points: list[Point], base: MpmConfig, file: Path) -> None:
     """Stable and unstable steps over the stiffness, with the formula as a line, as PNG."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     cases = list(dict.fromkeys(point.case for point in points))
-    figure, axes = pyplot.subplots(1, len(cases), figsize=(3.4 * len(cases), 3.6), sharey=True, layout="constrained")
-    for axis, case in zip(np.atleast_1d(axes), cases, strict=True):
+    figure, (axes,) = new_figure(1, len(cases), (3.4 * len(cases), 3.6), share_y=True)
+    for axis, case in zip(axes, cases, strict=True):
         own = [point for point in points if point.case == case]
         for stable, marker, color in ((True, "o", "#2a7f62"), (False, "x", "#b3402a")):
             kept = [point for point in own if point.stable == stable]
@@ -148,10 +143,7 @@ def draw(points: list[Point], base: MpmConfig, file: Path) -> None:
         used = limit[0] * base.stability_fraction
         axis.plot(stiffness, used / np.sqrt(stiffness), "--", color="#39424e", label="the solver's own step")
         axis.set(xscale="log", yscale="log", title=case, xlabel="Young's modulus, times 1 MPa")
-    np.atleast_1d(axes)[0].set_ylabel("step, ms")
-    np.atleast_1d(axes)[0].legend(fontsize=8)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    pyplot.close(figure)
+    axes[0].set_ylabel("step, ms")
+    axes[0].legend(fontsize=8)
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(file, buffer.getvalue())
+    write_atomically(file, as_png(figure))
