@@ -14,7 +14,7 @@ from hgn.config import NetworkConfig
 from hgn.data.order import Cursor, Sample
 from hgn.network.features import material_rows
 from hgn.scene.episode import Episode
-from hgn.scene.history import ballistic_positions
+from hgn.scene.history import frames_before
 from hgn.scene.symmetry import Symmetry, scene_symmetries
 
 
@@ -41,13 +41,7 @@ class Chunk:
 
 def whole_episode(episode: Episode, network: NetworkConfig) -> WholeEpisode:
     """Reads an episode; its windows are those of `hgn.scene.history.window`."""
-    past = ballistic_positions(
-        episode.position_TN3[0],
-        episode.initial_velocity_N3,
-        episode.gravity,
-        episode.frame_rate_hz,
-        range(-network.velocity_history, 0),
-    )
+    past = frames_before(episode, -network.velocity_history)
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
     return WholeEpisode(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),

@@ -31,6 +31,17 @@ def ballistic_positions(
     return (position_N3 + velocity_N3 * time_T11 + fall_3 * time_T11**2).astype(np.float32)
 
 
+def frames_before(episode: Episode, first: int) -> np.ndarray:
+    """The frames `first` (negative) to -1 of an episode, float32 [-first, N, 3]: where free flight came from."""
+    return ballistic_positions(
+        episode.position_TN3[0],
+        episode.initial_velocity_N3,
+        episode.gravity,
+        episode.frame_rate_hz,
+        range(first, 0),
+    )
+
+
 def window(episode: Episode, frame: int, history: int) -> np.ndarray:
     """Positions x^{n-H} … x^{n+1} around frame n of an episode, float32 [H + 2, N, 3], a fresh array.
 
@@ -42,11 +53,4 @@ def window(episode: Episode, frame: int, history: int) -> np.ndarray:
     stored = np.array(episode.position_TN3[max(first, 0) : frame + 2], np.float32)
     if first >= 0:
         return stored
-    past = ballistic_positions(
-        episode.position_TN3[0],
-        episode.initial_velocity_N3,
-        episode.gravity,
-        episode.frame_rate_hz,
-        range(first, 0),
-    )
-    return np.concatenate([past, stored])
+    return np.concatenate([frames_before(episode, first), stored])
