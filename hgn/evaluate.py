@@ -21,7 +21,7 @@ from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
-from hgn.schema import ConfigError, from_mapping
+from hgn.schema import from_mapping
 from hgn.training.errors import (
     REPORTED_FRAMES,
     frame_batches,
@@ -40,8 +40,6 @@ def main(mapping: dict[str, Any]) -> int:
     path, text = path_on(device, network.config, config.path, config.precision)
     set_matmul_precision(config.precision)
     store = EpisodeStore(config.data, config.split)
-    if not len(store):
-        raise ConfigError(f"data must hold episodes of the split {config.split}, got none in {config.data}")
     episodes = first_episodes(store, config.scenes)
     require_frame_rate(info, episodes[0].frame_rate_hz)
     rows = one_step_rows(network, episodes, config)

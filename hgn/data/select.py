@@ -17,7 +17,12 @@ def first_indices(store: EpisodeStore, count: int, known: int | None = None) -> 
 
 
 def first_episodes(store: EpisodeStore, count: int, known: int | None = None) -> list[Episode]:
-    """These episodes."""
+    """These episodes.
+
+    Raises: ConfigError when there are none.
+    """
+    if not len(store):
+        raise ConfigError(f"data must hold episodes of the split {store.split}, got none in {store.folder}")
     return [store.episodes[i] for i in first_indices(store, count, known)]
 
 

@@ -37,8 +37,6 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(ErrorVsTimeConfig, mapping)
     device = choose_device(config.device)
     store = EpisodeStore(config.data, config.split)
-    if not len(store):
-        raise ConfigError(f"data must hold episodes of the split {config.split}, got none in {config.data}")
     episodes = first_episodes(store, config.scenes)
     frames = min(config.frames, *(len(episode.position_TN3) for episode in episodes))
     mpm = replace(from_mapping(MpmConfig, store.manifest.config["mpm"], "mpm"), device=_solver_device(device))
