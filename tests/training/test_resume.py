@@ -43,6 +43,15 @@ class Samples:
             self.epochs.setdefault(cursor.epoch + (number >= left), []).append((sample.episode, sample.frame))
         assert all(order.cursor == orders[0].cursor for order in orders)
 
+    def require_each_once(self, cursor: Cursor, frames: Callable[[int], Sequence[int]]) -> None:
+        """Every epoch before the cursor's has each sample of episodes of `frames` frames once, its own none twice."""
+        for epoch, samples in self.epochs.items():
+            expected = [(e, n) for e, count in enumerate(frames(epoch)) for n in range(count - 1)]
+            if epoch < cursor.epoch:
+                assert sorted(samples) == expected
+            else:
+                assert len(set(samples)) == len(samples) and set(samples) <= set(expected)
+
 
 def ranks_of(
     world_size: int, batch: int, published: Callable[[int], Sequence[int]], cursor: Cursor | None = None
@@ -65,12 +74,7 @@ def test_each_sample_once_an_epoch_through_any_interruptions(
         for _ in range(batches):
             seen.take(orders)
         cursor = orders[0].cursor
-    expected = [(e, n) for e, count in enumerate(frames) for n in range(count - 1)]
-    for epoch, samples in seen.epochs.items():
-        if epoch < cursor.epoch:
-            assert sorted(samples) == expected
-        else:
-            assert len(set(samples)) == len(samples) and set(samples) <= set(expected)
+    seen.require_each_once(cursor, lambda _: frames)
 
 
 @settings(max_examples=80, deadline=None)
@@ -103,12 +107,7 @@ def test_an_epoch_keeps_the_revision_it_began_with(
             published.extend([2] * grown_meanwhile)
         cursor = orders[0].cursor
     assert cursor.episodes == begun[cursor.epoch]
-    for epoch, samples in seen.epochs.items():
-        expected = [(e, n) for e, count in enumerate(published[: begun[epoch]]) for n in range(count - 1)]
-        if epoch < cursor.epoch:
-            assert sorted(samples) == expected
-        else:
-            assert len(set(samples)) == len(samples) and set(samples) <= set(expected)
+    seen.require_each_once(cursor, lambda epoch: published[: begun[epoch]])
 
 
 @pytest.fixture
