@@ -20,9 +20,9 @@ from datagen.mpm.mls_mpm import (
     mark,
     move,
     node_places,
+    node_velocity,
     raise_maximum,
     respond,
-    update_node,
     weights,
 )
 from hgn.scene.material import SAND, WATER
@@ -74,7 +74,7 @@ def _particle_to_grid(
     fx = x - ti.cast(base, ti.f32)
     w0, w1, w2 = weights(fx)
     first_node = (copy + scene * shape[SHAPE.scene_blocks]) * BLOCK_NODES
-    index_x, index_y, index_z = node_places(base, first_node, shape)
+    index_x, index_y, index_z = node_places(base, first_node, shape, 1)
     w = ti.static((w0, w1, w2))
     A *= dx
     v = velocity[p] - A @ fx
@@ -115,7 +115,7 @@ def _grid_to_particle(
     """New velocity and its gradient, then advection."""
     x = position[p]
     first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
-    v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
+    v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape, 1)
     moved, speed, speed_square = move(
         x, v, C, step, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
     )
@@ -197,11 +197,16 @@ def substep(
         global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
         if n & 63 == 0:
             block[global_block] = 0
-        update_node(
-            global_block * BLOCK_NODES + (n & 63), global_block // shape[SHAPE.scene_blocks],
-            block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value, setting, shape, node, contact, contact_normal,
+        place = global_block * BLOCK_NODES + (n & 63)
+        total = node[place]
+        for part in ti.static(range(1, variant // VARIANT.parts)):  # what copies hold is summed in order
+            total += node[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
+        v = node_velocity(
+            ti.Vector([total[0], total[1], total[2]]), total[3], place, global_block // shape[SHAPE.scene_blocks],
+            block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value, setting, shape, contact, contact_normal,
             variant,
         )  # fmt: skip
+        node[place] = ti.Vector([v[0], v[1], v[2], total[3]])
 
     for p in range(position.shape[0]):
         scene = label[p] >> 2

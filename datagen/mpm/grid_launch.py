@@ -40,8 +40,11 @@ class GridLaunch(Launch):
             self.law,
         )  # fmt: skip
 
+    def _node_array(self, nodes: int) -> ti.VectorNdarray:
+        return ti.Vector.ndarray(4, ti.f32, nodes)
+
     def _vector_arrays(self) -> list[Any]:
-        return [*super()._vector_arrays(), self.position, self.velocity, self.affine, self.deformation]
+        return [*super()._vector_arrays(), self.node, self.position, self.velocity, self.affine, self.deformation]
 
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         completed = np.zeros(len(self.scenes), np.int64)

@@ -122,6 +122,7 @@ class Launch(ABC):
 
     parts = 1  # bounds that each scene's particles are cut at
     copies = 1  # of the grid
+    entries_a_node = 1  # in the array of nodes
 
     def __init__(
         self,
@@ -145,10 +146,10 @@ class Launch(ABC):
                 "cell_size"
             )
         nodes = self.all_blocks * BLOCK_NODES * self.copies
-        if max(nodes, self.particles) >= 2**31:
+        if max(nodes * self.entries_a_node, self.particles) >= 2**31:
             raise ConfigError(
-                f"a batch must hold less than 2^31 nodes and particles, got {nodes} nodes of {len(scenes)} scenes and "
-                f"{self.particles} particles; lower scenes_per_launch"
+                f"a batch must hold less than {2**31 // self.entries_a_node} nodes and {2**31} particles, got {nodes} "
+                f"nodes of {len(scenes)} scenes and {self.particles} particles; lower scenes_per_launch"
             )
         label = np.concatenate(
             [4 * index + np.asarray(scene.material_N, np.int32) for index, scene in enumerate(scenes)]
@@ -175,7 +176,7 @@ class Launch(ABC):
         self.scene_value = device_array(self._scene_values(laws, row))
         self.counter = device_array(np.zeros((len(scenes), COUNT.length), np.int64))
         self.shape = device_array(self._shape())
-        self.node = ti.Vector.ndarray(4, ti.f32, nodes)
+        self.node = self._node_array(nodes)
         places, values, vectors = [], [], [np.zeros((1, 3), np.float32)]
         length = 1
         if has_contact or has_sweep:
@@ -191,8 +192,12 @@ class Launch(ABC):
             place_contacts(self.contact, device_array(np.concatenate(places)), device_array(np.concatenate(values)))
         self.contact_normal = device_vectors(np.concatenate(vectors))
 
+    @abstractmethod
+    def _node_array(self, nodes: int) -> Any:
+        """Momentum or velocity, and mass, of so many nodes."""
+
     def _vector_arrays(self) -> list[Any]:
-        return [self.node, self.contact_normal]
+        return [self.contact_normal]
 
     def release(self) -> None:
         """Gives the device memory back: Taichi 1.7.4 frees scalar arrays by itself, but not those of vectors."""

@@ -151,19 +151,9 @@ class Live(NamedTuple):
     length: int = 6
 
 
-class Packed(NamedTuple):
-    """Positions in what a particle gives to its nodes, float32; velocities are those at its base node."""
-
-    weight: int = 0  # of nodes 0, 1, 2 along x, then y, then z; those along x hold the particle's mass
-    velocity: int = 9  # 9, 10, 11: at the base node
-    step: int = 12  # its change from a node to the next along x, then y, then z
-    base: int = 21  # 21, 22, 23: the base node along each axis
-    length: int = 24
-
-
 CONSTANT, COUNT, VALUE, STATUS = Constant(), Count(), SceneValue(), Status()
 SETTING, SHAPE, VARIANT = Setting(), Shape(), Variant()
-FIELD, TAG, LIVE, PACKED = Field(), Tag(), Live(), Packed()
+FIELD, TAG, LIVE = Field(), Tag(), Live()
 
 
 def lame_parameters(config: MpmConfig) -> tuple[float, float]:

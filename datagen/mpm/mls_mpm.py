@@ -46,6 +46,14 @@ def weights(fx):
 
 
 @ti.func
+def spline(distance: ti.f32) -> ti.f32:
+    """The same weight from the distance to a node, in (-1.5, 1.5) cells."""
+    away = ti.abs(distance)
+    outer = 1.5 - away
+    return 0.75 - away * away if away < 0.5 else 0.5 * outer * outer
+
+
+@ti.func
 def _node_of_axis(index, stride: ti.i32, local_stride: ti.i32):
     """The share of one axis in a node's position; shares of the three axes add up."""
     return (index >> 2) * stride + (index & 3) * local_stride
@@ -167,15 +175,19 @@ def mark(
 
 
 @ti.func
-def node_places(base, first_node: ti.i32, shape: ti.template()):
-    """Shares of x, y, z in the place of nodes base .. base + 2; the place is the sum of one of each."""
-    stride_y = shape[SHAPE.blocks + 2] * BLOCK_NODES
+def node_places(base, first_node: ti.i32, shape: ti.template(), components: ti.template()):
+    """Shares of x, y, z in the place of nodes base .. base + 2; the place is the sum of one of each.
+
+    With several components it is that of the first in an array [block, component, node in block].
+    """
+    stride_z = BLOCK_NODES * components
+    stride_y = shape[SHAPE.blocks + 2] * stride_z
     stride_x = shape[SHAPE.blocks + 1] * stride_y
     offset = ti.Vector([0, 1, 2])
     return (
         first_node + _node_of_axis(base[0] + offset, stride_x, BLOCK * BLOCK),
         _node_of_axis(base[1] + offset, stride_y, BLOCK),
-        _node_of_axis(base[2] + offset, BLOCK_NODES, 1),
+        _node_of_axis(base[2] + offset, stride_z, 1),
     )
 
 
@@ -239,29 +251,27 @@ def respond(
 
 
 @ti.func
-def update_node(
+def node_velocity(
+    momentum,
+    mass: ti.f32,
     place: ti.i32,
     scene: ti.i32,
     corner: ti.i32,
     scene_value: ti.template(),
     setting: ti.template(),
     shape: ti.template(),
-    node: ti.template(),
     contact: ti.template(),
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """Momentum to velocity; gravity, colliders and walls. What copies hold is summed in order.
+    """Momentum to velocity; gravity, colliders and walls.
 
     `corner` is the block's place along x, y, z, in ten bits each.
     """
-    total = node[place]
-    for part in ti.static(range(1, variant // VARIANT.parts)):
-        total += node[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
     v = ti.Vector([0.0, 0.0, 0.0])
-    if total[3] > SMALLEST_MASS:
+    if mass > SMALLEST_MASS:
         gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
-        v = ti.Vector([total[0], total[1], total[2]]) / total[3] + scene_value[scene, VALUE.time_step] * gravity
+        v = momentum / mass + scene_value[scene, VALUE.time_step] * gravity
         if ti.static(bool(variant & VARIANT.contact)):
             entry = contact[place]
             if entry >= 0:
@@ -286,18 +296,23 @@ def update_node(
                 stuck = 1
         if stuck and shape[SHAPE.sticky_walls]:
             v = ti.Vector([0.0, 0.0, 0.0])
-    node[place] = ti.Vector([v[0], v[1], v[2], total[3]])
+    return v
 
 
 @ti.func
-def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template()):
-    """Velocity and its gradient at x, from the nodes around."""
+def interpolate(
+    x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template(), components: ti.template()
+):
+    """Velocity and its gradient at x, from the nodes around.
+
+    Nodes are vectors with components=1, or scalars with several (see node_places).
+    """
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
     w0, w1, w2 = weights(fx)
     w = ti.static((w0, w1, w2))
-    index_x, index_y, index_z = node_places(base, first_node, shape)
+    index_x, index_y, index_z = node_places(base, first_node, shape, components)
     v = ti.Vector([0.0, 0.0, 0.0])
     gradient_x = ti.Vector([0.0, 0.0, 0.0])
     gradient_y = ti.Vector([0.0, 0.0, 0.0])
@@ -310,8 +325,14 @@ def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, 
             line = ti.Vector([0.0, 0.0, 0.0])
             line_z = ti.Vector([0.0, 0.0, 0.0])
             for k in ti.static(range(3)):
-                value = node[index_x[i] + index_y[j] + index_z[k]]
-                share = w[k][2] * ti.Vector([value[0], value[1], value[2]])
+                place = index_x[i] + index_y[j] + index_z[k]
+                value = ti.Vector([0.0, 0.0, 0.0])
+                if ti.static(components == 1):
+                    whole = node[place]
+                    value = ti.Vector([whole[0], whole[1], whole[2]])
+                else:
+                    value = ti.Vector([node[place + a * BLOCK_NODES] for a in range(3)])
+                share = w[k][2] * value
                 line += share
                 line_z += (k - fx[2]) * share
             plane += w[j][1] * line
@@ -346,7 +367,7 @@ def move(
     speed = v
     if ti.static(bool(variant & VARIANT.sweep)):
         cell = ti.floor(x * setting[SETTING.inverse_cell_size], ti.i32)
-        index_x, index_y, index_z = node_places(cell, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape)
+        index_x, index_y, index_z = node_places(cell, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape, 1)
         list_at = contact[shape[SHAPE.all_blocks] * BLOCK_NODES + index_x[0] + index_y[0] + index_z[0]]
         if list_at >= 0:
             out, speed = stop_at_surface(x, out, v, list_at, scene, contact, contact_normal, counter, setting)

@@ -9,6 +9,9 @@ Within a step particles are put in order by cell (a counting sort over the occup
 the grid are taken by cell: nine threads hold the 27 nodes that a cell's particles touch, add up all particles of the
 cell, and then add each node's sum once. That leaves one atomic sum a node and cell instead of one a particle.
 
+Nodes are stored by blocks of 4 x 4 x 4 as [block, component, node in block]: what the threads of a warp add to nodes
+next to each other falls into few sectors of memory, and the L2 cache of a GPU takes sums sector by sector.
+
 State is stored by field, `state[copy, field, particle]`: at each frame the particles are copied from one copy to
 the other in the order of their cells, so that neighbours in space stay neighbours in memory.
 
@@ -23,7 +26,6 @@ from datagen.mpm.layout import (
     COUNT,
     FIELD,
     LIVE,
-    PACKED,
     SETTING,
     SHAPE,
     STATUS,
@@ -33,7 +35,6 @@ from datagen.mpm.layout import (
 )
 from datagen.mpm.mls_mpm import (
     Integers,
-    Nodes,
     Scalars,
     Vectors,
     base_node,
@@ -43,14 +44,15 @@ from datagen.mpm.mls_mpm import (
     mark,
     move,
     node_places,
+    node_velocity,
     raise_maximum,
     respond,
-    update_node,
-    weights,
+    spline,
 )
 from hgn.scene.material import SAND
 
-LANES = 9  # threads that share a cell; each holds the three nodes of one x and y
+LANES = 9  # threads that share a cell; each holds the three nodes of one y and z
+COMPONENTS = 4  # of a node
 
 
 @ti.func
@@ -83,10 +85,21 @@ def _put_matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.t
 
 
 @ti.func
+def _first_node(scene: ti.i32, shape: ti.template()):
+    return scene * shape[SHAPE.scene_blocks] * (BLOCK_NODES * COMPONENTS)
+
+
+@ti.func
+def _planar(block: ti.i32, local: ti.i32):
+    """Where the first component of a block's node lies."""
+    return block * (BLOCK_NODES * COMPONENTS) + local
+
+
+@ti.func
 def _cell(x, scene: ti.i32, setting: ti.template(), shape: ti.template()):
     """Where the cell of a particle lies in the arrays of nodes: at its base node."""
     base = base_node(x, setting[SETTING.inverse_cell_size])
-    index_x, index_y, index_z = node_places(base, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape)
+    index_x, index_y, index_z = node_places(base, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape, 1)
     return index_x[0] + index_y[0] + index_z[0]
 
 
@@ -178,114 +191,72 @@ def _strain_and_sort(
 
 
 @ti.func
-def _pack(
+def _scatter(
     lane: ti.i32,
     scene: ti.i32,
     first: ti.i32,
-    count: ti.i32,
     particles: ti.i32,
     tags: ti.i32,
     stride: ti.i32,
     state: ti.template(),
     tag: ti.template(),
-    rank: ti.template(),
     order: ti.template(),
-    packed: ti.template(),
-    cell_count: ti.template(),
+    cell_begin: ti.template(),
+    live: ti.template(),
+    node: ti.template(),
     setting: ti.template(),
     law: ti.template(),
     shape: ti.template(),
     variant: ti.template(),
     threads: ti.template(),
 ):
-    """The order of the particles by cell, and in that order what each gives to its nodes: nine threads read it."""
+    """Adds mass and momentum of each cell's particles to its 27 nodes."""
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
-    p = lane
-    while p < count:
-        place = particles + p
-        x = _vector(state, place, stride, FIELD.position)
-        s = first + cell_count[_cell(x, scene, setting, shape)] + rank[first + p]
-        order[s] = p
-        base = base_node(x, inverse_dx)
-        fx = x * inverse_dx - ti.cast(base, ti.f32)
-        w0, w1, w2 = weights(fx)
-        if ti.static(bool(variant & VARIANT.several_laws)):
-            mass = law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
-            w0[0] *= mass
-            w1[0] *= mass
-            w2[0] *= mass
-        A = _matrix(state, place, stride, FIELD.affine) * dx
-        corner = _vector(state, place, stride, FIELD.velocity) - A @ fx
-        at = s * PACKED.length
-        for axis in ti.static(range(3)):
-            packed[at + PACKED.weight + 3 * axis] = w0[axis]
-            packed[at + PACKED.weight + 3 * axis + 1] = w1[axis]
-            packed[at + PACKED.weight + 3 * axis + 2] = w2[axis]
-            packed[at + PACKED.velocity + axis] = corner[axis]
-            packed[at + PACKED.base + axis] = ti.cast(base[axis], ti.f32)
-            for j in ti.static(range(3)):
-                packed[at + PACKED.step + 3 * j + axis] = A[axis, j]
-        p += threads
-
-
-@ti.func
-def _packed_vector(packed: ti.template(), at: ti.i32):
-    return ti.Vector([packed[at], packed[at + 1], packed[at + 2]])
-
-
-@ti.func
-def _scatter(
-    lane: ti.i32,
-    scene: ti.i32,
-    first: ti.i32,
-    packed: ti.template(),
-    cell_begin: ti.template(),
-    live: ti.template(),
-    node: ti.template(),
-    shape: ti.template(),
-    threads: ti.template(),
-):
-    """Adds mass and momentum of each cell's particles to its 27 nodes."""
     tasks = live[scene * LIVE.length + LIVE.cells] * LANES
     task = lane
     while task < tasks:
         entry = task // LANES
         slot = task - entry * LANES
-        offset_x = slot // 3
-        offset_y = slot - 3 * offset_x
-        along_x = ti.cast(offset_x, ti.f32)
-        along_y = ti.cast(offset_y, ti.f32)
+        offset_y = slot // 3
+        offset_z = slot - 3 * offset_y
         sum_0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
         sum_1 = ti.Vector([0.0, 0.0, 0.0, 0.0])
         sum_2 = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        at = (first + cell_begin[2 * (first + entry)]) * PACKED.length
-        base = ti.cast(_packed_vector(packed, at + PACKED.base), ti.i32)  # the same for all of them
-        end = at + cell_begin[2 * (first + entry) + 1] * PACKED.length
-        while at < end:
-            weight = packed[at + PACKED.weight + offset_x] * packed[at + PACKED.weight + 3 + offset_y]
-            up = _packed_vector(packed, at + PACKED.step + 6)
-            v_0 = (
-                _packed_vector(packed, at + PACKED.velocity)
-                + along_x * _packed_vector(packed, at + PACKED.step)
-                + along_y * _packed_vector(packed, at + PACKED.step + 3)
-            )
-            v_1 = v_0 + up
-            v_2 = v_1 + up
-            weight_0 = weight * packed[at + PACKED.weight + 6]
-            weight_1 = weight * packed[at + PACKED.weight + 7]
-            weight_2 = weight * packed[at + PACKED.weight + 8]
+        base = ti.Vector([0, 0, 0])
+        s = cell_begin[2 * (first + entry)]
+        end = s + cell_begin[2 * (first + entry) + 1]
+        while s < end:
+            p = order[first + s]
+            place = particles + p
+            scaled = _vector(state, place, stride, FIELD.position) * inverse_dx
+            base = ti.floor(scaled - 0.5, ti.i32)  # the same for all of them
+            away = ti.cast(base, ti.f32) - scaled
+            away_y = away[1] + ti.cast(offset_y, ti.f32)
+            away_z = away[2] + ti.cast(offset_z, ti.f32)
+            weight = spline(away_y) * spline(away_z)
+            if ti.static(bool(variant & VARIANT.several_laws)):
+                weight *= law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
+            A = _matrix(state, place, stride, FIELD.affine) * dx
+            ahead = ti.Vector([A[0, 0], A[1, 0], A[2, 0]])
+            v_0 = _vector(state, place, stride, FIELD.velocity) + A @ ti.Vector([away[0], away_y, away_z])
+            v_1 = v_0 + ahead
+            v_2 = v_1 + ahead
+            weight_0 = weight * spline(away[0])
+            weight_1 = weight * spline(away[0] + 1.0)
+            weight_2 = weight * spline(away[0] + 2.0)
             sum_0 += weight_0 * ti.Vector([v_0[0], v_0[1], v_0[2], 1.0])
             sum_1 += weight_1 * ti.Vector([v_1[0], v_1[1], v_1[2], 1.0])
             sum_2 += weight_2 * ti.Vector([v_2[0], v_2[1], v_2[2], 1.0])
-            at += PACKED.length
+            s += 1
         index_x, index_y, index_z = node_places(
-            base + ti.Vector([offset_x, offset_y, 0]), scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape
+            base + ti.Vector([0, offset_y, offset_z]), _first_node(scene, shape), shape, COMPONENTS
         )
-        column = index_x[0] + index_y[0]
-        ti.atomic_add(node[column + index_z[0]], sum_0)
-        ti.atomic_add(node[column + index_z[1]], sum_1)
-        ti.atomic_add(node[column + index_z[2]], sum_2)
+        row = index_y[0] + index_z[0]
+        for c in ti.static(range(COMPONENTS)):
+            ti.atomic_add(node[index_x[0] + row + c * BLOCK_NODES], sum_0[c])
+            ti.atomic_add(node[index_x[1] + row + c * BLOCK_NODES], sum_1[c])
+            ti.atomic_add(node[index_x[2] + row + c * BLOCK_NODES], sum_2[c])
         task += threads
 
 
@@ -311,13 +282,13 @@ def _gather(
     threads: ti.template(),
 ):
     """New velocity, gradient and position of each particle."""
-    first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
+    first_node = _first_node(scene, shape)
     largest = 0.0
     s = lane
     while s < count:
         place = particles + order[first + s]
         x = _vector(state, place, stride, FIELD.position)
-        v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
+        v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape, COMPONENTS)
         moved, speed, speed_square = move(
             x, v, C, step, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
         )
@@ -337,13 +308,12 @@ def advance(
     tag: Integers,
     rank: Integers,
     order: Integers,
-    packed: Scalars,
     cell_count: Integers,
     cell_list: Integers,
     cell_begin: Integers,
     block: Integers,
     live: Integers,
-    node: Nodes,
+    node: Scalars,
     turn: Integers,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
@@ -359,7 +329,7 @@ def advance(
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
     Arrays, with P particles and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, order,
-    cell_list [P], cell_begin [2 P] and packed [24 P] are work space; cell_count [G] and the flags in block
+    cell_list [P], cell_begin [2 P] and node [4 G] are work space; cell_count [G] and the flags in block
     [3 * G / 64] are zero between steps; turn [scenes] says which scene comes when (long ones first). A scene that
     failed keeps still.
     """
@@ -418,28 +388,36 @@ def advance(
                         c += threads
                     n = lane
                     while n < blocks * BLOCK_NODES:
-                        node[block[block_list + n // BLOCK_NODES] * BLOCK_NODES + n % BLOCK_NODES] = ti.Vector(
-                            [0.0, 0.0, 0.0, 0.0]
-                        )
+                        place = _planar(block[block_list + n // BLOCK_NODES], n % BLOCK_NODES)
+                        for c in ti.static(range(COMPONENTS)):
+                            node[place + c * BLOCK_NODES] = 0.0
                         n += threads
                     _wait(threads)
-                    _pack(
-                        lane, scene, first, count, particles, tags, stride, state, tag, rank, order, packed, cell_count,
-                        setting, law, shape, variant, threads,
-                    )  # fmt: skip
+                    p = lane
+                    while p < count:
+                        cell = _cell(_vector(state, particles + p, stride, FIELD.position), scene, setting, shape)
+                        order[first + cell_count[cell] + rank[first + p]] = p
+                        p += threads
                     _wait(threads)
-                    _scatter(lane, scene, first, packed, cell_begin, live, node, shape, threads)
+                    _scatter(
+                        lane, scene, first, particles, tags, stride, state, tag, order, cell_begin, live, node, setting,
+                        law, shape, variant, threads,
+                    )  # fmt: skip
                     _wait(threads)
                     n = lane
                     while n < blocks * BLOCK_NODES:
                         touched = block[block_list + n // BLOCK_NODES]
                         if n % BLOCK_NODES == 0:
                             block[touched] = 0
-                        update_node(
-                            touched * BLOCK_NODES + n % BLOCK_NODES, scene,
+                        place = _planar(touched, n % BLOCK_NODES)
+                        momentum = ti.Vector([node[place + c * BLOCK_NODES] for c in range(3)])
+                        v = node_velocity(
+                            momentum, node[place + 3 * BLOCK_NODES], touched * BLOCK_NODES + n % BLOCK_NODES, scene,
                             block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES], scene_value, setting,
-                            shape, node, contact, contact_normal, variant,
+                            shape, contact, contact_normal, variant,
                         )  # fmt: skip
+                        for c in ti.static(range(3)):
+                            node[place + c * BLOCK_NODES] = v[c]
                         n += threads
                     c = lane
                     while c < cells:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from datagen.mpm.launch import Launch, device_array
-from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, PACKED, TAG
+from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, TAG
 from hgn.scene.material import SAND, SNOW
 
 import taichi as ti  # isort: skip
@@ -24,6 +24,8 @@ PAUSE = 0.8  # of the time that a launch is expected to take
 class TeamLaunch(Launch):
     """Particles in one array, field by field, in two copies."""
 
+    entries_a_node = team_kernel.COMPONENTS
+
     def __init__(self, threads: int, *batch: Any) -> None:
         super().__init__(*batch)
         self.threads = threads
@@ -33,7 +35,6 @@ class TeamLaunch(Launch):
         tag[0, TAG.origin] = np.concatenate([np.arange(scene.particle_count) for scene in self.scenes])
         self.tag = device_array(tag.ravel())
         self.rank, self.order, self.cell_list = (ti.ndarray(ti.i32, self.particles) for _ in range(3))
-        self.packed = ti.ndarray(ti.f32, PACKED.length * self.particles)
         self.cell_begin = ti.ndarray(ti.i32, 2 * self.particles)
         self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
@@ -46,6 +47,9 @@ class TeamLaunch(Launch):
                 for name in ("position_N3", "velocity_N3")
             ), self.label, self.law_row, self.counter, self.law, fields,
         )  # fmt: skip
+
+    def _node_array(self, nodes: int) -> ti.ScalarNdarray:
+        return ti.ndarray(ti.f32, team_kernel.COMPONENTS * nodes)
 
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         most = max(1, MAXIMUM_OUTPUT_BYTES // (12 * self.particles))
@@ -73,8 +77,8 @@ class TeamLaunch(Launch):
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
         turn = np.arange(len(self.scenes)) if turn is None else turn
         team_kernel.advance(
-            frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.packed, self.cell_count,
-            self.cell_list, self.cell_begin, self.block, self.live, self.node, device_array(turn.astype(np.int32)),
+            frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.cell_count, self.cell_list,
+            self.cell_begin, self.block, self.live, self.node, device_array(turn.astype(np.int32)),
             self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal,
             output, self.variant, self.threads,
         )  # fmt: skip
