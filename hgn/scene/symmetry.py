@@ -10,7 +10,7 @@ number of nodes at both ends, so what rests on them rests at 2 and at 61 cells o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import permutations, product
 
 CELL_BITS = 17  # as in a cell's key
@@ -34,7 +34,7 @@ class Symmetry:
         x, y, z = (count * self.cell_size for count in self.cells)
         return x, y, z
 
-    @property
+    @cached_property
     def code(self) -> int:
         """All but the cell size in one integer below 2^60, for the kernels."""
         axes = zip(self.source, self.mirrored, self.cells, strict=True)

@@ -12,7 +12,7 @@ from kernels.engines import device, gradients
 from kernels.test_network import flat
 from kernels.test_update import HISTORY, parameters_of, updates_of
 from network.states import network_of
-from training.test_symmetry import CELL_SIZE, EIGHT, doubled, scene_with_obstacles, seeds_of
+from training.test_symmetry import CELL_SIZE, CYCLIC, EIGHT, doubled, scene_with_obstacles, seeds_of
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import make_batch
@@ -24,6 +24,7 @@ from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.agreement import relative_error
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.symmetry import scene_symmetries
 from hgn.training.fast import FastTraining
 from hgn.training.symmetry import under_symmetries
 
@@ -42,15 +43,18 @@ def on_device(network: HierarchicalGraphNetwork, made: Episode) -> DeviceEpisode
     return DeviceEpisode(position, material, obstacles, whole.domain_size, whole.symmetries)
 
 
-def test_an_update_of_all_eight_is_the_plain_one() -> None:
-    """An update of eight scenes, each under another symmetry, one without obstacles: positions, velocities, targets,
-    normals, loss and gradients are those of the plain path in float64, and the check of the kernels passes."""
+def test_an_update_under_symmetries_is_the_plain_one() -> None:
+    """An update of eight scenes, each under another symmetry, one without obstacles, one without gravity: positions,
+    velocities, targets, normals, loss and gradients are those of the plain path in float64, and the check passes."""
     network = small_network()
     episodes = [scene_with_obstacles(i, 2 + i) for i in range(8)]
     bare = ObstacleGrid(CELL_SIZE, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     episodes[2] = replace(episodes[2], obstacle_grid=bare)
-    seeds = seeds_of(EIGHT)
-    batch = under_symmetries(doubled(make_batch([(e, FRAME) for e in episodes], network.config, seeds)), EIGHT)
+    episodes[0] = replace(episodes[0], gravity=(0.0, 0.0, 0.0))
+    shown = [CYCLIC, *EIGHT[1:]]
+    free = scene_symmetries((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
+    seeds = (*seeds_of([CYCLIC], free), *seeds_of(EIGHT[1:]))
+    batch = under_symmetries(doubled(make_batch([(e, FRAME) for e in episodes], network.config, seeds)), shown)
     state = batch.state()
     target = network.normaliser.normalise_acceleration(batch.acceleration())
     loss = batch.mean_over_scenes((network.normalised_acceleration(state) - target).square().mean(-1))
