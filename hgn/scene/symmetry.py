@@ -37,6 +37,7 @@ class Symmetry:
     @cached_property
     def code(self) -> int:
         """All but the cell size in one integer below 2^60, for the kernels."""
+        assert min(self.cells) >= 0 and max(self.cells) < 1 << CELL_BITS
         axes = zip(self.source, self.mirrored, self.cells, strict=True)
         return sum((s | m << 2 | cells << 3) << CODE_BITS * i for i, (s, m, cells) in enumerate(axes))
 
@@ -50,7 +51,6 @@ def scene_symmetries(gravity: Vector, domain_size: Vector, cell_size: float) -> 
     """
     x, y, z = (round(length / cell_size) - 1 for length in domain_size)
     cells = x, y, z
-    assert min(cells) >= 0 and max(cells) < 1 << CELL_BITS
     found = []
     for s0, s1, s2 in permutations(range(3)):
         for m0, m1, m2 in product((False, True), repeat=3):
