@@ -72,8 +72,8 @@ def main(mapping: dict[str, Any]) -> int:
 
 def cases(size: float) -> list[tuple[str, Scene]]:
     """A cube of each material, and three beside each other."""
-    single = [_cubes([kind], [(0.5, 0.2, 0.5)], size) for kind in range(3)]
-    mixed = _cubes([0, 1, 2], [(0.45, 0.15, 0.5), (0.5, 0.3, 0.5), (0.55, 0.45, 0.5)], size)
+    single = [cubes([kind], [(0.5, 0.2, 0.5)], size) for kind in range(3)]
+    mixed = cubes([0, 1, 2], [(0.45, 0.15, 0.5), (0.5, 0.3, 0.5), (0.55, 0.45, 0.5)], size)
     return [*zip(MATERIALS, single, strict=True), ("mixed", mixed)]
 
 
@@ -89,7 +89,7 @@ def taichi_elements_substeps() -> int:
 
 def compare(name: str, scene: Scene, config: TaichiElementsConfig) -> dict[str, Any]:
     """A row: differences of the two trajectories, and times of a frame."""
-    theirs, their_s = _run_theirs(scene, config)
+    theirs, their_s = run_theirs(scene, config.folder, config.frames, config.threads)
     ours, our_s = _run_ours(scene, config)
     one, other = ours.astype(np.float64), theirs.astype(np.float64)
     height = [np.quantile(path[:, :, 1], 0.95, axis=1) - FLOOR for path in (one, other)]
@@ -116,7 +116,7 @@ def compare(name: str, scene: Scene, config: TaichiElementsConfig) -> dict[str, 
     return row
 
 
-def _cubes(kinds: list[int], centres: list[tuple[float, float, float]], size: float) -> Scene:
+def cubes(kinds: list[int], centres: list[tuple[float, float, float]], size: float) -> Scene:
     count = int(8 * (64 * size) ** 3 + 1)
     generator = np.random.default_rng(0)
     position = np.concatenate([generator.uniform(-size / 2, size / 2, (count, 3)) + centre for centre in centres])
@@ -126,15 +126,16 @@ def _cubes(kinds: list[int], centres: list[tuple[float, float, float]], size: fl
     )  # fmt: skip
 
 
-def _run_theirs(scene: Scene, config: TaichiElementsConfig) -> tuple[np.ndarray, float]:
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder) / "in.npz", Path(folder) / "out.npz"
+def run_theirs(scene: Scene, folder: str, frames: int, threads: int) -> tuple[np.ndarray, float]:
+    """Its trajectory, float32 [T, N, 3], and the median seconds of a frame; `threads` are a CPU's, 0 asks for a GPU."""
+    with tempfile.TemporaryDirectory() as exchange:
+        source, target = Path(exchange) / "in.npz", Path(exchange) / "out.npz"
         np.savez(
             source, position_N3=scene.position_N3, velocity_N3=scene.velocity_N3, material_N=scene.material_N,
-            frames=config.frames, frame_s=FRAME_S,
+            frames=frames, frame_s=FRAME_S,
         )  # fmt: skip
-        command = [sys.executable, "-m", "datagen.mpm.taichi_elements", config.folder, source, target]
-        subprocess.run([*map(str, command), str(config.threads)], check=True)
+        command = [sys.executable, "-m", "datagen.mpm.taichi_elements", folder, source, target, threads]
+        subprocess.run(list(map(str, command)), check=True)
         found = np.load(target)
         return found["position_TN3"], float(np.median(found["seconds_T"][WARM_FRAMES:]))
 
@@ -143,7 +144,13 @@ def _run_ours(scene: Scene, config: TaichiElementsConfig) -> tuple[np.ndarray, f
     from datagen.mpm.solver import SceneFailure, simulate
 
     step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
-    mpm = MpmConfig(device="cpu", time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements")
+    mpm = MpmConfig(
+        device="cpu",
+        time_step="fixed",
+        fixed_time_step_s=step,
+        sand_volume_correction="taichi_elements",
+        snow_maximum_hardening=100.0,
+    )
     rate = 1 / (taichi_elements_substeps() * step)
     ends: list[float] = []
     (outcome,) = simulate(

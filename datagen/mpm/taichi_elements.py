@@ -2,7 +2,8 @@
 
 A process of its own, with Taichi's default options, so that neither solver changes the other's. FOLDER is a checkout of
 github.com/taichi-dev/taichi_elements; INPUT an .npz with position_N3, velocity_N3, material_N (ours), frames and
-frame_s; OUTPUT an .npz with position_TN3 and seconds_T of each frame after the first state.
+frame_s; OUTPUT an .npz with position_TN3 and seconds_T of each frame after the first state; THREADS those of a CPU,
+or 0 for a GPU.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ def main(folder: str, source: str, target: str, threads: str) -> None:
     sys.path.insert(0, folder)
     given = np.load(source)
     with contextlib.redirect_stdout(io.StringIO()):
-        ti.init(arch=ti.cpu, cpu_max_num_threads=int(threads), log_level=ti.ERROR)
+        if int(threads) == 0:
+            ti.init(arch=ti.cuda, log_level=ti.ERROR)
+        else:
+            ti.init(arch=ti.cpu, cpu_max_num_threads=int(threads), log_level=ti.ERROR)
         module = importlib.import_module("engine.mpm_solver")
         solver = module.MPMSolver(res=(64, 64, 64), use_voxelizer=False, max_num_particles=MAXIMUM_PARTICLES)
         solver.set_gravity((0, -9.8, 0))

@@ -25,7 +25,7 @@ def test_report(copy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     file = tmp_path / "report.json"
     for shift, held in ((0.0, True), (0.02, False)):
         moved = (path + shift, 0.4)
-        monkeypatch.setattr(tools.taichi_elements, "_run_theirs", lambda scene, config, moved=moved: moved)
+        monkeypatch.setattr(tools.taichi_elements, "run_theirs", lambda *given, moved=moved: moved)
         assert main({"folder": copy, "frames": 6, "json": str(file)}) == 0
         rows = json.loads(file.read_text())["rows"]
         assert [row["case"] for row in rows] == ["water", "sand", "snow", "mixed"]

@@ -1,0 +1,168 @@
+"""python -m tools.solver_times [--json FILE]: frames of the solver, many scenes, many particles, Taichi Elements.
+
+Many scenes: random scenes with obstacles, simulated from their start; timed is the second half of the frames, when most
+particles have landed. Many particles: one scene of clumps and spray. With `taichi_elements=COPY` Taichi Elements runs
+the paper's four cubes on the same device, and ours runs them at its step, alone and 256 times side by side. A contender
+whose scenes fail, or end with a position that is not finite, gets no time.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hgn.command import run_command
+from hgn.config import MpmConfig, SceneConfig
+from hgn.files import write_json
+from hgn.progress import bar
+from hgn.provenance import provenance
+from hgn.scene.random_scene import generate_scene
+from hgn.scene.scene import Scene
+from hgn.schema import ConfigError, from_mapping, require, require_one_of, to_mapping
+from tools.bench.states import Workload, scene_of
+from tools.taichi_elements import FRAME_S, STEP_S, cubes, run_theirs, taichi_elements_substeps
+
+FRAME_RATE_HZ = 60.0
+FIRST_SEED = 1_000_000  # of no data set
+CUBES = [(0.3, 0.3, 0.3), (0.3, 0.3, 0.7), (0.7, 0.3, 0.3), (0.7, 0.3, 0.7)]
+CUBE_KINDS = [0, 1, 2, 0]
+SIDE_BY_SIDE = 256
+EXIT_RED = 1
+
+
+@dataclass(frozen=True)
+class SolverTimesConfig:
+    """`python -m tools.solver_times`: what is timed."""
+
+    scenes: tuple[int, ...] = (1, 64, 256)
+    particles: tuple[int, ...] = (4_296, 40_000, 400_000, 1_000_000)
+    scene_frames: int = 60
+    particle_frames: int = 6
+    taichi_elements: str | None = None
+    device: str = "auto"
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("scenes", "particles"):
+            require(all(value >= 1 for value in getattr(self, name)), name, "at least 1 each", getattr(self, name))
+        for name in ("scene_frames", "particle_frames"):
+            require(getattr(self, name) >= 3, name, "at least 3", getattr(self, name))
+        require_one_of(self, "device", ("auto", "cpu", "gpu"))
+        if self.taichi_elements is not None and not (Path(self.taichi_elements) / "engine/mpm_solver.py").is_file():
+            raise ConfigError(
+                f"taichi_elements must be a folder with a copy of it (engine/mpm_solver.py), got {self.taichi_elements}"
+            )
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table, and writes JSON where asked to; the exit code is 1 where a contender failed."""
+    from datagen.mpm.device import initialise
+
+    config = from_mapping(SolverTimesConfig, mapping)
+    made = _random_scenes(max(config.scenes, default=0))
+    device = initialise(config.device)
+    rows = []
+    total = len(config.scenes) + len(config.particles)
+    with bar("cases", total, unit="case") as progress:
+        for row in _cases(made, config, device.kind):
+            rows.append(row)
+            progress.update()
+    print(table(rows))
+    if config.json is not None:
+        meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": to_mapping(config)}
+        write_json(config.json, {"meta": meta, "rows": rows})
+    return 0 if all(row["ms"] is not None for row in rows) else EXIT_RED
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The figures for people, as Markdown."""
+    lines = [
+        "| case | scenes | particles | steps a frame | ms a frame | ms a scene and frame | million particle-steps/s |",
+        "| :-- | --: | --: | --: | --: | --: | --: |",
+    ]
+    for row in rows:
+        given = f"| {row['case']} | {row['scenes']} | {row['particles']:,} |"
+        if row["ms"] is None:
+            lines.append(f"{given} {row['cause']} | | | |")
+        else:
+            rate = row["particles"] * row["substeps"] / row["ms"] / 1e3
+            each = row["ms"] / row["scenes"]
+            lines.append(f"{given} {row['substeps']:.0f} | {row['ms']:.2f} | {each:.3f} | {rate:.0f} |")
+    return "\n".join(lines)
+
+
+def _cases(made: list[Scene], config: SolverTimesConfig, kind: str) -> Iterator[dict[str, Any]]:
+    mpm = MpmConfig(device=kind)
+    for count in config.scenes:
+        yield {"case": "random scenes with obstacles"} | _timed(made[:count], mpm, config.scene_frames)
+    for particles in config.particles:
+        scene = scene_of(Workload(particles, 1), 0, 0.035)
+        yield {"case": "one scene"} | _timed([scene], mpm, config.particle_frames)
+    if config.taichi_elements is not None:
+        scene = cubes(CUBE_KINDS, CUBES, 0.08)
+        threads = 0 if kind == "gpu" else os.cpu_count() or 1
+        _, seconds = run_theirs(scene, config.taichi_elements, config.scene_frames, threads)
+        substeps = taichi_elements_substeps()
+        yield {
+            "case": "Taichi Elements, four cubes", "scenes": 1, "particles": scene.particle_count,
+            "substeps": substeps, "ms": 1e3 * seconds,
+        }  # fmt: skip
+        step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
+        faithful = MpmConfig(
+            device=kind, time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements",
+            snow_maximum_hardening=100.0,
+        )  # fmt: skip
+        for count in (1, SIDE_BY_SIDE) if kind == "gpu" else (1,):
+            row = _timed([scene] * count, faithful, config.scene_frames, 1 / (substeps * step))
+            yield {"case": "the same, ours at its step"} | row
+
+
+def _timed(scenes: list[Scene], mpm: MpmConfig, frames: int, rate: float = FRAME_RATE_HZ) -> dict[str, Any]:
+    """Milliseconds a frame of the second half, after a first simulation that compiles."""
+    from datagen.mpm.collider import build_collider
+    from datagen.mpm.solver import SceneFailure, Simulated, simulate
+
+    colliders = [build_collider(scene, mpm.collider_band_cells) for scene in scenes]
+    simulate(scenes, mpm, 2, rate, colliders=colliders)
+    ends: list[float] = []
+    outcomes = simulate(
+        scenes, mpm, frames, rate, lambda _: ends.append(time.perf_counter()), colliders=colliders
+    )  # fmt: skip
+    row: dict[str, Any] = {"scenes": len(scenes), "particles": sum(scene.particle_count for scene in scenes)}
+    failures = [outcome.cause for outcome in outcomes if isinstance(outcome, SceneFailure)]
+    found = [outcome for outcome in outcomes if isinstance(outcome, Simulated)]
+    if not all(np.isfinite(outcome.position_TN3[-1]).all() for outcome in found):
+        failures.append("positions are not finite")
+    if failures:
+        return row | {"substeps": None, "ms": None, "cause": failures[0]}
+    steps = sum(
+        outcome.counters["substeps"] * scene.particle_count for outcome, scene in zip(found, scenes, strict=True)
+    )
+    # frames of one launch end together: from the end of the launch that the middle frame is in
+    begin = max(t for t in range(frames - 1) if ends[t] <= ends[(frames - 1) // 2] + 1e-3)
+    return row | {
+        "substeps": steps / row["particles"] / (frames - 1),
+        "ms": 1e3 * (ends[-1] - ends[begin]) / (frames - 1 - begin),
+        "projections": sum(outcome.counters["surface_projections"] for outcome in found),
+    }
+
+
+def _random_scenes(count: int) -> list[Scene]:
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+        return list(pool.map(_scene, range(FIRST_SEED, FIRST_SEED + count), chunksize=4))
+
+
+def _scene(seed: int) -> Scene:
+    return generate_scene(SceneConfig(), seed)
+
+
+if __name__ == "__main__":
+    run_command(main, "solver_times")
