@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Any
 
-from datagen.pool import LocalCrew, Pool, Stopped, available_cpus, plan_workers, visible_gpus
+from datagen.pool import LocalCrew, Pool, Stopped, available_cpus, memory_of_machine, plan_workers, visible_gpus
 from datagen.progress import Progress
 from datagen.worker import Backend
 from datagen.writer import DatasetWriter
@@ -88,7 +88,7 @@ def generate(
                     with RayCrew(config, backend) as crew:
                         Pool(config, writer, progress, crew.plan, crew, should_stop).run()
                 else:
-                    plan = plan_workers(config, visible_gpus(), available_cpus())
+                    plan = plan_workers(config, visible_gpus(), available_cpus(), memory_of_machine())
                     Pool(config, writer, progress, plan, LocalCrew(config, backend, plan), should_stop).run()
             except Stopped:
                 progress.message(

@@ -47,11 +47,11 @@ class WorkerPlan:
     gpus: tuple[str, ...] = ()  # CUDA devices, dealt out to the solvers in turn
 
 
-def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int) -> WorkerPlan:
+def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float) -> WorkerPlan:
     """One solver for two cores on a CPU; on GPUs one solver, with scene makers on the cores."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
-        launch = launch or gpu_scenes_per_launch(config)
+        launch = launch or gpu_scenes_per_launch(config, memory_bytes)
         makers = max(1, min(MAXIMUM_MAKERS, cpu_count - 1))
         return WorkerPlan(workers or 1, None, makers, launch, gpu_first_launch(config, launch), gpus)
     solvers = workers or max(1, cpu_count // 2)
@@ -59,10 +59,15 @@ def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int) -
     return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
 
 
-def gpu_scenes_per_launch(config: DatagenConfig) -> int:
-    """As many as give every part of a GPU work; fewer where their grids are large."""
-    nodes = math.prod(math.ceil(length / config.scene.cell_size) for length in config.scene.domain_size)
-    return max(1, min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes))
+def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
+    """As many as give every part of a GPU work; fewer where their grids are large, or their frames, which the host
+    holds until they are published, would take more than half of its memory.
+    """
+    scene = config.scene
+    nodes = math.prod(math.ceil(length / scene.cell_size) for length in scene.domain_size)
+    particles = scene.group_count * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
+    held = memory_bytes / 2 / (12 * config.dataset.frames * max(particles, 1))
+    return max(1, int(min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes, held)))
 
 
 def gpu_first_launch(config: DatagenConfig, launch: int) -> int:
@@ -78,6 +83,11 @@ def visible_gpus() -> tuple[str, ...]:
         return tuple(str(i) for i in range(count))
     devices = tuple(device.strip() for device in visible.split(",") if device.strip())
     return () if count == 0 or "-1" in devices or "NoDevFiles" in devices else devices
+
+
+def memory_of_machine() -> int:
+    """Bytes of physical memory."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def available_cpus() -> int:

@@ -9,6 +9,7 @@ it: machines may leave while the pool runs, and others may take their place.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import pkgutil
 import time
@@ -36,7 +37,8 @@ def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]]) ->
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     gpus = int(sum(node.get("GPU", 0) for node in nodes))
     if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
-        launch = launch or gpu_scenes_per_launch(config)
+        memory = min((node["memory"] for node in nodes if "memory" in node), default=math.inf)
+        launch = launch or gpu_scenes_per_launch(config, memory)
         solvers, threads, first = workers or max(1, gpus), None, gpu_first_launch(config, launch)
     else:
         cores = [int(node["CPU"]) for node in nodes if node.get("CPU", 0) >= 1]
