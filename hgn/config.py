@@ -91,6 +91,7 @@ class MpmConfig:
     snow_critical_stretch: float = 0.0045
     snow_maximum_hardening: float = 20.0  # bound on exp(hardening * (1 - Jp)); hits are counted
     water_equation: str = "linear"  # pressure lambda (1 - J); or stiffening: lambda / 7 (J^-7 - 1)
+    water_volume_update: str = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
     water_minimum_volume_ratio: float = 0.1  # floor on J; hits are counted
     minimum_singular_value: float = 0.05  # floor on the singular values of F; hits are counted
     time_step: str = "adaptive"  # or fixed
@@ -136,6 +137,7 @@ class MpmConfig:
         require_one_of(self, "sand_friction_law", ("compression", "plane_strain"))
         require_one_of(self, "sand_volume_correction", ("tampubolon", "taichi_elements"))
         require_one_of(self, "water_equation", ("linear", "stiffening"))
+        require_one_of(self, "water_volume_update", ("trace", "taichi_elements"))
         require_one_of(self, "time_step", ("adaptive", "fixed"))
         require_one_of(self, "wall_contact", ("slip", "stick"))
         require_one_of(self, "device", ("auto", "cpu", "gpu"))

@@ -41,10 +41,11 @@ def water(
     scene: ti.i32,
     stiffening: ti.template(),
 ):
-    """J (1 + dt tr C), floored; Kirchhoff pressure term; present stiffness, Pa.
+    """J (1 + expansion), floored; Kirchhoff pressure term; present stiffness, Pa.
 
-    The term is lambda J (J - 1), as in Taichi Elements, or with `stiffening` that of the pressure
-    lambda / 7 (J^-7 - 1) (Cole 1948), which withstands any compression.
+    The expansion of a step is dt tr C; Taichi Elements' det(1 + dt C) - 1 swells what turns and shrinks what is purely
+    sheared, in second order of the step. The term is lambda J (J - 1), as in Taichi Elements, or with `stiffening`
+    that of the pressure lambda / 7 (J^-7 - 1) (Cole 1948), which withstands any compression.
     """
     bulk = law[row + CONSTANT.bulk]
     smallest = law[row + CONSTANT.water_smallest_volume]

@@ -165,6 +165,7 @@ class Launch(ABC):
             + VARIANT.contact * has_contact
             + VARIANT.sweep * has_sweep
             + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
+            + VARIANT.taichi_elements_water * (config.water_volume_update == "taichi_elements")
             + VARIANT.stiffening_water * (config.water_equation == "stiffening")
             + VARIANT.several_laws * (len(laws) > 1)
             + VARIANT.parts * self.copies

@@ -115,7 +115,8 @@ class Variant(NamedTuple):
     several_laws: int = 64  # particles of one kind differ in their constants
     sweep: int = 128  # particles are stopped at triangles
     stiffening_water: int = 256
-    parts: int = 512  # times the number of parts
+    taichi_elements_water: int = 512
+    parts: int = 1024  # times the number of parts
 
 
 class Field(NamedTuple):

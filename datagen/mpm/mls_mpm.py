@@ -221,8 +221,11 @@ def respond(
     stiffness = 0.0
     if ti.static(has_water):
         if ti.static(not has_solid) or material == WATER:
+            expansion = step * C.trace()
+            if ti.static(bool(variant & VARIANT.taichi_elements_water)):
+                expansion = (ti.Matrix.identity(ti.f32, 3) + step * C).determinant() - 1.0
             J, pressure, water_stiffness = water(
-                volume, step * C.trace(), law, row, counter, scene, ti.static(bool(variant & VARIANT.stiffening_water))
+                volume, expansion, law, row, counter, scene, ti.static(bool(variant & VARIANT.stiffening_water))
             )
             new_volume = J
             stiffness = water_stiffness

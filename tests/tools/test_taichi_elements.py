@@ -26,11 +26,12 @@ def test_report(copy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     for shift, held in ((0.0, True), (0.02, False)):
         moved = (path + shift, 0.4)
         monkeypatch.setattr(tools.taichi_elements, "run_theirs", lambda *given, moved=moved: moved)
-        assert main({"folder": copy, "frames": 6, "json": str(file)}) == 0
+        assert main({"folder": copy, "frames": 6, "seeds": 2, "json": str(file)}) == 0
         rows = json.loads(file.read_text())["rows"]
         assert [row["case"] for row in rows] == ["water", "sand", "snow", "mixed"]
         assert all(row["held"] is held and row["time_ratio"] == pytest.approx(0.25) for row in rows)
-        assert rows[0]["centre"] == pytest.approx(shift * 3**0.5)
+        assert rows[0]["centre"] == pytest.approx(shift * 3**0.5) and rows[0]["seeds"] == 2
+        assert rows[0]["floor"] == dict.fromkeys(("first_frame", "centre", "height", "spread"), 0)
     assert "TE ms" in capsys.readouterr().out
 
 

@@ -5,9 +5,10 @@ import pytest
 import taichi as ti
 
 from datagen.mpm.constitutive import solid, water
-from datagen.mpm.layout import COUNT, constants, lame_parameters, sand_alpha
+from datagen.mpm.layout import COUNT, SETTING, VARIANT, constants, lame_parameters, sand_alpha
+from datagen.mpm.mls_mpm import respond
 from hgn.config import MpmConfig
-from hgn.scene.material import SAND, SNOW
+from hgn.scene.material import SAND, SNOW, WATER
 
 Matrices = ti.types.ndarray(dtype=ti.types.matrix(3, 3, ti.f32), ndim=1)
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -36,6 +37,18 @@ def update_water(
         volume[n] = v
         pressure[n] = p
         stiffness[n] = k
+
+
+@ti.kernel
+def update_volumes(
+    C: Matrices, volume: Scalars, step: ti.f32, setting: Scalars, constant: Scalars,
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), variant: ti.template(),
+):  # fmt: skip
+    for n in range(volume.shape[0]):
+        _, _, v, _ = respond(
+            C[n], ti.Matrix.identity(ti.f32, 3), volume[n], WATER, 0, step, 0, counter, setting, constant, variant
+        )
+        volume[n] = v
 
 
 def scalars(values) -> ti.ScalarNdarray:
@@ -153,6 +166,23 @@ def test_water() -> None:
     close(volume.to_numpy(), new_J, 1e-6)
     close(pressure.to_numpy(), bulk * new_J * (new_J - 1), 1e-6)
     assert counter.to_numpy()[0, COUNT.water_volume_floors] == 2
+
+
+def test_volume_updates_of_water() -> None:
+    """J *= 1 + dt tr C keeps the volume of turning and purely sheared water; Taichi Elements' determinant does not."""
+    rate, step = 50.0, 1e-3
+    turning = np.array([[0.0, -rate, 0], [rate, 0, 0], [0, 0, 0]])
+    C_N33 = np.stack([turning, np.diag([rate, -rate, 0]), np.diag([rate, rate, -rate])])
+    C = ti.Matrix.ndarray(3, 3, ti.f32, len(C_N33))
+    C.from_numpy(C_N33.astype(np.float32))
+    setting = np.ones(SETTING.length)
+    for bit, factor in ((0, 1 + step * np.trace(C_N33, axis1=1, axis2=2)),
+                        (VARIANT.taichi_elements_water, np.linalg.det(np.eye(3) + step * C_N33))):  # fmt: skip
+        volume = scalars([0.9] * 3)
+        update_volumes(
+            C, volume, step, scalars(setting), scalars(constants(MpmConfig())), counters(), VARIANT.water + bit
+        )
+        close(volume.to_numpy(), 0.9 * factor, 1e-6)
 
 
 def test_stiffening_water() -> None:
