@@ -8,9 +8,10 @@ import pytest
 
 from hgn.config import MpmConfig
 from hgn.schema import ConfigError
-from tools.stability import solver_steps
+from tools.stability import solver_leak, solver_steps, solver_validation
 from tools.stability.solver import main
-from tools.stability.solver_leak import _crossing_paths
+from tools.stability.solver_leak import crossing_paths, leaks
+from tools.stability.solver_loads import _sinks_until
 from tools.stability.solver_scenes import front_cells, thickness_cells
 
 
@@ -41,7 +42,48 @@ def test_crossing_paths() -> None:
     """Only a way through the triangle counts: not one beside it, not one that turns back before it."""
     triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]])
     path = np.array([[[0.2, 1, 0.2], [0.9, 1, 0.9], [0.2, 1, 0.2]], [[0.2, -1, 0.2], [0.9, -1, 0.9], [0.2, 0.1, 0.2]]])
-    assert _crossing_paths(path, triangle) == pytest.approx(1 / 3)
+    assert crossing_paths(path / 64, triangle / 64) == pytest.approx(1 / 3)
+
+
+def test_crossings_of_a_bent_surface() -> None:
+    """A straight way that cuts a ridge twice ends where it began, outside; long and short ways count alike."""
+    ridge = np.array([[[0.0, 0, -9], [0, 0, 9], [3, 3, 0]], [[6.0, 0, -9], [3, 3, 0], [6, 0, 9]]])
+    for scale in (1.0, 0.05):
+        way = scale * np.array([[[0.0, 1, 0.1], [3, 1, 0.1]], [[6, 1, 0.1], [6, 1, 0.1]]])
+        found = [crossing_paths(way[:, [k]] / 64, scale * ridge / 64) for k in (0, 1)]
+        assert found == [0.0, 1.0]
+
+
+def test_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small blocks that hit a sheet, a cone and a bowl: a row for each, with nothing through."""
+    monkeypatch.setattr(solver_leak, "OFFSETS", solver_leak.OFFSETS[3:4])
+    monkeypatch.setattr(solver_leak, "ORIENTATIONS", {"tilted": solver_leak.ORIENTATIONS["tilted"]})
+    rows = leaks(MpmConfig(device="cpu"), 0.03, 2.0)
+    assert len(rows) == 3 * 3 * 2
+    assert [row.measured for row in rows] == [0.0] * len(rows)
+    assert all(row.held for row in rows)
+
+
+def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even four cells of water lead the experiment by less than 18 %; sand runs further by the plane-strain slope."""
+    monkeypatch.setattr(solver_validation, "DAM_CELLS", (4, 5))
+    monkeypatch.setattr(solver_validation, "COLUMN_CELLS", 4)
+    monkeypatch.setattr(solver_validation, "COLUMNS", ((1.0, 31.0),))
+    monkeypatch.setattr(solver_validation, "REPOSE_ANGLES_DEG", ())
+    rows = solver_validation.validation(MpmConfig(device="cpu"))
+    assert [row.case.split(",")[0] for row in rows] == ["dam break"] * 3 + ["sand column"] * 2
+    assert rows[0].held and rows[1].held
+    assert rows[3].measured > rows[4].measured
+    assert rows[3].predicted == pytest.approx(2.24)
+
+
+def test_height_is_taken_while_there_is_a_block() -> None:
+    """Until the centre rises or less than two cells are left, whichever comes first."""
+    block = np.random.default_rng(0).uniform(0, 8 / 64, (100, 3))
+    sinking = np.stack([block * (1, size, 1) for size in (1.0, 0.8, 0.6, 0.1)])
+    assert _sinks_until(sinking) == 3
+    rising = np.stack([block - (0, shift / 64, 0) for shift in (0, 1, 2, 1, 3)])
+    assert _sinks_until(rising) == 2
 
 
 def test_extents() -> None:
@@ -49,7 +91,7 @@ def test_extents() -> None:
     line = np.linspace(0, 1, 101)
     position = np.stack([line, line, line], axis=1)
     assert thickness_cells(position) == pytest.approx(0.9 * 64)
-    assert front_cells(position) == pytest.approx(0.99 * 64 - 3)
+    assert front_cells(position) == pytest.approx(0.99 * 64 - 2)
 
 
 def test_bad_options_are_refused() -> None:

@@ -56,6 +56,16 @@ def thickness_cells(position_N3: np.ndarray) -> float:
     return float(high - low) / CELL
 
 
+def height_cells(position_N3: np.ndarray) -> float:
+    """How high above the last node of the floor's walls the uppermost twentieth begins."""
+    return float(np.quantile(position_N3[:, 1], 0.95)) / CELL - (FLOOR_CELLS - 1)
+
+
+def centre_cells(position_N3: np.ndarray) -> float:
+    """The centre's height above the last node of the floor's walls."""
+    return float(position_N3[:, 1].mean()) / CELL - (FLOOR_CELLS - 1)
+
+
 def front_cells(position_N3: np.ndarray) -> float:
-    """How far from the wall the foremost hundredth begins."""
-    return float(np.quantile(position_N3[:, 0], 0.99)) / CELL - FLOOR_CELLS
+    """How far from the last wall node the foremost hundredth begins."""
+    return float(np.quantile(position_N3[:, 0], 0.99)) / CELL - (FLOOR_CELLS - 1)

@@ -1,0 +1,94 @@
+"""Extreme scenes, each with a defined result; more of them are in test_solver, test_collider and test_constitutive."""
+
+import numpy as np
+import pytest
+
+from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds, simulate
+from hgn.config import MpmConfig
+from hgn.scene.material import SAND, SNOW, WATER
+from hgn.scene.scene import Scene
+from hgn.schema import ConfigError
+
+CELL = 1 / 16
+CONFIG = MpmConfig(device="cpu")
+
+
+def scene_of(place_N3: np.ndarray, velocity: tuple, material_N: np.ndarray, **scene) -> Scene:
+    place = np.asarray(place_N3, np.float32)
+    return Scene(
+        place, np.tile(np.float32(velocity), (len(place), 1)), material_N.astype(np.uint8), cell_size=CELL, **scene
+    )
+
+
+def test_a_hundred_thousand_substeps() -> None:
+    """A particle of each material in the smallest domain: after 100,000 substeps all lie still, inside, unfloored."""
+    place = np.array([[3.2, 3.5, 2.7], [4.1, 2.8, 3.3], [2.6, 2.9, 4.4]]) * CELL
+    scene = scene_of(place, (0, 0, 0), np.arange(3), domain_size=(8 * CELL,) * 3)
+    config = MpmConfig(device="cpu", time_step="fixed", fixed_time_step_s=5e-4)
+    (outcome,) = simulate([scene], config, 12, 1 / 4.55, team_threads=1)
+    assert isinstance(outcome, Simulated), outcome
+    assert outcome.counters["substeps"] == 11 * 9100 > 100_000
+    low, high = particle_bounds(scene, config)
+    assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+    # what is left is a creep of single particles into the floor's last cell, 0.04 cells in five seconds
+    assert np.abs(outcome.position_TN3[-1] - outcome.position_TN3[-2]).max() < 0.1 * CELL
+    floors = {
+        name: outcome.counters[name] for name in ("water_volume_floors", "singular_value_floors", "position_clamps")
+    }
+    assert set(floors.values()) == {0}, floors
+
+
+@pytest.mark.parametrize("distance", [1000.0, -1000.0])
+def test_a_scene_a_thousand_away(distance: float) -> None:
+    """Coordinates are the scene's own, from 0: particles 1,000 away are refused with the bounds and what to do."""
+    place = np.full((4, 3), 0.5)
+    place[:, 0] += distance
+    with pytest.raises(ConfigError, match=r"position_N3 of scene 0 .* within the walls.*move the particles"):
+        simulate([scene_of(place, (0, 0, 0), np.zeros(4))], CONFIG, 2, 60.0)
+
+
+def test_the_far_end_of_a_long_domain() -> None:
+    """Water 1,000 cells from the origin splashes as it does near it, but for the rounding of its coordinates."""
+    place = np.random.default_rng(0).uniform(0, 2, (64, 3)) + np.array([8, 3, 4])
+    paths = []
+    for shift in (0, 1000):
+        away = np.array([shift, 0, 0])
+        moved = ((place + away) * CELL).astype(np.float32)
+        scene = scene_of(moved, (0, -2, 0), np.full(64, WATER), domain_size=(1020 * CELL, 10 * CELL, 10 * CELL))
+        (outcome,) = simulate([scene], CONFIG, 4, 60.0)
+        assert isinstance(outcome, Simulated), outcome
+        paths.append(outcome.position_TN3.astype(float) - away * CELL)
+    assert np.abs(paths[1] - paths[0]).max() < 0.01 * CELL
+
+
+@pytest.mark.parametrize("material", [WATER, SAND, SNOW])
+def test_several_cells_a_substep(material: int) -> None:
+    """At 1,000 m/s the adaptive step crosses 0.3 cells at most; a fixed one of five cells stops the scene or leaves all
+    particles inside, never out of range.
+    """
+    place = np.random.default_rng(1).uniform(0, 2, (64, 3)) * CELL + 0.45
+    scene = scene_of(place, (300, -950, 0), np.full(64, material))
+    low, high = particle_bounds(scene, CONFIG)
+    (outcome,) = simulate([scene], CONFIG, 2, 960.0)
+    assert isinstance(outcome, Simulated), outcome
+    assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+    assert outcome.counters["smallest_time_step_s"] <= 0.3 * CELL / 990
+    fixed = MpmConfig(device="cpu", time_step="fixed")
+    for outcome in simulate([scene, scene_of(place, (0, 1000, 0), np.full(64, material))], fixed, 3, 60.0):
+        if isinstance(outcome, SceneFailure):
+            assert outcome.cause.startswith("frame ")
+        else:
+            assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite(bad: float) -> None:
+    """A position or velocity that is NaN or infinite is refused with the particle's index; so is gravity."""
+    place = np.full((3, 3), 0.5, np.float32)
+    for field in ("position_N3", "velocity_N3"):
+        values = {"position_N3": place.copy(), "velocity_N3": np.zeros((3, 3), np.float32)}
+        values[field][1, 2] = bad
+        with pytest.raises(ConfigError, match=f"{field} must be finite.*particle 1"):
+            Scene(**values, material_N=np.zeros(3, np.uint8), cell_size=CELL)
+    with pytest.raises(ConfigError, match="gravity of scene 0 must be finite"):
+        simulate([scene_of(place, (0, 0, 0), np.zeros(3), gravity=(0.0, bad, 0.0))], CONFIG, 2, 60.0)

@@ -1,0 +1,203 @@
+"""Against published experiments: a dam that breaks, columns of sand that collapse, and the angle at which sand rests.
+
+Walls stand at the last node that stops motion, number 2 (and three from the other end): material fills its basin to
+there, as what is left open is filled by creeping. Floors of sand are sheets at a layer of nodes that bear Coulomb
+friction there alone (a band of half a cell); with the usual band the lowest cell and a half would hardly flow.
+Shape legend: T frames, N particles.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from datagen.mpm.solver import SceneFailure, Simulated, simulate
+from hgn.config import MpmConfig
+from hgn.scene.material import SAND, WATER
+from hgn.scene.scene import Obstacle, Scene
+from tools.stability.row import Row
+from tools.stability.solver_scenes import PARTICLES_PER_CELL
+
+GRAVITY = 9.8
+WALL = 2.0  # cells: the last wall node; what lies beyond cannot move
+FAR_WALL = 3.0  # from the end of the domain
+SLAB = 3  # cells, the thinnest that fits between walls
+
+# Martin and Moyce 1952, n² = 2, a = 2.25 in: time sqrt(2 g / a) t, front x / a
+DAM = np.array(
+    [(0.832, 1.217), (1.219, 1.474), (1.997, 2.292), (2.547, 2.995), (3.345, 4.134), (4.034, 4.944), (4.418, 5.881)]
+)
+DAM_WIDTH = 0.2  # m: of a free surface at a speed of sound of 17 m/s
+DAM_CELLS = (8, 16)
+DAM_DEPTH = 1 / 16  # of the width: where water is as deep, there is the front
+DAM_LEADS, DAM_RESOLVED = 0.18, 0.05
+DAM_RATE_HZ = 200.0
+
+COLUMN_CELL = 1 / 16
+COLUMN_CELLS = 16
+COLUMN_DEPTH = 1 / 64  # of the radius
+LUBE = 0.15
+LUBE_ANGLE_DEG = 31.0  # at which the quartz sand of Lube et al. 2004 rests
+COLUMNS = ((0.6, LUBE_ANGLE_DEG), (1.0, LUBE_ANGLE_DEG), (1.0, 45.0))  # aspect, friction angle
+LAWS = ("plane_strain", "compression")
+TIMES = 4.0  # of sqrt(height / g) until all stands; the experiments took about 3
+
+REPOSE_ANGLES_DEG = (20.0, LUBE_ANGLE_DEG, 45.0)
+REPOSE_CELLS = 12
+REPOSE_TIMES = 6.0
+AT_REST = 1e-2  # m/s, root mean square
+
+
+def validation(base: MpmConfig) -> list[Row]:
+    """Rows of the dam break, of columns by both friction laws, and of angles of repose."""
+    return [*dam_breaks(base), *columns(base), *reposes(base)]
+
+
+def dam_breaks(base: MpmConfig) -> list[Row]:
+    """The front of a collapsing column of water beside the experiment, and at one resolution beside the other."""
+    rows, fronts = [], []
+    for cells in DAM_CELLS:
+        path = _path(dam(cells), base, 2 + math.ceil(DAM[-1, 0] * math.sqrt(DAM_WIDTH / (2 * GRAVITY)) * DAM_RATE_HZ))
+        time = np.arange(len(path)) / DAM_RATE_HZ * math.sqrt(2 * GRAVITY / DAM_WIDTH)
+        front = np.interp(DAM[:, 0], time, [dam_front(position, cells) for position in path])
+        lead = front / DAM[:, 1] - 1
+        fronts.append(front)
+        beyond = "fronts " + ", ".join(f"{x:.2f} at {t:.2f} ({y:.2f})" for x, (t, y) in zip(front, DAM, strict=True))
+        more = {"front": front.tolist(), "experiment": DAM.tolist()}
+        worst = float(np.abs(lead).max())
+        rows.append(Row(f"dam break, {cells} cells wide", DAM_LEADS, worst, worst <= DAM_LEADS, beyond, more))
+    change = float(np.abs(fronts[1] / fronts[0] - 1).max())
+    name = f"dam break, {DAM_CELLS[0]} against {DAM_CELLS[1]} cells"
+    return [*rows, Row(name, DAM_RESOLVED, change, change <= DAM_RESOLVED, "largest change of the front")]
+
+
+def dam(cells: int) -> Scene:
+    """Water `cells` wide and twice as high, three cells thick, left of an empty basin."""
+    return basin(WATER, (cells, 2 * cells, SLAB), (7 * cells, 3 * cells, SLAB), DAM_WIDTH / cells)
+
+
+def dam_front(position_N3: np.ndarray, cells: int) -> float:
+    """How far the water is DAM_DEPTH deep, in widths; depth is what the particles of a cell's width would fill."""
+    place = position_N3[:, 0] * cells / DAM_WIDTH - WALL
+    depth = np.bincount(np.maximum(np.floor(place).astype(int), 0)) / (SLAB * PARTICLES_PER_CELL)
+    return _edge(depth, DAM_DEPTH * cells) / cells
+
+
+def columns(base: MpmConfig) -> list[Row]:
+    """How far quarters of round columns run out, beside Lube et al. 2004, with the friction slope of both laws."""
+    rows = []
+    for aspect, angle in COLUMNS:
+        expected = lube(aspect)
+        for law in LAWS:
+            config = _sand(base, law, angle)
+            duration = TIMES * math.sqrt(aspect * COLUMN_CELLS * COLUMN_CELL / GRAVITY)
+            path = _path(column(aspect, COLUMN_CELLS), config, 41, 40 / duration)
+            cells = _above_floor(path[-1]) / COLUMN_CELL
+            distance = np.hypot(cells[:, 0], cells[:, 2])
+            many = np.bincount(np.floor(distance).astype(int))
+            depth = many / PARTICLES_PER_CELL / (math.pi / 4 * np.diff(np.arange(len(many) + 1) ** 2))
+            front = _edge(depth, COLUMN_DEPTH * COLUMN_CELLS) / COLUMN_CELLS
+            change = front / expected - 1
+            beyond = f"{change:+.0%}; speed at the end {_speed(path, 40 / duration):.2g} m/s"
+            name = f"sand column, aspect {aspect:g}, friction {angle:g} degrees, {law.replace('_', ' ')}"
+            rows.append(Row(name, expected, front, abs(change) <= LUBE, beyond))
+    return rows
+
+
+def column(aspect: float, cells: int) -> Scene:
+    """A quarter of a round column of sand `cells` in radius on a rough floor, between two smooth walls."""
+    room = math.ceil(1.15 * lube(aspect) * cells)
+    scene = basin(SAND, (cells, aspect * cells, cells), (room, aspect * cells + 2, room), COLUMN_CELL, floor=2.0)
+    cell = _above_floor(scene.position_N3) / COLUMN_CELL
+    round_N = np.hypot(cell[:, 0], cell[:, 2]) < cells
+    return dataclasses.replace(
+        scene, position_N3=scene.position_N3[round_N], velocity_N3=scene.velocity_N3[round_N],
+        material_N=scene.material_N[round_N],
+    )  # fmt: skip
+
+
+def lube(aspect: float) -> float:
+    """The final radius of a column, in initial radii."""
+    return 1 + (1.24 * aspect if aspect < 1.7 else 1.6 * math.sqrt(aspect))
+
+
+def reposes(base: MpmConfig) -> list[Row]:
+    """The slope of what a slab of sand leaves: it grows with the friction angle and stays below it."""
+    rows, before = [], 0.0
+    for angle in REPOSE_ANGLES_DEG:
+        slope, speed = repose(angle, base, REPOSE_CELLS)
+        held = before < slope < angle and speed < AT_REST
+        beyond = f"at rest at {speed:.2g} m/s root mean square"
+        rows.append(Row(f"angle of repose, friction {angle:g} degrees", angle, slope, held, beyond))
+        before = slope
+    return rows
+
+
+def repose(angle_deg: float, base: MpmConfig, cells: int) -> tuple[float, float]:
+    """Slope, degrees, and root mean square speed, m/s, of a slab of sand as high as wide that has collapsed."""
+    room = round((2.8 if angle_deg < 25 else 2.3) * cells)
+    scene = basin(SAND, (cells, cells, SLAB), (room, cells + 2, SLAB), COLUMN_CELL, floor=2.0)
+    duration = REPOSE_TIMES * math.sqrt(cells * COLUMN_CELL / GRAVITY)
+    path = _path(scene, _sand(base, "plane_strain", angle_deg), 31, 30 / duration)
+    place = np.floor(_above_floor(path[-1])[:, 0] / COLUMN_CELL).astype(int)
+    depth = np.bincount(place, minlength=room)[:room] / (SLAB * PARTICLES_PER_CELL)
+    between = np.flatnonzero((depth > 0.2 * depth.max()) & (depth < 0.8 * depth.max()))
+    own = np.arange(between[0], between[-1] + 1)
+    slope = -np.polyfit(own, depth[own], 1)[0]
+    return math.degrees(math.atan(slope)), _speed(path, 30 / duration)
+
+
+def basin(
+    material: int, size_cells: Sequence[float], room_cells: Sequence[float], cell: float, floor: float | None = None
+) -> Scene:
+    """A box of particles at random places in the corner of a basin, wall to wall where the room is as large; above
+    the wall's floor, or with `floor` that many cells higher on a sheet.
+    """
+    count = round(PARTICLES_PER_CELL * float(np.prod(size_cells)))
+    place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * np.asarray(size_cells) + WALL
+    nodes = [math.ceil(room + WALL + FAR_WALL) for room in room_cells]
+    obstacles: tuple[Obstacle, ...] = ()
+    if floor is not None:
+        place[:, 1] += floor
+        nodes[1] += math.ceil(floor)
+        low, high, y = -cell, (max(nodes) + 1) * cell, (WALL + floor) * cell
+        corner = np.array([[low, y, low], [high, y, low], [high, y, high], [low, y, high]])
+        obstacles = (Obstacle("floor", corner, np.array([[0, 1, 2], [0, 2, 3]], np.int32), False),)
+    return Scene(
+        (place * cell).astype(np.float32), np.zeros((count, 3), np.float32), np.full(count, material, np.uint8),
+        obstacles, domain_size=(nodes[0] * cell, nodes[1] * cell, nodes[2] * cell), cell_size=cell,
+        gravity=(0.0, -GRAVITY, 0.0),
+    )  # fmt: skip
+
+
+def _edge(depth: np.ndarray, least: float) -> float:
+    """Where depths, each of a cell in turn, fall below `least` for good, in cells."""
+    depth = np.append(depth, 0.0)
+    last = int(np.flatnonzero(depth >= least).max())
+    return last + 0.5 + float((depth[last] - least) / (depth[last] - depth[last + 1]))
+
+
+def _above_floor(position_N3: np.ndarray) -> np.ndarray:
+    """From the edge where the walls meet the sheet of a basin's floor."""
+    return np.asarray(position_N3, np.float64) - np.array([WALL, WALL + 2.0, WALL]) * COLUMN_CELL
+
+
+def _sand(base: MpmConfig, law: str, angle_deg: float) -> MpmConfig:
+    return dataclasses.replace(
+        base, sand_friction_law=law, sand_friction_angle_deg=angle_deg, collider_friction=1.0, collider_band_cells=0.5
+    )
+
+
+def _path(scene: Scene, config: MpmConfig, frames: int, rate_hz: float = DAM_RATE_HZ) -> np.ndarray:
+    (outcome,) = simulate([scene], config, frames, rate_hz)
+    if isinstance(outcome, SceneFailure):
+        raise RuntimeError(f"a validation scene was stopped: {outcome.cause}")
+    assert isinstance(outcome, Simulated)
+    return outcome.position_TN3
+
+
+def _speed(path_TN3: np.ndarray, rate_hz: float) -> float:
+    return float(np.sqrt((np.diff(path_TN3[-2:].astype(np.float64), axis=0) ** 2).sum(axis=2).mean())) * rate_hz
