@@ -7,6 +7,7 @@ table of leaks with leak_seconds=0.1 leak_block_cells=3.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,11 +36,14 @@ class StabilitySolverConfig:
     device: str = "auto"
     leak_seconds: float = 5.0
     leak_block_cells: float = 4.0
+    leak_band_cells: float | None = None
     picture: str | None = None
     json: str | None = None
 
     def __post_init__(self) -> None:
         require_positive(self, "leak_seconds", "leak_block_cells")
+        band = self.leak_band_cells
+        require(band is None or band > 0, "leak_band_cells", "> 0", band)
         require_one_of(self, "device", ("auto", "cpu", "gpu"))
         for i, name in enumerate(self.cases or ()):
             require(name in CASES, f"cases[{i}]", f"one of {', '.join(CASES)}", name)
@@ -57,7 +61,7 @@ def main(mapping: dict[str, Any]) -> int:
         "stiffness": lambda: stiffnesses(mpm),
         "impact": lambda: impacts(mpm),
         "convergence": lambda: convergence(mpm),
-        "leak": lambda: leaks(mpm, config.leak_seconds, config.leak_block_cells),
+        "leak": lambda: leaks(_leak_settings(mpm, config), config.leak_seconds, config.leak_block_cells),
         "long": lambda: long_run(mpm),
         "validation": lambda: validation(mpm),
     }
@@ -76,6 +80,12 @@ def main(mapping: dict[str, Any]) -> int:
     if config.picture is not None:
         draw(points, mpm, Path(config.picture))
     return 0
+
+
+def _leak_settings(mpm: MpmConfig, config: StabilitySolverConfig) -> MpmConfig:
+    if config.leak_band_cells is None:
+        return mpm
+    return dataclasses.replace(mpm, collider_band_cells=config.leak_band_cells)
 
 
 def _steps(mpm: MpmConfig, points: list[Point]) -> list[Row]:
