@@ -118,7 +118,7 @@ def _cases(made: list[Scene], config: SolverTimesConfig, kind: str) -> Iterator[
         step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
         faithful = MpmConfig(
             device=kind, time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements",
-            snow_maximum_hardening=100.0,
+            water_volume_update="taichi_elements", snow_maximum_hardening=100.0,
         )  # fmt: skip
         for count in (1, SIDE_BY_SIDE) if kind == "gpu" else (1,):
             row = _timed([scene] * count, faithful, config.scene_frames, 1 / (substeps * step))

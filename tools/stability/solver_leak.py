@@ -43,8 +43,8 @@ AT_REST_S = 3.0  # from when on a gap is one at rest
 
 
 def leaks(base: MpmConfig, seconds: float, block_cells: float) -> list[Row]:
-    """A row for each shape, orientation, material and speed: the share of paths that cross over all offsets, of depth, gap
-    and projections the worst.
+    """A row for each shape, orientation, material and speed: the share of paths of all offsets that cross; of depth,
+    gap and projections the worst.
     """
     keys = [
         (shape, turn, kind, speed)
