@@ -10,7 +10,7 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.kernels.engine import OUT, Block, Engine, Tuning
 from hgn.kernels.grid.op import DeviceGrid
-from hgn.kernels.message.kernel import message_backward
+from hgn.kernels.message.kernel import cell_backward, edge_backward
 from hgn.kernels.packing import PackedFCN, PackedNetwork
 from hgn.kernels.pairs.kernel import pairs_backward
 from hgn.kernels.rows.kernel import gather_project_backward, rows_backward
@@ -51,7 +51,8 @@ class TrainingEngine(Engine):
         self.product_gradient = self._float(capacities[0], width)  # of what the pairs read of the cells
         self.cell_gradient_up = [self._float(c, width) for c in capacities]
         self.cell_gradient_down = [self._float(c, width) for c in capacities]
-        self.edge_gradient = self._float(capacities[0], 6, width)
+        self.edge_gradient = self._operand(capacities[0], 6, width)
+        self.sum_gradient = self._operand(capacities[0], width)
         # what the weight products read: the gradients in one arena, so that one launch can reach them all
         shapes: dict[str, tuple[int, ...]] = {
             "encode_h": (particles, width),
@@ -177,7 +178,7 @@ class TrainingEngine(Engine):
             False,
         )
         self._gather_backward(
-            0, self.product_gradient, grid.children(0), 0, top.next_at, g["product0"], self._gradient_of(top), False
+            0, self.product_gradient, grid.children(0), 0, top.next_at, g["product0"], self._gradient_of(top)
         )
         for i in range(levels - 1):
             block, fcn = self.up[i], packed.coarse_to_fine[i]
@@ -204,7 +205,6 @@ class TrainingEngine(Engine):
                 coarse.next_at,
                 g[f"product{i + 1}"],
                 self._gradient_of(coarse),
-                False,
             )
         for i in reversed(range(levels)):
             if i < levels - 1:
@@ -387,11 +387,13 @@ class TrainingEngine(Engine):
         at: int,
         summed: torch.Tensor,
         gradient: torch.Tensor,
-        add: bool,
-        reverse: bool = False,
+        add: bool = False,
+        received: tuple[torch.Tensor, int] | None = None,
     ) -> None:
+        """With `received`, x are gradients of edges, and what came with it through other weights is added too."""
         rows = self.grid.capacities[level]
         size, warps = self._row_block(rows)
+        other, other_at = received or (summed, at)
         gather_project_backward[self._blocks(rows, size)](
             x,
             table,
@@ -399,10 +401,12 @@ class TrainingEngine(Engine):
             self.weights,
             at,
             summed,
+            other,
+            other_at,
             gradient,
             rows,
             SUM=summands,
-            REVERSE=reverse,
+            EDGES=received is not None,
             ADD=add,
             WIDTH=self.width,
             BLOCK=size,
@@ -414,48 +418,71 @@ class TrainingEngine(Engine):
         grid, level, steps, g = self.grid, block.level, self.config.message_passing_steps, self.g
         rows = grid.capacities[level]
         gradient = self._gradient_of(block)
-        edge_gradient = self.edge_gradient[:rows]
-        size, warps = self._cell_block(True)
+        edge_gradient, sum_gradient = self.edge_gradient[:rows], self.sum_gradient[:rows]
+        table = grid.neighbour(level)
+        size, warps = self._row_block(rows)
+        edge_size, edge_warps = self._edge_block(rows)
         for m in reversed(range(steps)):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
-            message_backward[self._blocks(rows, size)](
+            later = m if last else m + 1
+            cell_backward[self._blocks(rows, size)](
                 gradient,
-                g[f"{name}{m if last else m + 1}_eh"],
-                g[f"{name}{m if last else m + 1}_s"],
-                edge_gradient,
-                grid.neighbour(level),
+                g[f"{name}{later}_eh"],
+                g[f"{name}{later}_r"],
+                table,
                 grid.count(level),
                 self.weights,
                 self.values,
                 self.totals,
-                0 if last else block.packed.edge[m + 1].parts[0],
-                edge.parts[1],
-                edge.parts[2],
-                edge.second,
-                edge.second_bias,
-                edge.gain,
-                edge.shift,
+                block.packed.edge[later].parts[0],
+                block.packed.edge[later].parts[1],
                 cell.parts[0],
                 cell.parts[1],
                 cell.second,
-                cell.second_bias,
                 cell.gain,
                 cell.shift,
-                block.edge_hidden[m],
                 block.cell_hidden[m],
-                g[f"{name}{m}_eh"],
-                g[f"{name}{m}_ez"],
+                block.cell_normalised[m],
+                block.cell_deviation[m],
+                g[f"{name}{later}_s"],
                 g[f"{name}{m}_ch"],
                 g[f"{name}{m}_cz"],
-                g[f"{name}{m}_r"],
+                sum_gradient,
                 rows,
                 self.unscale,
-                FIRST=m == 0,
                 LAST=last,
                 WIDTH=self.width,
                 BLOCK=size,
                 PRECISION=self.precision,
                 num_warps=warps,
             )
-        table, first = grid.neighbour(level), block.packed.edge[0].parts[0]
-        self._gather_backward(level, g[f"{name}0_eh"], table, 6, first, g[f"{name}0_s"], gradient, True, True)
+            edge_backward[self._programs(rows, edge_size)](
+                sum_gradient,
+                edge_gradient,
+                table,
+                grid.count(level),
+                self.weights,
+                self.values,
+                self.totals,
+                edge.parts[2],
+                edge.second,
+                edge.gain,
+                edge.shift,
+                block.edge_hidden[m],
+                block.edge_normalised[m],
+                block.edge_deviation[m],
+                g[f"{name}{m}_eh"],
+                g[f"{name}{m}_ez"],
+                g[f"{name}{m}_r"],
+                rows,
+                self.unscale,
+                FIRST=m == 0,
+                LAST=last,
+                WIDTH=self.width,
+                BLOCK=edge_size,
+                PRECISION=self.precision,
+                num_warps=edge_warps,
+            )
+        first = block.packed.edge[0]
+        into, received = g[f"{name}0_s"], (g[f"{name}0_r"], first.parts[1])
+        self._gather_backward(level, g[f"{name}0_eh"], table, 6, first.parts[0], into, gradient, True, received)

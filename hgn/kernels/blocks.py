@@ -66,3 +66,35 @@ def normalise_backward(gradient, normalised, scale, gamma, WIDTH: tl.constexpr):
     mean = tl.sum(inner, 1) / WIDTH
     slope = tl.sum(inner * normalised, 1) / WIDTH
     return (inner - mean[:, None] - normalised * slope[:, None]) * scale[:, None]
+
+
+@triton.jit
+def gathered_sum(
+    x,
+    table,
+    row,
+    count,
+    capacity,
+    SUM: tl.constexpr,
+    EDGES: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """The sums [BLOCK, W] of x's rows that the table [SUM, capacity] lists for each of `row` (-1: none).
+
+    With EDGES, x is [capacity, SUM, W], and of the row listed for a direction the opposite direction's part is taken.
+    """
+    column = tl.arange(0, WIDTH)
+    even, odd = tl.zeros((BLOCK, WIDTH), tl.float32), tl.zeros((BLOCK, WIDTH), tl.float32)
+    for i in tl.static_range(SUM):
+        where = tl.load(table + i * capacity + row, mask=row < count, other=-1)
+        there = (where >= 0)[:, None]
+        if EDGES:
+            where = where * SUM + (i ^ 1)
+        part = tl.load(x + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
+        if i % 2 == 0:
+            even += part
+        else:
+            odd += part
+    # a reduction, not a sum: the compiler would take each part to the matrix unit's layout, and add there
+    return tl.sum(tl.join(even, odd), 2)

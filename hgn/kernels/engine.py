@@ -13,12 +13,14 @@ import triton
 
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import DeviceGrid
-from hgn.kernels.message.kernel import message_forward
+from hgn.kernels.message.kernel import cell_forward, edge_forward
 from hgn.kernels.packing import PackedFCN, PackedMessagePassing, PackedNetwork
 from hgn.kernels.pairs.kernel import pairs_forward
 from hgn.kernels.rows.kernel import gather_project, rows_forward
 
 PRECISIONS = ("ieee", "tf32x3", "tf32", "half")
+PROCESSORS = 132  # an H100's
+RESIDENT_PROGRAMS = 2 * PROCESSORS
 OUT = 16  # the decoder's three outputs, padded
 
 
@@ -26,23 +28,23 @@ OUT = 16  # the decoder's three outputs, padded
 class Tuning:
     """Rows and warps of a program. They change how fast, never what."""
 
-    cell_block: int  # cells of a message step, eight rows each
+    cell_block: int  # cells of a tile of edges, eight rows each
     cell_warps: int
-    cell_backward_block: int
-    cell_backward_warps: int
+    few_cell_block: int  # the same on a level of few cells
+    few_cell_warps: int
     row_block: int
     row_warps: int
     pair_particles: int  # eight rows each
     pair_warps: int
     small_block: int = 16  # where there are few rows
-    small_warps: int = 4
+    small_warps: int = 8
 
     @staticmethod
     def of(precision: str, cells: int, particles: int) -> Tuning:
         """What was fastest on an H100 for a finest level of `cells` cells."""
         if precision in ("ieee", "tf32x3"):
-            return Tuning(16, 4, 16, 4, 16, 4, 2 if precision == "ieee" else 4, 4)
-        return Tuning(16, 8, 16, 8, 64 if particles > 20_000 else 32, 4, 8, 4)
+            return Tuning(8, 4, 8, 4, 16, 4, 2 if precision == "ieee" else 4, 4)
+        return Tuning(8, 4, 4, 4, 64, 4, 8, 4)
 
 
 @dataclass
@@ -54,8 +56,12 @@ class Block:
     cell: list[torch.Tensor] = field(default_factory=list)  # M + 1 of [C, W]
     edge: list[torch.Tensor] = field(default_factory=list)  # M - 1 of [C, 6, W]
     edge_hidden: list[torch.Tensor] = field(default_factory=list)
+    edge_normalised: list[torch.Tensor] = field(default_factory=list)
+    edge_deviation: list[torch.Tensor] = field(default_factory=list)  # one over it, float32 [C, 6]
     sum: list[torch.Tensor] = field(default_factory=list)
     cell_hidden: list[torch.Tensor] = field(default_factory=list)
+    cell_normalised: list[torch.Tensor] = field(default_factory=list)
+    cell_deviation: list[torch.Tensor] = field(default_factory=list)
     send: list[torch.Tensor] = field(default_factory=list)
     receive: list[torch.Tensor] = field(default_factory=list)
     product: torch.Tensor | None = None  # of the block's output, for the step that follows
@@ -121,7 +127,7 @@ class Engine:
         self.message = [self._operand(capacities[i], width) for i in range(levels - 1)]  # to the parents
         self.transfer_hidden_down = [self._operand(capacities[i], width) for i in range(levels - 1)]
         self.transfer_hidden_up = [self._operand(capacities[i], width) for i in range(levels - 1)]
-        shared_edge = None if self.training else self._float(capacities[0], 6, width)
+        shared_edge = None if self.training else self._operand(capacities[0], 6, width)
         self.down = [Block(i, packed.passing_down[i]) for i in range(levels)]
         self.up = [Block(i, packed.passing_up[i]) for i in range(levels - 1)]
         for block in (*self.down, *self.up):
@@ -130,18 +136,24 @@ class Engine:
             block.receive = [self._operand(capacity, width) for _ in range(2)]
             if self.training:
                 block.cell = [self._float(capacity, width) for _ in range(steps + 1)]
-                block.edge = [self._float(capacity, 6, width) for _ in range(steps - 1)]
+                block.edge = [self._operand(capacity, 6, width) for _ in range(steps - 1)]
                 block.edge_hidden = [self._operand(capacity, 6, width) for _ in range(steps)]
-                block.sum = [self._float(capacity, width) for _ in range(steps)]
+                block.edge_normalised = [self._operand(capacity, 6, width) for _ in range(steps)]
+                block.edge_deviation = [self._float(capacity, 6) for _ in range(steps)]
+                block.sum = [self._operand(capacity, width) for _ in range(steps)]
                 block.cell_hidden = [self._operand(capacity, width) for _ in range(steps)]
+                block.cell_normalised = [self._operand(capacity, width) for _ in range(steps)]
+                block.cell_deviation = [self._float(capacity) for _ in range(steps)]
             else:
                 assert shared_edge is not None
                 first, second = self._float(capacity, width), self._float(capacity, width)
                 block.cell = [(first, second)[m % 2] for m in range(steps + 1)]
                 block.edge = [shared_edge.flatten(0, 1)[: 6 * capacity].view(capacity, 6, width)] * max(steps - 1, 0)
-                block.edge_hidden = [block.send[0]] * steps
-                block.sum = [block.cell[0]] * steps
-                block.cell_hidden = [block.send[0]] * steps
+                block.sum = [self._operand(capacity, width)] * steps
+                # not kept
+                block.edge_hidden = block.edge_normalised = [block.send[0]] * steps
+                block.cell_hidden = block.cell_normalised = [block.send[0]] * steps
+                block.edge_deviation = block.cell_deviation = [block.cell[0]] * steps
         for i in range(levels):
             block = self.down[i] if i == levels - 1 else self.up[i]
             block.product = self._operand(capacities[i], width)
@@ -237,11 +249,15 @@ class Engine:
         tuning = self.tuning
         return (tuning.small_block, tuning.small_warps) if rows < 4096 else (tuning.row_block, tuning.row_warps)
 
-    def _cell_block(self, backward: bool) -> tuple[int, int]:
+    def _edge_block(self, cells: int) -> tuple[int, int]:
+        """Cells and warps of a tile of edges: small tiles where there would be fewer than processors."""
         tuning = self.tuning
-        if backward:
-            return tuning.cell_backward_block, tuning.cell_backward_warps
-        return tuning.cell_block, tuning.cell_warps
+        few = cells <= PROCESSORS * tuning.few_cell_block
+        return (tuning.few_cell_block, tuning.few_cell_warps) if few else (tuning.cell_block, tuning.cell_warps)
+
+    def _programs(self, rows: int, block: int) -> tuple[int]:
+        """Programs that take one block after the other: as many as run at once."""
+        return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS),)
 
     def _rows(
         self,
@@ -357,7 +373,8 @@ class Engine:
     def _passing(self, block: Block) -> None:
         grid, level, steps = self.grid, block.level, self.config.message_passing_steps
         rows = grid.capacities[level]
-        size, warps = self._cell_block(False)
+        size, warps = self._row_block(rows)
+        edge_size, edge_warps = self._edge_block(rows)
         for m in range(steps):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             if not last:
@@ -367,8 +384,7 @@ class Engine:
             else:
                 product = block.product if block.product is not None else block.send[(m + 1) % 2]
                 next_at, into, products = (block.next_at, 0), (product, product), int(block.product is not None)
-            message_forward[self._blocks(rows, size)](
-                block.cell[m],
+            edge_forward[self._programs(rows, edge_size)](
                 block.send[m % 2],
                 block.receive[m % 2],
                 block.edge[m - 1] if m > 0 else block.cell[m],
@@ -382,6 +398,26 @@ class Engine:
                 edge.second_bias,
                 edge.gain,
                 edge.shift,
+                block.edge[m] if not last else block.cell[m],
+                block.sum[m],
+                block.edge_hidden[m],
+                block.edge_normalised[m],
+                block.edge_deviation[m],
+                rows,
+                FIRST=m == 0,
+                STORE_EDGE=not last,
+                SAVE=self.training,
+                WIDTH=self.width,
+                BLOCK=edge_size,
+                PRECISION=self.precision,
+                num_warps=edge_warps,
+            )
+            cell_forward[self._blocks(rows, size)](
+                block.cell[m],
+                block.sum[m],
+                grid.count(level),
+                self.weights,
+                self.values,
                 cell.parts[0],
                 cell.parts[1],
                 cell.first_bias,
@@ -392,15 +428,11 @@ class Engine:
                 next_at[0],
                 next_at[1],
                 block.cell[m + 1],
-                block.edge[m] if not last else block.cell[m],
-                block.edge_hidden[m],
-                block.sum[m],
                 block.cell_hidden[m],
+                block.cell_normalised[m],
+                block.cell_deviation[m],
                 into[0],
                 into[1],
-                rows,
-                FIRST=m == 0,
-                STORE_EDGE=not last,
                 NEXT=products,
                 SAVE=self.training,
                 WIDTH=self.width,

@@ -1,8 +1,9 @@
-"""One message-passing iteration on the cells of a level (paper fig. 5), forward and backward, in one launch each.
+"""One message-passing iteration on the cells of a level (paper fig. 5): its edges, then its cells; from behind backward.
 
-A program owns BLOCK cells and the up to six edges that end in each: a tile of 8 BLOCK rows, of which six in eight can
-hold an edge. Edge arrays are [capacity, 6, W], [c, d] for the edge to cell c from its neighbour in direction d. Sums
-over edges are reductions inside the tile and gathers in fixed order: no atomics, the same result every time.
+A tile of the edge kernels holds BLOCK cells and the up to six edges that end in each: 8 BLOCK rows, of which six in
+eight can hold an edge. A program takes one tile after the other and reads its weights once. Edge arrays are
+[capacity, 6, W], [c, d] for the edge to cell c from its neighbour in direction d. Sums over edges are reductions inside
+the tile and gathers in fixed order: no atomics, the same result every time.
 Shape legend: C cells, W width.
 """
 
@@ -11,12 +12,20 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import leaky, leaky_backward, matrix, normalise, normalise_backward, product, transposed
+from hgn.kernels.blocks import (
+    gathered_sum,
+    leaky,
+    leaky_backward,
+    matrix,
+    normalise,
+    normalise_backward,
+    product,
+    transposed,
+)
 
 
 @triton.jit
-def message_forward(
-    cell,
+def edge_forward(
     send,
     receive,
     edge_in,
@@ -25,93 +34,131 @@ def message_forward(
     weights,
     values,
     own_at,
-    edge_bias_at,
-    edge_second_at,
-    edge_second_bias_at,
-    edge_gain_at,
-    edge_shift_at,
-    cell_first_at,
-    sum_first_at,
-    cell_bias_at,
-    cell_second_at,
-    cell_second_bias_at,
-    cell_gain_at,
-    cell_shift_at,
-    next_at_0,
-    next_at_1,
-    cell_out,
+    bias_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
     edge_out,
-    edge_hidden,
     sum_out,
-    cell_hidden,
-    next_0,
-    next_1,
+    hidden,
+    normalised,
+    deviation,
     capacity,
     FIRST: tl.constexpr,
     STORE_EDGE: tl.constexpr,
+    SAVE: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """The edges' new features and their sums by receiver [C, W]; send and receive [C, W] are the cells' products with
+    the edge network's first two parts.
+
+    FIRST: edges have no features yet, their unit offset takes the place. The last iteration stores no edges. SAVE keeps
+    what edge_backward reads: the hidden layer, the normalised output and one over its deviation.
+    """
+    count = tl.load(count_ptr)
+    ROWS: tl.constexpr = BLOCK * 8
+    column = tl.arange(0, WIDTH)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    if not FIRST:
+        own = transposed(weights + own_at, WIDTH, WIDTH)
+    second = transposed(weights + second_at, WIDTH, WIDTH)
+    tile = tl.program_id(0)
+    while tile * BLOCK < count:
+        owner = tile * BLOCK + tl.arange(0, ROWS) // 8
+        slot = tl.arange(0, ROWS) % 8
+        holds = (owner < count) & (slot < 6)
+        other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
+        there = (other >= 0)[:, None]
+        edge_at = (owner * 6 + slot)[:, None] * WIDTH + column[None, :]
+        receive_at = owner[:, None] * WIDTH + column[None, :]
+        h = tl.load(receive + receive_at, mask=there, other=0.0).to(tl.float32)
+        h += tl.load(send + other[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
+        h += tl.load(values + bias_at + column)[None, :]
+        if FIRST:
+            for axis in tl.static_range(3):
+                # receiver minus sender: the opposite of where the sender lies
+                side = tl.where(slot // 2 == axis, 2.0 * (slot % 2) - 1.0, 0.0)
+                h += side[:, None] * tl.load(values + own_at + axis * WIDTH + column)[None, :]
+        else:
+            edge = tl.load(edge_in + edge_at, mask=there, other=0.0).to(tl.float32)
+            h += product(edge, own, PRECISION)
+        a = leaky(h)
+        if SAVE:
+            # zeros, not old values, where there is no edge: they meet zero gradients in the weights' products
+            tl.store(hidden + edge_at, tl.where(there, a, 0.0), mask=holds[:, None])
+        z = product(a, second, PRECISION)
+        z, scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
+        if SAVE:
+            tl.store(normalised + edge_at, z, mask=there)
+            tl.store(deviation + owner * 6 + slot, scale, mask=other >= 0)
+        z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
+        if not FIRST:
+            # read again: registers are dearer than a cache
+            z += tl.load(edge_in + edge_at, mask=there, other=0.0).to(tl.float32)
+        z = tl.where(there, z, 0.0)
+        if STORE_EDGE:
+            if SAVE:
+                tl.store(edge_out + edge_at, z, mask=holds[:, None])
+            else:
+                tl.store(edge_out + edge_at, z, mask=there)
+        mine = tile * BLOCK + tl.arange(0, BLOCK)
+        total = tl.sum(tl.reshape(z, (BLOCK, 8, WIDTH)), 1)
+        tl.store(sum_out + mine[:, None] * WIDTH + column[None, :], total, mask=(mine < count)[:, None])
+        tile += tl.num_programs(0)
+
+
+@triton.jit
+def cell_forward(
+    cell,
+    total,
+    count_ptr,
+    weights,
+    values,
+    first_at,
+    sum_first_at,
+    bias_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
+    next_at_0,
+    next_at_1,
+    cell_out,
+    hidden,
+    normalised,
+    deviation,
+    next_0,
+    next_1,
     NEXT: tl.constexpr,
     SAVE: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """send and receive [C, W] are the cells' products with the edge network's first two parts.
-
-    FIRST: edges have no features yet, their unit offset takes the place. The last iteration stores no edges.
-    """
+    """The cells' new features from theirs and their edges' sums, both [C, W], and up to two products of them."""
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
-    ROWS: tl.constexpr = BLOCK * 8
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = (row < count)[:, None]
     column = tl.arange(0, WIDTH)
     at = row[:, None] * WIDTH + column[None, :]
-    owner = tl.program_id(0) * BLOCK + tl.arange(0, ROWS) // 8
-    slot = tl.arange(0, ROWS) % 8
-    holds = (owner < count) & (slot < 6)
-    other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
-    there = (other >= 0)[:, None]
-    edge_at = (owner * 6 + slot)[:, None] * WIDTH + column[None, :]
-    receive_at = owner[:, None] * WIDTH + column[None, :]
-    h = tl.load(receive + receive_at, mask=there, other=0.0).to(tl.float32)
-    h += tl.load(send + other[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
-    h += tl.load(values + edge_bias_at + column)[None, :]
-    if FIRST:
-        for axis in tl.static_range(3):
-            # receiver minus sender: the opposite of where the sender lies
-            side = tl.where(slot // 2 == axis, 2.0 * (slot % 2) - 1.0, 0.0)
-            h += side[:, None] * tl.load(values + own_at + axis * WIDTH + column)[None, :]
-    else:
-        edge = tl.load(edge_in + edge_at, mask=there, other=0.0).to(tl.float32)
-        h += product(edge, transposed(weights + own_at, WIDTH, WIDTH), PRECISION)
-    a = leaky(h)
-    if SAVE:
-        # zeros, not old values, where there is no edge: they meet zero gradients in the weights' products
-        tl.store(edge_hidden + edge_at, tl.where(there, a, 0.0), mask=holds[:, None])
-    z = product(a, transposed(weights + edge_second_at, WIDTH, WIDTH), PRECISION)
-    z, _scale = normalise(z + tl.load(values + edge_second_bias_at + column)[None, :], WIDTH)
-    z = z * tl.load(values + edge_gain_at + column)[None, :] + tl.load(values + edge_shift_at + column)[None, :]
-    if not FIRST:
-        # read again: registers are dearer than a cache
-        z += tl.load(edge_in + edge_at, mask=there, other=0.0).to(tl.float32)
-    z = tl.where(there, z, 0.0)
-    if STORE_EDGE:
-        if SAVE:
-            tl.store(edge_out + edge_at, z, mask=holds[:, None])
-        else:
-            tl.store(edge_out + edge_at, z, mask=there)
-    total = tl.sum(tl.reshape(z, (BLOCK, 8, WIDTH)), 1)
     feature = tl.load(cell + at, mask=here, other=0.0).to(tl.float32)
-    h = product(feature, transposed(weights + cell_first_at, WIDTH, WIDTH), PRECISION)
-    h += product(total, transposed(weights + sum_first_at, WIDTH, WIDTH), PRECISION)
-    a = leaky(h + tl.load(values + cell_bias_at + column)[None, :])
+    summed = tl.load(total + at, mask=here, other=0.0).to(tl.float32)
+    h = product(feature, transposed(weights + first_at, WIDTH, WIDTH), PRECISION)
+    h += product(summed, transposed(weights + sum_first_at, WIDTH, WIDTH), PRECISION)
+    a = leaky(h + tl.load(values + bias_at + column)[None, :])
+    z = product(a, transposed(weights + second_at, WIDTH, WIDTH), PRECISION)
+    z, scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
     if SAVE:
-        tl.store(sum_out + at, total, mask=here)
-        tl.store(cell_hidden + at, a, mask=here)
-    z = product(a, transposed(weights + cell_second_at, WIDTH, WIDTH), PRECISION)
-    z, _scale = normalise(z + tl.load(values + cell_second_bias_at + column)[None, :], WIDTH)
-    z = z * tl.load(values + cell_gain_at + column)[None, :] + tl.load(values + cell_shift_at + column)[None, :]
+        tl.store(hidden + at, a, mask=here)
+        tl.store(normalised + at, z, mask=here)
+        tl.store(deviation + row, scale, mask=row < count)
+    z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
     feature += z
     tl.store(cell_out + at, feature, mask=here)
     if NEXT > 0:
@@ -123,35 +170,87 @@ def message_forward(
 
 
 @triton.jit
-def message_backward(
+def cell_backward(
     gradient,
     later_hidden_gradient,
-    send_gradient,
-    edge_gradient,
+    later_receive_gradient,
     neighbour,
     count_ptr,
     weights,
     values,
     totals,
     later_send_at,
-    receive_at,
-    own_at,
-    edge_second_at,
-    edge_second_bias_at,
-    edge_gain_at,
-    edge_shift_at,
-    cell_first_at,
+    later_receive_at,
+    first_at,
     sum_first_at,
-    cell_second_at,
-    cell_second_bias_at,
-    cell_gain_at,
-    cell_shift_at,
-    edge_hidden,
-    cell_hidden,
-    edge_hidden_gradient,
-    edge_second_gradient,
-    cell_hidden_gradient,
-    cell_second_gradient,
+    second_at,
+    gain_at,
+    shift_at,
+    hidden,
+    normalised,
+    deviation,
+    send_gradient,
+    hidden_gradient,
+    second_gradient,
+    sum_gradient,
+    capacity,
+    unscale,
+    LAST: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """In place: `gradient` [C, W] comes in as the gradient of cell_out, less what reaches it through `send` and
+    `receive` of the following iteration (added here unless LAST, what comes from the edges that start in a cell is left
+    in send_gradient), and leaves as that of `cell`, again less what goes through its own. sum_gradient [C, W] is that of
+    the edges' sums."""
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = (row < count)[:, None]
+    column = tl.arange(0, WIDTH)
+    at = row[:, None] * WIDTH + column[None, :]
+    df = tl.load(gradient + at, mask=here, other=0.0)
+    if not LAST:
+        # the edges that start here: each in its receiver's row, seen from there in the opposite direction
+        sent = gathered_sum(later_hidden_gradient, neighbour, row, count, capacity, 6, True, WIDTH, BLOCK)
+        tl.store(send_gradient + at, sent, mask=here)
+        df += product(sent, matrix(weights + later_send_at, WIDTH, WIDTH), PRECISION)
+        received = tl.load(later_receive_gradient + at, mask=here, other=0.0).to(tl.float32)
+        df += product(received, matrix(weights + later_receive_at, WIDTH, WIDTH), PRECISION)
+    z = tl.load(normalised + at, mask=here, other=0.0).to(tl.float32)
+    scale = tl.load(deviation + row, mask=row < count, other=0.0)
+    tl.atomic_add(totals + gain_at + column, tl.sum(df * z, 0) * unscale, sem="relaxed")
+    tl.atomic_add(totals + shift_at + column, tl.sum(df, 0) * unscale, sem="relaxed")
+    dz = normalise_backward(df, z, scale, tl.load(values + gain_at + column), WIDTH)
+    tl.store(second_gradient + at, dz, mask=here)
+    dh = product(dz, matrix(weights + second_at, WIDTH, WIDTH), PRECISION)
+    dh = leaky_backward(dh, tl.load(hidden + at, mask=here, other=0.0).to(tl.float32))
+    tl.store(hidden_gradient + at, dh, mask=here)
+    tl.store(sum_gradient + at, product(dh, matrix(weights + sum_first_at, WIDTH, WIDTH), PRECISION), mask=here)
+    df += product(dh, matrix(weights + first_at, WIDTH, WIDTH), PRECISION)
+    tl.store(gradient + at, df, mask=here)
+
+
+@triton.jit
+def edge_backward(
+    sum_gradient,
+    edge_gradient,
+    neighbour,
+    count_ptr,
+    weights,
+    values,
+    totals,
+    own_at,
+    second_at,
+    gain_at,
+    shift_at,
+    hidden,
+    normalised,
+    deviation,
+    hidden_gradient,
+    second_gradient,
     receive_gradient,
     capacity,
     unscale,
@@ -161,70 +260,58 @@ def message_backward(
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """In place: `gradient` [C, W] comes in as the gradient of cell_out, less what reaches it through `send` of the
-    following iteration (gathered here unless LAST, and left in send_gradient), and leaves as that of `cell`, again less
-    what goes through its own `send`. edge_gradient [C, 6, W] likewise: of edge_out (none if LAST), then of edge_in.
-    """
+    """In place: edge_gradient [C, 6, W] comes in as that of edge_out less sum_gradient's part (none if LAST), and leaves
+    as that of edge_in (none if FIRST). receive_gradient [C, W] is that of `receive`."""
     count = tl.load(count_ptr)
+    ROWS: tl.constexpr = BLOCK * 8
+    column = tl.arange(0, WIDTH)
     if tl.program_id(0) * BLOCK >= count:
         return
-    ROWS: tl.constexpr = BLOCK * 8
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = (row < count)[:, None]
-    column = tl.arange(0, WIDTH)
-    at = row[:, None] * WIDTH + column[None, :]
-    owner = tl.program_id(0) * BLOCK + tl.arange(0, ROWS) // 8
-    slot = tl.arange(0, ROWS) % 8
-    holds = (owner < count) & (slot < 6)
-    other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
-    there = (other >= 0)[:, None]
-    edge_at = (owner * 6 + slot)[:, None] * WIDTH + column[None, :]
-
-    cell_a = tl.load(cell_hidden + at, mask=here, other=0.0).to(tl.float32)
-    df = tl.load(gradient + at, mask=here, other=0.0)
-    if not LAST:
-        # the edges that start here: each in its receiver's row, seen from there in the opposite direction
-        away = (other * 6 + (slot ^ 1))[:, None] * WIDTH + column[None, :]
-        sent = tl.load(later_hidden_gradient + away, mask=there, other=0.0).to(tl.float32)
-        sent = tl.sum(tl.reshape(sent, (BLOCK, 8, WIDTH)), 1)
-        tl.store(send_gradient + at, sent, mask=here)
-        df += product(sent, matrix(weights + later_send_at, WIDTH, WIDTH), PRECISION)
-    cell_second = matrix(weights + cell_second_at, WIDTH, WIDTH)
-    z = product(cell_a, tl.trans(cell_second), PRECISION)
-    z, scale = normalise(z + tl.load(values + cell_second_bias_at + column)[None, :], WIDTH)
-    tl.atomic_add(totals + cell_gain_at + column, tl.sum(df * z, 0) * unscale)
-    tl.atomic_add(totals + cell_shift_at + column, tl.sum(df, 0) * unscale)
-    dz = normalise_backward(df, z, scale, tl.load(values + cell_gain_at + column), WIDTH)
-    dz = tl.where(here, dz, 0.0)
-    tl.store(cell_second_gradient + at, dz, mask=here)
-    sum_first = matrix(weights + sum_first_at, WIDTH, WIDTH)
-    dh = leaky_backward(product(dz, cell_second, PRECISION), cell_a)
-    tl.store(cell_hidden_gradient + at, dh, mask=here)
-    a = tl.load(edge_hidden + edge_at, mask=there, other=0.0).to(tl.float32)
-    dsum = product(dh, sum_first, PRECISION)
-    df += product(dh, matrix(weights + cell_first_at, WIDTH, WIDTH), PRECISION)
-
-    second = matrix(weights + edge_second_at, WIDTH, WIDTH)
-    z = product(a, tl.trans(second), PRECISION) + tl.load(values + edge_second_bias_at + column)[None, :]
-    z, scale = normalise(z, WIDTH)
-    de = tl.reshape(tl.broadcast_to(dsum[:, None, :], (BLOCK, 8, WIDTH)), (ROWS, WIDTH))
-    if not LAST:
-        de += tl.load(edge_gradient + edge_at, mask=there, other=0.0)
-    de = tl.where(there, de, 0.0)
-    tl.atomic_add(totals + edge_gain_at + column, tl.sum(de * z, 0) * unscale)
-    tl.atomic_add(totals + edge_shift_at + column, tl.sum(de, 0) * unscale)
-    dz = normalise_backward(de, z, scale, tl.load(values + edge_gain_at + column), WIDTH)
-    tl.store(edge_second_gradient + edge_at, dz, mask=holds[:, None])
-    dh = leaky_backward(product(dz, second, PRECISION), a)
-    tl.store(edge_hidden_gradient + edge_at, dh, mask=holds[:, None])
+    second = matrix(weights + second_at, WIDTH, WIDTH)
+    if not FIRST:
+        own = matrix(weights + own_at, WIDTH, WIDTH)
+    gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
+    x_total, y_total, z_total = shift_total, shift_total, shift_total
+    tile = tl.program_id(0)
+    while tile * BLOCK < count:
+        owner = tile * BLOCK + tl.arange(0, ROWS) // 8
+        slot = tl.arange(0, ROWS) % 8
+        holds = (owner < count) & (slot < 6)
+        other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
+        there = (other >= 0)[:, None]
+        edge_at = (owner * 6 + slot)[:, None] * WIDTH + column[None, :]
+        sum_at = owner[:, None] * WIDTH + column[None, :]
+        de = tl.load(sum_gradient + sum_at, mask=there, other=0.0).to(tl.float32)
+        if not LAST:
+            de += tl.load(edge_gradient + edge_at, mask=there, other=0.0).to(tl.float32)
+        z = tl.load(normalised + edge_at, mask=there, other=0.0).to(tl.float32)
+        scale = tl.load(deviation + owner * 6 + slot, mask=other >= 0, other=0.0)
+        gain_total += tl.sum(de * z, 0)
+        shift_total += tl.sum(de, 0)
+        dz = normalise_backward(de, z, scale, tl.load(values + gain_at + column), WIDTH)
+        tl.store(second_gradient + edge_at, dz, mask=holds[:, None])
+        dh = product(dz, second, PRECISION)
+        dh = leaky_backward(dh, tl.load(hidden + edge_at, mask=there, other=0.0).to(tl.float32))
+        tl.store(hidden_gradient + edge_at, dh, mask=holds[:, None])
+        if FIRST:
+            sign = 2.0 * (slot % 2) - 1.0
+            x_total += tl.sum(dh * tl.where(slot // 2 == 0, sign, 0.0)[:, None], 0)
+            y_total += tl.sum(dh * tl.where(slot // 2 == 1, sign, 0.0)[:, None], 0)
+            z_total += tl.sum(dh * tl.where(slot // 2 == 2, sign, 0.0)[:, None], 0)
+        else:
+            de = product(dh, own, PRECISION)
+            # read again: registers are dearer than a cache
+            de += tl.load(sum_gradient + sum_at, mask=there, other=0.0).to(tl.float32)
+            if not LAST:
+                de += tl.load(edge_gradient + edge_at, mask=there, other=0.0).to(tl.float32)
+            tl.store(edge_gradient + edge_at, de, mask=there)
+        mine = tile * BLOCK + tl.arange(0, BLOCK)
+        received = tl.sum(tl.reshape(dh, (BLOCK, 8, WIDTH)), 1)
+        tl.store(receive_gradient + mine[:, None] * WIDTH + column[None, :], received, mask=(mine < count)[:, None])
+        tile += tl.num_programs(0)
+    tl.atomic_add(totals + gain_at + column, gain_total * unscale, sem="relaxed")
+    tl.atomic_add(totals + shift_at + column, shift_total * unscale, sem="relaxed")
     if FIRST:
-        for axis in tl.static_range(3):
-            side = tl.where(slot // 2 == axis, 2.0 * (slot % 2) - 1.0, 0.0) * unscale
-            tl.atomic_add(totals + own_at + axis * WIDTH + column, tl.sum(dh * side[:, None], 0))
-    else:
-        de += product(dh, matrix(weights + own_at, WIDTH, WIDTH), PRECISION)
-        tl.store(edge_gradient + edge_at, de, mask=there)
-    dreceive = tl.sum(tl.reshape(dh, (BLOCK, 8, WIDTH)), 1)
-    tl.store(receive_gradient + at, dreceive, mask=here)
-    df += product(dreceive, matrix(weights + receive_at, WIDTH, WIDTH), PRECISION)
-    tl.store(gradient + at, df, mask=here)
+        tl.atomic_add(totals + own_at + column, x_total * unscale, sem="relaxed")
+        tl.atomic_add(totals + own_at + WIDTH + column, y_total * unscale, sem="relaxed")
+        tl.atomic_add(totals + own_at + 2 * WIDTH + column, z_total * unscale, sem="relaxed")

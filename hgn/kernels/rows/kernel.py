@@ -9,7 +9,16 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import leaky, leaky_backward, matrix, normalise, normalise_backward, product, transposed
+from hgn.kernels.blocks import (
+    gathered_sum,
+    leaky,
+    leaky_backward,
+    matrix,
+    normalise,
+    normalise_backward,
+    product,
+    transposed,
+)
 
 
 @triton.jit
@@ -211,11 +220,7 @@ def gather_project(
     column = tl.arange(0, WIDTH)
     at = row[:, None] * WIDTH + column[None, :]
     if SUM > 0:
-        tile = tl.zeros((BLOCK, WIDTH), tl.float32)
-        for i in tl.static_range(SUM):
-            where = tl.load(table + i * capacity + row, mask=row < count, other=-1)
-            there = (where >= 0)[:, None]
-            tile += tl.load(x + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
+        tile = gathered_sum(x, table, row, count, capacity, SUM, False, WIDTH, BLOCK)
         tl.store(y + at, tile, mask=live)
     else:
         tile = tl.load(x + at, mask=live, other=0.0).to(tl.float32)
@@ -233,10 +238,12 @@ def gather_project_backward(
     weights,
     at_0,
     summed,
+    other,
+    other_at,
     gradient,
     capacity,
     SUM: tl.constexpr,
-    REVERSE: tl.constexpr,
+    EDGES: tl.constexpr,
     ADD: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -244,7 +251,8 @@ def gather_project_backward(
 ):
     """summed = x, or the sum of x's rows listed in the table [SUM, capacity]; gradient (+)= summed W.
 
-    With REVERSE, x is [capacity, SUM, W], and of the row listed for a direction the opposite direction's part is taken.
+    With EDGES, x is [capacity, SUM, W], of the row listed for a direction the opposite direction's part is taken, and
+    the product of `other` [capacity, W] with its own weights is added to the gradient.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
@@ -256,15 +264,12 @@ def gather_project_backward(
     if SUM == 0:
         tile = tl.load(x + at, mask=live, other=0.0).to(tl.float32)
     else:
-        tile = tl.zeros((BLOCK, WIDTH), tl.float32)
-    for i in tl.static_range(SUM):
-        where = tl.load(table + i * capacity + row, mask=row < count, other=-1)
-        there = (where >= 0)[:, None]
-        if REVERSE:
-            where = where * SUM + (i ^ 1)
-        tile += tl.load(x + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
+        tile = gathered_sum(x, table, row, count, capacity, SUM, EDGES, WIDTH, BLOCK)
     tl.store(summed + at, tile, mask=live)
     result = product(tile, matrix(weights + at_0, WIDTH, WIDTH), PRECISION)
+    if EDGES:
+        tile = tl.load(other + at, mask=live, other=0.0).to(tl.float32)
+        result += product(tile, matrix(weights + other_at, WIDTH, WIDTH), PRECISION)
     if ADD:
         result += tl.load(gradient + at, mask=live, other=0.0)
     tl.store(gradient + at, result, mask=live)
