@@ -76,8 +76,6 @@ class TrainingEngine(Engine):
         self.left = self._operand(sum(torch.Size(shape).numel() for shape in shapes.values()))
         views = self.left.split([torch.Size(shape).numel() for shape in shapes.values()])
         self.g = {name: view.view(shape) for (name, shape), view in zip(shapes.items(), views, strict=True)}
-        self.pair_hidden_down = self._operand(8 * particles, width)
-        self.pair_hidden_up = self._operand(8 * particles, width)
         self._plan_weight_gradients()
 
     def _named_blocks(self) -> list[tuple[Block, str]]:
@@ -169,8 +167,6 @@ class TrainingEngine(Engine):
         self._pairs_backward(
             packed.cell_to_particle,
             self.latent_gradient,
-            self.by_particle_up,
-            top.product,
             self.pair_hidden_up,
             g["up_z"],
             g["up_p"],
@@ -225,8 +221,6 @@ class TrainingEngine(Engine):
         self._pairs_backward(
             packed.particle_to_cell,
             self.cell_gradient_down[0],
-            self.by_particle_down,
-            self.by_particle_down,
             self.pair_hidden_down,
             g["down_z"],
             g["down_p"],
@@ -298,7 +292,7 @@ class TrainingEngine(Engine):
         following: tuple[int, ...] = (),
         products: tuple[torch.Tensor, ...] = (),
     ) -> None:
-        block, warps = self._row_block(len(hidden))
+        block, warps = self._row_block(len(hidden), True)
         at, given = (*following, 0, 0), (*products, hidden, hidden)
         rows_backward[self._blocks(len(hidden), block)](
             gradient,
@@ -340,8 +334,6 @@ class TrainingEngine(Engine):
         self,
         fcn: PackedFCN,
         gradient: torch.Tensor,
-        by_particle: torch.Tensor,
-        by_cell: torch.Tensor,
         hidden: torch.Tensor,
         second_gradient: torch.Tensor,
         by_particle_gradient: torch.Tensor,
@@ -349,10 +341,8 @@ class TrainingEngine(Engine):
         to_cell: bool,
     ) -> None:
         grid = self.grid
-        pairs_backward[self._blocks(grid.particles, self.tuning.pair_particles)](
+        pairs_backward[self._programs(grid.particles, self.tuning.pair_particles)](
             gradient,
-            by_particle,
-            by_cell,
             grid.cell_N8,
             grid.weight_N8,
             grid.fraction_N3,
@@ -361,7 +351,6 @@ class TrainingEngine(Engine):
             self.values,
             self.totals,
             fcn.parts[-1],
-            fcn.first_bias,
             fcn.second,
             fcn.second_bias,
             fcn.gain,

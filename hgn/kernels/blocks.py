@@ -1,7 +1,7 @@
 """What the kernels share: matrix products at a chosen precision, layer normalisation and its gradient.
 
-Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range, "half" to 10 bits
-with float16's range, "tf32x3" makes float32 of three TF32 products (Triton's plain float32 product takes minutes to
+Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range (weights come
+rounded, see nearest_tf32), "half" to 10 bits with float16's range, "tf32x3" makes float32 of three TF32 products (Triton's plain float32 product takes minutes to
 compile at this size), and "ieee" is what it is in the interpreter. Sums are float32 always.
 """
 
@@ -15,10 +15,23 @@ EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
 
 
 @triton.jit
+def nearest_tf32(x):
+    """float32 rounded to 10 bits of mantissa, ties away from zero, as cvt.rna does.
+
+    The matrix units drop the other bits, which alone would make every operand too small by 2^-12 on average.
+    """
+    bits = x.to(tl.int32, bitcast=True)
+    rounded = ((bits + 0x1000) & -0x2000).to(tl.float32, bitcast=True)
+    return tl.where(x == x, rounded, x)  # a NaN's bits would overflow
+
+
+@triton.jit
 def product(x, w, PRECISION: tl.constexpr):
     """x [R, K] @ w [K, N] in float32 accumulation."""
     if PRECISION == "half":
         result = tl.dot(x.to(tl.float16), w.to(tl.float16))
+    elif PRECISION == "tf32":
+        result = tl.dot(nearest_tf32(x.to(tl.float32)), w, input_precision="tf32")
     else:
         result = tl.dot(x.to(tl.float32), w.to(tl.float32), input_precision=PRECISION)
     return result

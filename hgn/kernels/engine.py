@@ -21,6 +21,7 @@ from hgn.kernels.rows.kernel import gather_project, rows_forward
 PRECISIONS = ("ieee", "tf32x3", "tf32", "half")
 PROCESSORS = 132  # an H100's
 RESIDENT_PROGRAMS = 2 * PROCESSORS
+FEW_ROWS = 4096
 OUT = 16  # the decoder's three outputs, padded
 
 
@@ -34,6 +35,7 @@ class Tuning:
     few_cell_warps: int
     row_block: int
     row_warps: int
+    row_backward_warps: int
     pair_particles: int  # eight rows each
     pair_warps: int
     small_block: int = 16  # where there are few rows
@@ -43,8 +45,8 @@ class Tuning:
     def of(precision: str, cells: int, particles: int) -> Tuning:
         """What was fastest on an H100 for a finest level of `cells` cells."""
         if precision in ("ieee", "tf32x3"):
-            return Tuning(8, 4, 8, 4, 16, 4, 2 if precision == "ieee" else 4, 4)
-        return Tuning(8, 4, 4, 4, 64, 4, 8, 4)
+            return Tuning(8, 4, 8, 4, 16, 4, 4, 2 if precision == "ieee" else 4, 4)
+        return Tuning(8, 4, 4, 4, 64, 4, 8, 8, 4)
 
 
 @dataclass
@@ -77,8 +79,8 @@ def feature_columns(config: NetworkConfig) -> int:
 class Engine:
     """Runs a packed network on a DeviceGrid.
 
-    `values` float32 [packed.size] are the parameters. In half precision the kernels read `weights`, their float16
-    copy; call `refresh` after every change of `values`. With `training` everything that a backward pass reads is kept.
+    `values` float32 [packed.size] are the parameters. Products read `weights`, their copy in float16 or rounded to TF32,
+    at these precisions; call `refresh` after every change of `values`. With `training` everything that a backward pass reads is kept.
     """
 
     def __init__(
@@ -100,7 +102,8 @@ class Engine:
         self.particle_count = particle_count
         self.operand = torch.float16 if precision == "half" else torch.float32
         self.device = values.device
-        self.weights = values.to(self.operand) if precision == "half" else values
+        rounded = precision in ("half", "tf32")
+        self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
         self.encode_weights = torch.zeros(self.width, grid.features, dtype=self.operand, device=self.device)
         self.tuning = tuning or Tuning.of(precision, grid.capacities[0], grid.particles)
         self._allocate()
@@ -127,6 +130,8 @@ class Engine:
         self.message = [self._operand(capacities[i], width) for i in range(levels - 1)]  # to the parents
         self.transfer_hidden_down = [self._operand(capacities[i], width) for i in range(levels - 1)]
         self.transfer_hidden_up = [self._operand(capacities[i], width) for i in range(levels - 1)]
+        kept_pairs = 8 * particles if self.training else 1
+        self.pair_hidden_down, self.pair_hidden_up = (self._operand(kept_pairs, width) for _ in range(2))
         shared_edge = None if self.training else self._operand(capacities[0], 6, width)
         self.down = [Block(i, packed.passing_down[i]) for i in range(levels)]
         self.up = [Block(i, packed.passing_up[i]) for i in range(levels - 1)]
@@ -162,9 +167,9 @@ class Engine:
     # parameters
 
     def refresh(self) -> None:
-        """Copies what the kernels read in another form: all weights in float16, and the encoder's first layer."""
-        if self.precision == "half":
-            self.weights.copy_(self.values)
+        """Copies what the kernels read in another form: all weights rounded, and the encoder's first layer."""
+        if self.weights is not self.values:
+            self.weights.copy_(self._rounded(self.values))
         self.refresh_encoder()
 
     def refresh_encoder(self) -> None:
@@ -172,9 +177,15 @@ class Engine:
         first, embedding, bias = self._encode_views(self.values)
         used = self.config.feature_width - self.config.material_embedding
         materials = len(self.config.materials)
-        self.encode_weights[:, :used].copy_(first[:, :used])
+        self.encode_weights[:, :used].copy_(self._rounded(first[:, :used]))
         table = torch.addmm(bias[:, None], first[:, used:], embedding.T)
-        self.encode_weights[:, used : used + materials].copy_(table)
+        self.encode_weights[:, used : used + materials].copy_(self._rounded(table))
+
+    def _rounded(self, weights: torch.Tensor) -> torch.Tensor:
+        """To the nearest that TF32 can hold, as hgn.kernels.blocks.nearest_tf32; as they are at other precisions."""
+        if self.precision != "tf32":
+            return weights
+        return ((weights.contiguous().view(torch.int32) + 0x1000) & -0x2000).view(torch.float32)
 
     def _encode_views(self, flat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         config, packed, width = self.config, self.packed, self.width
@@ -201,7 +212,14 @@ class Engine:
             products=(self.by_particle_down, self.by_particle_up),
         )
         self.down[0].cell[0].zero_()
-        self._pairs(packed.particle_to_cell, self.by_particle_down, self.by_particle_down, self.down[0].cell[0], True)
+        self._pairs(
+            packed.particle_to_cell,
+            self.by_particle_down,
+            self.by_particle_down,
+            self.pair_hidden_down,
+            self.down[0].cell[0],
+            True,
+        )
         for i, block in enumerate(self.down):
             self._begin(block, i > 0)
             self._passing(block)
@@ -238,16 +256,20 @@ class Engine:
             self._passing(block)
             coarse = block
         assert coarse.product is not None
-        self._pairs(packed.cell_to_particle, self.by_particle_up, coarse.product, self.decoder_input, False)
+        self._pairs(
+            packed.cell_to_particle, self.by_particle_up, coarse.product, self.pair_hidden_up, self.decoder_input, False
+        )
         self._rows(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
 
     def _blocks(self, rows: int, block: int) -> tuple[int]:
         return (triton.cdiv(rows, block),)
 
-    def _row_block(self, rows: int) -> tuple[int, int]:
+    def _row_block(self, rows: int, backward: bool = False) -> tuple[int, int]:
         """Rows and warps of a program over so many rows."""
         tuning = self.tuning
-        return (tuning.small_block, tuning.small_warps) if rows < 4096 else (tuning.row_block, tuning.row_warps)
+        if rows < FEW_ROWS:
+            return tuning.small_block, tuning.small_warps
+        return tuning.row_block, tuning.row_backward_warps if backward else tuning.row_warps
 
     def _edge_block(self, cells: int) -> tuple[int, int]:
         """Cells and warps of a tile of edges: small tiles where there would be fewer than processors."""
@@ -319,10 +341,16 @@ class Engine:
         )
 
     def _pairs(
-        self, fcn: PackedFCN, by_particle: torch.Tensor, by_cell: torch.Tensor, out: torch.Tensor, to_cell: bool
+        self,
+        fcn: PackedFCN,
+        by_particle: torch.Tensor,
+        by_cell: torch.Tensor,
+        hidden: torch.Tensor,
+        out: torch.Tensor,
+        to_cell: bool,
     ) -> None:
         grid = self.grid
-        pairs_forward[self._blocks(grid.particles, self.tuning.pair_particles)](
+        pairs_forward[self._programs(grid.particles, self.tuning.pair_particles)](
             by_particle,
             by_cell,
             self.latent,
@@ -338,8 +366,10 @@ class Engine:
             fcn.second_bias,
             fcn.gain,
             fcn.shift,
+            hidden,
             out,
             TO_CELL=to_cell,
+            SAVE=self.training,
             WIDTH=self.width,
             PARTICLES=self.tuning.pair_particles,
             PRECISION=self.precision,

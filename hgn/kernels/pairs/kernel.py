@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import leaky, leaky_backward, normalise, normalise_backward, product, transposed
+from hgn.kernels.blocks import leaky, leaky_backward, matrix, normalise, normalise_backward, product, transposed
 
 
 @triton.jit
@@ -36,55 +36,66 @@ def pairs_forward(
     second_bias_at,
     gain_at,
     shift_at,
+    hidden,
     out,
     TO_CELL: tl.constexpr,
+    SAVE: tl.constexpr,
     WIDTH: tl.constexpr,
     PARTICLES: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
     """TO_CELL: out [C, W] += weight * FCN(by_particle_n + offset). Otherwise out [N, W] = particle + sum over the
-    corners of weight * FCN(by_cell_c + by_particle_n - offset). The by_… are products with first-layer weights."""
+    corners of weight * FCN(by_cell_c + by_particle_n - offset). The by_… are products with first-layer weights.
+
+    SAVE keeps the hidden layer [8 N, W].
+    """
     ROWS: tl.constexpr = PARTICLES * 8
     count = tl.load(count_ptr)
     if tl.program_id(0) * PARTICLES >= count:
         return
-    row = tl.arange(0, ROWS)
-    owner = tl.program_id(0) * PARTICLES + row // 8
-    corner = row % 8
-    live = owner < count
     column = tl.arange(0, WIDTH)
-    cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
-    weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
-    h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0).to(tl.float32)
-    h += tl.load(values + bias_at + column)[None, :]
-    if not TO_CELL:
-        h += tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0).to(tl.float32)
-    for axis in tl.static_range(3):
-        side = _offset(fraction, owner, corner, live, axis)
+    second = transposed(weights + second_at, WIDTH, WIDTH)
+    tile = tl.program_id(0)
+    while tile * PARTICLES < count:
+        row = tl.arange(0, ROWS)
+        owner = tile * PARTICLES + row // 8
+        corner = row % 8
+        live = owner < count
+        here = live[:, None]
+        cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
+        h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0).to(tl.float32)
+        h += tl.load(values + bias_at + column)[None, :]
         if not TO_CELL:
-            side = -side
-        h += side[:, None] * tl.load(values + offset_at + axis * WIDTH + column)[None, :]
-    z = product(leaky(h), transposed(weights + second_at, WIDTH, WIDTH), PRECISION)
-    z, _scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
-    z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
-    z = z * weight[:, None]
-    if TO_CELL:
-        # a weight of zero points at a cell that may be another's: it adds nothing
-        touched = (live & (weight != 0))[:, None]
-        tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
-    else:
-        summed = tl.sum(tl.reshape(z, (PARTICLES, 8, WIDTH)), 1)
-        mine = tl.program_id(0) * PARTICLES + tl.arange(0, PARTICLES)
-        at = mine[:, None] * WIDTH + column[None, :]
-        alive = (mine < count)[:, None]
-        tl.store(out + at, summed + tl.load(particle + at, mask=alive, other=0.0), mask=alive)
+            h += tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0).to(tl.float32)
+        for axis in tl.static_range(3):
+            side = _offset(fraction, owner, corner, live, axis)
+            if not TO_CELL:
+                side = -side
+            h += side[:, None] * tl.load(values + offset_at + axis * WIDTH + column)[None, :]
+        a = leaky(h)
+        if SAVE:
+            tl.store(hidden + (owner * 8 + corner)[:, None] * WIDTH + column[None, :], a, mask=here)
+        z = product(a, second, PRECISION)
+        z, _scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
+        z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
+        weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
+        z = z * weight[:, None]
+        if TO_CELL:
+            # a weight of zero points at a cell that may be another's: it adds nothing
+            touched = (live & (weight != 0))[:, None]
+            tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
+        else:
+            summed = tl.sum(tl.reshape(z, (PARTICLES, 8, WIDTH)), 1)
+            mine = tile * PARTICLES + tl.arange(0, PARTICLES)
+            at = mine[:, None] * WIDTH + column[None, :]
+            alive = (mine < count)[:, None]
+            tl.store(out + at, summed + tl.load(particle + at, mask=alive, other=0.0), mask=alive)
+        tile += tl.num_programs(0)
 
 
 @triton.jit
 def pairs_backward(
     gradient,
-    by_particle,
-    by_cell,
     cell_of,
     weight_of,
     fraction,
@@ -93,7 +104,6 @@ def pairs_backward(
     values,
     totals,
     offset_at,
-    bias_at,
     second_at,
     second_bias_at,
     gain_at,
@@ -110,53 +120,54 @@ def pairs_backward(
 ):
     """From the gradient of `out` ([C, W] if TO_CELL, else [N, W]) to those of by_particle, and of by_cell by atomics.
 
-    hidden and second_gradient [8 N, W] are left for the weight product.
+    second_gradient [8 N, W] is left for the weight product.
     """
     ROWS: tl.constexpr = PARTICLES * 8
     count = tl.load(count_ptr)
     if tl.program_id(0) * PARTICLES >= count:
         return
-    row = tl.arange(0, ROWS)
-    owner = tl.program_id(0) * PARTICLES + row // 8
-    corner = row % 8
-    live = owner < count
-    here = live[:, None]
     column = tl.arange(0, WIDTH)
-    cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
-    weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
-    h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0).to(tl.float32)
-    h += tl.load(values + bias_at + column)[None, :]
-    if not TO_CELL:
-        h += tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0).to(tl.float32)
-    for axis in tl.static_range(3):
-        side = _offset(fraction, owner, corner, live, axis)
+    second = matrix(weights + second_at, WIDTH, WIDTH)
+    gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
+    x_total, y_total, z_total = shift_total, shift_total, shift_total
+    tile = tl.program_id(0)
+    while tile * PARTICLES < count:
+        row = tl.arange(0, ROWS)
+        owner = tile * PARTICLES + row // 8
+        corner = row % 8
+        live = owner < count
+        here = live[:, None]
+        pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
+        cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
+        weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
+        a = tl.load(hidden + pair_at, mask=here, other=0.0).to(tl.float32)
+        z = product(a, tl.trans(second), PRECISION) + tl.load(values + second_bias_at + column)[None, :]
+        z, scale = normalise(z, WIDTH)
+        if TO_CELL:
+            dy = tl.load(gradient + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+        else:
+            dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+        dy = dy * weight[:, None]
+        gain_total += tl.sum(dy * z, 0)
+        shift_total += tl.sum(dy, 0)
+        dz = normalise_backward(dy, z, scale, tl.load(values + gain_at + column), WIDTH)
+        tl.store(second_gradient + pair_at, dz, mask=here)
+        dh = product(dz, second, PRECISION)
+        # read again: registers are dearer than a cache
+        dh = leaky_backward(dh, tl.load(hidden + pair_at, mask=here, other=0.0).to(tl.float32))
+        SIGN: tl.constexpr = 1.0 if TO_CELL else -1.0
+        x_total += tl.sum(dh * (SIGN * _offset(fraction, owner, corner, live, 0))[:, None], 0)
+        y_total += tl.sum(dh * (SIGN * _offset(fraction, owner, corner, live, 1))[:, None], 0)
+        z_total += tl.sum(dh * (SIGN * _offset(fraction, owner, corner, live, 2))[:, None], 0)
         if not TO_CELL:
-            side = -side
-        h += side[:, None] * tl.load(values + offset_at + axis * WIDTH + column)[None, :]
-    a = leaky(h)
-    pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
-    tl.store(hidden + pair_at, a, mask=here)
-    second = transposed(weights + second_at, WIDTH, WIDTH)
-    z = product(a, second, PRECISION) + tl.load(values + second_bias_at + column)[None, :]
-    z, scale = normalise(z, WIDTH)
-    if TO_CELL:
-        dy = tl.load(gradient + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
-    else:
-        dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
-    dy = dy * weight[:, None]
-    tl.atomic_add(totals + gain_at + column, tl.sum(dy * z, 0) * unscale)
-    tl.atomic_add(totals + shift_at + column, tl.sum(dy, 0) * unscale)
-    dz = normalise_backward(dy, z, scale, tl.load(values + gain_at + column), WIDTH)
-    tl.store(second_gradient + pair_at, dz, mask=here)
-    dh = leaky_backward(product(dz, tl.trans(second), PRECISION), a)
-    for axis in tl.static_range(3):
-        side = _offset(fraction, owner, corner, live, axis)
-        if not TO_CELL:
-            side = -side
-        tl.atomic_add(totals + offset_at + axis * WIDTH + column, tl.sum(dh * side[:, None], 0) * unscale)
-    if not TO_CELL:
-        touched = (live & (weight != 0))[:, None]
-        tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
-    mine = tl.program_id(0) * PARTICLES + tl.arange(0, PARTICLES)
-    summed = tl.sum(tl.reshape(dh, (PARTICLES, 8, WIDTH)), 1)
-    tl.store(by_particle_gradient + mine[:, None] * WIDTH + column[None, :], summed, mask=(mine < count)[:, None])
+            touched = (live & (weight != 0))[:, None]
+            tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
+        mine = tile * PARTICLES + tl.arange(0, PARTICLES)
+        summed = tl.sum(tl.reshape(dh, (PARTICLES, 8, WIDTH)), 1)
+        tl.store(by_particle_gradient + mine[:, None] * WIDTH + column[None, :], summed, mask=(mine < count)[:, None])
+        tile += tl.num_programs(0)
+    tl.atomic_add(totals + gain_at + column, gain_total * unscale, sem="relaxed")
+    tl.atomic_add(totals + shift_at + column, shift_total * unscale, sem="relaxed")
+    tl.atomic_add(totals + offset_at + column, x_total * unscale, sem="relaxed")
+    tl.atomic_add(totals + offset_at + WIDTH + column, y_total * unscale, sem="relaxed")
+    tl.atomic_add(totals + offset_at + 2 * WIDTH + column, z_total * unscale, sem="relaxed")

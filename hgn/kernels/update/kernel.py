@@ -11,6 +11,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from hgn.kernels.blocks import nearest_tf32
+
 SAMPLE_COLUMNS = tl.constexpr(10)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
@@ -162,7 +164,7 @@ def square_norm(gradient, size, share, flag, status, norm, BLOCK: tl.constexpr):
 @triton.jit
 def adam(
     value,
-    half,
+    weight,
     gradient,
     share,
     first_moment,
@@ -173,12 +175,13 @@ def adam(
     status,
     norm,
     size,
-    HALF: tl.constexpr,
+    PRECISION: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Adam (Kingma & Ba 2015) on flat buffers, unless the status is not zero or the gradient not finite.
 
-    rates [updates]; step, float64 [1], counts the steps made. With HALF the result's float16 copy is written too.
+    rates [updates]; step, float64 [1], counts the steps made. `weight` is the copy that products at
+    this precision read.
     """
     if tl.load(status) != 0:
         return
@@ -200,8 +203,10 @@ def adam(
     x = tl.load(value + at, mask=mask, other=0.0)
     x -= rate / first_bias * m / (tl.sqrt(v / second_bias) + EPSILON)
     tl.store(value + at, x, mask=mask)
-    if HALF:
-        tl.store(half + at, x, mask=mask)
+    if PRECISION == "half":
+        tl.store(weight + at, x, mask=mask)
+    if PRECISION == "tf32":
+        tl.store(weight + at, nearest_tf32(x), mask=mask)
 
 
 @triton.jit

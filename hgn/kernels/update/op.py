@@ -234,7 +234,7 @@ class Updates:
             self.grid.status,
             self.norm,
             size,
-            HALF=self.precision == "half",
+            PRECISION=self.precision,
             BLOCK=FLAT_BLOCK,
         )
         engine.refresh_encoder()
