@@ -21,7 +21,7 @@ from hgn.kernels.rows.kernel import gather_project, rows_forward
 PRECISIONS = ("ieee", "tf32x3", "tf32", "half")
 PROCESSORS = 132  # an H100's
 RESIDENT_PROGRAMS = 2 * PROCESSORS
-FEW_ROWS = 4096
+FEW_ROWS = 64 * PROCESSORS
 OUT = 16  # the decoder's three outputs, padded
 
 
@@ -46,6 +46,8 @@ class Tuning:
         """What was fastest on an H100 for a finest level of `cells` cells."""
         if precision in ("ieee", "tf32x3"):
             return Tuning(8, 4, 8, 4, 16, 4, 4, 2 if precision == "ieee" else 4, 4)
+        if precision == "tf32":  # operands of twice the size
+            return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8)
         return Tuning(8, 4, 4, 4, 64, 4, 8, 8, 4)
 
 
