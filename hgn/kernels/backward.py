@@ -5,6 +5,8 @@ Shape legend: N particles, C cells, W width.
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 
 from hgn.config import NetworkConfig
@@ -16,7 +18,8 @@ from hgn.kernels.pairs.kernel import pairs_backward
 from hgn.kernels.rows.kernel import gather_project_backward, rows_backward
 from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
 
-CHUNK_ROWS = 512
+CHUNK_ROWS = (512, 2048)  # of a program of the weights' products: where there are few rows, and many
+MANY_ROWS = 16384
 
 
 class TrainingEngine(Engine):
@@ -123,27 +126,29 @@ class TrainingEngine(Engine):
             job(g[f"cf_h{i}"], self.down[i].cell[-1], up.parts[1], i, up.first_bias)
             job(g[f"cf_z{i}"], self.transfer_hidden_up[i], up.second, i, up.second_bias)
         self._weight_jobs = []
-        for dtype in dict.fromkeys((torch.float32, self.operand)):
-            mine = [entry for entry in jobs if entry[1].dtype == dtype]
+        for dtype, chunk in itertools.product(dict.fromkeys((torch.float32, self.operand)), CHUNK_ROWS):
+            mine = [entry for entry in jobs if entry[1].dtype == dtype and chunk == _chunk_rows(entry[0])]
+            if not mine:
+                continue
             # offsets from the lowest address: allocations are aligned far beyond an element
             base = min((right for _, right, *_ in mine), key=lambda tensor: tensor.data_ptr())
             rows: list[list[int]] = []
             chunk_job: list[int] = []
             chunk_first: list[int] = []
             for left, right, at, count, bias, multiple in mine:
-                rows_held = left.numel() // left.shape[-1]
+                rows_held = _rows(left)
                 multiple = 6 if left.dim() == 3 else multiple
                 left_at = (left.data_ptr() - self.left.data_ptr()) // left.element_size()
                 right_at = (right.data_ptr() - base.data_ptr()) // right.element_size()
                 row = [left_at, right_at, at, count, left.shape[-1], right.shape[-1], multiple, bias]
                 assert len(row) == JOB_COLUMNS and left_at % 16 == 0 and right_at % 16 == 0
-                starts = range(0, rows_held, CHUNK_ROWS)
+                starts = range(0, rows_held, chunk)
                 chunk_job += [len(rows)] * len(starts)
                 chunk_first += list(starts)
                 rows.append(row)
             tables = [(rows, torch.int64), (chunk_job, torch.int32), (chunk_first, torch.int32)]
             on_device = [torch.tensor(table, dtype=kind, device=self.device) for table, kind in tables]
-            self._weight_jobs.append((base, *on_device))
+            self._weight_jobs.append((chunk, base, *on_device))
 
     def backward(self) -> None:
         """From `output_gradient` [N, OUT] (times the loss scale) to `totals`."""
@@ -237,7 +242,7 @@ class TrainingEngine(Engine):
             following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
             products=(g["down_p"], g["up_p"]),
         )
-        for base, jobs, chunk_job, chunk_first in self._weight_jobs:
+        for chunk, base, jobs, chunk_job, chunk_first in self._weight_jobs:
             weight_gradient[(len(chunk_job),)](
                 self.left,
                 base,
@@ -248,7 +253,7 @@ class TrainingEngine(Engine):
                 self.counts,
                 self.unscale,
                 TILE=max(self.width, grid.features, OUT),
-                CHUNK=CHUNK_ROWS,
+                CHUNK=chunk,
                 STEP=32 if self.precision != "half" else 64,
                 PRECISION=self.precision,
                 num_warps=8,
@@ -475,3 +480,11 @@ class TrainingEngine(Engine):
         first = block.packed.edge[0]
         into, received = g[f"{name}0_s"], (g[f"{name}0_r"], first.parts[1])
         self._gather_backward(level, g[f"{name}0_eh"], table, 6, first.parts[0], into, gradient, True, received)
+
+
+def _rows(table: torch.Tensor) -> int:
+    return table.numel() // table.shape[-1]
+
+
+def _chunk_rows(table: torch.Tensor) -> int:
+    return CHUNK_ROWS[_rows(table) >= MANY_ROWS]

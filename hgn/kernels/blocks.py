@@ -1,8 +1,9 @@
 """What the kernels share: matrix products at a chosen precision, layer normalisation and its gradient.
 
 Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range (weights come
-rounded, see nearest_tf32), "half" to 10 bits with float16's range, "tf32x3" makes float32 of three TF32 products (Triton's plain float32 product takes minutes to
-compile at this size), and "ieee" is what it is in the interpreter. Sums are float32 always.
+rounded, see nearest_tf32), "half" to 10 bits with float16's range, "tf32x3" makes float32 of three TF32 products
+(Triton's plain float32 product takes minutes to compile at this size), and "ieee" is what it is in the interpreter.
+Sums are float32 always.
 """
 
 from __future__ import annotations

@@ -81,8 +81,9 @@ def feature_columns(config: NetworkConfig) -> int:
 class Engine:
     """Runs a packed network on a DeviceGrid.
 
-    `values` float32 [packed.size] are the parameters. Products read `weights`, their copy in float16 or rounded to TF32,
-    at these precisions; call `refresh` after every change of `values`. With `training` everything that a backward pass reads is kept.
+    `values` float32 [packed.size] are the parameters. In half precision and TF32 the products read `weights`, their
+    rounded copy; call `refresh` after every change of `values`. With `training` everything that a backward pass reads
+    is kept.
     """
 
     def __init__(

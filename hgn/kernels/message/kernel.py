@@ -1,4 +1,4 @@
-"""One message-passing iteration on the cells of a level (paper fig. 5): its edges, then its cells; from behind backward.
+"""One message-passing iteration on a level (paper fig. 5), forward and backward: its edges and its cells in turn.
 
 A tile of the edge kernels holds BLOCK cells and the up to six edges that end in each: 8 BLOCK rows, of which six in
 eight can hold an edge. A program takes one tile after the other and reads its weights once. Edge arrays are
@@ -201,9 +201,11 @@ def cell_backward(
     PRECISION: tl.constexpr,
 ):
     """In place: `gradient` [C, W] comes in as the gradient of cell_out, less what reaches it through `send` and
-    `receive` of the following iteration (added here unless LAST, what comes from the edges that start in a cell is left
-    in send_gradient), and leaves as that of `cell`, again less what goes through its own. sum_gradient [C, W] is that of
-    the edges' sums."""
+    `receive` of the following iteration (added here unless LAST; what comes from the edges that start in a cell is left
+    in send_gradient), and leaves as that of `cell`, again less what goes through its own.
+
+    sum_gradient [C, W] is that of the edges' sums.
+    """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -260,8 +262,8 @@ def edge_backward(
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """In place: edge_gradient [C, 6, W] comes in as that of edge_out less sum_gradient's part (none if LAST), and leaves
-    as that of edge_in (none if FIRST). receive_gradient [C, W] is that of `receive`."""
+    """In place: edge_gradient [C, 6, W] comes in as that of edge_out, less the sums' part (there is none if LAST), and
+    leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`."""
     count = tl.load(count_ptr)
     ROWS: tl.constexpr = BLOCK * 8
     column = tl.arange(0, WIDTH)
