@@ -42,8 +42,8 @@ class Tuning:
     small_warps: int = 8
 
     @staticmethod
-    def of(precision: str, cells: int, particles: int) -> Tuning:
-        """What was fastest on an H100 for a finest level of `cells` cells."""
+    def of(precision: str) -> Tuning:
+        """What was fastest on an H100 at width 128."""
         if precision in ("ieee", "tf32x3"):
             return Tuning(8, 4, 8, 4, 16, 4, 4, 2 if precision == "ieee" else 4, 4)
         if precision == "tf32":  # operands of twice the size
@@ -108,7 +108,7 @@ class Engine:
         rounded = precision in ("half", "tf32")
         self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
         self.encode_weights = torch.zeros(self.width, grid.features, dtype=self.operand, device=self.device)
-        self.tuning = tuning or Tuning.of(precision, grid.capacities[0], grid.particles)
+        self.tuning = tuning or Tuning.of(precision)
         self._allocate()
         self.refresh()
 
@@ -124,9 +124,9 @@ class Engine:
         width, config, grid, packed = self.width, self.config, self.grid, self.packed
         particles, levels, steps = grid.particles, config.levels, config.message_passing_steps
         capacities = grid.capacities
-        self.latent = self._float(particles, width)
+        self.latent = self._operand(particles, width)
         self.by_particle_down, self.by_particle_up = self._operand(particles, width), self._operand(particles, width)
-        self.decoder_input = self._float(particles, width)
+        self.decoder_input = self._operand(particles, width)
         self.output = self._float(particles, OUT)
         self.encode_hidden = self._operand(particles, width)
         self.decode_hidden = self._operand(particles, width)
