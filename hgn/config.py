@@ -289,6 +289,7 @@ class TrainingConfig:
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
+    noise_shared: float = 0.0  # share of its variance that all particles of a scene have in common
     grid_jitter: bool = True
     symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
     seed: int = 0
@@ -325,6 +326,7 @@ class TrainingConfig:
             "monitor_particles_per_batch",
         )
         require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames")
+        require(0 <= self.noise_shared <= 1, "noise_shared", "0 to 1", self.noise_shared)
         require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
         require_one_of(self, "precision", PRECISIONS)

@@ -41,7 +41,12 @@ class FastTraining:
         self.device = next(network.parameters()).device
         self.symmetric = training.symmetry != "none"
         settings = UpdateSettings(
-            training.batch_scenes, training.noise_std, training.grid_jitter, obstacle_cell_size, self.symmetric
+            training.batch_scenes,
+            training.noise_std,
+            training.grid_jitter,
+            obstacle_cell_size,
+            self.symmetric,
+            training.noise_shared,
         )
         precision = kernel_precision(training.precision, self.device)
         self._take_over()

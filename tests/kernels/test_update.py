@@ -149,6 +149,30 @@ def test_noise_and_jitter() -> None:
     torch.testing.assert_close(first["target_N3"][:400], expected, rtol=0, atol=1e-3)
 
 
+def test_shared_noise() -> None:
+    """With noise_shared=1 the particles of a scene get one walk, another in another scene, of the asked spread; half of
+    the variance leaves the other half to each particle."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
+    made, _ = episode(1, 400, False, spread=0.3)
+    still, _ = episode(2, 300, False, spread=0.3)
+    walks = {}
+    for shared in (0.0, 0.5, 1.0):
+        updates = updates_of(network, 2, noise_std=1e-3, grid_jitter=False, noise_shared=shared)
+        updates._upload([[(made, 1, 5), (still, 0, 6)]], [1e-3])
+        updates.particles, updates.capacities = 704, (512,)
+        updates._reach = (torch.zeros(3), torch.ones(3))
+        updates._build()
+        updates._assemble()
+        windows = [e.position_TN3[f : f + HISTORY + 1].cpu() for e, f in ((made, 1), (still, 0))]
+        clean = torch.cat([(w[1:] - w[:-1]).flip(0).transpose(0, 1) for w in windows])
+        walks[shared] = updates.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
+    common = walks[1.0]
+    assert common[:400].std(0).max() < 1e-7 and common[400:].std(0).max() < 1e-7
+    assert (common[0] - common[-1]).abs().min() > 1e-7
+    assert 1e-4 < common[[0, -1], 0].abs().mean() < 3e-3
+    torch.testing.assert_close(walks[0.5], (walks[0.0] + common) / 2**0.5, rtol=0, atol=1e-6)
+
+
 def test_wrong_kernels_are_refused() -> None:
     """Before the first update outputs and gradients are compared with the plain network's on the noisy, jittered batch:
     they agree to rounding, and kernels that compute another network are refused with the remedy."""

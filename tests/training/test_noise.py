@@ -61,6 +61,24 @@ def test_noise_in_the_window_is_that_walk():
     torch.testing.assert_close(noise_WN3[-1], noise_WN3[-2], rtol=0, atol=2e-7)
 
 
+def test_shared_noise():
+    """A share of the variance is common to a scene's particles, the rest their own; other scenes share another walk,
+    and a share of zero is bitwise the noise without."""
+    batch = batch_of(episode(20_000), episode(300, seed=1))
+
+    def last_velocity(shared: float) -> torch.Tensor:
+        noise_WN3 = perturbed_window(batch, STD, shared).double() - batch.window_WN3.double()
+        return noise_WN3[-2] - noise_WN3[-3]
+
+    common_N3 = last_velocity(1.0)
+    assert common_N3[:20_000].std(0).max() < 1e-6 * STD + 2e-7
+    assert (common_N3[0] - common_N3[-1]).abs().min() > 1e-3 * STD
+    mixed_N3 = last_velocity(0.36)[:20_000]
+    assert abs(float((mixed_N3 - mixed_N3.mean(0)).std()) / (0.8 * STD) - 1) < 0.02
+    torch.testing.assert_close(mixed_N3.mean(0), 0.6 * common_N3[:20_000].mean(0), rtol=0, atol=0.03 * STD)
+    assert torch.equal(perturbed_window(batch, STD, 0.0), perturbed_window(batch, STD))
+
+
 def test_target_undoes_the_velocity_error():
     """The target is v_true^{n+1} - v_noisy^n."""
     batch = batch_of(episode(500), episode(300, seed=1))

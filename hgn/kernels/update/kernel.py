@@ -17,6 +17,7 @@ SAMPLE_COLUMNS = tl.constexpr(10)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
+SHARED_OFFSET = tl.constexpr(0x7FFFF000)  # of the noise that a scene's particles share
 REPEAT = tl.constexpr(8)  # another rank must repeat the update
 AGAIN = tl.constexpr(11)  # overflow, out of the window, or REPEAT: the same update again, with more room
 BETA_1 = tl.constexpr(0.9)  # torch.optim.Adam's defaults
@@ -42,14 +43,17 @@ def assemble_batch(
     mean,
     std,
     noise_step,
+    shared_step,
     jitter,
     scenes,
     obstacle_cell_size,
     HISTORY: tl.constexpr,
     SYMMETRY: tl.constexpr,
+    SHARED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow.
+    """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
+    with SHARED a part of it is the same for all particles of a scene.
 
     The target is v_true^{n+1} - v_noisy^n, normalised. Grid origins are uniform in [-jitter, 0]. Noise and jitter are
     Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY the window is the image of the
@@ -106,6 +110,8 @@ def assemble_batch(
         v = walk
         for k in tl.static_range(HISTORY):
             walk += noise_step * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
+            if SHARED:
+                walk += shared_step * tl.randn(seed_row, (own * 0 + SHARED_OFFSET + k * 3 + axis).to(tl.int32))
             moved += walk
             now = tl.load(column + (k + 1) * frame, mask=live, other=0.0)
             step = now - before

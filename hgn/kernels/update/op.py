@@ -58,6 +58,7 @@ class UpdateSettings:
     grid_jitter: bool
     obstacle_cell_size: float
     symmetry: bool = False
+    noise_shared: float = 0.0
 
 
 class Updates:
@@ -260,12 +261,14 @@ class Updates:
             self.particle_count,
             self.mean,
             self.std,
-            settings.noise_std / math.sqrt(config.velocity_history),
+            settings.noise_std * math.sqrt((1 - settings.noise_shared) / config.velocity_history),
+            settings.noise_std * math.sqrt(settings.noise_shared / config.velocity_history),
             config.cell_size if settings.grid_jitter else 0.0,
             settings.scenes,
             settings.obstacle_cell_size,
             HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry,
+            SHARED=settings.noise_shared > 0,
             BLOCK=BLOCK,
         )
 
