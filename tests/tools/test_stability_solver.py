@@ -58,7 +58,7 @@ def test_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small blocks that hit a sheet, a cone and a bowl: a row for each, with nothing through."""
     monkeypatch.setattr(solver_leak, "OFFSETS", solver_leak.OFFSETS[3:4])
     monkeypatch.setattr(solver_leak, "ORIENTATIONS", {"tilted": solver_leak.ORIENTATIONS["tilted"]})
-    rows = leaks(MpmConfig(device="cpu"), 0.03, 2.0)
+    rows = leaks(MpmConfig(device="cpu"), 0.03, 2.0, 1)
     assert len(rows) == 3 * 3 * 2
     assert [row.measured for row in rows] == [0.0] * len(rows)
     assert all(row.held for row in rows)

@@ -19,7 +19,7 @@ from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.schema import from_mapping, require, require_one_of, require_positive, to_mapping
 from tools.stability.row import Row, table
-from tools.stability.solver_leak import leaks
+from tools.stability.solver_leak import OFFSETS, leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
 from tools.stability.solver_steps import Point, draw, largest_steps
 from tools.stability.solver_validation import validation
@@ -36,12 +36,14 @@ class StabilitySolverConfig:
     device: str = "auto"
     leak_seconds: float = 5.0
     leak_block_cells: float = 4.0
+    leak_offsets: int = len(OFFSETS)
     leak_band_cells: float | None = None
     picture: str | None = None
     json: str | None = None
 
     def __post_init__(self) -> None:
         require_positive(self, "leak_seconds", "leak_block_cells")
+        require(1 <= self.leak_offsets <= len(OFFSETS), "leak_offsets", f"1 to {len(OFFSETS)}", self.leak_offsets)
         band = self.leak_band_cells
         require(band is None or band > 0, "leak_band_cells", "> 0", band)
         require_one_of(self, "device", ("auto", "cpu", "gpu"))
@@ -61,7 +63,9 @@ def main(mapping: dict[str, Any]) -> int:
         "stiffness": lambda: stiffnesses(mpm),
         "impact": lambda: impacts(mpm),
         "convergence": lambda: convergence(mpm),
-        "leak": lambda: leaks(_leak_settings(mpm, config), config.leak_seconds, config.leak_block_cells),
+        "leak": lambda: leaks(
+            _leak_settings(mpm, config), config.leak_seconds, config.leak_block_cells, config.leak_offsets
+        ),
         "long": lambda: long_run(mpm),
         "validation": lambda: validation(mpm),
     }

@@ -42,7 +42,7 @@ CROSSED_AT_MOST, DEPTH_AT_MOST, GAP_AT_MOST = 1e-3, 0.25, 1.0  # fraction of the
 AT_REST_S = 3.0  # from when on a gap is one at rest
 
 
-def leaks(base: MpmConfig, seconds: float, block_cells: float) -> list[Row]:
+def leaks(base: MpmConfig, seconds: float, block_cells: float, offsets: int = len(OFFSETS)) -> list[Row]:
     """A row for each shape, orientation, material and speed: the share of paths of all offsets that cross; of depth,
     gap and projections the worst.
     """
@@ -53,14 +53,14 @@ def leaks(base: MpmConfig, seconds: float, block_cells: float) -> list[Row]:
         for kind in range(len(MATERIALS))
         for speed in SPEEDS
     ]
-    scenes = [scene(*key, offset, block_cells) for key in keys for offset in OFFSETS]
+    scenes = [scene(*key, offset, block_cells) for key in keys for offset in OFFSETS[:offsets]]
     frames = 1 + max(1, round(seconds * FRAME_RATE_HZ))
     outcomes = simulate(scenes, base, frames, FRAME_RATE_HZ)
     with ThreadPoolExecutor() as pool:
         found = list(pool.map(_measure, scenes, outcomes))
     rows = []
     for index, (shape, turn, kind, speed) in enumerate(keys):
-        own = found[index * len(OFFSETS) : (index + 1) * len(OFFSETS)]
+        own = found[index * offsets : (index + 1) * offsets]
         name = f"leak, {shape} {turn}, {MATERIALS[kind]} at {speed:g} m/s"
         rows.append(_row(name, own, seconds >= AT_REST_S))
     return rows
