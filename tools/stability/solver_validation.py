@@ -41,7 +41,9 @@ COLUMN_CELLS = 16
 COLUMN_DEPTH = 1 / 64  # of the radius
 LUBE = 0.15
 LUBE_ANGLE_DEG = 31.0  # at which the quartz sand of Lube et al. 2004 rests
-COLUMNS = ((0.6, LUBE_ANGLE_DEG), (1.0, LUBE_ANGLE_DEG), (1.0, 45.0))  # aspect, friction angle
+COLUMNS = (  # aspect, friction angle
+    (0.6, LUBE_ANGLE_DEG), (1.0, LUBE_ANGLE_DEG), (2.0, LUBE_ANGLE_DEG), (1.0, 45.0),
+)  # fmt: skip
 LAWS = ("plane_strain", "compression")
 TIMES = 4.0  # of sqrt(height / g) until all stands; the experiments took about 3
 
