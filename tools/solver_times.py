@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,7 @@ from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, from_mapping, require, require_one_of, to_mapping
 from tools.bench.states import Workload, scene_of
-from tools.taichi_elements import FRAME_S, STEP_S, cubes, run_theirs, taichi_elements_substeps
+from tools.taichi_elements import FRAME_S, STEP_S, WARM_FRAMES, cubes, run_theirs, taichi_elements_substeps
 
 FRAME_RATE_HZ = 60.0
 FIRST_SEED = 1_000_000  # of no data set
@@ -56,6 +58,14 @@ class SolverTimesConfig:
         for name in ("scene_frames", "particle_frames"):
             require(getattr(self, name) >= 3, name, "at least 3", getattr(self, name))
         require_one_of(self, "device", ("auto", "cpu", "gpu"))
+        if self.taichi_elements is not None:
+            least = WARM_FRAMES + 3
+            require(
+                self.scene_frames >= least,
+                "scene_frames",
+                f"at least {least} beside Taichi Elements",
+                self.scene_frames,
+            )
         if self.taichi_elements is not None and not (Path(self.taichi_elements) / "engine/mpm_solver.py").is_file():
             raise ConfigError(
                 f"taichi_elements must be a folder with a copy of it (engine/mpm_solver.py), got {self.taichi_elements}"
@@ -69,16 +79,16 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(SolverTimesConfig, mapping)
     made = _random_scenes(max(config.scenes, default=0))
     device = initialise(config.device)
-    rows = []
-    total = len(config.scenes) + len(config.particles)
-    with bar("cases", total, unit="case") as progress:
-        for row in _cases(made, config, device.kind):
-            rows.append(row)
+    meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": to_mapping(config)}
+    rows: list[dict[str, Any]] = []
+    cases = _cases(made, config, device.kind)
+    with bar("cases", len(cases), unit="case") as progress:
+        for case in cases:
+            rows += case()
             progress.update()
+            if config.json is not None:  # after each: what a later case does takes nothing away
+                write_json(config.json, {"meta": meta, "rows": rows})
     print(table(rows))
-    if config.json is not None:
-        meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": to_mapping(config)}
-        write_json(config.json, {"meta": meta, "rows": rows})
     return 0 if all(row["ms"] is not None for row in rows) else EXIT_RED
 
 
@@ -99,30 +109,46 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _cases(made: list[Scene], config: SolverTimesConfig, kind: str) -> Iterator[dict[str, Any]]:
+def _cases(made: list[Scene], config: SolverTimesConfig, kind: str) -> list[Callable[[], list[dict[str, Any]]]]:
+    """Each times its contenders when it is called, and gives their rows."""
     mpm = MpmConfig(device=kind)
-    for count in config.scenes:
-        yield {"case": "random scenes with obstacles"} | _timed(made[:count], mpm, config.scene_frames)
-    for particles in config.particles:
-        scene = scene_of(Workload(particles, 1), 0, 0.035)
-        yield {"case": "one scene"} | _timed([scene], mpm, config.particle_frames)
-    if config.taichi_elements is not None:
-        scene = cubes(CUBE_KINDS, CUBES, 0.08)
-        threads = 0 if kind == "gpu" else os.cpu_count() or 1
-        _, seconds = run_theirs(scene, config.taichi_elements, config.scene_frames, threads)
-        substeps = taichi_elements_substeps()
-        yield {
-            "case": "Taichi Elements, four cubes", "scenes": 1, "particles": scene.particle_count,
-            "substeps": substeps, "ms": 1e3 * seconds,
-        }  # fmt: skip
-        step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
-        faithful = MpmConfig(
-            device=kind, time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements",
-            water_volume_update="taichi_elements", snow_maximum_hardening=100.0,
-        )  # fmt: skip
-        for count in (1, SIDE_BY_SIDE) if kind == "gpu" else (1,):
-            row = _timed([scene] * count, faithful, config.scene_frames, 1 / (substeps * step))
-            yield {"case": "the same, ours at its step"} | row
+
+    def scenes(count: int) -> list[dict[str, Any]]:
+        return [{"case": "random scenes with obstacles"} | _timed(made[:count], mpm, config.scene_frames)]
+
+    def particles(count: int) -> list[dict[str, Any]]:
+        return [{"case": "one scene"} | _timed([scene_of(Workload(count, 1), 0, 0.035)], mpm, config.particle_frames)]
+
+    cases = [partial(scenes, count) for count in config.scenes]
+    cases += [partial(particles, count) for count in config.particles]
+    return [*cases, partial(_beside_taichi_elements, config, kind)] if config.taichi_elements else list(cases)
+
+
+def _beside_taichi_elements(config: SolverTimesConfig, kind: str) -> list[dict[str, Any]]:
+    assert config.taichi_elements is not None
+    scene = cubes(CUBE_KINDS, CUBES, 0.08)
+    substeps = taichi_elements_substeps()
+    step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
+    theirs: dict[str, Any] = {"case": "Taichi Elements, four cubes", "scenes": 1, "particles": scene.particle_count}
+    try:
+        _, seconds = run_theirs(
+            scene, config.taichi_elements, config.scene_frames, 0 if kind == "gpu" else os.cpu_count() or 1
+        )
+        theirs |= {"substeps": substeps, "ms": 1e3 * seconds}
+    except subprocess.CalledProcessError as error:  # it has said why
+        theirs |= {"substeps": None, "ms": None, "cause": f"ended with {error.returncode}"}
+    faithful = MpmConfig(
+        device=kind, time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements",
+        water_volume_update="taichi_elements", snow_maximum_hardening=100.0,
+    )  # fmt: skip
+    return [
+        theirs,
+        *(
+            {"case": "the same, ours at its step"}
+            | _timed([scene] * count, faithful, config.scene_frames, 1 / (substeps * step))
+            for count in ((1, SIDE_BY_SIDE) if kind == "gpu" else (1,))
+        ),
+    ]
 
 
 def _timed(scenes: list[Scene], mpm: MpmConfig, frames: int, rate: float = FRAME_RATE_HZ) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import numpy as np
 
 OWN_MATERIAL = (0, 3, 2)  # its numbers of water, sand and snow
 MAXIMUM_PARTICLES = 2**20
+GPU_MEMORY_GB = 8  # its default of 1 is too little for its grid
 
 
 def main(folder: str, source: str, target: str, threads: str) -> None:
@@ -28,7 +29,7 @@ def main(folder: str, source: str, target: str, threads: str) -> None:
     given = np.load(source)
     with contextlib.redirect_stdout(io.StringIO()):
         if int(threads) == 0:
-            ti.init(arch=ti.cuda, log_level=ti.ERROR)
+            ti.init(arch=ti.cuda, device_memory_GB=GPU_MEMORY_GB, log_level=ti.ERROR)
         else:
             ti.init(arch=ti.cpu, cpu_max_num_threads=int(threads), log_level=ti.ERROR)
         module = importlib.import_module("engine.mpm_solver")
