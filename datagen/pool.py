@@ -24,9 +24,10 @@ from hgn.schema import ConfigError
 
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
 _LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
-GPU_SCENES_PER_LAUNCH = 832  # an H100 runs 264 at a time: two teams on each of its processors
+GPU_SCENES_AT_A_TIME = 264  # on an H100: two teams on each of its processors
+GPU_SCENES_PER_LAUNCH = 832  # all of the paper's data set: long scenes begin first, and short ones fill the gaps
 GPU_NODES_PER_LAUNCH = GPU_SCENES_PER_LAUNCH * 64**3  # of the grids of all scenes, about 30 bytes each
-GPU_FIRST_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
+GPU_EARLY_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
 _LAUNCH_GROWTH = 32  # from one launch to the next, up to the full size
 MAXIMUM_MAKERS = 32
 
@@ -71,8 +72,8 @@ def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
 
 
 def gpu_first_launch(config: DatagenConfig, launch: int) -> int:
-    """Few scenes where something waits for the first episodes; all that a launch holds are done sooner together."""
-    return min(launch, GPU_FIRST_LAUNCH) if config.dataset.early_episodes else launch
+    """Few scenes where something waits for the first episodes; else as many as run at a time, while others are made."""
+    return min(launch, GPU_EARLY_LAUNCH if config.dataset.early_episodes else GPU_SCENES_AT_A_TIME)
 
 
 def visible_gpus() -> tuple[str, ...]:

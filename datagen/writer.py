@@ -14,6 +14,8 @@ import errno
 import shutil
 import tarfile
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -39,6 +41,10 @@ from hgn.schema import ConfigError
 
 # seeds tried for one episode before the scene distribution itself is held to be at fault
 MAXIMUM_REPLACEMENTS = 20
+PACKED_AT_ONCE = 4  # shards, where so many are ready
+
+
+_Packed = tuple[ExitStack, Path, ShardEntry]
 
 
 class DatasetWriter:
@@ -64,6 +70,8 @@ class DatasetWriter:
         self._pending = self._share  # what of it is not published
         self._claimed: list[ShardRange] = []  # what of that this writer makes
         self._staged: set[tuple[str, int]] = set()  # and what of these waits in .staging
+        self._packers = ThreadPoolExecutor(PACKED_AT_ONCE - 1, "packer")
+        self._packing: dict[ShardRange, Future[_Packed]] = {}  # of the shards to be published next
         self._stamp: tuple[int, ...] | None = None  # of the manifest file that `manifest` was read from or written to
 
     def __enter__(self) -> DatasetWriter:
@@ -83,6 +91,10 @@ class DatasetWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
+            self._packers.shutdown(cancel_futures=True)
+            for packing in self._packing.values():
+                if not packing.cancelled() and packing.exception() is None:
+                    packing.result()[0].close()
             with self._locks.manifest():
                 self._sweep()
             staging = self.folder / STAGING_NAME
@@ -180,30 +192,44 @@ class DatasetWriter:
 
         Raises: OSError (a full disk): nothing half-written is left and what was published stays untouched.
         """
-        for shard in self._claimed:
-            if all((shard.split, index) in self._staged for index in shard.indices):
-                entry = self._publish(shard)
-                self._forget(shard)
-                self._plan()
-                return entry
-        return None
+        ready = [
+            shard for shard in self._claimed if all((shard.split, index) in self._staged for index in shard.indices)
+        ]
+        if not ready:
+            return None
+        for shard in ready[1:PACKED_AT_ONCE]:
+            if shard not in self._packing:
+                self._packing[shard] = self._packers.submit(self._pack, shard)
+        entry = self._publish(ready[0])
+        self._forget(ready[0])
+        self._plan()
+        return entry
 
-    def _publish(self, shard: ShardRange) -> ShardEntry:
-        if winner := self._winner(shard):
-            return winner
-        target = self.folder / shard.name
-        with temporary_file(target) as temporary:
+    def _pack(self, shard: ShardRange) -> _Packed:
+        """A shard's file under a temporary name, which is gone when the stack is closed, and its checked entry."""
+        with ExitStack() as stack:
+            temporary = stack.enter_context(temporary_file(self.folder / shard.name))
             with temporary.open("wb") as file:
                 write_tar(file, self._staged_members(shard))
                 sync_file(file)
             entry = inspect_shard(temporary, shard, self.config)
-            with self._locks.manifest():
-                if winner := self._winner(shard):
-                    return winner
-                if not _link(temporary, target):
-                    entry = inspect_shard(target, shard, self.config)
-                sync_folder(self.folder)
-                self._publish_list((*self.manifest.shards, entry))
+            return stack.pop_all(), temporary, entry
+
+    def _publish(self, shard: ShardRange) -> ShardEntry:
+        packing = self._packing.pop(shard, None)
+        if winner := self._winner(shard):
+            if packing is not None:
+                packing.result()[0].close()
+            return winner
+        target = self.folder / shard.name
+        stack, temporary, entry = self._pack(shard) if packing is None else packing.result()
+        with stack, self._locks.manifest():
+            if winner := self._winner(shard):
+                return winner
+            if not _link(temporary, target):
+                entry = inspect_shard(target, shard, self.config)
+            sync_folder(self.folder)
+            self._publish_list((*self.manifest.shards, entry))
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:

@@ -200,7 +200,7 @@ def test_worker_plans() -> None:
     default = DatagenConfig()
     assert plan_workers(default, (), 8, 2**36) == WorkerPlan(4, 2, 1, 1, 1)
     assert plan_workers(default, (), 1, 2**36) == WorkerPlan(1, 1, 1, 1, 1)
-    assert plan_workers(default, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 832, 832, ("0",))
+    assert plan_workers(default, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 832, 264, ("0",))
     assert plan_workers(DatagenConfig(mpm=MpmConfig(device="cpu")), ("0",), 4, 2**36).threads == 2
     many = DatagenConfig(dataset=DatasetConfig(workers=3), mpm=MpmConfig(scenes_per_launch=2))
     large = DatagenConfig(scene=SceneConfig(domain_size=(4.0, 1.0, 4.0)))

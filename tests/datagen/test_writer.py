@@ -12,6 +12,7 @@ import subprocess
 import tarfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from threading import Lock, current_thread
 from typing import Any
 
 import ballistic_solver
@@ -462,11 +463,14 @@ def full_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]
     """After the given number of further syncs the disk is full."""
     real = os.fsync
     left = -1
+    counting = Lock()
 
     def fsync(descriptor: int) -> None:
         nonlocal left
-        left -= 1
-        if left == -1:
+        with counting:
+            left -= 1
+            full = left == -1
+        if full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real(descriptor)
 
@@ -524,3 +528,52 @@ def test_default_dataset_is_the_papers() -> None:
     """800 training, 5 validation and 20 test scenes."""
     assert [DatasetConfig().scenes(split) for split in ("train", "validation", "test")] == [800, 5, 20]
     assert ballistic_solver.simulate([], MpmConfig(), 2, 60.0) == []
+
+
+def test_shards_that_wait_are_packed_together(
+    make_config: MakeConfig, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where several shards are ready they are packed side by side, published in order, and are the same files."""
+    with DatasetWriter(make_config()) as writer:
+        while writer.claim_next():
+            pass
+        for split, index in writer.remaining():
+            stage(writer, split, index)
+        packed_by = []
+        monkeypatch.setattr(
+            writer, "_pack", lambda shard, pack=writer._pack: (packed_by.append(current_thread()), pack(shard))[1]
+        )
+        while writer.publish_next():
+            pass
+        assert writer.complete and len(set(packed_by)) > 1
+        together = hashes(writer.folder)
+    with DatasetWriter(make_config(folder=str(tmp_path / "alone"))) as alone:
+        while alone.claim_next():
+            pass
+        for split, index in alone.remaining():
+            stage(alone, split, index)
+            alone.publish_next()
+        assert {name: digest for name, digest in hashes(alone.folder).items() if name.endswith(".tar")} == {
+            name: digest for name, digest in together.items() if name.endswith(".tar")
+        }
+
+
+@pytest.mark.parametrize("after", range(0, 12, 2))
+def test_full_disk_while_several_are_packed(
+    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, full_disk: Callable[[int], None], after: int
+) -> None:
+    """A full disk in any of several packers ends the run with its message and no partial file; then it goes on."""
+    with (
+        pytest.raises(OSError, match=r"No space left on device: .*data"),
+        DatasetWriter(make_config()) as writer,
+    ):
+        while writer.claim_next():
+            pass
+        for split, index in writer.remaining():
+            stage(writer, split, index)
+        full_disk(after)
+        while writer.publish_next():
+            pass
+    assert not list(writer.folder.rglob("*.partial"))
+    make_dataset(make_config())
+    assert Manifest.load(writer.folder).complete
