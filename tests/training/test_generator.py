@@ -1,0 +1,56 @@
+"""The generator that a training starts itself: a process of its own, that makes what is missing."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
+from hgn.data.manifest import Manifest
+from hgn.schema import ConfigError
+from hgn.training.generator import Generator
+
+PATIENCE_S = 120.0
+
+
+def small_config(folder: Path) -> DatagenConfig:
+    return DatagenConfig(
+        scene=SceneConfig(obstacle_count=0, group_count=1, group_size=0.03, materials=("water",)),
+        mpm=MpmConfig(device="cpu"),
+        dataset=DatasetConfig(
+            folder=str(folder), training_scenes=2, validation_scenes=1, test_scenes=0, frames=3, workers=1
+        ),
+    )
+
+
+def wait(generator: Generator) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while generator.running and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not generator.running
+
+
+def test_makes_what_is_missing(tmp_path: Path) -> None:
+    """It asks for the first episodes early, says how many frames are done, goes on after a stop, and completes the data
+    set; where the folder holds another one, `check` gives the generator's own message and names its log.
+    """
+    config = small_config(tmp_path / "data")
+    generator = Generator(config, tmp_path / "run")
+    assert yaml.safe_load((tmp_path / "run/dataset.yaml").read_text())["dataset"]["early_episodes"] is True
+    while generator.running and generator.frames_done() == 0:
+        time.sleep(0.05)
+    generator.stop()
+    assert not generator.running
+    generator = Generator(config, tmp_path / "run")
+    wait(generator)
+    generator.check()
+    manifest = Manifest.load(config.dataset.folder)
+    assert manifest.complete and sum(len(shard.episodes) for shard in manifest.shards) == 3
+    assert generator.frames_done() <= 9
+
+    other = Generator(replace(config, mpm=replace(config.mpm, poisson_ratio=0.3)), tmp_path / "other")
+    wait(other)
+    with pytest.raises(ConfigError, match=r"holds another data set: mpm.poisson_ratio .*log: .*datagen.log"):
+        other.check()
