@@ -10,6 +10,7 @@ import errno
 import os
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 from hgn.config import config_directory
@@ -100,7 +101,8 @@ def _compose(config_name: str) -> list[dict[str, Any]]:
         folder = folder / "command"
     composed: list[Any] = []  # one config, or several with --multirun
     arguments, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv = _with_quiet(_with_json_as_override(arguments))
+    quiet = _QUIET + (_help() if "--help" in arguments else ())
+    sys.argv = _with(quiet, _with_json_as_override(arguments))
     # Hydra would print and exit itself otherwise
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
@@ -131,13 +133,21 @@ def _with_json_as_override(arguments: list[str]) -> list[str]:
     return result
 
 
-def _with_quiet(arguments: list[str]) -> list[str]:
+def _with(ours: tuple[str, ...], arguments: list[str]) -> list[str]:
     # before the person's own overrides, so that theirs win, and beside them, because argparse takes overrides in one
     # run only
     for place, argument in enumerate(arguments):
         if place and "=" in argument and not argument.startswith("-") and not arguments[place - 1].startswith("--conf"):
-            return [*arguments[:place], *_QUIET, *arguments[place:]]
-    return [*arguments, *_QUIET]
+            return [*arguments[:place], *ours, *arguments[place:]]
+    return [*arguments, *ours]
+
+
+def _help() -> tuple[str, ...]:
+    """What --help says before the keys: the command's own description, which is its module's."""
+    program = sys.modules["__main__"]
+    name = program.__spec__.name.removesuffix(".__main__") if program.__spec__ else Path(sys.argv[0]).name
+    text = (program.__doc__ or name).strip().replace("\\", "\\\\").replace("'", "\\'")
+    return f"hydra.help.app_name='python -m {name}'", f"hydra.help.header='{text}'"
 
 
 def _one_line(text: str) -> str:

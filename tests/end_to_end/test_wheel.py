@@ -80,5 +80,6 @@ def test_commands_compose_their_config(python: Path, tmp_path: Path, module: str
 
 @pytest.mark.parametrize(("module", "key"), [("hgn.rollout", "weights: ???"), ("tools.render", "rollout: null")])
 def test_commands_help(python: Path, tmp_path: Path, module: str, key: str) -> None:
-    """`--help` shows the keys of a command, from an empty folder."""
-    assert key in run(python, tmp_path, "-m", module, "--help")
+    """`--help` says what a command does and shows its keys, from an empty folder."""
+    text = run(python, tmp_path, "-m", module, "--help")
+    assert key in text and text.strip("`\n").startswith(f"python -m {module}")
