@@ -136,7 +136,7 @@ def test_faults_of_ours_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) ->
 def test_help_and_config_print(tmp_path: Path) -> None:
     """Hydra's own options work and start nothing."""
     code, output, _ = run("--help", cwd=tmp_path, ballistic=False)
-    assert code == 0 and "Makes a data set, or completes one" in output
+    assert code == 0 and "makes a data set, or completes one" in output
     code, output, _ = run("--cfg", "job", *SMALL, cwd=tmp_path, ballistic=False)
     assert code == 0 and "training_scenes: 800" in output and yaml.safe_load(output)["scenes"] == 3
     assert list(tmp_path.iterdir()) == []
