@@ -30,7 +30,7 @@ from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, from_mapping, require, require_one_of, to_mapping
 from tools.bench.states import Workload, scene_of
-from tools.taichi_elements import FRAME_S, STEP_S, WARM_FRAMES, cubes, run_theirs, taichi_elements_substeps
+from tools.taichi_elements import WARM_FRAMES, cubes, faithful_mode, run_theirs, taichi_elements_substeps
 
 FRAME_RATE_HZ = 60.0
 FIRST_SEED = 1_000_000  # of no data set
@@ -127,25 +127,19 @@ def _cases(made: list[Scene], config: SolverTimesConfig, kind: str) -> list[Call
 def _beside_taichi_elements(config: SolverTimesConfig, kind: str) -> list[dict[str, Any]]:
     assert config.taichi_elements is not None
     scene = cubes(CUBE_KINDS, CUBES, 0.08)
-    substeps = taichi_elements_substeps()
-    step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
+    faithful, rate = faithful_mode(kind)
     theirs: dict[str, Any] = {"case": "Taichi Elements, four cubes", "scenes": 1, "particles": scene.particle_count}
     try:
         _, seconds = run_theirs(
             scene, config.taichi_elements, config.scene_frames, 0 if kind == "gpu" else os.cpu_count() or 1
         )
-        theirs |= {"substeps": substeps, "ms": 1e3 * seconds}
+        theirs |= {"substeps": taichi_elements_substeps(), "ms": 1e3 * seconds}
     except subprocess.CalledProcessError as error:  # it has said why
         theirs |= {"substeps": None, "ms": None, "cause": f"ended with {error.returncode}"}
-    faithful = MpmConfig(
-        device=kind, time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements",
-        water_volume_update="taichi_elements", snow_maximum_hardening=100.0,
-    )  # fmt: skip
     return [
         theirs,
         *(
-            {"case": "the same, ours at its step"}
-            | _timed([scene] * count, faithful, config.scene_frames, 1 / (substeps * step))
+            {"case": "the same, ours at its step"} | _timed([scene] * count, faithful, config.scene_frames, rate)
             for count in ((1, SIDE_BY_SIDE) if kind == "gpu" else (1,))
         ),
     ]

@@ -93,6 +93,16 @@ def cases(size: float, seed: int = 0) -> list[tuple[str, Scene]]:
     return [*zip(MATERIALS, single, strict=True), ("mixed", mixed)]
 
 
+def faithful_mode(device: str) -> tuple[MpmConfig, float]:
+    """Our solver as Taichi Elements, at its step, and the frame rate at which it takes as many of them a frame."""
+    step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
+    mpm = MpmConfig(
+        device=device, time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements",
+        water_volume_update="taichi_elements", snow_maximum_hardening=100.0,
+    )  # fmt: skip
+    return mpm, 1 / (taichi_elements_substeps() * step)
+
+
 def taichi_elements_substeps() -> int:
     """How often it steps in a frame: the time left is counted down in floats, and its rest may ask for one more."""
     whole = int(FRAME_S / STEP_S) + 1
@@ -182,12 +192,7 @@ def run_theirs(scene: Scene, folder: str, frames: int, threads: int) -> tuple[np
 def _run_ours(scene: Scene, config: TaichiElementsConfig) -> tuple[np.ndarray, float]:
     from datagen.mpm.solver import SceneFailure, simulate
 
-    step = FRAME_S / (int(FRAME_S / STEP_S) + 1)
-    mpm = MpmConfig(
-        device="cpu", time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements",
-        water_volume_update="taichi_elements", snow_maximum_hardening=100.0,
-    )  # fmt: skip
-    rate = 1 / (taichi_elements_substeps() * step)
+    mpm, rate = faithful_mode("cpu")
     ends: list[float] = []
     (outcome,) = simulate(
         [scene], mpm, config.frames, rate, lambda _: ends.append(time.perf_counter()), cpu_threads=config.threads
