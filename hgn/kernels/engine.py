@@ -44,8 +44,10 @@ class Tuning:
     @staticmethod
     def of(precision: str) -> Tuning:
         """What was fastest on an H100 at width 128."""
-        if precision in ("ieee", "tf32x3"):
-            return Tuning(8, 4, 8, 4, 16, 4, 4, 2 if precision == "ieee" else 4, 4)
+        if precision == "ieee":
+            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4)
+        if precision == "tf32x3":
+            return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8)
         if precision == "tf32":  # operands of twice the size
             return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8)
         return Tuning(8, 4, 4, 4, 64, 4, 8, 8, 4)
