@@ -102,9 +102,9 @@ class TrainingEngine(Engine):
         job(g["decode_h"], self.decoder_input, packed.decode.parts[0], particles, packed.decode.first_bias)
         job(g["decode_z"], self.decode_hidden, packed.decode.second, particles, packed.decode.second_bias)
         job(g["down_p"], self.latent, pair.parts[0], particles, pair.first_bias)
-        job(g["down_z"], self.pair_hidden_down, pair.second, particles, pair.second_bias, 8)
+        job(g["down_z"], self.kept_down[0], pair.second, particles, pair.second_bias, 8)
         job(g["up_p"], self.latent, back.parts[1], particles, back.first_bias)
-        job(g["up_z"], self.pair_hidden_up, back.second, particles, back.second_bias, 8)
+        job(g["up_z"], self.kept_up[0], back.second, particles, back.second_bias, 8)
         for block, name in self._named_blocks():
             for m in range(steps):
                 edge, cell = block.packed.edge[m], block.packed.cell[m]
@@ -141,7 +141,7 @@ class TrainingEngine(Engine):
                 left_at = (left.data_ptr() - self.left.data_ptr()) // left.element_size()
                 right_at = (right.data_ptr() - base.data_ptr()) // right.element_size()
                 row = [left_at, right_at, at, count, left.shape[-1], right.shape[-1], multiple, bias]
-                assert len(row) == JOB_COLUMNS and left_at % 16 == 0 and right_at % 16 == 0
+                assert len(row) == JOB_COLUMNS and left_at % 16 == right_at % 16 == at % 16 == 0
                 starts = range(0, rows_held, chunk)
                 chunk_job += [len(rows)] * len(starts)
                 chunk_first += list(starts)
@@ -172,7 +172,7 @@ class TrainingEngine(Engine):
         self._pairs_backward(
             packed.cell_to_particle,
             self.latent_gradient,
-            self.pair_hidden_up,
+            self.kept_up,
             g["up_z"],
             g["up_p"],
             self.product_gradient,
@@ -226,7 +226,7 @@ class TrainingEngine(Engine):
         self._pairs_backward(
             packed.particle_to_cell,
             self.cell_gradient_down[0],
-            self.pair_hidden_down,
+            self.kept_down,
             g["down_z"],
             g["down_p"],
             self.product_gradient,
@@ -339,7 +339,7 @@ class TrainingEngine(Engine):
         self,
         fcn: PackedFCN,
         gradient: torch.Tensor,
-        hidden: torch.Tensor,
+        kept: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
         second_gradient: torch.Tensor,
         by_particle_gradient: torch.Tensor,
         by_cell_gradient: torch.Tensor,
@@ -357,10 +357,9 @@ class TrainingEngine(Engine):
             self.totals,
             fcn.parts[-1],
             fcn.second,
-            fcn.second_bias,
             fcn.gain,
             fcn.shift,
-            hidden,
+            *kept,
             second_gradient,
             by_particle_gradient,
             by_cell_gradient,

@@ -39,6 +39,27 @@ def product(x, w, PRECISION: tl.constexpr):
 
 
 @triton.jit
+def weighted_sums(w, x, PRECISION: tl.constexpr):
+    """w [S, R] @ x [R, W]: S sums of x's rows, in float32 of operands rounded as those of `product`.
+
+    Sums inside a tile run on the matrix units: as reductions they pass the rows from thread to thread.
+    """
+    if PRECISION == "half":
+        result = tl.dot(w.to(tl.float16), x.to(tl.float16))
+    elif PRECISION == "tf32":
+        result = tl.dot(nearest_tf32(w), nearest_tf32(x), input_precision="tf32")
+    else:
+        result = tl.dot(w, x, input_precision=PRECISION)
+    return result
+
+
+@triton.jit
+def members(SUMS: tl.constexpr, ROWS: tl.constexpr):
+    """[SUMS, ROWS]: one where a row is among the eight of a sum, else zero."""
+    return tl.where(tl.arange(0, ROWS)[None, :] // 8 == tl.arange(0, SUMS)[:, None], 1.0, 0.0)
+
+
+@triton.jit
 def matrix(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
     """The row-major matrix [ROWS, COLUMNS] at `pointer`."""
     row = tl.arange(0, ROWS)
@@ -110,5 +131,13 @@ def gathered_sum(
             even += part
         else:
             odd += part
-    # a reduction, not a sum: the compiler would take each part to the matrix unit's layout, and add there
-    return tl.sum(tl.join(even, odd), 2)
+    return added(even, odd)
+
+
+@triton.jit
+def added(x, y):
+    """x + y in float32, as a reduction: so they are added where they were loaded, after both loads began.
+
+    Of a plain sum the compiler takes each part to the matrix units' layout by itself, one after the other.
+    """
+    return tl.sum(tl.join(x.to(tl.float32), y.to(tl.float32)), 2)

@@ -36,7 +36,7 @@ class Tuning:
     row_block: int
     row_warps: int
     row_backward_warps: int
-    pair_particles: int  # eight rows each
+    pair_particles: int  # eight rows each, at most 13
     pair_warps: int
     small_block: int = 16  # where there are few rows
     small_warps: int = 8
@@ -135,8 +135,11 @@ class Engine:
         self.message = [self._operand(capacities[i], width) for i in range(levels - 1)]  # to the parents
         self.transfer_hidden_down = [self._operand(capacities[i], width) for i in range(levels - 1)]
         self.transfer_hidden_up = [self._operand(capacities[i], width) for i in range(levels - 1)]
-        kept_pairs = 8 * particles if self.training else 1
-        self.pair_hidden_down, self.pair_hidden_up = (self._operand(kept_pairs, width) for _ in range(2))
+        pairs = 8 * particles if self.training else 1
+        # hidden layer, normalised output, one over its deviation
+        self.kept_down, self.kept_up = (
+            (self._operand(pairs, width), self._operand(pairs, width), self._float(pairs)) for _ in range(2)
+        )
         shared_edge = None if self.training else self._operand(capacities[0], 6, width)
         self.down = [Block(i, packed.passing_down[i]) for i in range(levels)]
         self.up = [Block(i, packed.passing_up[i]) for i in range(levels - 1)]
@@ -221,7 +224,7 @@ class Engine:
             packed.particle_to_cell,
             self.by_particle_down,
             self.by_particle_down,
-            self.pair_hidden_down,
+            self.kept_down,
             self.down[0].cell[0],
             True,
         )
@@ -262,7 +265,7 @@ class Engine:
             coarse = block
         assert coarse.product is not None
         self._pairs(
-            packed.cell_to_particle, self.by_particle_up, coarse.product, self.pair_hidden_up, self.decoder_input, False
+            packed.cell_to_particle, self.by_particle_up, coarse.product, self.kept_up, self.decoder_input, False
         )
         self._rows(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
 
@@ -350,7 +353,7 @@ class Engine:
         fcn: PackedFCN,
         by_particle: torch.Tensor,
         by_cell: torch.Tensor,
-        hidden: torch.Tensor,
+        kept: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
         out: torch.Tensor,
         to_cell: bool,
     ) -> None:
@@ -371,7 +374,7 @@ class Engine:
             fcn.second_bias,
             fcn.gain,
             fcn.shift,
-            hidden,
+            *kept,
             out,
             TO_CELL=to_cell,
             SAVE=self.training,

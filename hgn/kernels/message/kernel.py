@@ -13,14 +13,17 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import (
+    added,
     gathered_sum,
     leaky,
     leaky_backward,
     matrix,
+    members,
     normalise,
     normalise_backward,
     product,
     transposed,
+    weighted_sums,
 )
 
 
@@ -60,6 +63,7 @@ def edge_forward(
     """
     count = tl.load(count_ptr)
     ROWS: tl.constexpr = BLOCK * 8
+    SUMS: tl.constexpr = max(16, BLOCK)  # the least that the matrix units take
     column = tl.arange(0, WIDTH)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -74,17 +78,18 @@ def edge_forward(
         other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
         there = (other >= 0)[:, None]
         edge_at = (owner * 6 + slot)[:, None] * WIDTH + column[None, :]
-        receive_at = owner[:, None] * WIDTH + column[None, :]
-        h = tl.load(receive + receive_at, mask=there, other=0.0).to(tl.float32)
-        h += tl.load(send + other[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
-        h += tl.load(values + bias_at + column)[None, :]
+        # all loads before the first use: the compiler keeps their order, and waits at the first
+        received = tl.load(receive + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
+        sent = tl.load(send + other[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
+        if not FIRST:
+            edge = tl.load(edge_in + edge_at, mask=there, other=0.0)
+        h = added(received, sent) + tl.load(values + bias_at + column)[None, :]
         if FIRST:
             for axis in tl.static_range(3):
                 # receiver minus sender: the opposite of where the sender lies
                 side = tl.where(slot // 2 == axis, 2.0 * (slot % 2) - 1.0, 0.0)
                 h += side[:, None] * tl.load(values + own_at + axis * WIDTH + column)[None, :]
         else:
-            edge = tl.load(edge_in + edge_at, mask=there, other=0.0).to(tl.float32)
             h += product(edge, own, PRECISION)
         a = leaky(h)
         if SAVE:
@@ -97,17 +102,17 @@ def edge_forward(
             tl.store(deviation + owner * 6 + slot, scale, mask=other >= 0)
         z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
         if not FIRST:
-            # read again: registers are dearer than a cache
-            z += tl.load(edge_in + edge_at, mask=there, other=0.0).to(tl.float32)
+            z += edge.to(tl.float32)
         z = tl.where(there, z, 0.0)
         if STORE_EDGE:
             if SAVE:
                 tl.store(edge_out + edge_at, z, mask=holds[:, None])
             else:
                 tl.store(edge_out + edge_at, z, mask=there)
-        mine = tile * BLOCK + tl.arange(0, BLOCK)
-        total = tl.sum(tl.reshape(z, (BLOCK, 8, WIDTH)), 1)
-        tl.store(sum_out + mine[:, None] * WIDTH + column[None, :], total, mask=(mine < count)[:, None])
+        mine = tile * BLOCK + tl.arange(0, SUMS)
+        ends = ((tl.arange(0, SUMS) < BLOCK) & (mine < count))[:, None]
+        total = weighted_sums(members(SUMS, ROWS), z, PRECISION)
+        tl.store(sum_out + mine[:, None] * WIDTH + column[None, :], total, mask=ends)
         tile += tl.num_programs(0)
 
 
@@ -266,6 +271,7 @@ def edge_backward(
     leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`."""
     count = tl.load(count_ptr)
     ROWS: tl.constexpr = BLOCK * 8
+    SUMS: tl.constexpr = max(16, BLOCK)  # the least that the matrix units take
     column = tl.arange(0, WIDTH)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -273,7 +279,8 @@ def edge_backward(
     if not FIRST:
         own = matrix(weights + own_at, WIDTH, WIDTH)
     gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
-    x_total, y_total, z_total = shift_total, shift_total, shift_total
+    if FIRST:
+        side_total = tl.zeros((16, WIDTH), tl.float32)
     tile = tl.program_id(0)
     while tile * BLOCK < count:
         owner = tile * BLOCK + tl.arange(0, ROWS) // 8
@@ -283,23 +290,27 @@ def edge_backward(
         there = (other >= 0)[:, None]
         edge_at = (owner * 6 + slot)[:, None] * WIDTH + column[None, :]
         sum_at = owner[:, None] * WIDTH + column[None, :]
-        de = tl.load(sum_gradient + sum_at, mask=there, other=0.0).to(tl.float32)
+        # all loads before the first use: the compiler keeps their order, and waits at the first
+        de = tl.load(sum_gradient + sum_at, mask=there, other=0.0)
+        z = tl.load(normalised + edge_at, mask=there, other=0.0)
         if not LAST:
-            de += tl.load(edge_gradient + edge_at, mask=there, other=0.0).to(tl.float32)
-        z = tl.load(normalised + edge_at, mask=there, other=0.0).to(tl.float32)
+            later = tl.load(edge_gradient + edge_at, mask=there, other=0.0)
+        a = tl.load(hidden + edge_at, mask=there, other=0.0)
         scale = tl.load(deviation + owner * 6 + slot, mask=other >= 0, other=0.0)
+        if not LAST:
+            de = added(de, later)
+        de, z = de.to(tl.float32), z.to(tl.float32)
         gain_total += tl.sum(de * z, 0)
         shift_total += tl.sum(de, 0)
         dz = normalise_backward(de, z, scale, tl.load(values + gain_at + column), WIDTH)
         tl.store(second_gradient + edge_at, dz, mask=holds[:, None])
         dh = product(dz, second, PRECISION)
-        dh = leaky_backward(dh, tl.load(hidden + edge_at, mask=there, other=0.0).to(tl.float32))
+        dh = leaky_backward(dh, a.to(tl.float32))
         tl.store(hidden_gradient + edge_at, dh, mask=holds[:, None])
         if FIRST:
             sign = 2.0 * (slot % 2) - 1.0
-            x_total += tl.sum(dh * tl.where(slot // 2 == 0, sign, 0.0)[:, None], 0)
-            y_total += tl.sum(dh * tl.where(slot // 2 == 1, sign, 0.0)[:, None], 0)
-            z_total += tl.sum(dh * tl.where(slot // 2 == 2, sign, 0.0)[:, None], 0)
+            axis = tl.arange(0, 16)[:, None]
+            side_total += weighted_sums(tl.where(slot[None, :] // 2 == axis, sign[None, :], 0.0), dh, PRECISION)
         else:
             de = product(dh, own, PRECISION)
             # read again: registers are dearer than a cache
@@ -307,13 +318,14 @@ def edge_backward(
             if not LAST:
                 de += tl.load(edge_gradient + edge_at, mask=there, other=0.0).to(tl.float32)
             tl.store(edge_gradient + edge_at, de, mask=there)
-        mine = tile * BLOCK + tl.arange(0, BLOCK)
-        received = tl.sum(tl.reshape(dh, (BLOCK, 8, WIDTH)), 1)
-        tl.store(receive_gradient + mine[:, None] * WIDTH + column[None, :], received, mask=(mine < count)[:, None])
+        mine = tile * BLOCK + tl.arange(0, SUMS)
+        ends = ((tl.arange(0, SUMS) < BLOCK) & (mine < count))[:, None]
+        received = weighted_sums(members(SUMS, ROWS), dh, PRECISION)
+        tl.store(receive_gradient + mine[:, None] * WIDTH + column[None, :], received, mask=ends)
         tile += tl.num_programs(0)
     tl.atomic_add(totals + gain_at + column, gain_total * unscale, sem="relaxed")
     tl.atomic_add(totals + shift_at + column, shift_total * unscale, sem="relaxed")
     if FIRST:
-        tl.atomic_add(totals + own_at + column, x_total * unscale, sem="relaxed")
-        tl.atomic_add(totals + own_at + WIDTH + column, y_total * unscale, sem="relaxed")
-        tl.atomic_add(totals + own_at + 2 * WIDTH + column, z_total * unscale, sem="relaxed")
+        axis = tl.arange(0, 16)[:, None]
+        at = totals + own_at + axis * WIDTH + column[None, :]
+        tl.atomic_add(at, side_total * unscale, mask=axis < 3, sem="relaxed")

@@ -9,7 +9,18 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import leaky, leaky_backward, matrix, normalise, normalise_backward, product, transposed
+from hgn.kernels.blocks import (
+    added,
+    leaky,
+    leaky_backward,
+    matrix,
+    members,
+    normalise,
+    normalise_backward,
+    product,
+    transposed,
+    weighted_sums,
+)
 
 
 @triton.jit
@@ -37,6 +48,8 @@ def pairs_forward(
     gain_at,
     shift_at,
     hidden,
+    normalised,
+    deviation,
     out,
     TO_CELL: tl.constexpr,
     SAVE: tl.constexpr,
@@ -47,9 +60,10 @@ def pairs_forward(
     """TO_CELL: out [C, W] += weight * FCN(by_particle_n + offset). Otherwise out [N, W] = particle + sum over the
     corners of weight * FCN(by_cell_c + by_particle_n - offset). The by_… are products with first-layer weights.
 
-    SAVE keeps the hidden layer [8 N, W].
+    SAVE keeps what pairs_backward reads: the hidden layer and the normalised output [8 N, W], one over its deviation.
     """
     ROWS: tl.constexpr = PARTICLES * 8
+    SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
     count = tl.load(count_ptr)
     if tl.program_id(0) * PARTICLES >= count:
         return
@@ -63,20 +77,24 @@ def pairs_forward(
         live = owner < count
         here = live[:, None]
         cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
-        h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0).to(tl.float32)
-        h += tl.load(values + bias_at + column)[None, :]
+        h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
         if not TO_CELL:
-            h += tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0).to(tl.float32)
+            h = added(h, tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0))
+        h = h.to(tl.float32) + tl.load(values + bias_at + column)[None, :]
         for axis in tl.static_range(3):
             side = _offset(fraction, owner, corner, live, axis)
             if not TO_CELL:
                 side = -side
             h += side[:, None] * tl.load(values + offset_at + axis * WIDTH + column)[None, :]
         a = leaky(h)
+        pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
         if SAVE:
-            tl.store(hidden + (owner * 8 + corner)[:, None] * WIDTH + column[None, :], a, mask=here)
+            tl.store(hidden + pair_at, a, mask=here)
         z = product(a, second, PRECISION)
-        z, _scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
+        z, scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
+        if SAVE:
+            tl.store(normalised + pair_at, z, mask=here)
+            tl.store(deviation + owner * 8 + corner, scale, mask=live)
         z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
         weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
         z = z * weight[:, None]
@@ -85,11 +103,11 @@ def pairs_forward(
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
         else:
-            summed = tl.sum(tl.reshape(z, (PARTICLES, 8, WIDTH)), 1)
-            mine = tile * PARTICLES + tl.arange(0, PARTICLES)
+            mine = tile * PARTICLES + tl.arange(0, SUMS)
+            ends = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
             at = mine[:, None] * WIDTH + column[None, :]
-            alive = (mine < count)[:, None]
-            tl.store(out + at, summed + tl.load(particle + at, mask=alive, other=0.0), mask=alive)
+            summed = weighted_sums(members(SUMS, ROWS), z, PRECISION)
+            tl.store(out + at, summed + tl.load(particle + at, mask=ends, other=0.0), mask=ends)
         tile += tl.num_programs(0)
 
 
@@ -105,10 +123,11 @@ def pairs_backward(
     totals,
     offset_at,
     second_at,
-    second_bias_at,
     gain_at,
     shift_at,
     hidden,
+    normalised,
+    deviation,
     second_gradient,
     by_particle_gradient,
     by_cell_gradient,
@@ -123,13 +142,15 @@ def pairs_backward(
     second_gradient [8 N, W] is left for the weight product.
     """
     ROWS: tl.constexpr = PARTICLES * 8
+    SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
     count = tl.load(count_ptr)
     if tl.program_id(0) * PARTICLES >= count:
         return
     column = tl.arange(0, WIDTH)
     second = matrix(weights + second_at, WIDTH, WIDTH)
+    sums = tl.arange(0, SUMS)
     gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
-    x_total, y_total, z_total = shift_total, shift_total, shift_total
+    side_total = tl.zeros((SUMS, WIDTH), tl.float32)
     tile = tl.program_id(0)
     while tile * PARTICLES < count:
         row = tl.arange(0, ROWS)
@@ -140,34 +161,38 @@ def pairs_backward(
         pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
         cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
         weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
-        a = tl.load(hidden + pair_at, mask=here, other=0.0).to(tl.float32)
-        z = product(a, tl.trans(second), PRECISION) + tl.load(values + second_bias_at + column)[None, :]
-        z, scale = normalise(z, WIDTH)
+        # all loads before the first use: the compiler keeps their order, and waits at the first
+        z = tl.load(normalised + pair_at, mask=here, other=0.0)
+        a = tl.load(hidden + pair_at, mask=here, other=0.0)
+        scale = tl.load(deviation + owner * 8 + corner, mask=live, other=0.0)
         if TO_CELL:
             dy = tl.load(gradient + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
         else:
             dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
-        dy = dy * weight[:, None]
+        dy, z = dy * weight[:, None], z.to(tl.float32)
         gain_total += tl.sum(dy * z, 0)
         shift_total += tl.sum(dy, 0)
         dz = normalise_backward(dy, z, scale, tl.load(values + gain_at + column), WIDTH)
         tl.store(second_gradient + pair_at, dz, mask=here)
         dh = product(dz, second, PRECISION)
-        # read again: registers are dearer than a cache
-        dh = leaky_backward(dh, tl.load(hidden + pair_at, mask=here, other=0.0).to(tl.float32))
-        SIGN: tl.constexpr = 1.0 if TO_CELL else -1.0
-        x_total += tl.sum(dh * (SIGN * _offset(fraction, owner, corner, live, 0))[:, None], 0)
-        y_total += tl.sum(dh * (SIGN * _offset(fraction, owner, corner, live, 1))[:, None], 0)
-        z_total += tl.sum(dh * (SIGN * _offset(fraction, owner, corner, live, 2))[:, None], 0)
+        dh = leaky_backward(dh, a.to(tl.float32))
         if not TO_CELL:
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
-        mine = tile * PARTICLES + tl.arange(0, PARTICLES)
-        summed = tl.sum(tl.reshape(dh, (PARTICLES, 8, WIDTH)), 1)
-        tl.store(by_particle_gradient + mine[:, None] * WIDTH + column[None, :], summed, mask=(mine < count)[:, None])
+        # the sums over a particle's pairs, and in the last rows those of the offsets' weights
+        chosen = members(SUMS, ROWS)
+        for axis in tl.static_range(3):
+            side = _offset(fraction, owner, corner, live, axis)
+            chosen = tl.where((sums == SUMS - 3 + axis)[:, None], side[None, :], chosen)
+        summed = weighted_sums(chosen, dh, PRECISION)
+        mine = tile * PARTICLES + sums
+        ends = ((sums < PARTICLES) & (mine < count))[:, None]
+        tl.store(by_particle_gradient + mine[:, None] * WIDTH + column[None, :], summed, mask=ends)
+        side_total += summed
         tile += tl.num_programs(0)
     tl.atomic_add(totals + gain_at + column, gain_total * unscale, sem="relaxed")
     tl.atomic_add(totals + shift_at + column, shift_total * unscale, sem="relaxed")
-    tl.atomic_add(totals + offset_at + column, x_total * unscale, sem="relaxed")
-    tl.atomic_add(totals + offset_at + WIDTH + column, y_total * unscale, sem="relaxed")
-    tl.atomic_add(totals + offset_at + 2 * WIDTH + column, z_total * unscale, sem="relaxed")
+    axis = sums[:, None] - (SUMS - 3)
+    sign = unscale if TO_CELL else -unscale
+    at = totals + offset_at + axis * WIDTH + column[None, :]
+    tl.atomic_add(at, side_total * sign, mask=axis >= 0, sem="relaxed")

@@ -35,7 +35,7 @@ def weight_gradient(
         return
     a_at = tl.multiple_of(tl.load(job), 16)
     b_at = tl.multiple_of(tl.load(job + 1), 16)
-    out_at = tl.load(job + 2)
+    out_at = tl.multiple_of(tl.load(job + 2), 16)
     a_width = tl.multiple_of(tl.load(job + 4), 16)
     b_width = tl.multiple_of(tl.load(job + 5), 16)
     column = tl.arange(0, TILE)
