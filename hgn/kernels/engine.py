@@ -50,7 +50,7 @@ class Tuning:
             return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8)
         if precision == "tf32":  # operands of twice the size
             return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8)
-        return Tuning(8, 4, 4, 4, 64, 4, 8, 8, 4)
+        return Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4)
 
 
 @dataclass

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from hgn.kernels.backward import TrainingEngine
-from hgn.kernels.engine import feature_columns
+from hgn.kernels.engine import Engine, feature_columns
 from hgn.kernels.grid.op import DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
 from hgn.network.features import ParticleState
@@ -46,8 +46,13 @@ def engine_of(
     return TrainingEngine(config, packed, values, grid, count, precision, loss_scale)
 
 
+def inference_of(engine: TrainingEngine, network: HierarchicalGraphNetwork) -> Engine:
+    """An engine that keeps nothing, on the same grid: other kernels than those of training."""
+    return Engine(network.config, engine.packed, engine.values, engine.grid, engine.particle_count, engine.precision)
+
+
 def run_forward(
-    engine: TrainingEngine, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
+    engine: Engine, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
 ) -> torch.Tensor:
     """The engine's normalised accelerations of the state, [N, 3]."""
     where, grid, config = engine.device, engine.grid, network.config

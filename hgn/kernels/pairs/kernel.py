@@ -103,10 +103,16 @@ def pairs_forward(
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
         else:
-            mine = tile * PARTICLES + tl.arange(0, SUMS)
-            ends = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
+            if PRECISION == "tf32" and not SAVE:
+                # as a reduction: rounding the product's operands would cost more
+                mine = tile * PARTICLES + tl.arange(0, PARTICLES)
+                ends = (mine < count)[:, None]
+                summed = tl.sum(tl.reshape(z, (PARTICLES, 8, WIDTH)), 1)
+            else:
+                mine = tile * PARTICLES + tl.arange(0, SUMS)
+                ends = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
+                summed = weighted_sums(members(SUMS, ROWS), z, PRECISION)
             at = mine[:, None] * WIDTH + column[None, :]
-            summed = weighted_sums(members(SUMS, ROWS), z, PRECISION)
             tl.store(out + at, summed + tl.load(particle + at, mask=ends, other=0.0), mask=ends)
         tile += tl.num_programs(0)
 
