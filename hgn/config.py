@@ -288,6 +288,9 @@ class TrainingConfig:
     batch_scenes: int = 1  # frames of random scenes in one update, on each device
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
+    warmup_updates: int = 0  # first updates, over which the rate grows linearly to what it is without
+    weights: str | None = None  # what a new run begins with: a file of python -m hgn.export, or a shipped name
+    ema_decay: float = 0.0  # of the moving average of the weights, an update; 0: none
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
     noise_shared: float = 0.0  # share of its variance that all particles of a scene have in common
     grid_jitter: bool = True
@@ -325,7 +328,8 @@ class TrainingConfig:
             "monitor_frame_stride",
             "monitor_particles_per_batch",
         )
-        require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames")
+        require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates")
+        require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
         require(0 <= self.noise_shared <= 1, "noise_shared", "0 to 1", self.noise_shared)
         require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))

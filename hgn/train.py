@@ -25,12 +25,19 @@ from hgn.data.order import Cursor
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import UnreachableError, is_remote
 from hgn.files import write_atomically
+from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.schema import ConfigError, from_mapping, to_mapping
-from hgn.training.checkpoint import DataInfo, check_checkpoint, cursor_of_checkpoint, read_checkpoint
+from hgn.training.checkpoint import (
+    DataInfo,
+    check_checkpoint,
+    cursor_of_checkpoint,
+    network_of_weights,
+    read_checkpoint,
+)
 from hgn.training.generator import Generator
 from hgn.training.launch import default_run, first_rank, layout
 from hgn.training.stop import StopRequest
@@ -48,6 +55,7 @@ def main(mapping: dict[str, Any]) -> int:
         require_same_dataset(Manifest.load(config.dataset.folder).config, config.datagen, config.dataset.folder)
     last = run / "checkpoints" / "last.ckpt"
     checkpoint = _checkpoint_to_resume(config, last) if last.exists() else None
+    begin_with = _weights_to_begin_with(config, checkpoint)
     stop = StopRequest()
     stop.listen()
     with ExitStack() as stack:
@@ -61,7 +69,7 @@ def main(mapping: dict[str, Any]) -> int:
             print("stopped before the first episode was published; the same command goes on", file=sys.stderr)
             return stop.exit_code
         stop.restart_clock(config.training.maximum_minutes)
-        return _fit(config, run, store, checkpoint, stop, generator)
+        return _fit(config, run, store, checkpoint, begin_with, stop, generator)
 
 
 def _fit(
@@ -69,6 +77,7 @@ def _fit(
     run: Path,
     store: EpisodeStore,
     checkpoint: tuple[Path, Cursor] | None,
+    begin_with: ParticleNetwork | None,
     stop: StopRequest,
     generator: Generator | None,
 ) -> int:
@@ -93,7 +102,10 @@ def _fit(
     set_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
     module = TrainingModule(build_network(config.network), training, data, path)
-    module.set_statistics(store.statistics())
+    if begin_with is None:
+        module.set_statistics(store.statistics())
+    else:
+        module.begin_with(begin_with)
     feed = Feed(store, config.network, training, chunks=path == "fast", interrupted=lambda: stop.requested)
     if checkpoint is not None:
         feed.cursor = checkpoint[1]
@@ -140,6 +152,21 @@ def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Cursor
     checkpoint = read_checkpoint(path)
     check_checkpoint(checkpoint, config, identity_hash(dataset_identity(config.datagen)), path)
     return path, cursor_of_checkpoint(checkpoint)
+
+
+def _weights_to_begin_with(config: TrainConfig, checkpoint: tuple[Path, Cursor] | None) -> ParticleNetwork | None:
+    """The network of training.weights, for a new run alone: a checkpoint wins."""
+    weights = config.training.weights
+    if weights is None:
+        return None
+    if checkpoint is not None:
+        if first_rank():
+            print(f"training.weights={weights} is not read: the run goes on from {checkpoint[0]}", file=sys.stderr)
+        return None
+    network = network_of_weights(config)
+    if first_rank():
+        print(f"begins with the weights and the normaliser of {weights}", file=sys.stderr)
+    return network
 
 
 def _complete(config: TrainConfig) -> bool:

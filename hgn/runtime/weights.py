@@ -46,29 +46,31 @@ def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, half: 
     write_atomically(path, payload)
 
 
-def load_weights(path: Path, device: torch.device | str = "cpu") -> tuple[ParticleNetwork, WeightsInfo]:
-    """The network in evaluation mode, float32, on `device`.
+def load_weights(
+    path: Path, device: torch.device | str = "cpu", field: str = "weights"
+) -> tuple[ParticleNetwork, WeightsInfo]:
+    """The network in evaluation mode, float32, on `device`. `field` names the setting in messages.
 
     Raises: ConfigError when the file is missing, is no weights file of ours, has another format version, or
     holds tensors that do not fit the structure it declares.
     """
     if not path.is_file():
-        raise ConfigError(f"weights must be an existing file, got {path}; write one with python -m hgn.export")
+        raise ConfigError(f"{field} must be an existing file, got {path}; write one with python -m hgn.export")
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     except SafetensorError as error:
-        raise ConfigError(f"weights must be a safetensors file, got {path}: {error}; export it again") from None
+        raise ConfigError(f"{field} must be a safetensors file, got {path}: {error}; export it again") from None
     if "hgn" not in metadata:
-        raise ConfigError(f"weights must be a file of python -m hgn.export, got {path} without its structure")
+        raise ConfigError(f"{field} must be a file of python -m hgn.export, got {path} without its structure")
     try:
         mapping = json.loads(metadata["hgn"])
     except json.JSONDecodeError as error:
-        raise ConfigError(f"weights must declare their structure as JSON, got {path}: {error}") from None
+        raise ConfigError(f"{field} must declare their structure as JSON, got {path}: {error}") from None
     version = mapping.get("format_version") if isinstance(mapping, dict) else None
     if version != FORMAT_VERSION:
-        raise ConfigError(f"weights format_version must be {FORMAT_VERSION}, got {version!r} in {path}; export again")
+        raise ConfigError(f"{field} format_version must be {FORMAT_VERSION}, got {version!r} in {path}; export again")
     info = from_mapping(WeightsInfo, mapping, "weights")
     network = build_network(info.network)
     expected = {name: tensor.shape for name, tensor in network.state_dict().items()}
@@ -76,7 +78,7 @@ def load_weights(path: Path, device: torch.device | str = "cpu") -> tuple[Partic
     for name in sorted(expected.keys() | found.keys()):
         if expected.get(name) != found.get(name):
             raise ConfigError(
-                f"weights tensor {name} must have shape {_shape(expected.get(name))} for the declared network, "
+                f"{field} tensor {name} must have shape {_shape(expected.get(name))} for the declared network, "
                 f"got {_shape(found.get(name))} in {path}; these are the weights of another network"
             )
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})

@@ -119,7 +119,7 @@ class Monitor(Callback):
         if self._measured_update == trainer.global_step:
             return
         self._measured_update = trainer.global_step
-        config, network = module.training_config, module.network
+        config, network = module.training_config, module.result
         network.eval()
         started = time.monotonic()
         self.stores["validation"].refresh()
@@ -152,7 +152,7 @@ class Monitor(Callback):
     def _one_step(
         self, trainer: Trainer, module: TrainingModule, split: str, episodes: list[Episode]
     ) -> dict[str, float]:
-        config, network = module.training_config, module.network
+        config, network = module.training_config, module.result
         batches = frame_batches(
             episodes,
             network,
@@ -182,7 +182,7 @@ class Monitor(Callback):
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
         path = "plain" if module.automatic_optimization else "fast"
-        simulator = Simulator(module.network, episodes[0].frame_rate_hz, path, module.training_config.precision)
+        simulator = Simulator(module.result, episodes[0].frame_rate_hz, path, module.training_config.precision)
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
         try:
             predicted = simulator.rollout([InitialState.of_episode(episode) for episode in episodes], frames)

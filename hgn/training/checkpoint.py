@@ -16,9 +16,11 @@ from hgn.config import NetworkConfig, TrainConfig
 from hgn.data.order import Cursor
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
+from hgn.runtime.weights import load_weights
 from hgn.schema import ConfigError, from_mapping, to_mapping
 
 SECTION = "hgn"  # the checkpoint's key for what is ours
+NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the tensors: as trained, and their moving average
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,32 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
         )
 
 
+def network_of_weights(config: TrainConfig) -> ParticleNetwork:
+    """The network of training.weights, normaliser included, for a new run to begin with.
+
+    Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
+    """
+    assert config.training.weights is not None
+    path = Path(config.training.weights)
+    network, info = load_weights(path, field="training.weights")
+    remedy = "set it so, or take other training.weights"
+    found, wanted = to_mapping(info.network), to_mapping(config.network)
+    pairs = [(f"network.{key}", found[key], wanted[key]) for key in sorted(found)]
+    pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
+    if info.network.sees_obstacles:
+        pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
+    for name, theirs, ours in pairs:
+        if theirs != ours:
+            raise ConfigError(f"{name} must be {theirs!r}, as in training.weights {path}, got {ours!r}; {remedy}")
+    return network
+
+
 def network_of_checkpoint(checkpoint: dict[str, Any]) -> ParticleNetwork:
-    """The network of a checkpoint, normaliser included, in evaluation mode."""
+    """The network of a checkpoint, normaliser included, in evaluation mode: the moving average where there is one."""
     network = build_network(from_mapping(NetworkConfig, checkpoint[SECTION]["network"], "network"))
-    prefix = "network."
-    tensors = {k.removeprefix(prefix): v for k, v in checkpoint["state_dict"].items() if k.startswith(prefix)}
-    network.load_state_dict(tensors)
+    state = checkpoint["state_dict"]
+    prefix = AVERAGED if any(name.startswith(AVERAGED) for name in state) else NETWORK
+    network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
     network.eval()
     return network
 

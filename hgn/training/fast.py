@@ -35,8 +35,11 @@ class FastTraining:
         counters: torch.Tensor,
         reduce: Callable[[torch.Tensor], None] | None = None,
         ranks: int = 1,
+        averaged: HierarchicalGraphNetwork | None = None,
     ) -> None:
-        """loss_sum [2] and counters [5] are added to, as hgn.kernels.update.kernel.finish_update says."""
+        """`averaged` holds the moving average of the weights.
+
+        loss_sum [2] and counters [5] are added to, as hgn.kernels.update.kernel.finish_update says."""
         self.network, self.optimizer = network, optimizer
         self.device = next(network.parameters()).device
         self.symmetric = training.symmetry != "none"
@@ -52,11 +55,14 @@ class FastTraining:
         self._take_over()
         self.updates = Updates(network, settings, precision, loss_sum, counters, reduce, ranks)
         self._read_moments()
+        self._averaged = None if averaged is None else self._take_over_average(averaged)
         self._episodes: dict[int, DeviceEpisode] = {}
         self.agreement: tuple[float, float] | None = None  # with the plain network, see hgn.training.agreement
 
-    def run(self, chunk: Chunk, rates: list[float]) -> None:
+    def run(self, chunk: Chunk, rates: list[float], shares: list[float] | None = None) -> None:
         """Makes an update for each entry of the chunk, at these learning rates.
+
+        `shares` are those of the new weights in their moving average, where there is one.
 
         Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong here.
         """
@@ -70,7 +76,8 @@ class FastTraining:
             if self.symmetric:
                 shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
             self.agreement = require_agreement(self.updates, episodes, shown)
-        self.updates.run([[(self._episodes[s.episode], s.frame, s.seed) for s in u] for u in chunk.samples], rates)
+        samples = [[(self._episodes[s.episode], s.frame, s.seed) for s in u] for u in chunk.samples]
+        self.updates.run(samples, rates, shares)
         self._write_back()
 
     def _placed(self, episode: WholeEpisode) -> DeviceEpisode:
@@ -103,11 +110,24 @@ class FastTraining:
             state["step"] = self._steps[i]
             state["exp_avg"], state["exp_avg_sq"] = (m[i].view(parameter.shape) for m in (first, second))
 
+    def _take_over_average(self, averaged: HierarchicalGraphNetwork) -> torch.Tensor:
+        """Makes its parameters views of a flat buffer, which it returns."""
+        parameters = list(averaged.parameters())
+        flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
+        for parameter, view in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
+            parameter.data = view.view(parameter.shape)
+        self.updates.average = self._packed(flat)
+        return flat
+
+    def _packed(self, flat: torch.Tensor) -> torch.Tensor:
+        index = self.updates.packed.index.to(self.device)
+        return torch.where(index >= 0, flat[index.clamp(min=0)], 0.0)
+
     def _read_moments(self) -> None:
         index = self.updates.packed.index.to(self.device)
         used = index >= 0
         for flat, packed in zip(self._moments, (self.updates.first_moment, self.updates.second_moment), strict=True):
-            packed.copy_(torch.where(used, flat[index.clamp(min=0)], 0.0))
+            packed.copy_(self._packed(flat))
         self.updates.step.fill_(float(self._steps.max()))
         self._place = torch.empty_like(index[used])  # of each parameter element in the packed buffers
         self._place[index[used]] = torch.nonzero(used).flatten()
@@ -117,4 +137,7 @@ class FastTraining:
         torch.index_select(updates.values, 0, self._place, out=self._flat)
         torch.index_select(updates.first_moment, 0, self._place, out=self._moments[0])
         torch.index_select(updates.second_moment, 0, self._place, out=self._moments[1])
+        if self._averaged is not None:
+            assert updates.average is not None
+            torch.index_select(updates.average, 0, self._place, out=self._averaged)
         self._steps.copy_(updates.step.expand_as(self._steps))

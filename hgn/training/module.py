@@ -5,6 +5,7 @@ Shape legend: N particles of all scenes of a batch.
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 from typing import Any
@@ -20,7 +21,14 @@ from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.schema import to_mapping
-from hgn.training.checkpoint import SECTION, DataInfo, cursor_of_checkpoint, updates_of_checkpoint
+from hgn.training.checkpoint import (
+    AVERAGED,
+    NETWORK,
+    SECTION,
+    DataInfo,
+    cursor_of_checkpoint,
+    updates_of_checkpoint,
+)
 from hgn.training.noise import jittered_origin, perturbed_window
 from hgn.training.ranks import sum_over_ranks
 from hgn.training.symmetry import drawn_symmetries, under_symmetries
@@ -34,6 +42,7 @@ class TrainingModule(LightningModule):
         super().__init__()
         self.automatic_optimization = path == "plain"
         self.network = network
+        self.averaged = copy.deepcopy(network).requires_grad_(False) if training.ema_decay else None
         self.training_config = training
         self.data = data
         self.cursor = Cursor()
@@ -52,6 +61,36 @@ class TrainingModule(LightningModule):
             moments = getattr(statistics, quantity)
             mean_3, std_3 = torch.tensor(moments.mean), torch.tensor(moments.std)
             self.network.normaliser.set(quantity, mean_3, std_3, noise)
+        self._begin_average()
+
+    def begin_with(self, network: ParticleNetwork) -> None:
+        """Takes over weights and normaliser; instead of `set_statistics`, when a run begins."""
+        self.network.load_state_dict(network.state_dict())
+        self._begin_average()
+
+    @property
+    def result(self) -> ParticleNetwork:
+        """What is measured and exported: the moving average of the weights where there is one."""
+        return self.network if self.averaged is None else self.averaged
+
+    def _begin_average(self) -> None:
+        if self.averaged is not None:
+            self.averaged.load_state_dict(self.network.state_dict())
+
+    def _average_share(self, update: int) -> float:
+        """Of the new weights in the moving average, after update number `update`, from 0.
+
+        First weights are forgotten soon: while there are few updates, the average is over the last tenth of them.
+        """
+        return 1.0 - min(self.training_config.ema_decay, (1 + update) / (10 + update))
+
+    def optimizer_step(self, *arguments: Any, **named: Any) -> None:
+        update = self.global_step
+        super().optimizer_step(*arguments, **named)
+        if self.averaged is not None:
+            averaged = [parameter.detach() for parameter in self.averaged.parameters()]
+            weights = [parameter.detach() for parameter in self.network.parameters()]
+            torch._foreach_lerp_(averaged, weights, self._average_share(update))
 
     def loss(self, batch: Batch) -> torch.Tensor:
         """Mean squared error of the normalised acceleration: over axes, over particles, over scenes."""
@@ -70,6 +109,7 @@ class TrainingModule(LightningModule):
             from hgn.training.fast import FastTraining
 
             assert isinstance(self.network, HierarchicalGraphNetwork)
+            assert self.averaged is None or isinstance(self.averaged, HierarchicalGraphNetwork)
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Adam)
             self._fast = FastTraining(
@@ -81,6 +121,7 @@ class TrainingModule(LightningModule):
                 self.gradient_counters,
                 sum_over_ranks if self.trainer.world_size > 1 else None,
                 self.trainer.world_size,
+                self.averaged,
             )
 
     def training_step(self, batch: Batch | Chunk, batch_index: int) -> torch.Tensor | None:
@@ -97,7 +138,9 @@ class TrainingModule(LightningModule):
     def _train_chunk(self, chunk: Chunk) -> None:
         first, count = self.global_step, len(chunk.samples)
         new = self._fast.agreement is None
-        self._fast.run(chunk, [self._rate(first + k) for k in range(count)])
+        updates = range(first, first + count)
+        shares = [self._average_share(update) for update in updates] if self.averaged is not None else None
+        self._fast.run(chunk, [self._rate(update) for update in updates], shares)
         if new and self.trainer.is_global_zero:
             outputs, gradients = self._fast.agreement
             text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"
@@ -117,19 +160,19 @@ class TrainingModule(LightningModule):
 
     def _rate(self, update: int) -> float:
         """The learning rate of update number `update`, from 0."""
-        return self.training_config.learning_rate * self._decay**update
+        return self.training_config.learning_rate * self._rate_factor(update)
 
-    @property
-    def _decay(self) -> float:
+    def _rate_factor(self, update: int) -> float:
         config = self.training_config
-        return (config.final_learning_rate / config.learning_rate) ** (1 / config.maximum_updates)
+        decay = (config.final_learning_rate / config.learning_rate) ** (1 / config.maximum_updates)
+        warmth = min(1.0, (update + 1) / config.warmup_updates) if config.warmup_updates else 1.0
+        return decay**update * warmth
 
     def configure_optimizers(self) -> Any:
         config = self.training_config
         # One launch instead of several for each group of tensors; and only the fused kind can skip a step by itself.
         optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=True)
-        decay = self._decay
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda update: decay**update)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate_factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -143,6 +186,13 @@ class TrainingModule(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.cursor = cursor_of_checkpoint(checkpoint)
+        state = checkpoint["state_dict"]
+        if self.averaged is None:
+            for name in [name for name in state if name.startswith(AVERAGED)]:
+                del state[name]
+        elif not any(name.startswith(AVERAGED) for name in state):  # the average begins here
+            begun = {AVERAGED + k.removeprefix(NETWORK): v.clone() for k, v in state.items() if k.startswith(NETWORK)}
+            state.update(begun)
         # Lightning counts updates in one of two places, by the path that made them.
         updates = {"ready": updates_of_checkpoint(checkpoint), "completed": updates_of_checkpoint(checkpoint)}
         loops = checkpoint["loops"]["fit_loop"]

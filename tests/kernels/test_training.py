@@ -38,11 +38,11 @@ def run_mapping(config: DatagenConfig, run: Path, **training: Any) -> dict[str, 
 def test_fast_training_is_the_plain_one(
     data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without noise and jitter both paths make the same updates: every count and log line is there, weights and
-    moments agree; a training may change path at any checkpoint, and ends where the others do."""
+    """Without noise and jitter both paths make the same updates: every count and log line is there, weights,
+    their average and moments agree; a training may change path at any checkpoint, and ends where the others do."""
     if device().type == "cpu":
         monkeypatch.setattr("hgn.runtime.path.why_not_fast", lambda *_: None)  # kernels run in the interpreter
-    same = {"noise_std": 0.0, "grid_jitter": False}
+    same = {"noise_std": 0.0, "grid_jitter": False, "warmup_updates": 3, "ema_decay": 0.7}
     ends = {}
     for name, parts in {
         "plain": [("plain", 4)],

@@ -26,6 +26,7 @@ from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
 UPDATES = 16  # of 2 samples, where an epoch has 25
+MORE = {"symmetry": "gravity", "warmup_updates": 6, "ema_decay": 0.8}
 FRAMES = st.lists(st.integers(2, 9), min_size=1, max_size=6)
 
 
@@ -221,13 +222,13 @@ def assert_same(found: Any, expected: Any, where: str = "") -> None:
 
 def test_resume_equals_no_interruption(data: DatagenConfig, stop_at: Callable[[int | None], None]) -> None:
     """Interrupted at any updates, once or several times, a training ends where an uninterrupted one does, bit by bit:
-    weights, both moments, learning rate and order; noise, jitter and symmetries come from the samples' seeds, so they
-    agree too."""
+    weights, their average, both moments, learning rate and order; noise, jitter and symmetries come from the samples'
+    seeds, so they agree too."""
 
     def trained(run: Path, stops: Sequence[int]) -> dict[str, Any]:
         for stop in (*stops, None):
             stop_at(stop)
-            mapping = train_mapping(data, run, maximum_updates=UPDATES, monitor_every=1000, symmetry="gravity")
+            mapping = train_mapping(data, run, maximum_updates=UPDATES, monitor_every=1000, **MORE)
             assert train.main(mapping) == 0
             updates = read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"]
             assert updates == (UPDATES if stop is None else stop)

@@ -216,6 +216,21 @@ def adam(
 
 
 @triton.jit
+def average_values(value, average, shares, update, status, size, BLOCK: tl.constexpr):
+    """Moving average of the values, with the update's share, shares [updates], of the new ones.
+
+    Not while the update has to be made again; after one that was skipped, with the values that stayed.
+    """
+    if (tl.load(status) & AGAIN) != 0:
+        return
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = at < size
+    mean = tl.load(average + at, mask=mask, other=0.0)
+    mean += (tl.load(value + at, mask=mask, other=0.0) - mean) * tl.load(shares + tl.load(update))
+    tl.store(average + at, mean, mask=mask)
+
+
+@triton.jit
 def finish_update(status, update, step, loss, norm, loss_sum, counters):
     """Counts the update, unless it has to be done again with more room.
 

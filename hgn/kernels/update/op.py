@@ -89,6 +89,7 @@ class Updates:
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
         self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
+        self.average: torch.Tensor | None = None  # of the values over the updates; set it before the first one
         self.step = torch.zeros(1, dtype=torch.float64, device=device)
         self.update = torch.zeros(1, dtype=torch.int32, device=device)
         self.particle_count = torch.zeros(1, dtype=torch.int32, device=device)
@@ -106,16 +107,24 @@ class Updates:
         self.growths = 0  # how often the buffers had to grow
         self._reach = (torch.zeros(3), torch.zeros(3))  # what the window must hold
         self._graphs: list[torch.cuda.CUDAGraph] = []
-        self._samples = self._domains = self._rates = torch.empty(0)
+        self._samples = self._domains = self._rates = self._shares = torch.empty(0)
 
     # updates
 
-    def run(self, chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]], rates: Sequence[float]) -> None:
+    def run(
+        self,
+        chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]],
+        rates: Sequence[float],
+        shares: Sequence[float] | None = None,
+    ) -> None:
         """One update for each entry of `chunk`, which lists episode, frame and seed of every scene.
 
-        Raises: ConfigError when positions are not finite.
+        `shares` are those of the new values in `average`. Raises: ConfigError when positions are not finite.
         """
+        assert (shares is None) == (self.average is None)
         self._prepare(chunk, rates)
+        if shares is not None:
+            self._shares[: len(chunk)].copy_(torch.tensor(shares, dtype=torch.float64))
         done = 0
         while True:
             for _ in range(len(chunk) - done):
@@ -169,6 +178,7 @@ class Updates:
             self._samples = torch.zeros(table.shape, dtype=torch.int64, device=self.device)
             self._domains = torch.zeros(domain.shape, device=self.device)
             self._rates = torch.zeros(length, device=self.device)
+            self._shares = torch.zeros(length, device=self.device)
         self._samples[: len(chunk)].copy_(torch.from_numpy(table))
         self._domains[: len(chunk)].copy_(torch.from_numpy(domain))
         self._rates[: len(chunk)].copy_(torch.tensor(rates, dtype=torch.float64))
@@ -238,6 +248,10 @@ class Updates:
             PRECISION=self.precision,
             BLOCK=FLAT_BLOCK,
         )
+        if self.average is not None:
+            kernel.average_values[blocks](
+                self.values, self.average, self._shares, self.update, self.grid.status, size, BLOCK=FLAT_BLOCK
+            )
         engine.refresh_encoder()
         kernel.finish_update[(1,)](
             self.grid.status, self.update, self.step, self.loss, self.norm, self.loss_sum, self.counters

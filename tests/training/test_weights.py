@@ -1,0 +1,150 @@
+"""What a run begins with, how it warms up, and the moving average it ends with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from training.runs import NETWORK, TRAINING, metrics, train_mapping
+
+from hgn import train
+from hgn.config import DatagenConfig, EvaluateConfig, NetworkConfig, TrainingConfig
+from hgn.data.reader import EpisodeStore
+from hgn.data.select import first_episodes
+from hgn.evaluate import one_step_rows
+from hgn.export import export
+from hgn.network.build import build_network
+from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
+from hgn.schema import ConfigError
+from hgn.training.checkpoint import DataInfo, network_of_checkpoint, read_checkpoint
+from hgn.training.module import TrainingModule
+
+
+@pytest.fixture
+def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
+    config = make_config(training_scenes=2, validation_scenes=1, test_scenes=0)
+    make_dataset(config)
+    return config
+
+
+def weights_file(path: Path, half: bool = True, rate: float = 60.0, cell_size: float = 1 / 64, **network: Any) -> Path:
+    torch.manual_seed(3)
+    config = NetworkConfig(**NETWORK | network)
+    built = build_network(config)
+    for quantity in ("velocity", "acceleration"):
+        built.normaliser.set(quantity, torch.tensor([0.1, 0.2, 0.3]), torch.tensor([1.5, 2.5, 3.5]), 0.0)
+    save_weights(path, built, WeightsInfo(config, rate, cell_size), half)
+    return path
+
+
+def evaluate(data: DatagenConfig, weights: Path) -> float:
+    mapping = {"weights": str(weights), "data": data.dataset.folder, "rollout_frames": 0, "device": "cpu"}
+    config = EvaluateConfig(**mapping)
+    rows = one_step_rows(load_weights(weights)[0], first_episodes(EpisodeStore(config.data, config.split), 5), config)
+    return next(row["one_step_mse"] for row in rows if row["system"] == "network")
+
+
+def last(run: Path) -> dict[str, Any]:
+    return read_checkpoint(run / "checkpoints" / "last.ckpt")
+
+
+@pytest.mark.parametrize("half", [True, False])
+def test_a_run_begins_with_weights(
+    data: DatagenConfig, tmp_path: Path, half: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A new run has the file's weights and its normaliser, whether halved or not; one that goes on takes its
+    checkpoint's, even where the file is gone, and says so."""
+    file = weights_file(tmp_path / "begin.safetensors", half)
+    tiny = {"learning_rate": 1e-12, "final_learning_rate": 1e-12, "maximum_updates": 1}
+    mapping = train_mapping(data, tmp_path / "run", weights=str(file), **tiny)
+    assert train.main(mapping) == 0
+    assert "begins with the weights" in capsys.readouterr().err
+    begun, _ = load_weights(file)
+    for name, tensor in network_of_checkpoint(last(tmp_path / "run")).state_dict().items():
+        torch.testing.assert_close(tensor, begun.state_dict()[name], rtol=0, atol=1e-10)
+    file.unlink()
+    assert train.main(train_mapping(data, tmp_path / "run", weights=str(file), **tiny | {"maximum_updates": 2})) == 0
+    assert "is not read: the run goes on from" in capsys.readouterr().err
+    assert last(tmp_path / "run")["hgn"]["updates"] == 2
+
+
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        ({"width": 16}, r"network.width must be 16, as in training.weights .*, got 8; set it so, or take other"),
+        ({"materials": ("water",)}, r"network.materials must be \['water'\], as in training.weights"),
+        ({"rate": 30.0}, r"dataset.frame_rate_hz must be 30.0, as in training.weights .*, got 60.0; set"),
+        ({"cell_size": 0.02}, r"scene.cell_size must be 0.02, as in training.weights .*, got 0.015625; set"),
+        (None, r"training.weights must be an existing file, got .*; write one with python -m hgn.export"),
+    ],
+)
+def test_other_weights_are_refused(data: DatagenConfig, tmp_path: Path, file: Any, message: str) -> None:
+    """Another structure, other materials, frame rates and cells are refused by name before anything is written."""
+    path = tmp_path / "other.safetensors"
+    if file is not None:
+        weights_file(path, **file)
+    with pytest.raises(ConfigError, match=message):
+        train.main(train_mapping(data, tmp_path / "run", weights=str(path)))
+    assert not (tmp_path / "run").exists()
+
+
+def test_warm_up() -> None:
+    """The rate grows linearly over the first updates to what it is without warm-up, and is the same from there."""
+    values = {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "maximum_updates": 100}
+    warm, cold = (
+        TrainingModule(
+            build_network(NetworkConfig(**NETWORK)),
+            TrainingConfig(**values, warmup_updates=n),
+            DataInfo("", 60.0, 1 / 64),
+        )
+        for n in (10, 0)
+    )
+    for update in range(30):
+        share = min(1.0, (update + 1) / 10)
+        assert warm._rate(update) == pytest.approx(share * cold._rate(update), rel=1e-12)
+    assert cold._rate(0) == 1e-3 and warm._rate(100) == pytest.approx(1e-5)
+
+
+def test_the_average_is_what_is_measured_and_exported(
+    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The average follows its definition over every update; the export holds it, and monitoring measures it."""
+    seen: list[dict[str, torch.Tensor]] = []
+    original = TrainingModule.optimizer_step
+
+    def optimizer_step(self: TrainingModule, *arguments: Any, **named: Any) -> None:
+        if not seen:
+            seen.append({name: p.detach().clone() for name, p in self.network.named_parameters()})
+        original(self, *arguments, **named)
+        seen.append({name: p.detach().clone() for name, p in self.network.named_parameters()})
+
+    monkeypatch.setattr(TrainingModule, "optimizer_step", optimizer_step)
+    mapping = train_mapping(data, tmp_path / "run", ema_decay=0.6, learning_rate=1e-2)
+    assert train.main(mapping) == 0
+    assert len(seen) == TRAINING["maximum_updates"] + 1
+    expected = {name: tensor.double() for name, tensor in seen[0].items()}
+    for update, weights in enumerate(seen[1:]):
+        decay = min(0.6, (1 + update) / (10 + update))
+        expected = {name: decay * mean + (1 - decay) * weights[name].double() for name, mean in expected.items()}
+    export(tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path / "out.safetensors")
+    exported, _ = load_weights(tmp_path / "out.safetensors")
+    for name, parameter in exported.named_parameters():
+        torch.testing.assert_close(parameter.double(), expected[name], rtol=1e-5, atol=1e-7)
+    assert any(not torch.equal(exported.get_parameter(name), tensor) for name, tensor in seen[-1].items())
+    measured = {
+        record["update"]: record["one_step/validation"]
+        for record in metrics(tmp_path / "run")
+        if "one_step/validation" in record
+    }
+    assert measured[12] == pytest.approx(evaluate(data, tmp_path / "out.safetensors"), rel=1e-4)
+    checkpoint = last(tmp_path / "run")
+    checkpoint["state_dict"] = {k: v for k, v in checkpoint["state_dict"].items() if not k.startswith("averaged.")}
+    torch.save(checkpoint, tmp_path / "run" / "checkpoints" / "last.ckpt")
+    # begun anew at the checkpoint's weights, where it had none; and left out where it is no longer wanted
+    for decay, updates in ((0.6, 13), (0.0, 14), (0.6, 15)):
+        mapping = train_mapping(data, tmp_path / "run", ema_decay=decay, learning_rate=1e-2, maximum_updates=updates)
+        assert train.main(mapping) == 0
+        assert any(name.startswith("averaged.") for name in last(tmp_path / "run")["state_dict"]) == (decay > 0)
