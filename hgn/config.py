@@ -279,6 +279,11 @@ class NetworkConfig:
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + self.material_embedding
 
 
+# Plane waves of the smooth noise, and the lengths that they are drawn from, in finest cells: short ones stir a body,
+# long ones shift it.
+SMOOTH_WAVES, SMOOTH_CELLS = 16, (4, 64)
+
+
 @dataclass(frozen=True)
 class TrainingConfig:
     """How a network is trained (paper sec. 3.3)."""
@@ -292,7 +297,7 @@ class TrainingConfig:
     weights: str | None = None  # what a new run begins with: a file of python -m hgn.export, or a shipped name
     ema_decay: float = 0.0  # of the moving average of the weights, an update; 0: none
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
-    noise_shared: float = 0.0  # share of its variance that all particles of a scene have in common
+    noise_smooth: float = 0.0  # share of its variance that neighbours have in common
     grid_jitter: bool = True
     symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
     seed: int = 0
@@ -330,7 +335,7 @@ class TrainingConfig:
         )
         require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates")
         require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
-        require(0 <= self.noise_shared <= 1, "noise_shared", "0 to 1", self.noise_shared)
+        require(0 <= self.noise_smooth <= 1, "noise_smooth", "0 to 1", self.noise_smooth)
         require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
         require_one_of(self, "precision", PRECISIONS)

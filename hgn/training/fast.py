@@ -49,7 +49,7 @@ class FastTraining:
             training.grid_jitter,
             obstacle_cell_size,
             self.symmetric,
-            training.noise_shared,
+            training.noise_smooth,
         )
         precision = kernel_precision(training.precision, self.device)
         self._take_over()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 
 import pytest
 import torch
@@ -149,28 +150,34 @@ def test_noise_and_jitter() -> None:
     torch.testing.assert_close(first["target_N3"][:400], expected, rtol=0, atol=1e-3)
 
 
-def test_shared_noise() -> None:
-    """With noise_shared=1 the particles of a scene get one walk, another in another scene, of the asked spread; half of
-    the variance leaves the other half to each particle."""
-    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
+def test_smooth_noise() -> None:
+    """With noise_smooth=1 a scene's noise is the sum of its waves as the plain path takes it, of the asked spread; other
+    scenes have other waves; half of the variance leaves the other half to each particle."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.01)
     made, _ = episode(1, 400, False, spread=0.3)
     still, _ = episode(2, 300, False, spread=0.3)
-    walks = {}
-    for shared in (0.0, 0.5, 1.0):
-        updates = updates_of(network, 2, noise_std=1e-3, grid_jitter=False, noise_shared=shared)
+    walks, waves = {}, torch.empty(0)
+    windows = [e.position_TN3[f : f + HISTORY + 1].cpu() for e, f in ((made, 1), (still, 0))]
+    clean = torch.cat([(w[1:] - w[:-1]).flip(0).transpose(0, 1) for w in windows])
+    for smooth in (0.0, 0.5, 1.0):
+        updates = updates_of(network, 2, noise_std=1e-3, grid_jitter=False, noise_smooth=smooth)
         updates._upload([[(made, 1, 5), (still, 0, 6)]], [1e-3])
-        updates.particles, updates.capacities = 704, (512,)
+        updates.particles, updates.capacities = 704, (4096,)
         updates._reach = (torch.zeros(3), torch.ones(3))
         updates._build()
         updates._assemble()
-        windows = [e.position_TN3[f : f + HISTORY + 1].cpu() for e, f in ((made, 1), (still, 0))]
-        clean = torch.cat([(w[1:] - w[:-1]).flip(0).transpose(0, 1) for w in windows])
-        walks[shared] = updates.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
-    common = walks[1.0]
-    assert common[:400].std(0).max() < 1e-7 and common[400:].std(0).max() < 1e-7
-    assert (common[0] - common[-1]).abs().min() > 1e-7
-    assert 1e-4 < common[[0, -1], 0].abs().mean() < 3e-3
-    torch.testing.assert_close(walks[0.5], (walks[0.0] + common) / 2**0.5, rtol=0, atol=1e-6)
+        walks[smooth] = updates.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
+        waves = updates.waves_SKC.cpu()
+    length = 2 * math.pi / waves[..., :3].norm(dim=-1) / 0.01
+    assert 4 <= float(length.min()) < 8 and 32 < float(length.max()) <= 64.01
+    assert not torch.isclose(waves[0], waves[1]).any()
+    expected = []
+    for window, wave in zip(windows, waves, strict=True):
+        height_NK = torch.cos(window[-1] @ wave[:, :3].T + wave[:, 3])
+        expected.append((height_NK @ wave[:, 4:]).view(-1, HISTORY, 3).cumsum(1).flip(1))
+    torch.testing.assert_close(walks[1.0], torch.cat(expected), rtol=0, atol=2e-6)
+    assert 3e-4 < float(walks[1.0][:, 0].std()) < 3e-3
+    torch.testing.assert_close(walks[0.5], (walks[0.0] + walks[1.0]) / 2**0.5, rtol=0, atol=2e-6)
 
 
 def test_wrong_kernels_are_refused() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -61,21 +62,28 @@ def test_noise_in_the_window_is_that_walk():
     torch.testing.assert_close(noise_WN3[-1], noise_WN3[-2], rtol=0, atol=2e-7)
 
 
-def test_shared_noise():
-    """A share of the variance is common to a scene's particles, the rest their own; other scenes share another walk,
-    and a share of zero is bitwise the noise without."""
-    batch = batch_of(episode(20_000), episode(300, seed=1))
+def test_smooth_noise():
+    """The waves' share of the variance is asked for; what is left of it are the particles' own walks. Neighbours have
+    the waves in common, particles far apart do not, nor do other scenes; no share is bitwise the noise without."""
+    still = np.random.default_rng(3).uniform(0.1, 0.9, (1, 4_000, 3)).astype(np.float32)
+    scene = replace(episode(4_000), position_TN3=np.repeat(still, 12, 0))
+    cell_size = 0.035
 
-    def last_velocity(shared: float) -> torch.Tensor:
-        noise_WN3 = perturbed_window(batch, STD, shared).double() - batch.window_WN3.double()
+    def last_velocity(smooth: float, seed: int) -> torch.Tensor:
+        batch = batch_of(scene, scene, seeds=(seed, seed + 1))
+        noise_WN3 = perturbed_window(batch, STD, smooth, cell_size).double() - batch.window_WN3.double()
         return noise_WN3[-2] - noise_WN3[-3]
 
-    common_N3 = last_velocity(1.0)
-    assert common_N3[:20_000].std(0).max() < 1e-6 * STD + 2e-7
-    assert (common_N3[0] - common_N3[-1]).abs().min() > 1e-3 * STD
-    mixed_N3 = last_velocity(0.36)[:20_000]
-    assert abs(float((mixed_N3 - mixed_N3.mean(0)).std()) / (0.8 * STD) - 1) < 0.02
-    torch.testing.assert_close(mixed_N3.mean(0), 0.6 * common_N3[:20_000].mean(0), rtol=0, atol=0.03 * STD)
+    noise_SN3 = torch.stack([last_velocity(1.0, seed) for seed in range(0, 400, 2)]).view(400, 4_000, 3)
+    assert abs(float(noise_SN3.square().mean().sqrt()) / STD - 1) < 0.05
+    distance_NN = np.linalg.norm(still[0, :200, None] - still[0, None], axis=-1)
+    correlation_NN = torch.einsum("snx,smx->nm", noise_SN3[:, :200], noise_SN3) / (3 * 400 * STD**2)
+    near, far = torch.from_numpy((distance_NN > 0) & (distance_NN < 0.02)), torch.from_numpy(distance_NN > 0.8)
+    assert float(correlation_NN[near].mean()) > 0.9 and abs(float(correlation_NN[far].mean())) < 0.3
+    mixed_N3 = last_velocity(0.36, 8)
+    own_N3 = mixed_N3 - 0.6 * last_velocity(1.0, 8)
+    assert abs(float(own_N3.std()) / (0.8 * STD) - 1) < 0.02
+    batch = batch_of(scene, episode(300, seed=1))
     assert torch.equal(perturbed_window(batch, STD, 0.0), perturbed_window(batch, STD))
 
 

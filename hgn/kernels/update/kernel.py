@@ -17,12 +17,46 @@ SAMPLE_COLUMNS = tl.constexpr(10)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
-SHARED_OFFSET = tl.constexpr(0x7FFFF000)  # of the noise that a scene's particles share
+WAVES_OFFSET = tl.constexpr(0x7FFFF000)  # of the smooth noise
 REPEAT = tl.constexpr(8)  # another rank must repeat the update
 AGAIN = tl.constexpr(11)  # overflow, out of the window, or REPEAT: the same update again, with more room
 BETA_1 = tl.constexpr(0.9)  # torch.optim.Adam's defaults
 BETA_2 = tl.constexpr(0.999)
 EPSILON = tl.constexpr(1e-8)
+
+
+@triton.jit
+def draw_waves(
+    samples,
+    update,
+    waves,
+    amplitude_step,
+    largest_number,
+    log_range,
+    scenes,
+    HISTORY: tl.constexpr,
+    WAVES: tl.constexpr,
+):
+    """The plane waves of a scene's smooth velocity noise, from its sample's seed; a program a scene.
+
+    waves [S, WAVES, 4 + 3 HISTORY]: wave vector (direction uniform, length log-uniform), phase, and what the amplitude
+    gains with each velocity, the oldest first.
+    """
+    scene = tl.program_id(0)
+    seed = tl.load(samples + (tl.load(update).to(tl.int64) * scenes + scene) * SAMPLE_COLUMNS + 3)
+    index = tl.arange(0, WAVES)
+    columns: tl.constexpr = 4 + 3 * HISTORY
+    line = waves + (scene * WAVES + index) * columns
+    draw = WAVES_OFFSET + index
+    x, y, z = tl.randn(seed, draw), tl.randn(seed, draw + WAVES), tl.randn(seed, draw + 2 * WAVES)
+    number = largest_number * tl.exp(-log_range * tl.rand(seed, draw + 3 * WAVES))
+    number /= tl.sqrt(x * x + y * y + z * z)
+    tl.store(line, number * x)
+    tl.store(line + 1, number * y)
+    tl.store(line + 2, number * z)
+    tl.store(line + 3, 6.283185307179586 * tl.rand(seed, draw + 4 * WAVES))
+    for k in tl.static_range(3 * HISTORY):
+        tl.store(line + 4 + k, amplitude_step * tl.randn(seed, draw + (5 + k) * WAVES))
 
 
 @triton.jit
@@ -43,17 +77,17 @@ def assemble_batch(
     mean,
     std,
     noise_step,
-    shared_step,
+    waves,
     jitter,
     scenes,
     obstacle_cell_size,
     HISTORY: tl.constexpr,
     SYMMETRY: tl.constexpr,
-    SHARED: tl.constexpr,
+    WAVES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
-    with SHARED a part of it is the same for all particles of a scene.
+    with WAVES a part of it comes from the waves of the particle's scene, see draw_waves.
 
     The target is v_true^{n+1} - v_noisy^n, normalised. Grid origins are uniform in [-jitter, 0]. Noise and jitter are
     Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY the window is the image of the
@@ -98,6 +132,14 @@ def assemble_batch(
     frame = particles * 3
     if SYMMETRY:
         symmetry = tl.load(line + SAMPLE_COLUMNS - 1, mask=live, other=0)
+    if WAVES > 0:
+        columns: tl.constexpr = 4 + 3 * HISTORY
+        wave = waves + (scene_row[:, None] * WAVES + tl.arange(0, WAVES)[None, :]) * columns
+        height = tl.load(wave + 3)
+        for axis in tl.static_range(3):
+            place = tl.load(first + HISTORY * frame + axis, mask=live, other=0.0)
+            height += tl.load(wave + axis) * place[:, None]
+        height = tl.cos(height)
     for axis in tl.static_range(3):
         column = first + axis
         if SYMMETRY:
@@ -110,8 +152,8 @@ def assemble_batch(
         v = walk
         for k in tl.static_range(HISTORY):
             walk += noise_step * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
-            if SHARED:
-                walk += shared_step * tl.randn(seed_row, (own * 0 + SHARED_OFFSET + k * 3 + axis).to(tl.int32))
+            if WAVES > 0:
+                walk += tl.sum(height * tl.load(wave + 4 + k * 3 + axis), 1)
             moved += walk
             now = tl.load(column + (k + 1) * frame, mask=live, other=0.0)
             step = now - before

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 import triton
 
+from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES
 from hgn.kernels.backward import TrainingEngine
 from hgn.kernels.engine import OUT, feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
@@ -58,7 +59,7 @@ class UpdateSettings:
     grid_jitter: bool
     obstacle_cell_size: float
     symmetry: bool = False
-    noise_shared: float = 0.0
+    noise_smooth: float = 0.0
 
 
 class Updates:
@@ -96,6 +97,8 @@ class Updates:
         self.loss, self.norm = torch.zeros(1, device=device), torch.zeros(1, device=device)
         scenes, normaliser = settings.scenes, network.normaliser
         self.origin_S3, self.domain_S3 = torch.zeros(scenes, 3, device=device), torch.ones(scenes, 3, device=device)
+        columns = 4 + 3 * self.config.velocity_history  # a wave's number and phase, its amplitude in each velocity
+        self.waves_SKC = torch.zeros(scenes, SMOOTH_WAVES, columns, device=device)
         sees = self.config.obstacle_features
         self.obstacles = ObstacleTable([None] * scenes, settings.obstacle_cell_size, device) if sees else None
         none_S5 = torch.zeros(scenes, OBSTACLE_COLUMNS, dtype=torch.int64, device=device)
@@ -259,6 +262,19 @@ class Updates:
 
     def _assemble(self) -> None:
         settings, config = self.settings, self.config
+        if settings.noise_smooth > 0:
+            shortest, longest = (cells * config.cell_size for cells in SMOOTH_CELLS)
+            kernel.draw_waves[(settings.scenes,)](
+                self._samples,
+                self.update,
+                self.waves_SKC,
+                settings.noise_std * math.sqrt(2 / SMOOTH_WAVES * settings.noise_smooth / config.velocity_history),
+                2 * math.pi / shortest,
+                math.log(longest / shortest),
+                settings.scenes,
+                HISTORY=config.velocity_history,
+                WAVES=SMOOTH_WAVES,
+            )
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
             self._samples,
             self._domains,
@@ -275,14 +291,14 @@ class Updates:
             self.particle_count,
             self.mean,
             self.std,
-            settings.noise_std * math.sqrt((1 - settings.noise_shared) / config.velocity_history),
-            settings.noise_std * math.sqrt(settings.noise_shared / config.velocity_history),
+            settings.noise_std * math.sqrt((1 - settings.noise_smooth) / config.velocity_history),
+            self.waves_SKC,
             config.cell_size if settings.grid_jitter else 0.0,
             settings.scenes,
             settings.obstacle_cell_size,
             HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry,
-            SHARED=settings.noise_shared > 0,
+            WAVES=SMOOTH_WAVES if settings.noise_smooth > 0 else 0,
             BLOCK=BLOCK,
         )
 
