@@ -97,9 +97,7 @@ class TrainingModule(LightningModule):
         config = self.training_config
         if config.symmetry != "none":
             batch = under_symmetries(batch, drawn_symmetries(batch))
-        window_WN3 = perturbed_window(
-            batch, config.noise_std, config.noise_smooth, self.network.config.cell_size
-        )
+        window_WN3 = perturbed_window(batch, config.noise_std, config.noise_smooth, self.network.config.cell_size)
         origin_S3 = jittered_origin(batch, self.network.config.cell_size) if config.grid_jitter else None
         target_N3 = self.network.normaliser.normalise_acceleration(batch.acceleration(window_WN3))
         predicted_N3 = self.network.normalised_acceleration(batch.state(window_WN3), origin_S3)

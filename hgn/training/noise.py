@@ -15,6 +15,7 @@ from hgn.data.batch import Batch
 # Of other streams than the particles' own noise: the same seed would tie them to the first particles' noise.
 JITTER_STREAM, SMOOTH_STREAM = 0x5DEECE66D, 0x2545F4914F
 
+
 def random_walk(shape_MN3: tuple[int, int, int], std_last: float, generator: torch.Generator) -> torch.Tensor:
     """Velocity noise [m, N, 3], oldest first: a random walk whose last step has standard deviation `std_last`."""
     steps_MN3 = torch.randn(shape_MN3, generator=generator, device=generator.device)
