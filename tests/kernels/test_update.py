@@ -151,7 +151,7 @@ def test_noise_and_jitter() -> None:
 
 
 def test_smooth_noise() -> None:
-    """With noise_smooth=1 the noise of a scene is the sum of its waves, as in the plain path, of the asked spread; other
+    """With noise_smooth=1 a scene gets the sum of its waves for noise, as in the plain path, of the asked spread; other
     scenes have other waves; half of the variance leaves the other half to each particle."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.01)
     made, _ = episode(1, 400, False, spread=0.3)
