@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import yaml
@@ -39,8 +39,11 @@ from hgn.training.checkpoint import (
     read_checkpoint,
 )
 from hgn.training.generator import Generator
-from hgn.training.launch import default_run, first_rank, layout
+from hgn.training.launch import default_run, first_on_machine, first_rank, layout
 from hgn.training.stop import StopRequest
+
+if TYPE_CHECKING:
+    from hgn.training.ahead import AheadCompilation
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -64,12 +67,13 @@ def main(mapping: dict[str, Any]) -> int:
         if first_rank() and config.training.generate and not is_remote(config.dataset.folder) and not _complete(config):
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)
+        ahead = _compile_ahead(config, stack)
         store = _wait_for_episodes(config, generator, stop)
         if store is None:
             print("stopped before the first episode was published; the same command goes on", file=sys.stderr)
             return stop.exit_code
         stop.restart_clock(config.training.maximum_minutes)
-        return _fit(config, run, store, checkpoint, begin_with, stop, generator)
+        return _fit(config, run, store, checkpoint, begin_with, stop, generator, ahead)
 
 
 def _fit(
@@ -80,6 +84,7 @@ def _fit(
     begin_with: ParticleNetwork | None,
     stop: StopRequest,
     generator: Generator | None,
+    ahead: AheadCompilation | None,
 ) -> int:
     # Lightning loads for seconds: not before the waiting is over, and never for the other commands.
     from lightning.pytorch import Trainer, seed_everything
@@ -132,6 +137,8 @@ def _fit(
         use_distributed_sampler=False,
         log_every_n_steps=training.maximum_updates,
     )
+    if ahead is not None:
+        print(ahead.wait(lambda: stop.requested), file=sys.stderr)
     trainer.fit(module, feed, ckpt_path=checkpoint[0] if checkpoint else None, weights_only=True)
     if trainer.is_global_zero:
         _report(config, run, trainer.global_step, monitor.last, stop)
@@ -145,6 +152,22 @@ def _path(config: TrainConfig) -> tuple[str, str]:
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
     return path_on(device, config.network, training.path, training.precision, "training.path")
+
+
+def _compile_ahead(config: TrainConfig, stack: ExitStack) -> AheadCompilation | None:
+    """Lets the kernels be compiled while others wait for data, where this process leads its machine's on GPUs."""
+    training = config.training
+    path, _ = _path(config)
+    on_gpu = training.accelerator != "cpu" and torch.cuda.is_available() and torch.version.hip is None
+    if path != "fast" or not on_gpu or not first_on_machine():
+        return None
+    # Triton, which the plain path does without, is loaded here.
+    from hgn.training.ahead import AheadCompilation, job_of_training
+
+    devices, nodes = layout(training)
+    ahead = AheadCompilation(job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1))
+    stack.callback(ahead.stop)
+    return ahead
 
 
 def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Cursor]:

@@ -43,14 +43,7 @@ class FastTraining:
         self.network, self.optimizer = network, optimizer
         self.device = next(network.parameters()).device
         self.symmetric = training.symmetry != "none"
-        settings = UpdateSettings(
-            training.batch_scenes,
-            training.noise_std,
-            training.grid_jitter,
-            obstacle_cell_size,
-            self.symmetric,
-            training.noise_smooth,
-        )
+        settings = UpdateSettings.of(training, obstacle_cell_size)
         precision = kernel_precision(training.precision, self.device)
         self._take_over()
         self.updates = Updates(network, settings, precision, loss_sum, counters, reduce, ranks)

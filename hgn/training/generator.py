@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import signal
@@ -16,8 +15,8 @@ import yaml
 
 from hgn.config import DatagenConfig
 from hgn.schema import ConfigError, to_mapping
+from hgn.training.parent import die_with_parent
 
-PR_SET_PDEATHSIG = 1
 STOP_PATIENCE_S = 60.0
 
 
@@ -50,7 +49,7 @@ class Generator:
             ]
             # Its own process group: Ctrl-C reaches the trainer, which then ends the generator in order.
             self._process = subprocess.Popen(
-                command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, preexec_fn=_die_with_parent, process_group=0
+                command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, preexec_fn=die_with_parent, process_group=0
             )
 
     @property
@@ -102,9 +101,3 @@ class Generator:
             log.seek(0, os.SEEK_END)
             log.seek(max(log.tell() - 8192, 0))
             return log.read().decode("utf-8", "replace").splitlines()
-
-
-def _die_with_parent() -> None:
-    """Runs in the child: Linux sends it SIGINT when the trainer is gone, however that ended."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGINT)

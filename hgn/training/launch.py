@@ -27,6 +27,13 @@ def first_rank() -> bool:
     return all(os.environ.get(name, "0") == "0" for name in ("SLURM_PROCID", "NODE_RANK", "LOCAL_RANK"))
 
 
+def first_on_machine() -> bool:
+    """Whether this process leads those of its machine."""
+    if "RANK" in os.environ:
+        return os.environ.get("LOCAL_RANK", "0") == "0"
+    return all(os.environ.get(name, "0") == "0" for name in ("SLURM_LOCALID", "LOCAL_RANK"))
+
+
 def default_run(name: str) -> Path:
     """The run's folder where the configuration names none; the same in all processes and after every restart.
 

@@ -27,7 +27,7 @@ from hgn.kernels.blocks import (
 )
 
 
-@triton.jit
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def edge_forward(
     send,
     receive,
@@ -122,7 +122,7 @@ def edge_forward(
         tile += tl.num_programs(0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def cell_forward(
     cell,
     total,
@@ -180,7 +180,7 @@ def cell_forward(
         tl.store(next_1 + at, y, mask=here)
 
 
-@triton.jit
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def cell_backward(
     gradient,
     later_hidden_gradient,
@@ -246,7 +246,7 @@ def cell_backward(
     tl.store(gradient + at, df, mask=here)
 
 
-@triton.jit
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def edge_backward(
     sum_gradient,
     edge_gradient,

@@ -33,7 +33,7 @@ def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
     return result
 
 
-@triton.jit
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def rows_forward(
     x,
     count_ptr,
@@ -104,7 +104,7 @@ def rows_forward(
         tl.store(next_1 + at, product(z, transposed(weights + next_at_1, WIDTH, WIDTH), PRECISION), mask=live)
 
 
-@triton.jit
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def rows_backward(
     gradient,
     gradient_index,
@@ -193,7 +193,7 @@ def rows_backward(
         tl.store(x_gradient + at, dx, mask=live)
 
 
-@triton.jit
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def gather_project(
     x,
     table,
@@ -230,7 +230,7 @@ def gather_project(
         tl.store(next_1 + at, product(tile, transposed(weights + at_1, WIDTH, WIDTH), PRECISION), mask=live)
 
 
-@triton.jit
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def gather_project_backward(
     x,
     table,

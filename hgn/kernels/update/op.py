@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import triton
 
-from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES
+from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES, TrainingConfig
 from hgn.kernels.backward import TrainingEngine
 from hgn.kernels.engine import OUT, feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
@@ -60,6 +60,17 @@ class UpdateSettings:
     obstacle_cell_size: float
     symmetry: bool = False
     noise_smooth: float = 0.0
+
+    @staticmethod
+    def of(training: TrainingConfig, obstacle_cell_size: float) -> UpdateSettings:
+        return UpdateSettings(
+            training.batch_scenes,
+            training.noise_std,
+            training.grid_jitter,
+            obstacle_cell_size,
+            training.symmetry != "none",
+            training.noise_smooth,
+        )
 
 
 class Updates:
@@ -176,12 +187,7 @@ class Updates:
                 first += count
             most = max(most, first)
         if len(chunk) > len(self._rates):
-            self._graphs = []  # they read the old tables
-            length = len(chunk)
-            self._samples = torch.zeros(table.shape, dtype=torch.int64, device=self.device)
-            self._domains = torch.zeros(domain.shape, device=self.device)
-            self._rates = torch.zeros(length, device=self.device)
-            self._shares = torch.zeros(length, device=self.device)
+            self._allocate_tables(len(chunk))
         self._samples[: len(chunk)].copy_(torch.from_numpy(table))
         self._domains[: len(chunk)].copy_(torch.from_numpy(domain))
         self._rates[: len(chunk)].copy_(torch.tensor(rates, dtype=torch.float64))
@@ -189,6 +195,14 @@ class Updates:
         largest = torch.from_numpy(domain.reshape(-1, 3)).amax(0)
         self._reach = (self._reach[0], torch.maximum(self._reach[1], largest))
         return most
+
+    def _allocate_tables(self, length: int) -> None:
+        self._graphs = []  # they read the old tables
+        shape = (length, self.settings.scenes)
+        self._samples = torch.zeros(*shape, SAMPLE_COLUMNS, dtype=torch.int64, device=self.device)
+        self._domains = torch.zeros(*shape, 3, device=self.device)
+        self._rates = torch.zeros(length, device=self.device)
+        self._shares = torch.zeros(length, device=self.device)
 
     def _replay(self) -> None:
         if self.device.type == "cuda" and not self._graphs:
@@ -201,6 +215,12 @@ class Updates:
         self._graphs[1].replay() if self._graphs else self.launches_after_reduction()
 
     # launches
+
+    def allocate(self, particles: int, cells: Sequence[int]) -> None:
+        """Buffers for about so many particles and cells of each level, without samples: for hgn.kernels.ahead."""
+        self._allocate_tables(1)
+        self.particles, self.capacities = 16 * math.ceil(particles / 16), _rounded(cells)
+        self._build()
 
     def launches(self) -> None:
         """All launches of one update."""

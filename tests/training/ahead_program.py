@@ -1,0 +1,29 @@
+"""Lists the launches of a small update twice, and compiles one kernel, under a driver that needs no GPU."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import triton
+
+from hgn.config import NetworkConfig
+from hgn.kernels.ahead import AheadJob, compile_share, launches_of, use_target
+from hgn.kernels.update.op import UpdateSettings
+
+
+class NoGpu:
+    """What of a driver compiling asks for."""
+
+    @staticmethod
+    def launcher_cls(source: Any, metadata: Any) -> None: ...
+
+
+triton.runtime.driver.set_active(NoGpu())
+use_target(90)
+settings = UpdateSettings(2, 1e-3, True, 1 / 64)
+network = NetworkConfig(width=16, levels=2, message_passing_steps=2)
+job = AheadJob(network, settings, "half", True, True, 300, (200, 60), 90)
+expected = set(launches_of(job, "cpu"))
+assert set(launches_of(job)) == expected and len(expected) > 30, len(expected)
+last = len(expected) - 1
+assert compile_share(job, last, len(expected)) == 1

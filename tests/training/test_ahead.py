@@ -1,0 +1,78 @@
+"""Kernels compiled ahead: processes that compile, what the user hears of them, and that the cache then has it all."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
+from hgn.kernels.ahead import AheadJob, job_of, job_text
+from hgn.training.ahead import AheadCompilation, job_of_training
+
+CHECKOUT = Path(__file__).parents[2]
+
+
+def job(batch_scenes: int = 8) -> AheadJob:
+    training = TrainingConfig(batch_scenes=batch_scenes, precision="half")
+    config = TrainConfig(SceneConfig(), network=NetworkConfig(width=16, levels=2), training=training)
+    return job_of_training(config, (9, 0), False)
+
+
+@pytest.fixture
+def started() -> Iterator[list[AheadCompilation]]:
+    all_started: list[AheadCompilation] = []
+    yield all_started
+    for ahead in all_started:
+        ahead.stop()
+
+
+def start(started: list[AheadCompilation], program: str) -> AheadCompilation:
+    started.append(AheadCompilation(job(), 2, (sys.executable, "-c", f"import sys; {program}")))
+    return started[0]
+
+
+def test_the_job_follows_from_the_configuration() -> None:
+    """Sizes are those of the scenes' distribution as it begins, to a few per cent, and the job survives its text."""
+    made = job()
+    assert made.precision == "half" and made.capability == 90 and made.settings.scenes == 8
+    assert made.particles == pytest.approx(8 * 4296, rel=0.05)
+    assert made.cells == pytest.approx((8 * 1419, 8 * 231), rel=0.2)  # of a measured batch
+    assert job_of(job_text(made)) == made
+
+
+def test_what_was_compiled_is_counted(started: list[AheadCompilation]) -> None:
+    """Each process gets its share and the job; the counts of all are told together."""
+    ahead = start(started, "assert 'half' in sys.stdin.read(); print(10 + int(sys.argv[1]) + int(sys.argv[2]))")
+    assert "fast path: 25 kernels ready" in ahead.wait(lambda: False)
+
+
+def test_a_failure_is_told(started: list[AheadCompilation]) -> None:
+    """When a process fails, its exit code and last line are told, and that nothing is lost."""
+    text = start(started, "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)").wait(lambda: False)
+    assert "1 of 2 processes" in text and "exit code 1: no ptxas" in text and "before the first update" in text
+
+
+def test_an_interruption_ends_them(started: list[AheadCompilation]) -> None:
+    """Whoever is interrupted waits no longer, and no process is left."""
+    ahead = start(started, "import time; time.sleep(60)")
+    begin = time.monotonic()
+    assert "interrupted" in ahead.wait(lambda: True)
+    assert time.monotonic() - begin < 30
+    assert all(process.poll() is not None for process in ahead._processes)
+
+
+def test_the_launches_are_those_of_an_update(tmp_path: Path) -> None:
+    """Without memory and without a GPU the same kernels with the same specialisations are found as on tensors that
+    exist, and one of them is compiled into Triton's cache."""
+    program = Path(__file__).with_name("ahead_program.py")
+    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
+    environment |= {"TRITON_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(CHECKOUT)}
+    done = subprocess.run([sys.executable, str(program)], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert list(tmp_path.glob("*/*.cubin"))
