@@ -11,13 +11,23 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from datagen.plan import SceneTask, generation_order
 from datagen.progress import Progress
-from datagen.worker import Backend, LocalWorker, MadeScene, Worker, receive, start_maker, start_solver
+from datagen.worker import (
+    Backend,
+    BuiltGrid,
+    GridTask,
+    LocalWorker,
+    MadeScene,
+    Worker,
+    receive,
+    start_maker,
+    start_solver,
+)
 from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig
 from hgn.schema import ConfigError
@@ -118,7 +128,7 @@ class LocalCrew:
     def start_solver(self, number: int) -> Worker:
         gpus = self._plan.gpus
         gpu = gpus[number % len(gpus)] if self._plan.solvers > 1 and gpus else None
-        return start_solver(self._config, self._backend, self._plan.threads, gpu)
+        return start_solver(self._config, self._backend, self._plan.threads, gpu, self._plan.first_launch)
 
     def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
         return receive([worker for worker in workers if isinstance(worker, LocalWorker)], timeout)
@@ -141,6 +151,7 @@ class Pool:
         self._launch_size = plan.first_launch
         self._deaths_in_a_row = 0
         self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
+        self._grid_deaths: dict[SceneTask, int] = {}
 
     def run(self) -> None:
         """Returns when the share is published.
@@ -150,6 +161,7 @@ class Pool:
         self._order = {item: place for place, item in enumerate(generation_order(self._writer.requested))}
         self._todo: list[SceneTask] = []
         self._ready: list[MadeScene] = []
+        self._gridless: list[MadeScene] = []  # what lacks its obstacle grid, and nobody builds it
         self._makers: list[Worker] = []
         self._solvers: list[Worker] = []
         self._counted, self._next_look, self._said_waiting = self._writer.done, 0.0, False
@@ -209,13 +221,28 @@ class Pool:
             if solver.idle and (batch := self._next_batch(solver)):
                 solver.tasks.update((made.task.key, made) for made in batch)
                 solver.give(batch)
-        ahead = 2 * self._plan.scenes_per_launch * self._plan.solvers
         for maker in self._makers:
-            making = sum(len(other.tasks) for other in self._makers)
-            if maker.idle and self._todo and len(self._ready) + making < ahead:
-                task = self._todo.pop(0)
-                maker.tasks[task.key] = task
+            if maker.idle and (task := self._next_task()):
+                maker.tasks[_task(task).key] = task
                 maker.give(task)
+
+    def _next_task(self) -> SceneTask | GridTask | None:
+        """For a maker: a scene while the next launch lacks some, then what a launch must have at its end."""
+        coming = len(self._ready) + len(self._being_made())
+        short = coming < self._launch_size
+        if self._todo and short:
+            return self._todo.pop(0)
+        ahead = coming < 2 * self._plan.scenes_per_launch * self._plan.solvers
+        simulated = bool(self._gridless) and any(self._gridless[0].task.key in solver.tasks for solver in self._solvers)
+        if self._todo and ahead and not simulated:
+            return self._todo.pop(0)
+        if self._gridless:
+            made = self._gridless.pop(0)
+            return GridTask(made.task, made.scene)
+        return None
+
+    def _being_made(self) -> list[SceneTask]:
+        return [task for maker in self._makers for task in maker.tasks.values() if isinstance(task, SceneTask)]
 
     def _next_batch(self, solver: Worker) -> list[MadeScene]:
         """The next scenes to simulate; empty when it is better to wait for more of them."""
@@ -227,12 +254,12 @@ class Pool:
                 self._ready.remove(made)
                 return [made]
         size = self._launch_size
-        unmade = [*self._todo, *(task for maker in self._makers for task in maker.tasks.values())]
+        unmade = [*self._todo, *self._being_made()]
         if not self._ready or (unmade and len(self._ready) < size):
             return []
         # training waits for the first shards in order, so small launches must not overtake a scene still being made
         growing = size < self._plan.scenes_per_launch
-        if growing and any(self._place(_task(item)) < self._place(self._ready[size - 1].task) for item in unmade):
+        if growing and any(self._place(task) < self._place(self._ready[size - 1].task) for task in unmade):
             return []
         self._launch_size = min(_LAUNCH_GROWTH * size, self._plan.scenes_per_launch)
         batch, self._ready = self._ready[:size], self._ready[size:]
@@ -258,6 +285,12 @@ class Pool:
             (made,) = values
             del worker.tasks[made.task.key]
             self._ready.append(made)
+            if made.obstacle_grid is None:
+                self._gridless.append(made)
+        elif kind == "grid":
+            (built,) = values
+            del worker.tasks[built.task.key]
+            self._grid_built(built)
         elif kind == "staged":
             self._accept(_task(worker.tasks.pop(values[0])))
         elif kind == "failed":
@@ -269,6 +302,24 @@ class Pool:
             raise OSError(*values)
         else:
             raise RuntimeError(f"a worker failed:\n{values[0]}")
+
+    def _grid_built(self, built: BuiltGrid) -> None:
+        """Gives a scene its grid, wherever it is by now: among those to be simulated, or with a solver."""
+        key, grid = built.task.key, built.grid
+        for place, made in enumerate(self._ready):
+            if made.task == built.task:
+                if isinstance(grid, str):
+                    self._quarantine(self._ready.pop(place).task, grid)
+                else:
+                    self._ready[place] = replace(made, obstacle_grid=grid)
+                return
+        for solver in self._solvers:
+            held = solver.tasks.get(key)
+            if isinstance(held, MadeScene) and held.task == built.task:
+                if not isinstance(grid, str):
+                    solver.tasks[key] = replace(held, obstacle_grid=grid)
+                solver.tell(built)
+                return
 
     def _accept(self, task: SceneTask) -> None:
         self._deaths_in_a_row = 0
@@ -302,6 +353,9 @@ class Pool:
             self._makers[self._makers.index(worker)] = self._crew.start_maker()
         for item in lost:
             task = _task(item)
+            if isinstance(item, GridTask):
+                self._grid_lost(item, cause, blamable)
+                continue
             if isinstance(item, MadeScene) and self._writer.is_staged(task.split, task.index):
                 self._accept(task)
                 continue
@@ -315,9 +369,16 @@ class Pool:
             else:
                 self._put_back(task)
 
+    def _grid_lost(self, item: GridTask, cause: str, blamable: bool) -> None:
+        deaths = self._grid_deaths[item.task] = self._grid_deaths.get(item.task, 0) + blamable
+        if deaths >= self._config.dataset.maximum_attempts:
+            self._grid_built(BuiltGrid(item.task, cause))
+        else:
+            self._gridless.insert(0, MadeScene(item.task, item.scene, None))
+
     def _place(self, task: SceneTask) -> int:
         return self._order[task.split, task.index]
 
 
-def _task(item: SceneTask | MadeScene) -> SceneTask:
-    return item.task if isinstance(item, MadeScene) else item
+def _task(item: SceneTask | MadeScene | GridTask) -> SceneTask:
+    return item if isinstance(item, SceneTask) else item.task

@@ -19,7 +19,7 @@ from typing import Any
 
 from datagen.plan import SceneTask
 from datagen.pool import MAXIMUM_MAKERS, WorkerPlan, gpu_first_launch, gpu_scenes_per_launch
-from datagen.shard import pack_episode, stage_bytes
+from datagen.shard import pack_episode, stage_parts
 from datagen.worker import Backend, MadeScene, Worker, error_message, failure_of, make_episode, make_scene
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
@@ -105,7 +105,7 @@ class RayCrew:
                 (worker.node,) = values
             elif kind == "packed":
                 key, packed = values
-                stage_bytes(Path(self._config.dataset.folder), key, packed)
+                stage_parts(Path(self._config.dataset.folder), key, [packed])
                 yield worker, ("staged", key)
             else:
                 yield worker, (kind, *values)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import os
 import tarfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -18,11 +17,12 @@ from hgn.data.manifest import EpisodeEntry, ShardEntry
 from hgn.data.reader import read_episode
 from hgn.data.statistics import episode_statistics, merge_statistics
 from hgn.data.storage import file_sha256
-from hgn.files import sync_folder, temporary_file
+from hgn.files import temporary_file
 from hgn.scene.episode import Episode, encode_episode
 from hgn.schema import ConfigError
 
 STAGING_NAME = ".staging"
+_COPY_BYTES = 1 << 22
 
 
 def staged_path(folder: Path, split: str, index: int) -> Path:
@@ -31,42 +31,65 @@ def staged_path(folder: Path, split: str, index: int) -> Path:
 
 
 def stage_episode(folder: Path, episode: Episode) -> None:
-    """Writes `<folder>/.staging/<key>.tar` whole or not at all. Safe to call from worker processes.
+    """Writes `<folder>/.staging/<key>.tar`. Safe to call from worker processes.
 
     `episode.solver["dataset"]` holds `config_hash` and `attempt`, by which a later run knows the episode.
     Raises: OSError (a full disk), ConfigError (positions that are not finite).
     """
-    stage_bytes(folder, episode.key, pack_episode(episode))
+    stage_parts(folder, episode.key, _tar_of(episode))
 
 
 def pack_episode(episode: Episode) -> bytes:
     """The tar file of one episode. Raises: ConfigError (positions that are not finite)."""
-    buffer = io.BytesIO()
-    members = encode_episode(episode)
-    write_tar(buffer, ((f"{episode.key}.{name}", len(data), io.BytesIO(data)) for name, data in members.items()))
-    return buffer.getvalue()
+    return b"".join(_tar_of(episode))
 
 
-def stage_bytes(folder: Path, key: str, packed: bytes) -> None:
-    """Writes what `pack_episode` made, whole or not at all. Raises: OSError (a full disk)."""
+def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
+    """Writes the parts of an episode's tar file, whole or not at all, if the machine does not lose its power: what
+    waits here is read back before it is used, and soon stands in a shard, so it need not reach the disk.
+
+    Raises: OSError (a full disk).
+    """
     target = folder / STAGING_NAME / f"{key}.tar"
     with temporary_file(target) as temporary:
-        with temporary.open("wb") as file:
-            file.write(packed)
-            sync_file(file)
+        with temporary.open("wb", buffering=0) as file:
+            for part in parts:
+                rest = memoryview(part)
+                while rest:  # a write takes 2 GB at most
+                    rest = rest[file.write(rest) :]
         temporary.replace(target)
-    sync_folder(target.parent)
 
 
-def write_tar(file: BinaryIO, members: Iterable[tuple[str, int, Any]]) -> None:
-    """Writes members (name, bytes, stream) as a tar. The same members give the same bytes: no times, no owners, a
-    fixed mode.
-    """
-    with tarfile.open(fileobj=file, mode="w", format=tarfile.GNU_FORMAT) as tar:
-        for name, size, stream in members:
-            info = tarfile.TarInfo(name)
-            info.size, info.mtime, info.mode = size, 0, 0o644
-            tar.addfile(info, stream)
+def _tar_of(episode: Episode) -> Iterator[bytes]:
+    """The parts of its tar: the same episode gives the same bytes, for there are no times, no owners, a fixed mode."""
+    written = 0
+    for name, data in encode_episode(episode).items():
+        info = tarfile.TarInfo(f"{episode.key}.{name}")
+        info.size, info.mtime, info.mode = len(data), 0, 0o644
+        header, rest = info.tobuf(tarfile.GNU_FORMAT), bytes(-len(data) % tarfile.BLOCKSIZE)
+        written += len(header) + len(data) + len(rest)
+        yield from (header, data, rest)
+    yield _tar_end(written)
+
+
+def _tar_end(written: int) -> bytes:
+    """What follows the last member: two empty blocks, and as many as fill a record."""
+    end = 2 * tarfile.BLOCKSIZE
+    return bytes(end + -(written + end) % tarfile.RECORDSIZE)
+
+
+def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
+    """Writes the members of several tars as one."""
+    written = 0
+    for source in sources:
+        members = (place for named in locate_members(source).values() for place in named.values())
+        length = max((offset + size for offset, size in members), default=0)
+        length += -length % tarfile.BLOCKSIZE
+        with source.open("rb", buffering=0) as staged:
+            for start in range(0, length, _COPY_BYTES):
+                file.write(staged.read(min(_COPY_BYTES, length - start)))
+        written += length
+    file.write(_tar_end(written))
 
 
 def sync_file(file: BinaryIO) -> None:

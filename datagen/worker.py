@@ -17,12 +17,14 @@ import threading
 import time
 import traceback
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -37,7 +39,7 @@ from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
 _FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
-_STAGING_THREADS = 4
+_STAGING_THREADS = 8
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -51,6 +53,7 @@ class Backend:
     build_obstacle_grid: str = "hgn.scene.obstacle_grid:build_obstacle_grid"
     build_collider: str = "datagen.mpm.collider:build_collider"
     simulate: str = "datagen.mpm.solver:simulate"
+    warm_up: str = "datagen.mpm.solver:warm_up"
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,24 @@ class MadeScene:
 
     task: SceneTask
     scene: Scene
-    obstacle_grid: ObstacleGrid
+    obstacle_grid: ObstacleGrid | None  # none: it follows, for the solver does not need it
     collider: Any = None  # what the solver makes of the obstacles
+
+
+@dataclass(frozen=True)
+class GridTask:
+    """The obstacle grid of a made scene, to be built."""
+
+    task: SceneTask
+    scene: Scene
+
+
+@dataclass(frozen=True)
+class BuiltGrid:
+    """What became of it: the grid, or why there is none."""
+
+    task: SceneTask
+    grid: ObstacleGrid | str
 
 
 class Worker(ABC):
@@ -68,11 +87,15 @@ class Worker(ABC):
 
     def __init__(self) -> None:
         self.idle = False
-        self.tasks: dict[str, SceneTask | MadeScene] = {}  # what it has and has not answered for, by key
+        self.tasks: dict[str, SceneTask | MadeScene | GridTask] = {}  # what it has and has not answered for, by key
 
     @abstractmethod
     def give(self, message: object) -> None:
         """Sends work. A worker that has died meanwhile is noticed at the next receive."""
+
+    def tell(self, message: object) -> None:
+        """Sends what belongs to work that it has. Only workers that leave something to be sent later are told."""
+        raise NotImplementedError
 
     @abstractmethod
     def kill(self) -> None:
@@ -102,6 +125,9 @@ class LocalWorker(Worker):
 
     def give(self, message: object) -> None:
         self.idle = False
+        self.tell(message)
+
+    def tell(self, message: object) -> None:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send(message)
 
@@ -120,13 +146,18 @@ class LocalWorker(Worker):
 
 
 def start_maker(config: DatagenConfig, backend: Backend) -> LocalWorker:
-    """A process that answers each SceneTask with a MadeScene, or a cause."""
+    """A process that answers each SceneTask with a MadeScene, or a cause, and each GridTask with a BuiltGrid."""
     return LocalWorker(_make_scenes, config, backend)
 
 
-def start_solver(config: DatagenConfig, backend: Backend, threads: int | None, gpu: str | None) -> LocalWorker:
-    """A process that simulates lists of MadeScene. `gpu` is the one CUDA device that it may see; none: as given."""
-    return LocalWorker(_solve, config, backend, threads, gpu)
+def start_solver(
+    config: DatagenConfig, backend: Backend, threads: int | None, gpu: str | None, first_launch: int
+) -> LocalWorker:
+    """A process that simulates lists of MadeScene, and takes the BuiltGrid of those that lack one at any time.
+
+    `gpu` is the one CUDA device that it may see; none: as given. The first list has `first_launch` scenes.
+    """
+    return LocalWorker(_solve, config, backend, threads, gpu, first_launch)
 
 
 def receive(workers: Iterable[LocalWorker], timeout: float) -> Iterator[tuple[LocalWorker, tuple[Any, ...] | None]]:
@@ -182,23 +213,79 @@ def _errors_sent(send: _Sender) -> Iterator[None]:
 
 def _make_scenes(connection: Connection, send: _Sender, config: DatagenConfig, backend: Backend) -> None:
     for task in _received(connection):
-        send(*make_scene(task, config, backend))
+        if isinstance(task, GridTask):
+            send("grid", _build_grid(task, backend))
+        else:
+            send(*make_scene(task, config, backend, with_grid=False))
         send("idle")
 
 
-def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend) -> tuple[Any, ...]:
+def make_scene(task: SceneTask, config: DatagenConfig, backend: Backend, with_grid: bool = True) -> tuple[Any, ...]:
     """What a maker answers: ("made", MadeScene), or ("failed", key, cause)."""
     generate_scene = pkgutil.resolve_name(backend.generate_scene)
-    build_obstacle_grid = pkgutil.resolve_name(backend.build_obstacle_grid)
     build_collider = pkgutil.resolve_name(backend.build_collider)
     try:
         scene = generate_scene(config.scene, task.seed)
-        grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size)
         # here rather than in the solver, which would do it for one scene after another while its device waits
         collider = build_collider(scene, config.mpm.collider_band_cells)
     except ConfigError as error:  # no room for the obstacles, say: another seed may do
         return "failed", task.key, str(error)
-    return "made", MadeScene(task, scene, grid, collider)
+    made = MadeScene(task, scene, None, collider)
+    if with_grid:
+        grid = _build_grid(GridTask(task, scene), backend).grid
+        if isinstance(grid, str):
+            return "failed", task.key, grid
+        made = replace(made, obstacle_grid=grid)
+    return "made", made
+
+
+def _build_grid(task: GridTask, backend: Backend) -> BuiltGrid:
+    build_obstacle_grid = pkgutil.resolve_name(backend.build_obstacle_grid)
+    scene = task.scene
+    try:
+        grid = build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size)
+    except ConfigError as error:
+        return BuiltGrid(task.task, str(error))
+    return BuiltGrid(task.task, grid)
+
+
+class _Inbox:
+    """What the pool sends to a solver, read while it simulates: lists of scenes, and grids."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._batches: SimpleQueue[list[MadeScene] | None] = SimpleQueue()
+        self._grids: defaultdict[SceneTask, Future[ObstacleGrid | str]] = defaultdict(Future)
+        self._lock = threading.Lock()
+        threading.Thread(target=self._read, args=(connection,), name="inbox", daemon=True).start()
+
+    def batches(self) -> Iterator[list[MadeScene]]:
+        """Until the pool has gone."""
+        while (batch := self._batches.get()) is not None:
+            yield batch
+
+    def grid(self, made: MadeScene) -> ObstacleGrid | str:
+        """The grid of a scene, or why there is none; waits for it."""
+        if made.obstacle_grid is not None:
+            return made.obstacle_grid
+        grid = self._coming(made.task).result()
+        with self._lock:
+            self._grids.pop(made.task, None)
+        return grid
+
+    def _coming(self, task: SceneTask) -> Future[ObstacleGrid | str]:
+        with self._lock:
+            return self._grids[task]
+
+    def _read(self, connection: Connection) -> None:
+        for message in _received(connection):
+            if isinstance(message, BuiltGrid):
+                self._coming(message.task).set_result(message.grid)
+            else:
+                self._batches.put(message)
+        self._batches.put(None)
+        with self._lock:
+            for grid in self._grids.values():
+                grid.cancel()
 
 
 def _solve(
@@ -208,16 +295,23 @@ def _solve(
     backend: Backend,
     threads: int | None,
     gpu: str | None,
+    first_launch: int,
 ) -> None:
     if gpu is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpu
     simulate = pkgutil.resolve_name(backend.simulate)
     dataset = config.dataset
     config_hash = identity_hash(dataset_identity(config))
+    inbox = _Inbox(connection)
+    on_gpu = threads is None
+    if on_gpu:  # it compiles while the first scenes are made
+        pkgutil.resolve_name(backend.warm_up)(config.scene, config.mpm, first_launch)
     # one batch is staged while the next is simulated, so that a GPU does not wait for the disk
     with ThreadPoolExecutor(max_workers=_STAGING_THREADS) as stager:
         staging: list[Future[None]] = []
-        for batch in _received(connection):
+        for batch in inbox.batches():
+            if on_gpu:  # the next may come already
+                send("idle")
             results = simulate(
                 [made.scene for made in batch],
                 config.mpm,
@@ -230,19 +324,25 @@ def _solve(
             for future in staging:
                 future.result()
             staging = [
-                stager.submit(_stage, send, config, config_hash, made, result)
+                stager.submit(_stage, send, config, config_hash, inbox, made, result)
                 for made, result in zip(batch, results, strict=True)
             ]
-            send("idle")
+            send("frame", 0, 0)
+            if not on_gpu:
+                send("idle")
 
 
-def _stage(send: _Sender, config: DatagenConfig, config_hash: str, made: MadeScene, result: Any) -> None:
+def _stage(send: _Sender, config: DatagenConfig, config_hash: str, inbox: _Inbox, made: MadeScene, result: Any) -> None:
     with _errors_sent(send):
         cause = failure_of(result)
-        if cause is not None:
-            send("failed", made.task.key, cause)
+        grid = inbox.grid(made) if cause is None else cause
+        if isinstance(grid, str):
+            send("failed", made.task.key, grid)
             return
-        stage_episode(Path(config.dataset.folder), make_episode(made, result, config, config_hash))
+        stage_episode(
+            Path(config.dataset.folder),
+            make_episode(replace(made, obstacle_grid=grid), result, config, config_hash),
+        )
         send("staged", made.task.key)
 
 
@@ -255,7 +355,8 @@ def failure_of(result: Any) -> str | None:
 
 
 def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_hash: str) -> Episode:
-    """The episode of a scene and what the solver returned for it (`position_TN3`, `counters`)."""
+    """The episode of a scene with its grid and what the solver returned for it (`position_TN3`, `counters`)."""
+    assert made.obstacle_grid is not None
     return Episode(
         key=made.task.key,
         position_TN3=np.ascontiguousarray(result.position_TN3, np.float32),

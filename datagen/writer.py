@@ -11,14 +11,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import os
 import shutil
-import tarfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 from datagen.claims import Claims
 from datagen.plan import (
@@ -32,7 +31,7 @@ from datagen.plan import (
     scene_seed,
     work_order,
 )
-from datagen.shard import STAGING_NAME, inspect_shard, staged_path, sync_file, write_tar
+from datagen.shard import STAGING_NAME, inspect_shard, join_tars, staged_path, sync_file
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest, QuarantinedScene, ShardEntry
@@ -41,7 +40,7 @@ from hgn.schema import ConfigError
 
 # seeds tried for one episode before the scene distribution itself is held to be at fault
 MAXIMUM_REPLACEMENTS = 20
-PACKED_AT_ONCE = 4  # shards, where so many are ready
+PACKED_AT_ONCE = max(4, min(12, (os.cpu_count() or 1) - 1))  # shards, where so many are ready; 0.1 GB each
 
 
 _Packed = tuple[ExitStack, Path, ShardEntry]
@@ -70,7 +69,7 @@ class DatasetWriter:
         self._pending = self._share  # what of it is not published
         self._claimed: list[ShardRange] = []  # what of that this writer makes
         self._staged: set[tuple[str, int]] = set()  # and what of these waits in .staging
-        self._packers = ThreadPoolExecutor(PACKED_AT_ONCE - 1, "packer")
+        self._packers = ThreadPoolExecutor(PACKED_AT_ONCE, "packer")
         self._packing: dict[ShardRange, Future[_Packed]] = {}  # of the shards to be published next
         self._stamp: tuple[int, ...] | None = None  # of the manifest file that `manifest` was read from or written to
 
@@ -197,7 +196,8 @@ class DatasetWriter:
         ]
         if not ready:
             return None
-        for shard in ready[1:PACKED_AT_ONCE]:
+        # two rounds, so that no packer waits while this thread lists what is packed
+        for shard in ready[: 2 * PACKED_AT_ONCE] if len(ready) > 1 else []:
             if shard not in self._packing:
                 self._packing[shard] = self._packers.submit(self._pack, shard)
         entry = self._publish(ready[0])
@@ -210,7 +210,7 @@ class DatasetWriter:
         with ExitStack() as stack:
             temporary = stack.enter_context(temporary_file(self.folder / shard.name))
             with temporary.open("wb") as file:
-                write_tar(file, self._staged_members(shard))
+                join_tars(file, (staged_path(self.folder, shard.split, index) for index in shard.indices))
                 sync_file(file)
             entry = inspect_shard(temporary, shard, self.config)
             return stack.pop_all(), temporary, entry
@@ -323,12 +323,6 @@ class DatasetWriter:
 
     def _published_episodes(self) -> set[tuple[str, int]]:
         return {(shard.split, entry.index) for shard in self.manifest.shards for entry in shard.episodes}
-
-    def _staged_members(self, shard: ShardRange) -> Iterable[tuple[str, int, Any]]:
-        for index in shard.indices:
-            with tarfile.open(staged_path(self.folder, shard.split, index), mode="r:") as tar:
-                for info in tar:
-                    yield info.name, info.size, tar.extractfile(info)
 
     def _reload(self) -> None:
         with contextlib.suppress(FileNotFoundError):  # removed by hand: it is written anew with the next shard

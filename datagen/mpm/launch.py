@@ -89,6 +89,8 @@ def material_laws(scenes: Sequence[Scene], config: MpmConfig) -> tuple[np.ndarra
     the config's own.
     Raises: ConfigError for a value that MpmConfig refuses.
     """
+    if not any(scene.material_parameters for scene in scenes):  # to sort a million rows takes seconds
+        return constants(config, config.density_kg_m3)[None], np.zeros(sum(s.particle_count for s in scenes), np.int32)
     own = {name: np.float32(getattr(config, name)) for name in MATERIAL_PARAMETERS}
     columns = [
         np.concatenate(
@@ -189,8 +191,9 @@ class Launch(ABC):
             places, values, vectors = [*places, place], [*values, value], [*vectors, triangle]
         self.contact = ti.ndarray(ti.i32, length)
         self.contact.fill(-1)
-        if places and len(np.concatenate(places)):
-            place_contacts(self.contact, device_array(np.concatenate(places)), device_array(np.concatenate(values)))
+        for place, value in zip(places, values, strict=True):
+            if len(place):
+                place_contacts(self.contact, device_array(place), device_array(value))
         self.contact_normal = device_vectors(np.concatenate(vectors))
 
     @abstractmethod
@@ -255,51 +258,51 @@ class Launch(ABC):
     def _contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places of contact nodes; twice the index of each one's normal, plus 1 where both sides stop; normals."""
         scene_nodes = math.prod(self.blocks) * BLOCK_NODES
-        places, values = [], []
-        first = 0
-        for index, collider in enumerate(self.colliders):
-            place = self._places(collider.node_K3)
-            places.append(index * scene_nodes + place)
-            values.append(2 * np.arange(first, first + len(place)) + (collider.kind_K == BOTH_SIDES))
-            first += len(place)
-        normal = np.concatenate([collider.normal_K3 for collider in self.colliders])
-        return np.concatenate(places).astype(np.int32), np.concatenate(values).astype(np.int32), normal
+        places = [
+            self._places(collider.node_K3) + np.int32(index * scene_nodes)
+            for index, collider in enumerate(self.colliders)
+        ]
+        both_sides = np.concatenate([collider.kind_K for collider in self.colliders]) == BOTH_SIDES
+        values = 2 * np.arange(len(both_sides), dtype=np.int32) + both_sides
+        return np.concatenate(places), values, np.concatenate([collider.normal_K3 for collider in self.colliders])
 
     def _places(self, node_K3: np.ndarray) -> np.ndarray:
-        """Where nodes lie within a scene's arrays of nodes, int64 [K]."""
-        block, local = np.divmod(node_K3.astype(np.int64), BLOCK)
-        place = (block[:, 0] * self.blocks[1] + block[:, 1]) * self.blocks[2] + block[:, 2]
-        return place * BLOCK_NODES + (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
+        """Where nodes lie within a scene's arrays of nodes, int32 [K]."""
+        x, y, z = node_K3.T
+        place = ((x // BLOCK) * np.int32(self.blocks[1]) + y // BLOCK) * np.int32(self.blocks[2]) + z // BLOCK
+        return place * np.int32(BLOCK_NODES) + ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK
 
     def _sweeps(self, first_vector: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         """Entries of the contact array for the swept test (see grid_kernel.substep): places, values; the triangles'
         vectors; the array's length.
         """
         all_nodes = self.all_blocks * BLOCK_NODES
-        places, values, vectors = [], [], []
-        end = 2 * all_nodes
-        for index, collider in enumerate(self.colliders):
-            sweep = collider.sweep
-            count = np.diff(np.append(sweep.begin_K, len(sweep.triangle_L)))
-            head = end + sweep.begin_K + np.arange(len(count))  # each list is headed by its length
-            places.append(all_nodes + index * (all_nodes // len(self.scenes)) + self._places(sweep.cell_K3))
-            values.append(head)
-            places.append(head)
-            values.append(count)
-            places.append(end + np.arange(len(sweep.triangle_L)) + np.repeat(np.arange(len(count)), count) + 1)
-            values.append(first_vector + TRIANGLE_VECTORS * sweep.triangle_L.astype(np.int64))
-            vectors.append(sweep.triangle_F43.reshape(-1, 3))
-            first_vector += TRIANGLE_VECTORS * len(sweep.triangle_F43)
-            end += len(count) + len(sweep.triangle_L)
+        sweeps = [collider.sweep for collider in self.colliders]
+        lists = sum(len(sweep.begin_K) for sweep in sweeps)
+        end = 2 * all_nodes + lists + sum(len(sweep.triangle_L) for sweep in sweeps)
         if end >= 2**31:
             raise ConfigError(
                 f"a batch must hold less than 2^31 nodes, cells and lists of triangles, got {end}; lower "
                 "scenes_per_launch, or turn collider_projection off"
             )
-        return (
-            np.concatenate(places).astype(np.int32), np.concatenate(values).astype(np.int32),
-            np.concatenate(vectors), end,
-        )  # fmt: skip
+        places = np.empty(end - 2 * all_nodes + lists, np.int32)
+        values = np.empty_like(places)
+        filled, end = 0, 2 * all_nodes
+        for index, sweep in enumerate(sweeps):
+            count = np.diff(np.append(sweep.begin_K, len(sweep.triangle_L))).astype(np.int32)
+            order = np.arange(len(count), dtype=np.int32)
+            head = end + sweep.begin_K.astype(np.int32) + order  # each list is headed by its length
+            body = end + 1 + np.arange(len(sweep.triangle_L), dtype=np.int32) + np.repeat(order, count)
+            for place, value in (
+                (self._places(sweep.cell_K3) + np.int32(all_nodes + index * (all_nodes // len(sweeps))), head),
+                (head, count),
+                (body, first_vector + TRIANGLE_VECTORS * sweep.triangle_L),
+            ):
+                places[filled : filled + len(place)], values[filled : filled + len(place)] = place, value
+                filled += len(place)
+            first_vector += TRIANGLE_VECTORS * len(sweep.triangle_F43)
+            end += len(count) + len(sweep.triangle_L)
+        return places, values, np.concatenate([sweep.triangle_F43.reshape(-1, 3) for sweep in sweeps]), end
 
     @abstractmethod
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -16,8 +16,10 @@ from datagen.mpm.device import Device, initialise
 from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.launch import Launch, SceneFailure, Simulated, fixed_substeps, no_counters, particle_bounds
 from datagen.mpm.team_launch import TeamLaunch
-from hgn.config import MpmConfig
+from hgn.config import MpmConfig, SceneConfig
+from hgn.scene.material import material_index
 from hgn.scene.scene import Scene
+from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
 # a scene of more fills a GPU better by itself
@@ -26,7 +28,7 @@ TEAM_THREADS = 256  # two teams fit on a processor then, with 128 registers a th
 TEAM_SCENES = 16  # fewer are done sooner where each has the whole GPU, a launch a substep
 CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
 
-__all__ = ["SceneFailure", "Simulated", "fixed_substeps", "initialise", "particle_bounds", "simulate"]
+__all__ = ["SceneFailure", "Simulated", "fixed_substeps", "initialise", "particle_bounds", "simulate", "warm_up"]
 
 
 def simulate(
@@ -92,6 +94,25 @@ def simulate(
         for frame in range(frames):
             on_frame(frame)
     return results
+
+
+def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
+    """Starts a GPU and compiles what a launch of so many random scenes of `scene` needs; nothing on a CPU."""
+    if initialise(config.device).kind == "cpu":
+        return
+    x, y, z = scene.domain_size
+    middle = (0.5 * x, 0.5 * y, 0.5 * z)
+    obstacles = tuple(
+        shape_obstacle(shape, scene.obstacle_size[0], middle)
+        for shape in scene.obstacle_shapes[: min(scene.obstacle_count, 1)]
+    )
+    one = Scene(
+        np.full((len(scene.materials), 3), 0.25, np.float32) * np.array(scene.domain_size, np.float32),
+        np.zeros((len(scene.materials), 3), np.float32),
+        np.array([material_index(name) for name in scene.materials], np.uint8),
+        obstacles, scene.domain_size, scene.cell_size, scene.gravity,
+    )  # fmt: skip
+    simulate([one] * min(scenes, TEAM_SCENES), config, 2, 60.0)
 
 
 def _team_threads(device: Device, scenes: Sequence[Scene]) -> int:

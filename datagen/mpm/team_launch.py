@@ -40,6 +40,7 @@ class TeamLaunch(Launch):
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
         for array in (self.cell_count, self.block):
             array.fill(0)
+        self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))
         team_kernel.start_team(
             self.state, self.tag, *(
@@ -53,33 +54,35 @@ class TeamLaunch(Launch):
 
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         most = max(1, MAXIMUM_OUTPUT_BYTES // (12 * self.particles))
-        done, size, substeps, expected = 0, 1, np.zeros(len(self.scenes), np.int64), 0.0
-        self._launch(0)  # compiles
+        done, size, substeps, expected = 0, min(1, frames), np.zeros(len(self.scenes), np.int64), 0.0
         work = np.array([scene.particle_count for scene in self.scenes])
-        while done < frames:
-            size = min(size, most, frames - done)
-            begin = time.perf_counter()
-            # long scenes first, so that none is left alone at the end
-            output = self._launch(size, np.argsort(-work, kind="stable"))
+        self._launch(0, work)  # compiles
+        begin, output = time.perf_counter(), self._launch(size, work)
+        while size:
             # Taichi holds the interpreter's lock while it waits for the device: other threads run before that
-            time.sleep(PAUSE * min(expected * size, LAUNCH_SECONDS))
+            pause = PAUSE * min(expected * size, LAUNCH_SECONDS)
+            time.sleep(max(0.0, begin + pause - time.perf_counter()))
             position = output.to_numpy().reshape(size, self.particles, 3)
-            seconds = time.perf_counter() - begin
             total = self.counter.to_numpy()[:, COUNT.substeps]
+            completed = self.live.to_numpy().reshape(-1, LIVE.length)[:, LIVE.frames].astype(np.int64)
             work, substeps = (total - substeps) * np.diff(self.particle_begin), total
             done += size
-            yield position, self.live.to_numpy().reshape(-1, LIVE.length)[:, LIVE.frames].astype(np.int64)
-            expected = seconds / size
-            size = max(1, min(2 * size, int(LAUNCH_SECONDS / expected)))
+            expected = (time.perf_counter() - begin) / size
+            size = min(max(1, min(2 * size, int(LAUNCH_SECONDS / expected))), most, frames - done)
+            del output  # before the device is at work: memory may only come free when it rests
+            # which it does not need to while these frames are taken away
+            begin, output = time.perf_counter(), self._launch(size, work)
+            yield position, completed
 
-    def _launch(self, frames: int, turn: np.ndarray | None = None) -> ti.ScalarNdarray:
-        """Starts that many frames of the scenes, in the order given; the positions once the device is done."""
+    def _launch(self, frames: int, work: np.ndarray) -> ti.ScalarNdarray:
+        """Starts that many frames of the scenes, long ones first so that none is left alone at the end; the positions
+        once the device is done.
+        """
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
-        turn = np.arange(len(self.scenes)) if turn is None else turn
+        self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
         team_kernel.advance(
             frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.cell_count, self.cell_list,
-            self.cell_begin, self.block, self.live, self.node, device_array(turn.astype(np.int32)),
-            self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal,
-            output, self.variant, self.threads,
+            self.cell_begin, self.block, self.live, self.node, self.turn, self.scene_value, self.counter, self.setting,
+            self.law, self.shape, self.contact, self.contact_normal, output, self.variant, self.threads,
         )  # fmt: skip
         return output

@@ -105,7 +105,9 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
             if any(_too_near(obstacle, point, gap, other, clearance) for other in placed):
                 continue
             record = {"shape": shape, "size": size, "position": list(position), "quaternion": list(quaternion)}
-            return _Placed(obstacle, point, gap, cKDTree(point), low + centre, high + centre, record)
+            return _Placed(
+                obstacle, point, gap, cKDTree(point, balanced_tree=False), low + centre, high + centre, record
+            )
     raise _NoRoomError(
         f"obstacle_count must leave room for each obstacle, got no place for number {index + 1} of "
         f"{config.obstacle_count}; lower obstacle_count, obstacle_size or clearance_cells, or raise domain_size"

@@ -47,7 +47,7 @@ def sample_surface(
         owner = usable[np.minimum(chosen, len(usable) - 1)]
         point = _uniform_in_triangles(corner[owner], rng)
         if len(points):
-            near = cKDTree(points).query(point, distance_upper_bound=spacing)[0]
+            near = cKDTree(points, balanced_tree=False).query(point, distance_upper_bound=spacing)[0]
             free = near >= spacing  # infinite where nothing is nearer
             point, owner = point[free], owner[free]
         kept = _spread_out(point, spacing)
@@ -111,7 +111,7 @@ def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
     """Indices that a loop over the points would keep, each unless it is too near to one kept before."""
     if len(point) == 0:
         return np.zeros(0, np.int64)
-    pair = cKDTree(point).query_pairs(spacing, output_type="ndarray").astype(np.int64)
+    pair = cKDTree(point, balanced_tree=False).query_pairs(spacing, output_type="ndarray").astype(np.int64)
     earlier, later = pair.min(axis=1), pair.max(axis=1)
     undecided = np.ones(len(point), bool)
     kept = np.zeros(len(point), bool)

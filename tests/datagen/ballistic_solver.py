@@ -28,6 +28,7 @@ BALLISTIC = Backend(
     generate_scene="ballistic_solver:generate_scene",
     build_obstacle_grid="ballistic_solver:build_obstacle_grid",
     simulate="ballistic_solver:simulate",
+    warm_up="ballistic_solver:warm_up",
 )
 
 
@@ -66,7 +67,17 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
 def build_obstacle_grid(
     obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: tuple[float, float, float]
 ) -> ObstacleGrid:
+    if control(f"gridless-{seed}").exists():
+        raise ConfigError("a surface too large")
+    kill = control(f"kill-grid-{seed}")
+    if kill.exists():
+        kill.unlink()
+        os.kill(os.getpid(), signal.SIGKILL)
     return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+
+
+def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
+    pass
 
 
 def simulate(

@@ -10,7 +10,7 @@ import json
 import os
 import subprocess
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from threading import Lock, current_thread
 from typing import Any
@@ -157,9 +157,15 @@ def test_resume_after_a_crash_makes_the_same_shards(
         if calls == call:
             raise InterruptionError
 
+    stage_parts = datagen.shard.stage_parts
+
+    def stage_and_crash(folder: Path, key: str, parts: Iterable[bytes]) -> None:
+        stage_parts(folder, key, parts)
+        crash(folder)
+
     with monkeypatch.context() as patch:
-        # sync_folder is the last step of each staging and of each shard, so a crash there is a crash between files
-        patch.setattr(datagen.shard, "sync_folder", crash)
+        # the last step of each staging and of each shard, so a crash there is a crash between files
+        patch.setattr(datagen.shard, "stage_parts", stage_and_crash)
         patch.setattr(datagen.writer, "sync_folder", crash)
         patch.setattr("hgn.files.sync_folder", crash)
         try:
@@ -497,7 +503,7 @@ def test_full_disk_leaves_nothing_half_written(
         DatasetWriter(make_config()) as writer,
     ):
         full_disk(after)
-        for index in (1, 2):
+        for index in (1, 2, 3):
             stage(writer, "train", index)
             writer.publish_next()
     assert before.items() <= hashes(writer.folder).items()
