@@ -392,11 +392,13 @@ class ExportConfig:
 
 @dataclass(frozen=True)
 class RolloutConfig:
-    """`python -m hgn.rollout`: simulates a scene file, or an episode of a data set beside its truth."""
+    """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
 
-    weights: str
-    out: str
-    scene: str | None = None  # a scene file
+    weights: str = "obstacles"  # a file, or the name of shipped weights
+    out: str | None = None  # none: rollout/NAME.vtkhdf
+    render: bool | None = None  # also a PNG and a GIF beside it; none: where out is none
+    scene: str | None = None  # a scene file, or the name of an example; none: a random scene …
+    seed: int = 0  # … of this seed
     data: str | None = None  # or a data set …
     episode: str | None = None  # … and the key of one of its episodes
     frames: int = 300
@@ -409,12 +411,16 @@ class RolloutConfig:
         require_one_of(self, "path", PATHS)
         require_one_of(self, "precision", PRECISIONS)
         require(
-            (self.scene is None) == (self.data is not None and self.episode is not None),
-            "scene",
-            "given, or data and episode instead",
-            self.scene,
-            "for example scene=conf/example/funnel.yaml, or data=data/obstacles episode=validation-000000",
+            (self.data is None) == (self.episode is None),
+            "data",
+            "given together with episode",
+            self.data,
+            "for example data=data/obstacles episode=validation-000000",
         )
+        require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
+        require_non_negative(self, "seed")
+        picture = self.out is not None and Path(self.out).suffix in (".png", ".gif")
+        require(self.out != "" and not picture, "out", "the name of an HDF5 file, as in rollout.vtkhdf", self.out)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from hgn.progress import bar
 from hgn.provenance import provenance
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
-from hgn.runtime.weights import load_weights, require_frame_rate
+from hgn.runtime.weights import find_weights, load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.schema import from_mapping
 from hgn.training.errors import (
@@ -36,7 +36,7 @@ def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; returns the exit code."""
     config = from_mapping(EvaluateConfig, mapping)
     device = choose_device(config.device)
-    network, info = load_weights(Path(config.weights), device)
+    network, info = load_weights(find_weights(config.weights), device)
     path, text = path_on(device, network.config, config.path, config.precision)
     set_matmul_precision(config.precision)
     store = EpisodeStore(config.data, config.split)
@@ -49,7 +49,10 @@ def main(mapping: dict[str, Any]) -> int:
         rows.append(rollout_row(simulator, episodes, config.rollout_frames))
     print(table(rows, config, len(episodes)))
     if config.json is not None:
-        report = {"meta": provenance(device) | {"weights": config.weights, "updates": info.updates}, "rows": rows}
+        report = {
+            "meta": provenance(device) | {"weights": Path(config.weights).name, "updates": info.updates},
+            "rows": rows,
+        }
         write_json(config.json, report)
     return 0
 

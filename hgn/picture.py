@@ -115,7 +115,7 @@ def animate(
         raise ConfigError(f"fps must be in (0, 50], which GIF viewers keep, got {rate:g}; {remedy}")
     frames = range(0, rollout.frame_count, every)
     stage = _stage(rollout, size)
-    palette = _Palette([_animation_picture(stage, rollout, frames[i], size) for i in _spread(len(frames), 6)])
+    palette = _Palette([_animation_picture(stage, rollout, frames[i], size) for i in spread(len(frames), 6)])
     pictures = _animation(stage, rollout, frames, size, palette, progress)
     buffer = io.BytesIO()
     next(pictures).save(
@@ -332,7 +332,8 @@ def _upper_bits(color: np.ndarray) -> np.ndarray:
     return (bits[..., 0] << 12) | (bits[..., 1] << 6) | bits[..., 2]
 
 
-def _spread(count: int, wanted: int) -> list[int]:
+def spread(count: int, wanted: int) -> list[int]:
+    """At most `wanted` of `count` indices, the first and the last among them, evenly spread."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
 
 

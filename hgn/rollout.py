@@ -1,51 +1,71 @@
-"""python -m hgn.rollout weights=… scene=… frames=300 out=…: simulates a scene with trained weights."""
+"""python -m hgn.rollout: simulates a random scene with shipped weights and draws it; scene=… and weights=… take others.
+
+Writes a VTKHDF file, and pictures beside it.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import RolloutConfig
+from hgn.config import RolloutConfig, SceneConfig, config_directory
 from hgn.data.select import find_episode
 from hgn.device import choose_device
+from hgn.network.base import ParticleNetwork
+from hgn.picture import animate, compare_picture, spread, write_picture
 from hgn.progress import bar
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
-from hgn.runtime.weights import WeightsInfo, load_weights, require_frame_rate
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, require_frame_rate
+from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
+from hgn.scene.scene import Scene
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, from_mapping, require
 
+PICTURES = 4  # in the PNG
+EVERY = 3  # frames of the rollout for one picture of the GIF
+
 
 def main(mapping: dict[str, Any]) -> int:
-    """Simulates and writes the rollout file; returns the exit code."""
+    """Simulates, writes the rollout file and what is drawn of it; returns the exit code."""
     config = from_mapping(RolloutConfig, mapping)
-    path = rollout(config)
+    path, made = rollout(config)
     print(path)
+    if config.render if config.render is not None else config.out is None:
+        still, moving = path.with_suffix(".png"), path.with_suffix(".gif")
+        write_picture(still, compare_picture(made, spread(made.frame_count, PICTURES)), made.source)
+        print(still)
+        with bar("drawing", total=len(range(0, made.frame_count, EVERY)), unit="picture") as progress:
+            animate(made, moving, every=EVERY, progress=lambda *_: progress.update())
+        print(moving)
     return 0
 
 
-def rollout(config: RolloutConfig) -> Path:
-    """Simulates a scene file, or an episode beside its truth, and writes HDF5; returns its path.
+def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
+    """Simulates a scene, or an episode beside its truth, and writes HDF5; returns its path, and what is in it.
 
     Raises: ConfigError for bad input, weights that let the simulation diverge among them; nothing is written then.
     """
     device = choose_device(config.device)
-    weights = Path(config.weights)
+    weights = find_weights(config.weights)
     network, info = load_weights(weights, device)
     source = {"weights": weights.name, "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
     frames = config.frames
     reference_TN3 = None
-    if config.scene is not None:
-        scene = load_scene(Path(config.scene))
+    if config.data is None:
+        name, scene = _scene(config, network, info)
         initial = InitialState.of_scene(scene)
         obstacles, cell_size = scene.obstacles, scene.cell_size
-        source["scene"] = config.scene
+        source["scene"] = config.scene or f"random, seed {config.seed}"
     else:
-        assert config.data is not None and config.episode is not None
+        assert config.episode is not None  # RolloutConfig saw to it
+        name = config.episode
         episode = find_episode(config.data, config.episode)
         require_frame_rate(info, episode.frame_rate_hz)
         frames = min(frames, len(episode.position_TN3))
@@ -63,22 +83,34 @@ def rollout(config: RolloutConfig) -> Path:
             (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
         except DivergenceError as error:
             raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
-    path = Path(config.out)
-    write_rollout(
-        path,
-        Rollout(
-            position_TN3=position_TN3,
-            material_N=initial.material_N,
-            obstacles=obstacles,
-            domain_size=initial.domain_size,
-            frame_rate_hz=info.frame_rate_hz,
-            gravity=initial.gravity,
-            cell_size=cell_size,
-            source=source,
-            reference_TN3=reference_TN3,
-        ),
+    path = Path(config.out if config.out is not None else f"rollout/{name}.vtkhdf")
+    made = Rollout(
+        position_TN3=position_TN3,
+        material_N=initial.material_N,
+        obstacles=obstacles,
+        domain_size=initial.domain_size,
+        frame_rate_hz=info.frame_rate_hz,
+        gravity=initial.gravity,
+        cell_size=cell_size,
+        source=source,
+        reference_TN3=reference_TN3,
     )
-    return path
+    write_rollout(path, made)
+    return path, made
+
+
+def _scene(config: RolloutConfig, network: ParticleNetwork, info: WeightsInfo) -> tuple[str, Scene]:
+    """A scene file or an example, or a scene like those that the network was trained on; and a name for it."""
+    if config.scene is not None:
+        path = Path(config.scene)
+        example = config_directory() / "example" / f"{config.scene}.yaml"
+        if re.fullmatch(r"\w+", config.scene) and not path.exists() and example.is_file():
+            path = example
+        return path.stem, load_scene(path)
+    drawn = SceneConfig(cell_size=info.obstacle_cell_size, materials=network.config.materials)
+    if not network.config.sees_obstacles:
+        drawn = replace(drawn, obstacle_count=0)
+    return f"random_{config.seed}", generate_scene(drawn, config.seed)
 
 
 def _require_cell_size(info: WeightsInfo, cell_size: float) -> None:

@@ -10,8 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hgn.command import run_command
 from hgn.config import RenderConfig
 from hgn.data.select import find_episode
@@ -21,6 +19,7 @@ from hgn.picture import (
     error_curve,
     position_error,
     rollout_of_episode,
+    spread,
     write_picture,
 )
 from hgn.progress import bar
@@ -65,8 +64,7 @@ def _load(config: RenderConfig) -> tuple[str, Rollout]:
 def _write_png(config: RenderConfig, rollout: Rollout, path: Path) -> None:
     frames = config.frames
     if frames is None:
-        last = rollout.frame_count - 1
-        frames = tuple(sorted({round(frame) for frame in np.linspace(0, last, PICTURES)}))
+        frames = tuple(spread(rollout.frame_count, PICTURES))
     write_picture(path, compare_picture(rollout, frames, config.size), rollout.source)
     print(path)
 

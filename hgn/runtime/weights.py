@@ -21,6 +21,8 @@ from hgn.network.build import build_network
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 
 FORMAT_VERSION = 1
+SUFFIX = ".safetensors"
+SHIPPED = Path(__file__).resolve().parents[1] / "weights"  # beside each file a card, NAME.md
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,26 @@ def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, half: 
     payload = save(tensors, metadata={"hgn": json.dumps(to_mapping(info), sort_keys=True)})
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, payload)
+
+
+def shipped_weights() -> dict[str, Path]:
+    """The files that come with this package, by name."""
+    return {path.stem: path for path in sorted(SHIPPED.glob(f"*{SUFFIX}"))}
+
+
+def find_weights(name: str, field: str = "weights") -> Path:
+    """The file that `name` means: shipped weights by their name, as in `obstacles`, else a path.
+
+    Raises: ConfigError for what is neither a name that is shipped nor looks like a path.
+    """
+    shipped = shipped_weights()
+    if name in shipped:
+        return shipped[name]
+    path = Path(name)
+    if path.suffix or len(path.parts) > 1 or path.exists():
+        return path
+    names = ", ".join(shipped) or "none in this copy"
+    raise ConfigError(f"{field} must be a file or the name of shipped weights ({names}), got {name!r}")
 
 
 def load_weights(

@@ -16,7 +16,7 @@ from hgn.config import NetworkConfig, TrainConfig
 from hgn.data.order import Cursor
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
-from hgn.runtime.weights import load_weights
+from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import ConfigError, from_mapping, to_mapping
 
 SECTION = "hgn"  # the checkpoint's key for what is ours
@@ -82,7 +82,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
     """
     assert config.training.weights is not None
-    path = Path(config.training.weights)
+    path = find_weights(config.training.weights, "training.weights")
     network, info = load_weights(path, field="training.weights")
     remedy = "set it so, or take other training.weights"
     found, wanted = to_mapping(info.network), to_mapping(config.network)

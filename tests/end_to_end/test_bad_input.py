@@ -155,10 +155,14 @@ EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "jso
         ("export", ["out=x"], "Missing mandatory value: checkpoint"),
         ("rollout", [*ROLLOUT, "frames=1"], "frames must be at least 2, got 1"),
         ("rollout", [*ROLLOUT, "scene=none.yaml"], "scene must be an existing YAML file, got none.yaml"),
-        ("rollout", [*ROLLOUT, "scene=null"], "scene must be given, or data and episode instead, got None; for"),
+        ("rollout", [*ROLLOUT, "data=data"], "data must be given together with episode, got 'data'; for example"),
         ("rollout", [*ROLLOUT, "device=abacus"], "device must be auto, cpu or cuda[:index], got 'abacus'"),
         ("rollout", [*ROLLOUT, "device=cuda:77"], "device must exist, got 'cuda:77' with"),
-        ("rollout", [*ROLLOUT, "weights=none"], "weights must be an existing file, got none; write one with python -m"),
+        (
+            "rollout",
+            [*ROLLOUT, "weights=none.safetensors"],
+            "weights must be an existing file, got none.safetensors; write one",
+        ),
         ("evaluate", [*EVALUATE, "scenes=0"], "scenes must be a finite number > 0, got 0"),
         ("evaluate", [*EVALUATE, "split=moon"], "split must be one of train, validation, test, got 'moon'"),
         (

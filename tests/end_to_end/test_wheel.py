@@ -54,12 +54,14 @@ def run(python: Path, folder: Path, *arguments: str) -> str:
 
 
 def test_configs_travel_inside(wheel: Path) -> None:
-    """All of conf/ is inside the package, byte for byte; tests, job files and caches are not."""
+    """All of conf/ and the shipped weights are inside, byte for byte; tests, job files and caches are not."""
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         for path in (ROOT / "conf").rglob("*"):
             if path.is_file():
                 assert archive.read(f"hgn/conf/{path.relative_to(ROOT / 'conf')}") == path.read_bytes()
+        for path in (ROOT / "hgn" / "weights").iterdir():
+            assert archive.read(f"hgn/weights/{path.name}") == path.read_bytes()
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"hgn", "datagen", "tools"}
     assert not [name for name in names if "__pycache__" in name or "test" in name]
 
@@ -78,7 +80,7 @@ def test_commands_compose_their_config(python: Path, tmp_path: Path, module: str
     assert composed["name"] == "small" and key in composed
 
 
-@pytest.mark.parametrize(("module", "key"), [("hgn.rollout", "weights: ???"), ("tools.render", "rollout: null")])
+@pytest.mark.parametrize(("module", "key"), [("hgn.rollout", "weights: obstacles"), ("tools.render", "rollout: null")])
 def test_commands_help(python: Path, tmp_path: Path, module: str, key: str) -> None:
     """`--help` says what a command does and shows its keys, from an empty folder."""
     text = run(python, tmp_path, "-m", module, "--help")

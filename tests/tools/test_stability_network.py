@@ -127,9 +127,11 @@ def test_bad_options(change: dict[str, Any], message: str) -> None:
 
 
 def test_the_command_names_its_parts() -> None:
-    """An unknown part is refused with those that there are; a known one takes the options of its own."""
+    """Help says what parts there are; an unknown one is refused with them; a known one takes the options of its own."""
     command = [sys.executable, "-m", "tools.stability"]
+    told = subprocess.run([*command, "--help"], capture_output=True, text=True, timeout=120)
+    assert told.returncode == 0 and "python -m tools.stability network" in told.stdout and not told.stderr
     refused = subprocess.run([*command, "bridge"], capture_output=True, text=True, timeout=120)
     assert refused.returncode == 2 and "must be one of" in refused.stderr and "network" in refused.stderr
-    missing = subprocess.run([*command, "network", "weights=none"], capture_output=True, text=True, timeout=120)
+    missing = subprocess.run([*command, "network", "weights=none.pt"], capture_output=True, text=True, timeout=120)
     assert missing.returncode == 2 and "weights must be an existing file" in missing.stderr

@@ -15,6 +15,10 @@ PARTS = ("network", "solver")
 
 def run() -> None:
     """Runs the part that the first argument names."""
+    if sys.argv[1:2] in (["--help"], ["-h"]):
+        parts = "\n".join(f"  python -m tools.stability {part} --help" for part in PARTS)
+        print(f"{__doc__}\n{parts}")
+        return
     if len(sys.argv) < 2 or sys.argv[1] not in PARTS:
         found = sys.argv[1] if len(sys.argv) > 1 else "nothing"
         print(f"error: the first argument must be one of {', '.join(PARTS)}, got {found}", file=sys.stderr)

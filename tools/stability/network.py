@@ -20,10 +20,10 @@ from hgn.command import run_command
 from hgn.device import choose_device
 from hgn.files import write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.weights import load_weights
+from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import from_mapping, to_mapping
 from tools.measures import energies, energy_scale, outside_domain
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
@@ -38,7 +38,7 @@ def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; what does not hold is a finding, and the exit code is 0."""
     config = from_mapping(StabilityNetworkConfig, mapping)
     device = choose_device(config.device)
-    network, info = load_weights(Path(config.weights), device)
+    network, info = load_weights(find_weights(config.weights), device)
     path, text = path_on(device, network.config, config.path, config.precision)
     print(text, file=sys.stderr)
     set_matmul_precision(config.precision)
@@ -53,7 +53,10 @@ def main(mapping: dict[str, Any]) -> int:
         rows.append(guard_row(simulator, config))
     print(table(rows))
     if config.json is not None:
-        meta = provenance(device) | {"config": to_mapping(config), "weights": Path(config.weights).name}
+        meta = provenance(device) | {
+            "config": without_folders(to_mapping(config)),
+            "weights": Path(config.weights).name,
+        }
         meta |= {"updates": info.updates, "path": path, "network": to_mapping(info.network)}
         report = {"meta": meta, "rows": [row.mapping(PART) for row in rows]}
         write_json(config.json, report, allow_nan=False)

@@ -1,0 +1,93 @@
+"""python -m hgn.rollout where little is said: shipped weights, random scenes, examples by name, pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from hgn import rollout
+from hgn.config import NetworkConfig
+from hgn.network.build import build_network
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights, shipped_weights
+from hgn.scene.rollout_file import read_rollout
+from hgn.schema import ConfigError
+
+MAXIMUM_BYTES = 8_000_000
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> str:
+    """A small network that predicts no acceleration."""
+    config = NetworkConfig(width=8, levels=2, message_passing_steps=1)
+    network = build_network(config)
+    torch.nn.init.zeros_(network.get_parameter("decode.second.weight"))
+    torch.nn.init.zeros_(network.get_parameter("decode.second.bias"))
+    save_weights(tmp_path / "still.safetensors", network, WeightsInfo(config, 60.0, 1 / 64))
+    return str(tmp_path / "still.safetensors")
+
+
+def test_shipped_weights_are_whole() -> None:
+    """Each shipped file loads, is small enough to ship, and has a card that names it."""
+    assert "obstacles" in shipped_weights()
+    for name, path in shipped_weights().items():
+        assert find_weights(name) == path and path.stat().st_size <= MAXIMUM_BYTES
+        _, info = load_weights(path)
+        assert info.updates > 0
+        assert f"{name}.safetensors" in path.with_suffix(".md").read_text()
+
+
+def test_names_and_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A path stays a path, whether there is such a file or not; an unknown name lists what is shipped."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine").touch()
+    for path in ("mine", "missing.safetensors", "folder/missing"):
+        assert find_weights(path) == Path(path)
+    with pytest.raises(
+        ConfigError, match=r"weights must be a file or .* shipped weights \(.*obstacles.*\), got 'sand'"
+    ):
+        find_weights("sand")
+
+
+def test_nothing_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without out, it draws: three files in rollout/, named by the scene, a random one with the shipped network."""
+    monkeypatch.chdir(tmp_path)
+    assert rollout.main({"frames": 2}) == 0
+    names = capsys.readouterr().out.split()
+    assert names == [f"rollout/random_0.{ending}" for ending in ("vtkhdf", "png", "gif")]
+    made = read_rollout(tmp_path / names[0])
+    assert len(made.obstacles) == 5 and made.source["scene"] == "random, seed 0"
+    assert all(Path(name).stat().st_size > 1000 for name in names)
+
+
+def test_scenes(tmp_path: Path, weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seeds draw different scenes, an example has its name, a file of that name wins; with out nothing is drawn unless
+    asked."""
+    monkeypatch.chdir(tmp_path)
+    sizes = set()
+    for seed in (1, 2):
+        assert rollout.main({"weights": weights, "frames": 2, "seed": seed, "out": "a.vtkhdf"}) == 0
+        sizes.add(read_rollout("a.vtkhdf").position_TN3[0].tobytes())
+    assert len(sizes) == 2 and not Path("a.png").exists()
+    assert rollout.main({"weights": weights, "frames": 2, "scene": "funnel", "out": "b/f.vtkhdf", "render": True}) == 0
+    assert sorted(path.name for path in Path("b").iterdir()) == ["f.gif", "f.png", "f.vtkhdf"]
+    assert len(read_rollout("b/f.vtkhdf").obstacles) == 5
+    Path("funnel").write_text("groups: [{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand}]\n")
+    assert rollout.main({"weights": weights, "frames": 2, "scene": "funnel", "out": "c.vtkhdf"}) == 0
+    assert not read_rollout("c.vtkhdf").obstacles
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"data": "data"}, "data must be given together with episode, got 'data'"),
+        ({"scene": "funnel", "data": "d", "episode": "e"}, "scene must be left out where data is given, got 'funnel'"),
+        ({"out": "a.png"}, "out must be the name of an HDF5 file, as in rollout.vtkhdf, got 'a.png'"),
+        ({"seed": -1}, "seed must be a finite number >= 0, got -1"),
+    ],
+)
+def test_refused(given: dict[str, object], message: str) -> None:
+    """What contradicts itself is refused by name."""
+    with pytest.raises(ConfigError, match=message):
+        rollout.main(given)
