@@ -6,6 +6,7 @@ import datetime
 import importlib.metadata
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from typing import Any
 import torch
 
 PACKAGES = ("torch", "lightning", "taichi", "numpy")
+# /a/b/c, but no URL's path
+_ABSOLUTE_PATH = re.compile(r"(?<![\w.:/~-])/(?:[^/\s,='\"\[\](){}]+/)*([^/\s,='\"\[\](){}]+)/?")
 
 
 def commit() -> str:
@@ -61,10 +64,18 @@ def provenance(device: torch.device | str = "cpu") -> dict[str, Any]:
 
 def command_line() -> str:
     """How this process was started, without the folders that are this machine's."""
-    specification = getattr(sys.modules["__main__"], "__spec__", None)
-    name = None if specification is None else specification.name.removesuffix(".__main__")
-    program = [Path(sys.argv[0]).name] if name is None else ["-m", name]
-    return shlex.join([Path(sys.executable).name, *program, *sys.argv[1:]])
+    return shlex.join(without_folders(sys.orig_argv))
+
+
+def without_folders(value: Any) -> Any:
+    """Plain containers with the last part alone of each absolute path in their texts: folders are a machine's own."""
+    if isinstance(value, str):
+        return _ABSOLUTE_PATH.sub(r"\1", value)
+    if isinstance(value, dict):
+        return {key: without_folders(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_folders(item) for item in value]
+    return value
 
 
 def _git(folder: Path, *arguments: str) -> str:

@@ -28,7 +28,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.storage import verify_file
 from hgn.files import TEMPORARY_SUFFIX, write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 
@@ -82,7 +82,7 @@ def main(mapping: dict[str, Any]) -> int:
     )
     print("\n".join(found) or "complete and verified, with the same scenes and first frames; no temporary file is left")
     if kills_config.json is not None:
-        meta = provenance() | {"config": to_mapping(config) | {"kills": to_mapping(kills_config)}}
+        meta = provenance() | {"config": without_folders(to_mapping(config) | {"kills": to_mapping(kills_config)})}
         report = {"meta": meta, "summary": summary, "rows": [asdict(kill) for kill in kills]}
         write_json(kills_config.json, report)
     return EXIT_RED if found else 0

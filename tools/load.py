@@ -30,7 +30,7 @@ from hgn.data.statistics import merge_statistics
 from hgn.data.storage import file_sha256
 from hgn.files import write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.schema import from_mapping, to_mapping
 
 HOST = "127.0.0.1"
@@ -77,7 +77,7 @@ def main(mapping: dict[str, Any]) -> None:
         speed, low, high = (row[key] / 1e9 for key in ("bytes_per_second", "slowest", "fastest"))
         print(f"{row['way']:31} {speed:5.2f} GB/s ({low:.2f} to {high:.2f})  {row['ratio']:.2f} of the plain one")
     if config.json is not None:
-        meta = provenance() | {"cpus": os.cpu_count(), "config": to_mapping(config)}
+        meta = provenance() | {"cpus": os.cpu_count(), "config": without_folders(to_mapping(config))}
         write_json(config.json, {"meta": meta, "rows": rows})
 
 

@@ -17,7 +17,7 @@ from hgn.command import run_command
 from hgn.config import MpmConfig
 from hgn.files import write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.scene.material import MATERIALS, SAND, SNOW, WATER
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
@@ -70,7 +70,7 @@ def main(mapping: dict[str, Any]) -> int:
             f"{row['ms_every_branch']:>17.1f} {row['gain']:>6.2f}"
         )
     if config.json is not None:
-        meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": to_mapping(config)}
+        meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": without_folders(to_mapping(config))}
         write_json(config.json, {"meta": meta, "rows": rows})
     return 0
 

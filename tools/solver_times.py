@@ -25,7 +25,7 @@ from hgn.command import run_command
 from hgn.config import MpmConfig, SceneConfig
 from hgn.files import write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, from_mapping, require, require_one_of, to_mapping
@@ -79,7 +79,7 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(SolverTimesConfig, mapping)
     made = _random_scenes(max(config.scenes, default=0))
     device = initialise(config.device)
-    meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": to_mapping(config)}
+    meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": without_folders(to_mapping(config))}
     rows: list[dict[str, Any]] = []
     cases = _cases(made, config, device.kind)
     with bar("cases", len(cases), unit="case") as progress:

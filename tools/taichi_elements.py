@@ -24,7 +24,7 @@ from hgn.command import run_command
 from hgn.config import MpmConfig
 from hgn.files import write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, from_mapping, require, require_positive, to_mapping
@@ -81,7 +81,7 @@ def main(mapping: dict[str, Any]) -> int:
             f"{floor['spread']:>8.2g}"
         )
     if config.json is not None:
-        meta = provenance("cpu") | {"config": to_mapping(config)}
+        meta = provenance("cpu") | {"config": without_folders(to_mapping(config))}
         write_json(config.json, {"meta": meta, "rows": rows})
     return 0
 

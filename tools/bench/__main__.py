@@ -19,7 +19,7 @@ from hgn.config import BENCH_CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
 from hgn.device import choose_device
 from hgn.files import write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.runtime.path import why_not_fast
 from hgn.schema import from_mapping, to_mapping
 from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, Train, checked_workload
@@ -65,7 +65,7 @@ def main(mapping: dict[str, Any]) -> int:
             progress.update()
     print(table(rows))
     if config.json is not None:
-        meta = provenance(device) | {"config": to_mapping(config)}
+        meta = provenance(device) | {"config": without_folders(to_mapping(config))}
         write_json(config.json, {"meta": meta, "rows": rows})
     return 0 if all(row["check"] in (PASS, OUT_OF_MEMORY) for row in rows) else EXIT_RED
 

@@ -22,7 +22,7 @@ from hgn.data.select import first_episodes
 from hgn.device import choose_device
 from hgn.files import write_atomically, write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from tools.error_vs_time.contenders import Contender, NetworkContender, SolverContender, TrivialContender
@@ -64,7 +64,7 @@ def main(mapping: dict[str, Any]) -> int:
     add_pay_back(rows, config, mpm, references[0], frames)
 
     meta = provenance(device) | {
-        "config": to_mapping(config),
+        "config": without_folders(to_mapping(config)),
         "data": Path(config.data).name,
         "split": config.split,
         "scenes": len(references),

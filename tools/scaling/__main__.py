@@ -21,7 +21,7 @@ from hgn.command import run_command
 from hgn.config import ScalingConfig
 from hgn.files import write_json
 from hgn.network.build import build_network
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.schema import ConfigError, from_mapping, to_mapping
 from hgn.training.ranks import MESSAGE_MB
 from tools.bench.contenders import PASS
@@ -61,7 +61,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 def _write(config: ScalingConfig, device_type: str, found: dict[str, Any]) -> None:
     if config.json is not None:
-        meta = provenance(device_type) | {"config": to_mapping(config)}
+        meta = provenance(device_type) | {"config": without_folders(to_mapping(config))}
         write_json(config.json, {"meta": meta} | found)
 
 

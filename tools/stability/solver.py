@@ -16,7 +16,7 @@ from typing import Any
 from hgn.config import MpmConfig
 from hgn.files import write_json
 from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.provenance import provenance, without_folders
 from hgn.schema import from_mapping, require, require_one_of, require_positive, to_mapping
 from tools.stability.row import Row, table
 from tools.stability.solver_leak import OFFSETS, leaks
@@ -77,7 +77,10 @@ def main(mapping: dict[str, Any]) -> int:
             progress.update()
     print(table(rows))
     if config.json is not None:
-        meta = provenance(_torch_device(config.device)) | {"config": to_mapping(config), "solver": to_mapping(mpm)}
+        meta = provenance(_torch_device(config.device)) | {
+            "config": without_folders(to_mapping(config)),
+            "solver": to_mapping(mpm),
+        }
         steps = [point.mapping() for point in points]
         report = {"meta": meta, "rows": [row.mapping(PART) for row in rows], "steps": steps}
         write_json(config.json, report, allow_nan=False)
