@@ -5,6 +5,7 @@ PYTHON ?= $(shell command -v python3.12 >/dev/null 2>&1 && python3.12 --version 
 VENV := .venv
 RUN := $(VENV)/bin/python
 DEMO := runs/demo
+TEST_PROCESSES ?= 2
 
 .PHONY: setup demo test check format lint types layers clean
 
@@ -34,7 +35,7 @@ demo: setup
 	@echo "picture: $(DEMO)/pictures/rollout.png, moving: $(DEMO)/pictures/rollout.gif"
 
 test: setup
-	$(RUN) -m pytest
+	$(RUN) -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
 check: setup format lint types layers test
 

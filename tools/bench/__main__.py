@@ -59,14 +59,14 @@ def main(mapping: dict[str, Any]) -> int:
         for cases in (FRAME_CASES, TRAIN_CASES)
         if _wanted(config, device, precision, cases) and _meant(cases, work)
     ]
+    meta = provenance(device) | {"config": without_folders(to_mapping(config))}
     with bar("timing", total=len(groups), unit="group") as progress:
         for precision, cases, work in groups:
             rows += group_rows(config, device, precision, _wanted(config, device, precision, cases), work)
             progress.update()
+            if config.json is not None:  # after each: what a later group does takes nothing away
+                write_json(config.json, {"meta": meta, "rows": rows})
     print(table(rows))
-    if config.json is not None:
-        meta = provenance(device) | {"config": without_folders(to_mapping(config))}
-        write_json(config.json, {"meta": meta, "rows": rows})
     return 0 if all(row["check"] in (PASS, OUT_OF_MEMORY) for row in rows) else EXIT_RED
 
 
