@@ -20,14 +20,16 @@ from hgn.provenance import provenance
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import find_weights, load_weights, require_frame_rate
+from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
+from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.schema import from_mapping
 from hgn.training.errors import (
     REPORTED_FRAMES,
     frame_batches,
     network_predictor,
     one_step_errors,
-    position_mse,
+    rollout_errors,
     trivial_predictors,
 )
 
@@ -85,12 +87,26 @@ def rollout_row(simulator: Simulator, episodes: list[Episode], frames: int) -> d
             predicted = simulator.rollout(initial, frames, lambda _: progress.update())
         except DivergenceError as error:
             return {"system": "network rollout", "diverged_at_frame": error.frame}
-    pairs = zip(predicted, episodes, strict=True)
-    mse_T = np.mean([position_mse(path, episode.position_TN3[:frames]) for path, episode in pairs], axis=0)
+    mse_T = rollout_errors(predicted, episodes)
+    told = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
     return {
         "system": "network rollout",
-        "position_mse": {str(n): float(mse_T[n]) for n in (*REPORTED_FRAMES, frames - 1) if n < frames},
-        "mean_position_mse": float(mse_T.mean()),
+        "position_mse": {str(n): float(mse_T["all"][n]) for n in told},
+        "mean_position_mse": float(mse_T["all"].mean()),
+        "by_material": {name: {str(n): float(of_T[n]) for n in told} for name, of_T in mse_T.items() if name != "all"},
+        "ends": [end_of_rollout(path, episode) for path, episode in zip(predicted, episodes, strict=True)],
+    }
+
+
+def end_of_rollout(path_TN3: np.ndarray, episode: Episode) -> dict[str, Any]:
+    """Shares of the particles within closed obstacles, beside the data's, and beyond the domain, in the last frame."""
+    obstacles, last = obstacles_of_episode(episode), len(path_TN3) - 1
+    beyond_N3 = (path_TN3[last] < 0) | (path_TN3[last] > np.asarray(episode.domain_size))
+    return {
+        "episode": episode.key,
+        "penetration": share_inside(path_TN3[last], obstacles),
+        "reference_penetration": share_inside(np.asarray(episode.position_TN3[last]), obstacles),
+        "outside_domain": float(beyond_N3.any(-1).mean()),
     }
 
 
@@ -108,6 +124,13 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
         else:
             frames = ", ".join(f"frame {frame} {value:.2e}" for frame, value in row["position_mse"].items())
             lines.append(f"{row['system']:<20} position MSE: {frames}")
+            mean = {name: np.mean([end[name] for end in row["ends"]]) for name in row["ends"][0] if name != "episode"}
+            worst = max(end["penetration"] - end["reference_penetration"] for end in row["ends"])
+            lines.append(
+                f"{'at the end':<20} within obstacles {mean['penetration']:.2%}, the solver's "
+                f"{mean['reference_penetration']:.2%} (at most {worst:.2%} more), "
+                f"beyond the domain {mean['outside_domain']:.2%}"
+            )
     ours = next(row["one_step_mse"] for row in rows if row["system"] == "network")
     best = min(row["one_step_mse"] for row in rows if "one_step_mse" in row and row["system"] != "network")
     ratio = best / ours if ours > 0 else float("inf")

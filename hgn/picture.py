@@ -54,16 +54,16 @@ def draw_frame(
     return picture
 
 
-def compare_picture(rollout: Rollout, frames: Sequence[int], size: int = 360) -> Image.Image:
+def compare_picture(rollout: Rollout, frames: Sequence[int], size: int = 360, label: str = "prediction") -> Image.Image:
     """A grid: a column each frame, the prediction above, the ground truth below where there is one.
 
-    size: width of one panel in pixels.
+    size: width of one panel in pixels. label: what stands beside the first row.
 
     Raises: ConfigError when a frame lies outside the rollout.
     """
     check_frames(frames, rollout.frame_count)
     stage = _stage(rollout, size)
-    rows = [("prediction", rollout.position_TN3)]
+    rows = [(label, rollout.position_TN3)]
     if rollout.reference_TN3 is not None:
         rows.append(("ground truth", rollout.reference_TN3))
     elif "weights" not in rollout.source:
@@ -83,13 +83,23 @@ def compare_picture(rollout: Rollout, frames: Sequence[int], size: int = 360) ->
         for row, (_, position_TN3) in enumerate(rows):
             panel = _panel(stage, position_TN3, frame, rollout.material_N)
             picture.paste(panel, (x, header + row * (height + gap)))
-    for row, (label, _) in enumerate(rows):
-        if label:
+    for row, (name, _) in enumerate(rows):
+        if name:
             strip = Image.new("RGB", (height, left), _background())
-            _write(strip, (height / 2, left / 2), label, _text_size(size))
+            _write(strip, (height / 2, left / 2), name, _text_size(size))
             picture.paste(strip.rotate(90, expand=True), (0, header + row * (height + gap)))
     _legend(picture, picture.height - footer / 2, rollout, _text_size(size))
     return picture
+
+
+def stacked(pictures: Sequence[Image.Image]) -> Image.Image:
+    """Pictures below each other."""
+    size = max(picture.width for picture in pictures), sum(picture.height for picture in pictures)
+    whole, y = Image.new("RGB", size, _background()), 0
+    for picture in pictures:
+        whole.paste(picture, (0, y))
+        y += picture.height
+    return whole
 
 
 def animate(

@@ -10,9 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hgn.scene.distance import contains
-from hgn.scene.scene import Obstacle
-
 FRAMES_AT_ONCE = 50  # in float64
 
 
@@ -42,14 +39,6 @@ def energies(path_TN3: np.ndarray, gravity_3: np.ndarray) -> np.ndarray:
 def energy_scale(gravity_3: np.ndarray, domain_size: Sequence[float]) -> float:
     """The energy per mass of a fall through the domain; 1 without gravity."""
     return float(np.abs(gravity_3) @ np.asarray(domain_size)) or 1.0
-
-
-def inside_obstacles(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> float:
-    """Share of the particles within closed obstacles; nothing is within a sheet."""
-    inside_N = np.zeros(len(position_N3), bool)
-    for obstacle in obstacles:
-        inside_N |= contains(position_N3, obstacle)
-    return float(inside_N.mean()) if len(inside_N) else 0.0
 
 
 def outside_domain(position_N3: np.ndarray, domain_size: Sequence[float]) -> float:

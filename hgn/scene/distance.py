@@ -6,6 +6,7 @@ Shape legend: P points (or point-triangle pairs), F triangles, T tree nodes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,6 +84,14 @@ def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
     near = np.flatnonzero(((point >= low) & (point <= high)).all(axis=1))
     inside[near] = np.abs(winding_numbers(point[near], triangle)) > 0.5
     return inside
+
+
+def share_inside(position_N3: np.ndarray, obstacles: Sequence[Obstacle]) -> float:
+    """Share of the particles within closed obstacles; nothing is within a sheet."""
+    inside_N = np.zeros(len(position_N3), bool)
+    for obstacle in obstacles:
+        inside_N |= contains(position_N3, obstacle)
+    return float(inside_N.mean()) if len(inside_N) else 0.0
 
 
 def _closest_on_segment(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:

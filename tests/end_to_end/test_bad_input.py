@@ -375,7 +375,10 @@ def test_errors_file_makes_its_folder(place: Place, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(sys, "argv", ["evaluate", *EVALUATE])
     with pytest.raises(SystemExit) as raised:
         run_command(evaluate.main, "evaluate")
-    assert raised.value.code == 0 and json.loads(place.path("made/errors.json").read_text())["rows"]
+    assert raised.value.code == 0
+    last = json.loads(place.path("made/errors.json").read_text())["rows"][-1]
+    keys = {"episode", "penetration", "reference_penetration", "outside_domain"}
+    assert last["by_material"].keys() <= {"water", "sand", "snow"} and last["ends"][0].keys() == keys
 
 
 @pytest.mark.parametrize(

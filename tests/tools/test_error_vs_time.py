@@ -22,6 +22,7 @@ from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.scene.distance import share_inside
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, from_mapping
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
@@ -30,7 +31,7 @@ from tools.error_vs_time.__main__ import main, network_contenders
 from tools.error_vs_time.contenders import FastPredictor, TrivialContender
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergence
-from tools.measures import energies, energy_scale, inside_obstacles, momentum_error, outside_domain
+from tools.measures import energies, energy_scale, momentum_error, outside_domain
 from tools.trial import FrameClock, Trial, network_trials, other_grid
 
 CPU = torch.device("cpu")
@@ -97,6 +98,7 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert mpm[64, 1.0]["failed_scenes"] == 1 and mpm[64, 1.0]["first_failure"] == "too fast"
     assert mpm[64, 1.0]["scenes_reached"] == {"5": 1} and mpm[64, 0.5]["scenes_reached"] == {"5": 2}
     assert 0 < mpm[64, 0.5]["position_mse"]["5"] < mpm[32, 0.5]["position_mse"]["5"]
+    assert report["meta"]["not_run"] == [] and all(row["scoring_s"] >= 0 for row in rows)
     floor = {row["floor"]: row["position_mse"]["5"] for row in rows if row["system"] == "chaos"}
     assert 1e-13 < floor["perturbed by 1e-06"] < 3e-12
     assert floor["twice the step"] == pytest.approx(mpm[64, 0.5]["position_mse"]["5"])
@@ -110,10 +112,43 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     )
 
 
+def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What has not begun by then is named, and the report is written without it; a shorter rollout of the solver is
+    scored as far as it goes, and each setting is simulated once."""
+    calls: list[tuple[float, float, int]] = []
+
+    def counted(scenes, config, frames, *more):
+        calls.append((scenes[0].cell_size, config.stability_fraction, frames))
+        return fake_simulate(scenes, config, frames, *more)
+
+    monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
+    monkeypatch.setattr("tools.error_vs_time.__main__.shipped_weights", dict)
+    out = tmp_path / "report"
+    options = {"data": data, "out": str(out), "split": "validation", "device": "cpu", "resimulate": False}
+    options |= {
+        "mpm_grids": [64],
+        "mpm_frames": 3,
+        "timed_frames": 5,
+        "mpm_timed_frames": 4,
+        "rounds": 1,
+        "perturbation": 0.0,
+    }
+    assert main(options) == 0
+    assert [call for call in calls if call[2] == 3] == [(1 / 64, 1.0, 3), (1 / 64, 0.5, 3)]
+    assert {call[2] for call in calls} == {3, 4}
+    rows = json.loads(Path(f"{out}.json").read_text())["rows"]
+    assert [row["system"] for row in rows] == ["trivial"] * 3 + ["mpm", "mpm", "chaos"]
+    assert rows[4]["scenes_reached"] == {"5": 0} and rows[4]["failed_scenes"] == 0
+    assert main(options | {"seconds": 1e-9}) == 0
+    report = json.loads(Path(f"{out}.json").read_text())
+    assert report["rows"] == [] and len(report["meta"]["not_run"]) == 6
+
+
 def test_the_data_can_be_the_reference(data: str, tmp_path: Path) -> None:
     """Without a solver the data itself is the reference, and what moves like it has no error."""
     out = tmp_path / "report"
-    assert main({"data": data, "out": str(out), "split": "validation", "resimulate": False, "device": "cpu"}) == 0
+    options = {"data": data, "out": str(out), "split": "validation", "resimulate": False, "device": "cpu"}
+    assert main(options | {"weights": [], "mpm_grids": [], "perturbation": 0.0}) == 0
     rows = {row["predictor"]: row for row in json.loads(Path(f"{out}.json").read_text())["rows"]}
     assert rows["ballistic motion"]["position_mse"]["5"] < 1e-13 < rows["constant velocity"]["position_mse"]["5"]
     assert rows["ballistic motion"]["one_step_mse"] < 1e-13 < rows["constant velocity"]["one_step_mse"]
@@ -147,10 +182,10 @@ def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys:
     options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": [str(file)]}
     config = from_mapping(ErrorVsTimeConfig, options | {"precisions": ["fp32", "fp16"]})
     (episode,) = EpisodeStore(data, "test").episodes
-    (only,) = network_contenders(config, CPU, episode)
+    (only,) = network_contenders(config, CPU, [episode])
     assert only.row["precision"] == "fp32" and "left out: gns.safetensors at fp16" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="path must be plain or auto here, got fast"):
-        network_contenders(replace(config, path="fast"), CPU, episode)
+        network_contenders(replace(config, path="fast"), CPU, [episode])
 
 
 def test_ghost_acceleration_counts_particles_at_rest(data: str) -> None:
@@ -216,7 +251,7 @@ def test_shares_inside_obstacles_and_outside_of_the_domain() -> None:
     cone = shape_obstacle("cone", 0.4, (0.5, 0.5, 0.5), np.eye(3), "cone")
     square = shape_obstacle("square", 0.4, (0.5, 0.5, 0.5), np.eye(3), "square")
     point = np.array([[0.5, 0.5, 0.5], [0.9, 0.9, 0.9], [1.1, 0.5, 0.5], [0.5, -0.1, 0.5]])
-    assert inside_obstacles(point, [cone]) == 0.25 and inside_obstacles(point, [square]) == 0
+    assert share_inside(point, [cone]) == 0.25 and share_inside(point, [square]) == 0
     assert outside_domain(point, (1.0, 1.0, 1.0)) == 0.5 and outside_domain(point[:0], (1.0, 1.0, 1.0)) == 0
 
 

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 import torch
 from network.states import network_of
+from PIL import Image
 
 from hgn.config import SceneConfig
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.schema import ConfigError, from_mapping
-from tools.stability.network import case_row, energy_growth, main
+from tools.stability.network import case_row, case_trials, energy_growth, main
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
+from tools.stability.row import Row
 from tools.trial import Trial
 
 SCENE = {
@@ -45,8 +47,10 @@ def weights(tmp_path: Path) -> str:
 
 def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each case is simulated and told with the report's keys; what rests holds everywhere."""
-    path = tmp_path / "reports" / "stability.json"
-    assert main(SMALL | {"weights": weights, "json": str(path), "speed_factor": 8.0}) == 0
+    path, picture = tmp_path / "reports" / "stability.json", tmp_path / "reports" / "stability.png"
+    assert main(SMALL | {"weights": weights, "json": str(path), "picture": str(picture), "speed_factor": 8.0}) == 0
+    with Image.open(picture) as drawn:
+        assert drawn.height > 11 * 300
     report = json.loads(path.read_text())
     assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
     rows = {row["case"]: row for row in report["rows"]}
@@ -67,6 +71,10 @@ def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.Captu
     assert "a weight that explodes" in capsys.readouterr().out
 
 
+def row_of(simulator: Simulator, case: Case, energy_bound: float) -> Row:
+    return case_row(simulator, case, energy_bound, *case_trials(simulator, case))
+
+
 def test_failures_are_told(weights: str) -> None:
     """A rollout that diverges says at which frame; energy from nowhere and particles that leave are failures too."""
     config = from_mapping(StabilityNetworkConfig, SMALL | {"weights": weights, "cases": ["single"]})
@@ -76,14 +84,14 @@ def test_failures_are_told(weights: str) -> None:
     push = torch.tensor([0.0, -9.8 / 60**2, 0.0])
     simulator.predict = lambda state: push.expand(len(state.position_N3), 3)
     case = Case(case.name, case.scenes, 16)
-    assert case_row(simulator, case, 0.02).held
+    assert row_of(simulator, case, 0.02).held
     push[0] = 1e-2
-    row = case_row(simulator, Case(case.name, case.scenes, 40), 0.02)
+    row = row_of(simulator, Case(case.name, case.scenes, 40), 0.02)
     assert not row.held and row.measured < 40 and "diverged at frame" in row.beyond
     assert row.more["guard"] == "raised" and row.more["failed_scenes"] == 1
-    row = case_row(simulator, case, 0.02)
+    row = row_of(simulator, case, 0.02)
     assert not row.held and row.measured == 16 and row.beyond.startswith("energy grows")
-    row = case_row(simulator, case, 1e9)
+    row = row_of(simulator, case, 1e9)
     assert not row.held and row.beyond == "1e+02 % of the particles end outside of the domain"
 
 

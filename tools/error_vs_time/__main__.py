@@ -1,12 +1,14 @@
 """python -m tools.error_vs_time data=… weights=[…] out=results/error_vs_time: error against run time.
 
-Networks, the solver at coarser grids and larger steps, and predictors that learn nothing, all on the same test scenes,
-scored by one converged simulation. Writes a table, OUT.json, OUT.png and OUT_frames.png.
+Networks (shipped ones where none are named), the solver at coarser grids and larger steps, and predictors that learn
+nothing, all on the same test scenes, scored by one converged simulation. Writes a table, OUT.json, OUT.png and
+OUT_frames.png.
 """
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +25,7 @@ from hgn.device import choose_device
 from hgn.files import write_atomically, write_json
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
+from hgn.runtime.weights import find_weights, load_weights, shipped_weights
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from tools.error_vs_time.contenders import Contender, NetworkContender, SolverContender, TrivialContender
@@ -31,16 +34,19 @@ from tools.error_vs_time.score import pay_back, report, score, table, time_in_tu
 from tools.error_vs_time.settings import PRECISIONS, ErrorVsTimeConfig
 from tools.trial import other_grid, solver_scene, solver_trials
 
+SCORING_SHARE = 0.7  # of the seconds given; the rest is for run times
+
 
 def main(mapping: dict[str, Any]) -> int:
     """Prints a table and writes the report; returns the exit code."""
+    begun = time.monotonic()
     config = from_mapping(ErrorVsTimeConfig, mapping)
     device = choose_device(config.device)
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     frames = min(config.frames, *(len(episode.position_TN3) for episode in episodes))
     mpm = replace(from_mapping(MpmConfig, store.manifest.config["mpm"], "mpm"), device=_solver_device(device))
-    contenders = network_contenders(config, device, episodes[0])
+    contenders = network_contenders(config, device, episodes)
     if config.resimulate:
         references, left_out = resimulated(episodes, replace(mpm, stability_fraction=config.reference_step), frames)
         reference = f"the solver on the data's grid at {config.reference_step:g} of the limit of stability"
@@ -49,17 +55,27 @@ def main(mapping: dict[str, Any]) -> int:
         reference = "the data"
     require(bool(references), "data", "scenes that the solver gets through", left_out)
     contenders += trivial_contenders(store, device)
-    if config.resimulate:
-        contenders += solver_contenders(config, mpm, references[0])
+    contenders += solver_contenders(config, mpm, references[0])
 
-    rows, curves = [], []
+    def late(share: float) -> bool:
+        return config.seconds is not None and time.monotonic() - begun > share * config.seconds
+
+    rows, curves, scored, not_run = [], [], [], []
     with bar("errors", total=len(contenders) * len(references), unit="scene") as progress:
         for contender in contenders:
+            if late(SCORING_SHARE):
+                not_run.append(contender.row)
+                print(f"left out, for the time is over: {contender.row}", file=sys.stderr)
+                continue
+            started = time.monotonic()
             row, curve_T = score(contender, references, config, device, progress.update)
             rows.append(row)
             curves.append(curve_T)
+            scored.append(contender)
+            row["scoring_s"] = time.monotonic() - started
     timed = [i for i, row in enumerate(rows) if row["system"] not in ("trivial", "chaos")]
-    for i, times in zip(timed, time_in_turns([contenders[i] for i in timed], references, config, device), strict=True):
+    times_of = time_in_turns([scored[i] for i in timed], references, config, device, lambda: late(1.0))
+    for i, times in zip(timed, times_of, strict=True):
         rows[i] |= times
     add_pay_back(rows, config, mpm, references[0], frames)
 
@@ -70,6 +86,8 @@ def main(mapping: dict[str, Any]) -> int:
         "scenes": len(references),
         "episodes": [episode.key for episode in references],
         "left_out": left_out,
+        "not_run": not_run,
+        "seconds": time.monotonic() - begun,
         "frames": frames,
         "reference": reference,
         "convention": CONVENTION,
@@ -84,18 +102,25 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def network_contenders(config: ErrorVsTimeConfig, device: torch.device, episode: Episode) -> list[Contender]:
-    """Every weights file at every precision that its path knows; what is left out is said."""
+def network_contenders(config: ErrorVsTimeConfig, device: torch.device, episodes: Sequence[Episode]) -> list[Contender]:
+    """Every weights file at every precision that its path knows; what is left out is said.
+
+    Of shipped weights, those that see obstacles, where there are obstacles, and else those that do not.
+    """
+    files = [find_weights(name) for name in config.weights or ()]
+    if config.weights is None:
+        obstacles = any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
+        files = [f for f in shipped_weights().values() if load_weights(f)[1].network.sees_obstacles == obstacles]
     precisions = config.precisions or (PRECISIONS if device.type == "cuda" else ("fp32",))
     contenders: list[Contender] = []
-    for file in config.weights:
+    for file in files:
         for precision in precisions:
             try:
-                contenders.append(NetworkContender(Path(file), precision, config.path, device, episode.frame_rate_hz))
+                contenders.append(NetworkContender(file, precision, config.path, device, episodes[0].frame_rate_hz))
             except ConfigError as error:
                 if precision != "fp16":
                     raise
-                print(f"left out: {Path(file).name} at fp16: {error}", file=sys.stderr)
+                print(f"left out: {file.name} at fp16: {error}", file=sys.stderr)
     return contenders
 
 
@@ -113,19 +138,21 @@ def trivial_contenders(store: EpisodeStore, device: torch.device) -> list[Conten
 def solver_contenders(config: ErrorVsTimeConfig, mpm: MpmConfig, episode: Episode) -> list[Contender]:
     """The solver at its settings, and how far the reference departs from itself: the chaos floor."""
     own, rate = episode.obstacle_grid.cell_size, episode.frame_rate_hz
-    contenders: list[Contender] = [
-        SolverContender(replace(other_grid(mpm, 1 / grid, own), stability_fraction=step), 1 / grid, rate)
-        for grid in config.mpm_grids
-        for step in config.mpm_steps
-    ]
-    finest = replace(mpm, stability_fraction=config.reference_step)
-    perturbed = SolverContender(finest, own, rate, config.perturbation)
-    perturbed.row = {"system": "chaos", "floor": f"perturbed by {config.perturbation:g}"}
-    contenders.append(perturbed)
-    if 2 * config.reference_step <= 1:
-        coarser = SolverContender(replace(mpm, stability_fraction=2 * config.reference_step), own, rate)
-        coarser.row = {"system": "chaos", "floor": "twice the step"}
-        contenders.append(coarser)
+    step = config.reference_step if config.resimulate else mpm.stability_fraction
+
+    def solver(grid: int, step: float, perturbation: float = 0.0) -> SolverContender:
+        settings = replace(other_grid(mpm, 1 / grid, own), stability_fraction=step)
+        return SolverContender(settings, 1 / grid, rate, config.mpm_frames, config.mpm_timed_frames, perturbation)
+
+    own_grid = round(1 / own)
+    points = {(grid, step): solver(grid, step) for grid in config.mpm_grids for step in config.mpm_steps}
+    contenders: list[Contender] = list(points.values())
+    if config.perturbation:
+        perturbed = solver(own_grid, step, config.perturbation)
+        contenders.append(perturbed.named(system="chaos", floor=f"perturbed by {config.perturbation:g}"))
+    if config.mpm_grids and 2 * step <= 1:
+        coarser = points.get((own_grid, 2 * step)) or solver(own_grid, 2 * step)
+        contenders.append(coarser.named(system="chaos", floor="twice the step"))
     return contenders
 
 
@@ -153,7 +180,9 @@ def add_pay_back(
         (r.get("ms") for r in rows if r["system"] == "mpm" and (r["grid"], r["step"]) == (own, mpm.stability_fraction)),
         None,
     )
-    hours = dict(zip((Path(file).name for file in config.weights), config.training_hours or (), strict=False))
+    hours = dict(
+        zip((find_weights(name).name for name in config.weights or ()), config.training_hours or (), strict=False)
+    )
     for row in rows:
         if "weights" in row:
             row["training_hours"] = hours.get(row["weights"])

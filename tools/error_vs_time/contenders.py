@@ -6,6 +6,7 @@ Shape legend: T frames, N particles of a scene.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -42,6 +43,7 @@ class Contender(Protocol):
     """One row of the report."""
 
     row: dict[str, Any]  # system and settings
+    all_at_once: bool  # whether all scenes are simulated side by side, or so many as the command says
 
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep | None:
         """Errors of the accelerations of every stride-th frame; none where the contender has no such thing."""
@@ -52,6 +54,8 @@ class Contender(Protocol):
 
 class NetworkContender:
     """A weights file at one precision of its matrix products, on the path that a simulation would take."""
+
+    all_at_once = False
 
     def __init__(self, file: Path, precision: str, path: str, device: torch.device, frame_rate_hz: float) -> None:
         """Raises: ConfigError where the path does not take the network or the precision."""
@@ -99,9 +103,21 @@ class NetworkContender:
 class SolverContender:
     """The solver that made the data, on a grid and with a step of its own."""
 
-    def __init__(self, config: MpmConfig, cell_size: float, frame_rate_hz: float, perturbation: float = 0.0) -> None:
+    all_at_once = True  # a scene takes one of a GPU's many processors
+
+    def __init__(
+        self,
+        config: MpmConfig,
+        cell_size: float,
+        frame_rate_hz: float,
+        frames: int,
+        timed_frames: int,
+        perturbation: float = 0.0,
+    ) -> None:
+        """Rollouts end at `frames`, timed ones at `timed_frames`."""
         self.config, self.cell_size, self.frame_rate_hz = config, cell_size, frame_rate_hz
-        self.perturbation = perturbation
+        self.frames, self.timed_frames, self.perturbation = frames, timed_frames, perturbation
+        self._known: dict[tuple[str, ...], list[Trial]] = {}
         self.row: dict[str, Any] = {
             "system": "mpm",
             "grid": round(1 / cell_size),
@@ -109,10 +125,26 @@ class SolverContender:
             "precision": "fp32",
         }
 
+    def named(self, **row: Any) -> SolverContender:
+        """The same in another row; what one has simulated the other need not."""
+        same = copy.copy(self)
+        same.row = row
+        return same
+
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> None:
         """None: a step begins from stresses and volumes, which positions do not tell."""
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
+        if on_frame is not None:
+            return self._simulate(episodes, min(frames, self.timed_frames), on_frame)
+        keys = tuple(episode.key for episode in episodes)
+        if keys not in self._known:
+            self._known[keys] = self._simulate(episodes, min(frames, self.frames), None)
+        return self._known[keys]
+
+    def _simulate(
+        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
+    ) -> list[Trial]:
         scenes = [solver_scene(episode, self.cell_size) for episode in episodes]
         for scene in scenes if self.perturbation else ():
             generator = np.random.default_rng(scene.seed)
@@ -122,6 +154,8 @@ class SolverContender:
 
 class TrivialContender:
     """The same acceleration for every particle, whatever happens: nothing is learned."""
+
+    all_at_once = False
 
     def __init__(self, name: str, acceleration: Callable[[Episode], np.ndarray], device: torch.device) -> None:
         self.row: dict[str, Any] = {"system": "trivial", "predictor": name}

@@ -53,7 +53,8 @@ def draw_frames(rows: Sequence[Mapping[str, Any]], curves: Sequence[np.ndarray],
     panel.set_ylabel("position MSE (domain units²)")
     panel.set_yscale("log")
     panel.grid(alpha=0.3)
-    panel.legend(fontsize=6)
+    if rows:
+        panel.legend(fontsize=6)
     return _png(figure, meta, "Error over the frames")
 
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import torch
 
+from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import obstacles_of_episode
@@ -20,8 +22,8 @@ from hgn.training.errors import REPORTED_FRAMES, position_mse
 from tools.error_vs_time.contenders import Contender, OneStep, frame_milliseconds
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergence
-from tools.measures import energies, energy_scale, inside_obstacles, momentum_error, outside_domain
-from tools.trial import Trial
+from tools.measures import energies, energy_scale, momentum_error, outside_domain
+from tools.trial import FrameClock, Trial
 
 
 def score(
@@ -35,8 +37,9 @@ def score(
     steps = [contender.one_step(episode, config.frame_stride, config.rest_speed) for episode in references]
     frames = len(references[0].position_TN3)
     trials: list[Trial] = []
-    for first in range(0, len(references), config.batch_scenes):
-        some = references[first : first + config.batch_scenes]
+    together = len(references) if contender.all_at_once else config.batch_scenes
+    for first in range(0, len(references), together):
+        some = references[first : first + together]
         trials += contender.trials(some, frames, None)
         on_scene(len(some))
     row = contender.row | one_step_figures([step for step in steps if step is not None])
@@ -72,14 +75,17 @@ def rollout_figures(
     curve_T = np.where(reached_T > 0, np.nansum(mse_ST, axis=0) / np.maximum(reached_T, 1), np.nan)
     reported = sorted({frame for frame in (*REPORTED_FRAMES, frames - 1) if frame < frames})
     told = [frame for frame in reported if reached_T[frame]]
-    motions = [_motion(trial, reference) for trial, reference in zip(trials, references, strict=True)]
-    ends = [_end(trial, reference) for trial, reference in zip(trials, references, strict=True)]
+    with ThreadPoolExecutor(torch.get_num_threads()) as threads:
+        motions = list(threads.map(_motion, trials, references))
+        ends = list(threads.map(_end, trials, references))
     failures = [trial for trial in trials if trial.cause is not None]
     row: dict[str, Any] = {
         "position_mse": {str(frame): float(curve_T[frame]) for frame in told},
         "position_quartiles": {str(frame): _quartiles(mse_ST[:, frame]) for frame in told},
         "scenes_reached": {str(frame): int(reached_T[frame]) for frame in reported},
-        "sinkhorn": _sinkhorn(trials, references, reported, config, device),
+        "sinkhorn": _sinkhorn(
+            trials[: config.sinkhorn_scenes], references[: config.sinkhorn_scenes], reported, config, device
+        ),
         "failed_scenes": len(failures),
         "first_failure_frame": min((trial.frame_count for trial in failures), default=None),
         "first_failure": failures[0].cause if failures else None,
@@ -93,11 +99,16 @@ def rollout_figures(
 
 
 def time_in_turns(
-    contenders: Sequence[Contender], references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
+    contenders: Sequence[Contender],
+    references: Sequence[Episode],
+    config: ErrorVsTimeConfig,
+    device: torch.device,
+    late: Callable[[], bool] = lambda: False,
 ) -> list[dict[str, Any]]:
     """Run times of all contenders in this process: each simulates the same scenes once to warm up, then in turns.
 
-    `ms` is a frame of one scene, `ms_batched` a frame of each of `batch_scenes` scenes side by side.
+    No round begins when it is late, but for the first. `ms` is a frame of one scene, `ms_batched` a frame of each of
+    `batch_scenes` scenes side by side.
     """
     frames = min(config.timed_frames, len(references[0].position_TN3))
     singles = [[episode] for episode in references[: config.timed_scenes]]
@@ -105,7 +116,9 @@ def time_in_turns(
     memory = [_warm_up(contender, singles, batch, frames, device) for contender in contenders]
     single: list[list[float]] = [[] for _ in contenders]
     batched: list[list[float]] = [[] for _ in contenders]
-    for _ in range(config.rounds):
+    for done in range(config.rounds):
+        if done and late():
+            break
         for scenes in (*singles, batch):
             for i, contender in enumerate(contenders):
                 taken = frame_milliseconds(contender, scenes, frames)
@@ -182,7 +195,7 @@ def _motion(trial: Trial, reference: Episode) -> dict[str, float]:
 def _end(trial: Trial, reference: Episode) -> dict[str, float]:
     last_N3 = trial.position_TN3[-1]
     return {
-        "penetration": inside_obstacles(last_N3, obstacles_of_episode(reference)),
+        "penetration": share_inside(last_N3, obstacles_of_episode(reference)),
         "reference_penetration": _reference_penetration(reference, trial.frame_count - 1),
         "outside_domain": outside_domain(last_N3, reference.domain_size),
     }
@@ -200,7 +213,7 @@ def _reference_energies(reference: Episode) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1024)
 def _reference_penetration(reference: Episode, frame: int) -> float:
-    return inside_obstacles(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
+    return share_inside(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
 
 
 def _sinkhorn(
@@ -241,10 +254,11 @@ def _warm_up(
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
+    clock = FrameClock() if contender.row["system"] == "mpm" else None  # the solver's short form
     for scenes in singles:
-        contender.trials(scenes, frames, None)
+        contender.trials(scenes, frames, clock)
     peak = torch.cuda.max_memory_allocated(device) - before if device.type == "cuda" else 0
-    contender.trials(batch, frames, None)
+    contender.trials(batch, frames, clock)
     return peak / 1e9 if network and device.type == "cuda" else None
 
 

@@ -17,7 +17,7 @@ class ErrorVsTimeConfig:
 
     data: str
     out: str
-    weights: tuple[str, ...] = ()
+    weights: tuple[str, ...] | None = None
     split: str = "test"
     scenes: int = 20
     frames: int = 300
@@ -27,6 +27,8 @@ class ErrorVsTimeConfig:
     mpm_grids: tuple[int, ...] = (32, 48, 64)
     mpm_steps: tuple[float, ...] = (1.0, 0.5)
     reference_step: float = 0.25
+    mpm_frames: int = 300
+    mpm_timed_frames: int = 12
     resimulate: bool = True
     perturbation: float = 1e-6
     batch_scenes: int = 8
@@ -34,10 +36,12 @@ class ErrorVsTimeConfig:
     timed_frames: int = 100
     rounds: int = 3
     sinkhorn_points: int = 1024
+    sinkhorn_scenes: int = 20
     sinkhorn_blur: float = 0.01
     rest_speed: float = 1e-4
     training_hours: tuple[float, ...] | None = None
     generation_hours: float | None = None
+    seconds: float | None = None
     device: str = "auto"
     json: str | None = None
 
@@ -56,7 +60,12 @@ class ErrorVsTimeConfig:
         )
         require_non_negative(self, "perturbation", "rest_speed")
         require(self.frames >= 2, "frames", "at least 2", self.frames)
-        require(self.timed_frames >= 4, "timed_frames", "at least 4", self.timed_frames)
+        for name in ("timed_frames", "mpm_timed_frames"):
+            require(getattr(self, name) >= 4, name, "at least 4", getattr(self, name))
+        require(self.mpm_frames >= 2, "mpm_frames", "at least 2", self.mpm_frames)
+        require_non_negative(self, "sinkhorn_scenes")
+        if self.seconds is not None:
+            require_positive(self, "seconds")
         require(0 < self.reference_step <= 1, "reference_step", "above 0 and at most 1", self.reference_step)
         for i, step in enumerate(self.mpm_steps):
             require(0 < step <= 1, f"mpm_steps[{i}]", "above 0 and at most 1", step)
@@ -65,8 +74,8 @@ class ErrorVsTimeConfig:
         for i, name in enumerate(self.precisions or ()):
             require(name in PRECISIONS, f"precisions[{i}]", f"one of {', '.join(PRECISIONS)}", name)
         require_one_of(self, "path", ("auto", "plain", "fast"))
-        names = [Path(file).name for file in self.weights]
+        names = [Path(file).name for file in self.weights or ()]
         require(len(set(names)) == len(names), "weights", "files of different names", names)
         if self.training_hours is not None:
-            told, count = len(self.training_hours), len(self.weights)
+            told, count = len(self.training_hours), len(self.weights or ())
             require(told == count, "training_hours", f"a list of {count}, one for each of weights", told)

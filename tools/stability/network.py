@@ -10,20 +10,24 @@ import copy
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from hgn.command import run_command
 from hgn.device import choose_device
 from hgn.files import write_json
+from hgn.picture import compare_picture, spread, stacked, write_picture
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import find_weights, load_weights
+from hgn.scene.rollout_file import Rollout
 from hgn.schema import from_mapping, to_mapping
 from tools.measures import energies, energy_scale, outside_domain
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
@@ -31,6 +35,8 @@ from tools.stability.row import Row, table
 from tools.trial import FrameClock, Trial, network_trials
 
 PART = "network"
+PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
+LONGEST = 100.0  # domain that is drawn whole, in heights
 FAR_DOMAINS = 100.0  # how far the guard's case throws particles
 
 
@@ -43,31 +49,73 @@ def main(mapping: dict[str, Any]) -> int:
     print(text, file=sys.stderr)
     set_matmul_precision(config.precision)
     simulator = Simulator(network, info.frame_rate_hz, path, config.precision)
-    rows = []
+    rows: list[Row] = []
+    pictures: list[Image.Image] = []
+    meta = provenance(device) | {"config": without_folders(to_mapping(config)), "weights": Path(config.weights).name}
+    meta |= {"updates": info.updates, "path": path, "network": to_mapping(info.network)}
+
+    def keep() -> None:  # after each case: a run that is cut off leaves the cases that it had
+        if config.json is not None:
+            write_json(config.json, {"meta": meta, "rows": [row.mapping(PART) for row in rows]}, allow_nan=False)
+        if config.picture is not None and pictures:
+            write_picture(config.picture, stacked(pictures))
+
     made = list(cases(config, network.config))
     with bar("cases", total=len(made), unit="case") as progress:
         for case in made:
-            rows.append(case_row(simulator, case, config.energy_bound))
+            trials = case_trials(simulator, case)
+            rows.append(case_row(simulator, case, config.energy_bound, *trials))
+            if config.picture is not None:
+                pictures.append(case_picture(simulator, case, trials[0][0], Path(config.weights).name))
+            keep()
             progress.update()
     if "guard" in (config.cases or CASES):
         rows.append(guard_row(simulator, config))
     print(table(rows))
-    if config.json is not None:
-        meta = provenance(device) | {
-            "config": without_folders(to_mapping(config)),
-            "weights": Path(config.weights).name,
-        }
-        meta |= {"updates": info.updates, "path": path, "network": to_mapping(info.network)}
-        report = {"meta": meta, "rows": [row.mapping(PART) for row in rows]}
-        write_json(config.json, report, allow_nan=False)
+    keep()
     return 0
 
 
-def case_row(simulator: Simulator, case: Case, energy_bound: float) -> Row:
-    """Simulates a case and says whether it held."""
-    initial = [InitialState.of_scene(scene) for scene in case.scenes]
+def case_trials(simulator: Simulator, case: Case) -> tuple[list[Trial], float | None]:
+    """Simulates a case; the milliseconds of a frame too."""
     clock = FrameClock()
-    trials = network_trials(simulator, initial, case.frames, clock)
+    initial = [InitialState.of_scene(scene) for scene in case.scenes]
+    return network_trials(simulator, initial, case.frames, clock), clock.milliseconds()
+
+
+def case_picture(simulator: Simulator, case: Case, trial: Trial, weights: str) -> Image.Image:
+    """Some frames of a case's first scene."""
+    scene = case.scenes[0]
+    rollout = Rollout(
+        trial.position_TN3,
+        scene.material_N,
+        scene.obstacles,
+        scene.domain_size,
+        simulator.frame_rate_hz,
+        source={"weights": weights},
+    )
+    # A domain that is long beyond all others would leave a line: where its particles are is drawn of it.
+    return compare_picture(_cut(rollout), spread(trial.frame_count, PICTURES), PICTURE_SIZE, case.name)
+
+
+def _cut(rollout: Rollout) -> Rollout:
+    length, height, depth = rollout.domain_size
+    if length <= LONGEST * height:
+        return rollout
+    shift_3 = np.array([length - height, 0.0, 0.0])
+    return replace(
+        rollout,
+        position_TN3=(rollout.position_TN3 - shift_3).astype(np.float32),
+        obstacles=tuple(replace(body, vertex_V3=body.vertex_V3 - shift_3) for body in rollout.obstacles),
+        domain_size=(height, height, depth),
+    )
+
+
+def case_row(
+    simulator: Simulator, case: Case, energy_bound: float, trials: Sequence[Trial], milliseconds: float | None
+) -> Row:
+    """Says whether a case held."""
+    initial = [InitialState.of_scene(scene) for scene in case.scenes]
     reached = min(trial.frame_count for trial in trials)
     finite = all(bool(np.isfinite(trial.position_TN3).all()) for trial in trials)
     growth = max(
@@ -101,7 +149,7 @@ def case_row(simulator: Simulator, case: Case, energy_bound: float) -> Row:
             "outside_domain": outside,
             "failed_scenes": len(causes),
             "guard": "missed" if not finite else "raised" if causes else "not needed",
-            "ms": clock.milliseconds(),
+            "ms": milliseconds,
         },
     )
 

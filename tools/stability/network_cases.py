@@ -40,6 +40,7 @@ class StabilityNetworkConfig:
     path: str = "auto"
     precision: str = "high"
     device: str = "auto"
+    picture: str | None = None
     json: str | None = None
 
     def __post_init__(self) -> None:
