@@ -107,21 +107,26 @@ def time_in_turns(
 ) -> list[dict[str, Any]]:
     """Run times of all contenders in this process: each simulates the same scenes once to warm up, then in turns.
 
-    No round begins when it is late, but for the first. `ms` is a frame of one scene, `ms_batched` a frame of each of
-    `batch_scenes` scenes side by side.
+    When it is late no other one is begun with (its times are none then), and no further round. `ms` is a frame of one
+    scene, `ms_batched` a frame of each of `batch_scenes` scenes side by side.
     """
     frames = min(config.timed_frames, len(references[0].position_TN3))
     singles = [[episode] for episode in references[: config.timed_scenes]]
     batch = list(references[: config.batch_scenes])
-    memory = [_warm_up(contender, singles, batch, frames, device) for contender in contenders]
+    memory: list[float | None] = [None] * len(contenders)
+    in_time = []
+    for i, contender in enumerate(contenders):
+        if not late():
+            memory[i] = _warm_up(contender, singles, batch, frames, device)
+            in_time.append(i)
     single: list[list[float]] = [[] for _ in contenders]
     batched: list[list[float]] = [[] for _ in contenders]
     for done in range(config.rounds):
         if done and late():
             break
         for scenes in (*singles, batch):
-            for i, contender in enumerate(contenders):
-                taken = frame_milliseconds(contender, scenes, frames)
+            for i in in_time:
+                taken = frame_milliseconds(contenders[i], scenes, frames)
                 if taken is not None:
                     (batched[i] if scenes is batch else single[i]).append(taken / len(scenes))
     return [
