@@ -61,7 +61,10 @@ def main(mapping: dict[str, Any]) -> int:
     def late(share: float) -> bool:
         return config.seconds is not None and time.monotonic() - begun > share * config.seconds
 
-    rows, curves, scored, not_run = [], [], [], []
+    rows: list[dict[str, Any]] = []
+    curves: list[np.ndarray] = []
+    scored: list[Contender] = []
+    not_run: list[dict[str, Any]] = []
     meta = provenance(device) | {
         "config": without_folders(to_mapping(config)),
         "data": Path(config.data).name,
