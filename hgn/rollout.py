@@ -109,7 +109,7 @@ def _scene(config: RolloutConfig, network: ParticleNetwork, info: WeightsInfo) -
         return path.stem, load_scene(path)
     drawn = SceneConfig(cell_size=info.obstacle_cell_size, materials=network.config.materials)
     if not network.config.sees_obstacles:
-        drawn = replace(drawn, obstacle_count=0)
+        drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as conf/scene/no_obstacles.yaml says
     return f"random_{config.seed}", generate_scene(drawn, config.seed)
 
 

@@ -61,6 +61,16 @@ def test_nothing_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert all(Path(name).stat().st_size > 1000 for name in names)
 
 
+def test_a_network_without_obstacles_gets_none(tmp_path: Path) -> None:
+    """Its random scene is one of the second data set's: four cubes and nothing else."""
+    config = NetworkConfig(width=8, levels=2, message_passing_steps=1, obstacle_features=False)
+    file, out = tmp_path / "free.safetensors", str(tmp_path / "a.vtkhdf")
+    save_weights(file, build_network(config), WeightsInfo(config, 60.0, 1 / 64))
+    assert rollout.main({"weights": str(file), "frames": 2, "out": out}) == 0
+    made = read_rollout(out)
+    assert not made.obstacles and made.position_TN3.shape[1] == 4296
+
+
 def test_scenes(tmp_path: Path, weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Seeds draw different scenes, an example has its name, a file of that name wins; with out nothing is drawn unless
     asked."""
