@@ -5,6 +5,8 @@ Writes a VTKHDF file, and pictures beside it.
 
 from __future__ import annotations
 
+import hgn.idle_threads  # noqa: F401  # isort: skip  # before torch is loaded
+
 import hashlib
 import re
 import sys
