@@ -100,7 +100,7 @@ class MpmConfig:
     speed_fraction: float = 0.3  # of a cell that the fastest particle may cross in a step
     wall_cells: int = 3  # grid nodes at each face of the domain that stop outgoing motion
     wall_contact: str = "slip"  # or stick
-    collider_band_cells: float = 1.5
+    collider_band_cells: float = 0.5  # from a sheet, where nodes stop motion
     collider_friction: float = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
     device: str = "auto"  # or cpu, gpu

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from datagen.mpm.collider import Collider, build_collider
 from hgn.command import run_command
 from hgn.config import MpmConfig, SceneConfig
 from hgn.files import write_json
@@ -77,7 +78,7 @@ def main(mapping: dict[str, Any]) -> int:
     from datagen.mpm.device import initialise
 
     config = from_mapping(SolverTimesConfig, mapping)
-    made = _random_scenes(max(config.scenes, default=0))
+    made = _random_scenes(max(config.scenes, default=0), MpmConfig().collider_band_cells)
     device = initialise(config.device)
     meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": without_folders(to_mapping(config))}
     rows: list[dict[str, Any]] = []
@@ -109,12 +110,17 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _cases(made: list[Scene], config: SolverTimesConfig, kind: str) -> list[Callable[[], list[dict[str, Any]]]]:
+def _cases(
+    made: list[tuple[Scene, Collider]], config: SolverTimesConfig, kind: str
+) -> list[Callable[[], list[dict[str, Any]]]]:
     """Each times its contenders when it is called, and gives their rows."""
     mpm = MpmConfig(device=kind)
 
     def scenes(count: int) -> list[dict[str, Any]]:
-        return [{"case": "random scenes with obstacles"} | _timed(made[:count], mpm, config.scene_frames)]
+        own = [scene for scene, _ in made[:count]]
+        colliders = [collider for _, collider in made[:count]]
+        row = _timed(own, mpm, config.scene_frames, colliders=colliders)
+        return [{"case": "random scenes with obstacles"} | row]
 
     def particles(count: int) -> list[dict[str, Any]]:
         return [{"case": "one scene"} | _timed([scene_of(Workload(count, 1), 0, 0.035)], mpm, config.particle_frames)]
@@ -145,12 +151,16 @@ def _beside_taichi_elements(config: SolverTimesConfig, kind: str) -> list[dict[s
     ]
 
 
-def _timed(scenes: list[Scene], mpm: MpmConfig, frames: int, rate: float = FRAME_RATE_HZ) -> dict[str, Any]:
+def _timed(
+    scenes: list[Scene],
+    mpm: MpmConfig,
+    frames: int,
+    rate: float = FRAME_RATE_HZ,
+    colliders: list[Collider] | None = None,
+) -> dict[str, Any]:
     """Milliseconds a frame of the second half, after a first simulation that compiles."""
-    from datagen.mpm.collider import build_collider
     from datagen.mpm.solver import SceneFailure, Simulated, simulate
 
-    colliders = [build_collider(scene, mpm.collider_band_cells) for scene in scenes]
     simulate(scenes, mpm, 2, rate, colliders=colliders)
     ends: list[float] = []
     outcomes = simulate(
@@ -175,13 +185,15 @@ def _timed(scenes: list[Scene], mpm: MpmConfig, frames: int, rate: float = FRAME
     }
 
 
-def _random_scenes(count: int) -> list[Scene]:
+def _random_scenes(count: int, band_cells: float) -> list[tuple[Scene, Collider]]:
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
-        return list(pool.map(_scene, range(FIRST_SEED, FIRST_SEED + count), chunksize=4))
+        seeds = range(FIRST_SEED, FIRST_SEED + count)
+        return list(pool.map(_scene, seeds, [band_cells] * count, chunksize=4))
 
 
-def _scene(seed: int) -> Scene:
-    return generate_scene(SceneConfig(), seed)
+def _scene(seed: int, band_cells: float) -> tuple[Scene, Collider]:
+    scene = generate_scene(SceneConfig(), seed)
+    return scene, build_collider(scene, band_cells)
 
 
 if __name__ == "__main__":

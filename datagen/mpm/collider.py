@@ -3,11 +3,17 @@
 The paper's cell normals leak when used as a collider, so the solver builds its own from the triangles.
 Shape legend: K contact nodes, P points, F triangles, V vertices.
 
-Sheets (open meshes): nodes within `band_cells` of the surface, on both sides, with the normal toward the node's
-own side. The nodes nearest to the sheet (within half a cell) stop motion both ways: one that lies just behind the
-sheet would else pass on what comes from the front. Closed bodies: nodes inside, and nodes outside nearer than half
-a cell, with the normal outward; where the body is thinner than a cell, so that no node may lie inside, the sheet's
-band holds on its outside too. Where two obstacles claim a node, the closest surface wins.
+Sheets (open meshes): nodes within `band_cells` of the surface, with the normal toward the node's own side. The nodes
+nearest to the sheet (within half a cell) stop motion both ways: one that lies just behind the sheet would else pass on
+what comes from the front. Closed bodies: nodes inside, a third of a cell below the surface, with the
+normal outward; where the body is thinner than a cell, so that no node may lie there, those nearer to the surface and
+outside too, in a band of one cell at least. Where two obstacles claim a node, the closest surface wins. What nodes
+leave open the swept test stops.
+
+A particle's spline reaches 1.5 cells, so a solid block stops well above the uppermost node that stops it: 0.85 cells
+where there is one layer of such nodes, 1.32 where there are more below. For it to rest within a cell of the surface
+those nodes must lie that much lower: 0.15 cells above a sheet at most, so bands are lowered by 0.35 cells the way
+gravity pulls, and stay as thick; and 0.35 cells within a body.
 """
 
 from __future__ import annotations
@@ -24,8 +30,10 @@ from hgn.schema import ConfigError
 
 ONE_SIDED, BOTH_SIDES = 1, 2
 ON_SURFACE_CELLS = 0.05  # nearer than this, the direction to the surface is rounding
-BOTH_SIDES_CELLS = 0.5 + 1e-6
-CLOSED_BAND_CELLS = 0.5
+ROUNDING = 2e-6  # of a distance: a sheet midway between nodes has nodes on both sides within half a cell
+BOTH_SIDES_CELLS = 0.5 * (1 + ROUNDING)
+LOWERED_CELLS = 0.35  # of a band, where a sheet lies level
+BARE_CELLS = 0.35  # below a body's surface, where nodes stop nothing
 # squared area over fourth power of the longest edge, below which a triangle has no direction
 FLAT_TRIANGLE = 1e-20
 
@@ -57,13 +65,18 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
     """
     shape = tuple(round(length / scene.cell_size) for length in scene.domain_size)
     surface = _Surface(shape)
+    gravity = np.array(scene.gravity, np.float64)
+    up = -gravity / (np.linalg.norm(gravity) or 1.0)
     triangles = [np.zeros((0, 3, 3))]
     for index, obstacle in enumerate(scene.obstacles):
         triangle_F33 = _triangles(obstacle, index) / scene.cell_size
         triangles.append(triangle_F33)
         if len(triangle_F33):
-            own = _closed_contacts if obstacle.closed else _sheet_contacts
-            surface.merge(own(obstacle, triangle_F33, band_cells, shape, scene.cell_size))
+            surface.merge(
+                _closed_contacts(obstacle, triangle_F33, band_cells, shape, scene.cell_size)
+                if obstacle.closed
+                else _sheet_contacts(triangle_F33, band_cells, shape, up)
+            )
     node = np.flatnonzero(np.isfinite(surface.distance))
     return Collider(
         np.stack(np.unravel_index(node, shape), axis=1).astype(np.int32),
@@ -153,21 +166,25 @@ def _points(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _sheet_contacts(
-    obstacle: Obstacle, triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], cell_size: float
+    triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], up: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    node, distance, foot, owner = _rasterise(triangle_F33, band, shape)
+    lowered = min(LOWERED_CELLS, band)
+    node, distance, foot, owner = _rasterise(triangle_F33, (band + lowered) * (1 + ROUNDING), shape)
     on_surface = distance < ON_SURFACE_CELLS
     away = (_points(node, shape) - foot) / np.where(on_surface, 1.0, distance)[:, None]
     normal = np.where(on_surface[:, None], _face_normals(triangle_F33)[owner], away)
-    kind = np.where(distance <= BOTH_SIDES_CELLS, BOTH_SIDES, ONE_SIDED)
-    return node, distance, normal, kind
+    reach = distance + lowered * np.where(on_surface, 0.0, normal @ up)
+    chosen = reach <= band * (1 + ROUNDING)
+    kind = np.where(reach <= BOTH_SIDES_CELLS, BOTH_SIDES, ONE_SIDED)
+    return node[chosen], distance[chosen], normal[chosen], kind[chosen]
 
 
 def _closed_contacts(
     obstacle: Obstacle, triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], cell_size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     # one cell at least: a line of nodes that crosses the surface then meets a node of the band
-    node, distance, foot, owner = _rasterise(triangle_F33, max(band, 1.0), shape)
+    band = max(band, 1.0)
+    node, distance, foot, owner = _rasterise(triangle_F33, band, shape)
     within = contains(_points(node, shape) * cell_size, obstacle)
     inside = np.zeros(shape, bool)
     inside.ravel()[node[within]] = True
@@ -188,9 +205,9 @@ def _closed_contacts(
 
     # thin: a cell further on, past the surface, lies outside again
     thin = np.zeros(len(node), bool)
-    between = np.flatnonzero(~within & (distance > CLOSED_BAND_CELLS) & (distance <= band))
+    between = np.flatnonzero((sign * distance > -BARE_CELLS) & (distance <= band))
     thin[between] = ~contains((foot[between] - normal[between]) * cell_size, obstacle)
-    chosen = within | (distance < CLOSED_BAND_CELLS) | thin
+    chosen = (sign * distance <= -BARE_CELLS) | thin
     node, distance, normal = node[chosen], distance[chosen], normal[chosen]
 
     deep = np.flatnonzero(inside.ravel() & ~near.ravel())

@@ -10,11 +10,15 @@ Shape legend: T frames, N particles, F triangles.
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
+import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
+from datagen.mpm.collider import build_collider
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from datagen.mpm.sweep import near_pairs
 from hgn.config import MpmConfig
@@ -38,6 +42,8 @@ SIZE, SHEET = 12.8, 80.0  # of obstacles and of sheets, in cells
 GAP_CELLS = 1.5  # between obstacle and block
 NEAR_CELLS, NEAR_PARTICLES = 3.0, 20
 WAYS_AT_ONCE = 2_000_000
+FINER = 4
+PROCESSES_FROM_FRAMES = 20_000  # of all scenes
 CROSSED_AT_MOST, DEPTH_AT_MOST, GAP_AT_MOST = 1e-3, 0.25, 1.0  # fraction of the paths; cells; cells
 AT_REST_S = 3.0  # from when on a gap is one at rest
 
@@ -53,11 +59,17 @@ def leaks(base: MpmConfig, seconds: float, block_cells: float, offsets: int = le
         for kind in range(len(MATERIALS))
         for speed in SPEEDS
     ]
-    scenes = [scene(*key, offset, block_cells) for key in keys for offset in OFFSETS[:offsets]]
     frames = 1 + max(1, round(seconds * FRAME_RATE_HZ))
-    outcomes = simulate(scenes, base, frames, FRAME_RATE_HZ)
-    with ThreadPoolExecutor() as pool:
-        found = list(pool.map(_measure, scenes, outcomes))
+    # Taichi's process cannot be forked; a few scenes are done sooner here
+    many = len(keys) * offsets * frames >= PROCESSES_FROM_FRAMES
+    workers = max(1, len(os.sched_getaffinity(0)) - 1) if hasattr(os, "sched_getaffinity") else 1
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) if many else ThreadPoolExecutor() as pool:
+        scenes = [scene(*key, offset, block_cells) for key in keys for offset in OFFSETS[:offsets]]
+        colliders = list(pool.map(build_collider, scenes, [base.collider_band_cells] * len(scenes)))
+        outcomes = simulate(scenes, base, frames, FRAME_RATE_HZ, colliders=colliders)
+        paths = [outcome.cause if isinstance(outcome, SceneFailure) else _looked_at(outcome) for outcome in outcomes]
+        counters = [{} if isinstance(outcome, SceneFailure) else outcome.counters for outcome in outcomes]
+        found = list(pool.map(_measure, scenes, paths, counters))
     rows: list[Row] = []
     gaps: dict[str, float] = {}
     for index, (shape, turn, kind, speed) in enumerate(keys):
@@ -103,14 +115,20 @@ def scene(shape: str, turn: str, kind: int, speed: float, offset: Sequence[float
     return dataclasses.replace(fallen, domain_size=(DOMAIN_CELLS * CELL,) * 3)
 
 
-def _measure(scene: Scene, outcome: Simulated | SceneFailure) -> dict[str, float] | str:
-    if isinstance(outcome, SceneFailure):
-        return outcome.cause
+def _looked_at(outcome: Simulated) -> np.ndarray:
+    """All frames of the impact, fewer later, and the last."""
+    return np.concatenate(
+        [outcome.position_TN3[:IMPACT_FRAMES], outcome.position_TN3[IMPACT_FRAMES::LATER], outcome.position_TN3[-1:]]
+    )
+
+
+def _measure(scene: Scene, path: np.ndarray | str, counters: dict[str, Any]) -> dict[str, float] | str:
+    if isinstance(path, str):
+        return path
     (obstacle,) = scene.obstacles
-    path = np.concatenate([outcome.position_TN3[:IMPACT_FRAMES], outcome.position_TN3[IMPACT_FRAMES::LATER]])
-    crossed = crossing_paths(path, obstacle.vertex_V3[obstacle.triangle_F3])
+    crossed = crossing_paths(path, obstacle.vertex_V3[obstacle.triangle_F3], rim(obstacle))
     depth, gap = 0.0, 0.0
-    end = outcome.position_TN3[-1]
+    end = path[-1]
     distance, above = _distances(end, obstacle)
     if obstacle.closed:
         inside = contains(end, obstacle)
@@ -118,12 +136,12 @@ def _measure(scene: Scene, outcome: Simulated | SceneFailure) -> dict[str, float
     near = distance[above & (distance < NEAR_CELLS)]
     if len(near) >= NEAR_PARTICLES:  # of what rests on it, the lowest layer
         gap = float(np.quantile(near, 0.05))
-    steps = outcome.counters["substeps"] * scene.particle_count
+    steps = counters["substeps"] * scene.particle_count
     return {
         "crossed": crossed,
         "depth_p99_cells": depth,
         "gap_cells": gap,
-        "projections": outcome.counters["surface_projections"] / steps,
+        "projections": counters["surface_projections"] / steps,
     }
 
 
@@ -138,12 +156,13 @@ def _distances(point_N3: np.ndarray, obstacle: Obstacle) -> tuple[np.ndarray, np
     return best, above
 
 
-def crossing_paths(path_TN3: np.ndarray, triangle_F33: np.ndarray) -> float:
+def crossing_paths(path_TN3: np.ndarray, triangle_F33: np.ndarray, rim_E23: np.ndarray | None = None) -> float:
     """The fraction of particles with a way from frame to frame that crosses triangles (Möller, Trumbore 1997) an odd
-    number of times: the straight line between two places on one side of a bent surface may cut it twice.
+    number of times: the straight line between two places on one side of a bent surface may cut it twice. One that
+    begins or ends nearer to an edge of `rim_E23` than it is long is left out: it may have led around it.
 
-    Ways are looked up by cells: only those that begin within two cells of a triangle's box are tried against it. One
-    longer than a cell is tried against all.
+    Ways are looked up by cells, short ones by finer cells: only those that begin within two cells of a triangle's box
+    are tried against it. One longer than a cell is tried against all.
     """
     count = path_TN3.shape[1]
     start = path_TN3[:-1].reshape(-1, 3).astype(np.float64) / CELL
@@ -151,28 +170,57 @@ def crossing_paths(path_TN3: np.ndarray, triangle_F33: np.ndarray) -> float:
     particle = np.tile(np.arange(count), len(path_TN3) - 1)
     triangle = triangle_F33 / CELL
     crossings = np.zeros(len(start), np.int64)
-    long = np.flatnonzero(np.abs(way).max(axis=1) > 1)
+    longest = np.abs(way).max(axis=1)
+    long = np.flatnonzero(longest > 1)
     for corner in range(len(triangle)):
         crossings[long] += _crosses(start[long], way[long], triangle[np.full(len(long), corner)])
+    short = longest <= 1 / FINER
+    for scale, chosen in ((1, (longest <= 1) & ~short), (FINER, short)):
+        crossings[chosen] = _count_crossings(scale * start[chosen], scale * way[chosen], scale * triangle)
+    odd = np.flatnonzero(crossings % 2)
+    if rim_E23 is not None and len(rim_E23):
+        length = np.linalg.norm(way[odd], axis=1)
+        edge = (rim_E23 / CELL)[:, [0, 1, 1]].repeat(len(odd), axis=0)  # closest_points takes segments too
+        near = np.zeros(len(odd), bool)
+        for place in (start[odd], start[odd] + way[odd]):
+            many = np.tile(place, (len(rim_E23), 1))
+            away = np.linalg.norm(many - closest_points(many, edge), axis=1).reshape(len(rim_E23), -1)
+            near |= away.min(axis=0, initial=np.inf) <= length
+        odd = odd[~near]
+    crossed = np.zeros(count, bool)
+    crossed[particle[odd]] = True
+    return float(crossed.mean())
 
-    low = np.floor(start.min(axis=0)).astype(np.int64)
-    shape = tuple(np.floor(start.max(axis=0)).astype(np.int64) - low + 1)
-    cell = np.ravel_multi_index((np.floor(start).astype(np.int64) - low).T, shape)
-    cell[long] = -1  # tried already
+
+def _count_crossings(start_P3: np.ndarray, way_P3: np.ndarray, triangle_F33: np.ndarray) -> np.ndarray:
+    """How many triangles each way leads through, int64 [P]; no way may be longer than one along an axis."""
+    crossings = np.zeros(len(start_P3), np.int64)
+    if not len(start_P3):
+        return crossings
+    low = np.floor(start_P3.min(axis=0)).astype(np.int64)
+    shape = tuple(np.floor(start_P3.max(axis=0)).astype(np.int64) - low + 1)
+    cell = np.ravel_multi_index((np.floor(start_P3).astype(np.int64) - low).T, shape)
     order = np.argsort(cell, kind="stable")
     cell = cell[order]
-    for place, owner in near_pairs(triangle - low, 2.0, shape):
+    for place, owner in near_pairs(triangle_F33 - low, 2.0, shape):
         flat = np.ravel_multi_index(place.T, shape)
         begin, end = np.searchsorted(cell, flat), np.searchsorted(cell, flat, side="right")
         for part in np.array_split(np.arange(len(flat)), 1 + int((end - begin).sum()) // WAYS_AT_ONCE):
             many = (end - begin)[part]
             within = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
             own = order[np.repeat(begin[part], many) + within]
-            hit = _crosses(start[own], way[own], triangle[np.repeat(owner[part], many)])
-            crossings += np.bincount(own[hit], minlength=len(start))
-    crossed = np.zeros(count, bool)
-    crossed[particle[crossings % 2 == 1]] = True
-    return float(crossed.mean())
+            hit = _crosses(start_P3[own], way_P3[own], triangle_F33[np.repeat(owner[part], many)])
+            crossings += np.bincount(own[hit], minlength=len(start_P3))
+    return crossings
+
+
+def rim(obstacle: Obstacle) -> np.ndarray:
+    """The edges that only one triangle has, [E, 2, 3]."""
+    triangle = np.asarray(obstacle.triangle_F3)
+    edge, uses = np.unique(
+        np.sort(np.concatenate([triangle[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1), axis=0, return_counts=True
+    )
+    return np.asarray(obstacle.vertex_V3, np.float64)[edge[uses == 1]]
 
 
 def _crosses(start_P3: np.ndarray, way_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray:

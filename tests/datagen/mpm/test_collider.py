@@ -66,6 +66,23 @@ def test_sheet_nodes() -> None:
     assert set(collider.node_K3[collider.kind_K == BOTH_SIDES, 1]) == {5}
 
 
+def test_one_layer_of_nodes_holds_a_level_sheet() -> None:
+    """With the default band a level sheet has one layer of nodes wherever it lies, at most 0.15 cells above it as
+    gravity goes; an upright one has the nodes within half a cell.
+    """
+    band = MpmConfig().collider_band_cells
+    for offset in (0.0, 0.1, 0.15, 0.4, 0.5, 0.84, 0.86):
+        height = 5 + offset
+        for gravity, sign in ((-9.8, 1), (9.8, -1)):
+            collider = build_collider(scene_of(sheet(height * CELL), gravity=(0.0, gravity, 0.0)), band)
+            above = sign * (collider.node_K3[:, 1] - height)
+            assert len(set(above)) == 1 or offset in (0.15, 0.85)
+            assert above.min() >= -0.85 - 1e-5 and above.max() <= 0.15 + 1e-5
+            assert (collider.kind_K == BOTH_SIDES).all()
+        upright = build_collider(scene_of(sheet(height * CELL), gravity=(9.8, 0.0, 9.8)), band)
+        assert np.abs(upright.node_K3[:, 1] - height).max() <= 0.5 + 1e-5
+
+
 def test_sheet_on_nodes() -> None:
     """Where the sheet runs through nodes, those take the face normal and stop motion both ways."""
     collider = build_collider(scene_of(sheet(5 * CELL)), 1.5)
@@ -77,13 +94,11 @@ def test_sheet_on_nodes() -> None:
 
 @pytest.mark.parametrize("flip", [False, True], ids=["outward", "inward"])
 def test_body_nodes(flip: bool) -> None:
-    """A closed body claims its inside and half a cell outside, normals outward, whichever way its faces turn."""
+    """A closed body claims its inside but for a third of a cell, normals outward, whichever way its faces turn."""
     low, high = 4.2 * CELL, 11.1 * CELL
     collider = build_collider(scene_of(box((low,) * 3, (high,) * 3, flip)), 1.5)
     node = collider.node_K3 * CELL
-    distance = np.linalg.norm(np.maximum(np.maximum(low - node, node - high), 0), axis=1)
-    assert distance.max() <= 0.5 * CELL + 1e-9
-    assert ((node > low) & (node < high)).all(axis=1).sum() == 7**3
+    assert ((node > low + 0.35 * CELL) & (node < high - 0.35 * CELL)).all(axis=1).sum() == len(node) == 6**3
     centre = (low + high) / 2
     assert ((node - centre) * collider.normal_K3).sum(axis=1).min() > 0
     assert collider.count_inside(np.array([[0.5, 0.5, 0.5], [0.1, 0.5, 0.5]], np.float32)) == 1
@@ -96,7 +111,7 @@ def test_sheet_nodes_of_a_crumpled_mesh() -> None:
         corner + np.random.default_rng(1).uniform(-1, 1, (120, 3, 3)) * np.geomspace(0.005, 0.2, 120)[:, None, None]
     )
     mesh = Obstacle("crumpled", corner.reshape(-1, 3), np.arange(360).reshape(-1, 3).astype(np.int32), False)
-    collider = build_collider(scene_of(mesh), 1.5)
+    collider = build_collider(scene_of(mesh, gravity=(0.0, 0.0, 0.0)), 1.5)
     node = np.stack(np.unravel_index(np.arange(16**3), (16,) * 3), axis=1)
     distance = np.full(len(node), np.inf)
     for triangle in corner:
