@@ -151,6 +151,7 @@ class Pool:
         self._launch_size = plan.first_launch
         self._deaths_in_a_row = 0
         self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
+        self._group: dict[str, int] = {}  # keys whose worker died: which others they are tried again with
         self._grid_deaths: dict[SceneTask, int] = {}
 
     def run(self) -> None:
@@ -248,11 +249,13 @@ class Pool:
         """The next scenes to simulate; empty when it is better to wait for more of them."""
         self._ready.sort(key=lambda made: self._place(made.task))
         for made in self._ready:
-            if made.task.key in self._alone:
-                if solver.tasks:  # still being staged: alone means that no other can be to blame
+            group = self._group.get(made.task.key)
+            if group is not None:
+                if solver.tasks:  # still being staged: no other can be to blame
                     return []
-                self._ready.remove(made)
-                return [made]
+                batch = [other for other in self._ready if self._group.get(other.task.key) == group]
+                self._ready = [other for other in self._ready if self._group.get(other.task.key) != group]
+                return batch
         size = self._launch_size
         unmade = [*self._todo, *self._being_made()]
         if not self._ready or (unmade and len(self._ready) < size):
@@ -330,6 +333,7 @@ class Pool:
     def _quarantine(self, task: SceneTask, cause: str) -> None:
         self._progress.message(f"{task.key} (seed {task.seed}) could not be simulated: {cause}; trying another seed")
         self._alone.pop(task.key, None)
+        self._group.pop(task.key, None)
         self._put_back(self._writer.quarantine(task, cause))
 
     def _put_back(self, task: SceneTask) -> None:
@@ -340,7 +344,8 @@ class Pool:
         cause, blamable = worker.cause_of_death(), worker.blamable()
         self._deaths_in_a_row += blamable
         attempts = self._config.dataset.maximum_attempts
-        if self._deaths_in_a_row > 3 * attempts + self._plan.solvers:
+        halvings = self._plan.scenes_per_launch.bit_length()
+        if self._deaths_in_a_row > 3 * attempts + self._plan.solvers + halvings:
             raise RuntimeError(f"workers keep dying before they finish any scene, the last because {cause}")
         self._progress.message(f"a worker died ({cause}); it is replaced and its scenes are tried again")
         lost = list(worker.tasks.values())
@@ -351,7 +356,8 @@ class Pool:
             self._solvers[number] = self._crew.start_solver(number)
         else:
             self._makers[self._makers.index(worker)] = self._crew.start_maker()
-        for item in lost:
+        groups = max(self._group.values(), default=0) + 1
+        for place, item in enumerate(lost):
             task = _task(item)
             if isinstance(item, GridTask):
                 self._grid_lost(item, cause, blamable)
@@ -359,9 +365,11 @@ class Pool:
             if isinstance(item, MadeScene) and self._writer.is_staged(task.split, task.index):
                 self._accept(task)
                 continue
-            # of several scenes any may be to blame: each is tried alone before it is counted against it
+            # of several scenes any may be to blame: each half is tried without the other, down to a scene alone, and
+            # only then is it counted against it
             if blamable:
                 self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
+                self._group[task.key] = groups + (2 * place >= len(lost))
             if self._alone.get(task.key, 0) >= attempts:
                 self._quarantine(task, cause)
             elif isinstance(item, MadeScene):

@@ -6,8 +6,10 @@ Shape legend: T frames, N particles of a scene, B scenes.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -83,17 +85,38 @@ def simulate(
     if occupied:
         batch = ([scenes[i] for i in occupied], [colliders[i] for i in occupied], config, node_counts, frame_rate_hz)
         threads = _team_threads(device, batch[0]) if team_threads is None else team_threads
-        launch: Launch = TeamLaunch(threads, *batch) if threads else GridLaunch(device, *batch)
-        try:
-            outcomes = launch.run(frames, on_frame)
-        finally:
-            launch.release()
+        with _arrays_freed_here():
+            outcomes = _launched(
+                TeamLaunch(threads, *batch) if threads else GridLaunch(device, *batch), frames, on_frame
+            )
         for index, outcome in zip(occupied, outcomes, strict=True):
             results[index] = outcome
     elif on_frame is not None:
         for frame in range(frames):
             on_frame(frame)
     return results
+
+
+def _launched(launch: Launch, frames: int, on_frame: Callable[[int], None] | None) -> list[Simulated | SceneFailure]:
+    try:
+        return launch.run(frames, on_frame)
+    finally:
+        launch.release()
+
+
+@contextlib.contextmanager
+def _arrays_freed_here() -> Iterator[None]:
+    """Taichi's copies leave arrays in reference cycles, which are freed by whichever thread happens to collect garbage;
+    one that has no CUDA context ends the process. So garbage is collected by this thread alone.
+    """
+    automatic = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.collect()
+        if automatic:
+            gc.enable()
 
 
 def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -70,6 +71,7 @@ class TeamLaunch(Launch):
             expected = (time.perf_counter() - begin) / size
             size = min(max(1, min(2 * size, int(LAUNCH_SECONDS / expected))), most, frames - done)
             del output  # before the device is at work: memory may only come free when it rests
+            gc.collect(0)  # its cycle, see solver: none is collected by itself
             # which it does not need to while these frames are taken away
             begin, output = time.perf_counter(), self._launch(size, work)
             yield position, completed
