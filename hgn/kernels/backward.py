@@ -415,6 +415,7 @@ class TrainingEngine(Engine):
         table = grid.neighbour(level)
         size, warps = self._row_block(rows)
         edge_size, edge_warps = self._edge_block(rows)
+        overlap = self.overlaps(rows)
         for m in reversed(range(steps)):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             later = m if last else m + 1
@@ -447,9 +448,11 @@ class TrainingEngine(Engine):
                 WIDTH=self.width,
                 BLOCK=size,
                 PRECISION=self.precision,
+                OVERLAP=overlap and size == self.tuning.small_block,
                 num_warps=warps,
+                launch_pdl=overlap and size == self.tuning.small_block,
             )
-            edge_backward[self._programs(rows, edge_size)](
+            edge_backward[self._programs(rows, self._edge_cells(edge_size))](
                 sum_gradient,
                 edge_gradient,
                 table,
@@ -472,9 +475,12 @@ class TrainingEngine(Engine):
                 FIRST=m == 0,
                 LAST=last,
                 WIDTH=self.width,
-                BLOCK=edge_size,
+                ROWS=8 * edge_size,
+                DENSE=self.tuning.dense,
                 PRECISION=self.precision,
+                OVERLAP=overlap,
                 num_warps=edge_warps,
+                launch_pdl=overlap,
             )
         first = block.packed.edge[0]
         into, received = g[f"{name}0_s"], (g[f"{name}0_r"], first.parts[1])

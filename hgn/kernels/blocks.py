@@ -54,9 +54,9 @@ def weighted_sums(w, x, PRECISION: tl.constexpr):
 
 
 @triton.jit
-def members(SUMS: tl.constexpr, ROWS: tl.constexpr):
-    """[SUMS, ROWS]: one where a row is among the eight of a sum, else zero."""
-    return tl.where(tl.arange(0, ROWS)[None, :] // 8 == tl.arange(0, SUMS)[:, None], 1.0, 0.0)
+def members(SUMS: tl.constexpr, ROWS: tl.constexpr, EACH: tl.constexpr):
+    """[SUMS, ROWS]: one where a row is among the EACH of a sum, else zero."""
+    return tl.where(tl.arange(0, ROWS)[None, :] // EACH == tl.arange(0, SUMS)[:, None], 1.0, 0.0)
 
 
 @triton.jit
@@ -73,6 +73,13 @@ def transposed(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
     row = tl.arange(0, ROWS)
     column = tl.arange(0, COLUMNS)
     return tl.load(pointer + row[None, :] * COLUMNS + column[:, None])
+
+
+@triton.jit
+def inside(vector, tile):
+    """`vector`, as a value of the loop over tiles: else it is laid out for the matrix units before the loop, where each
+    thread holds a quarter of it, and registers spill. Tiles are numbered from 0."""
+    return tl.where(tile >= 0, vector, 0.0)
 
 
 @triton.jit

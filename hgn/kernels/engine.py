@@ -40,17 +40,19 @@ class Tuning:
     pair_warps: int
     small_block: int = 16  # where there are few rows
     small_warps: int = 8
+    dense: bool = False  # six rows a cell in the tiles of edges, not eight
+    overlap: bool = False  # on levels with few rows, kernels of a message step read their weights before their turn
 
     @staticmethod
     def of(precision: str) -> Tuning:
         """What was fastest on an H100 at width 128."""
         if precision == "ieee":
-            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4)
+            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, dense=True)
         if precision == "tf32x3":
             return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8)
         if precision == "tf32":  # operands of twice the size
             return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8)
-        return Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4)
+        return Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, dense=True, overlap=True)
 
 
 @dataclass
@@ -285,6 +287,17 @@ class Engine:
         few = cells <= PROCESSORS * tuning.few_cell_block
         return (tuning.few_cell_block, tuning.few_cell_warps) if few else (tuning.cell_block, tuning.cell_warps)
 
+    def overlaps(self, rows: int) -> bool:
+        """Whether the kernels of a message step on so many cells start before the one before has ended."""
+        if not self.tuning.overlap or rows >= FEW_ROWS or triton.knobs.runtime.interpret:
+            return False
+        target = triton.runtime.driver.active.get_current_target()
+        return target.backend == "cuda" and target.arch >= 90
+
+    def _edge_cells(self, block: int) -> int:
+        """Cells that a tile of edges takes where it has rows for `block` of eight each."""
+        return 8 * block // 6 if self.tuning.dense else block
+
     def _programs(self, rows: int, block: int) -> tuple[int]:
         """Programs that take one block after the other: as many as run at once."""
         return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS),)
@@ -413,6 +426,7 @@ class Engine:
         rows = grid.capacities[level]
         size, warps = self._row_block(rows)
         edge_size, edge_warps = self._edge_block(rows)
+        overlap = self.overlaps(rows)
         for m in range(steps):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             if not last:
@@ -422,7 +436,7 @@ class Engine:
             else:
                 product = block.product if block.product is not None else block.send[(m + 1) % 2]
                 next_at, into, products = (block.next_at, 0), (product, product), int(block.product is not None)
-            edge_forward[self._programs(rows, edge_size)](
+            edge_forward[self._programs(rows, self._edge_cells(edge_size))](
                 block.send[m % 2],
                 block.receive[m % 2],
                 block.edge[m - 1] if m > 0 else block.cell[m],
@@ -446,9 +460,12 @@ class Engine:
                 STORE_EDGE=not last,
                 SAVE=self.training,
                 WIDTH=self.width,
-                BLOCK=edge_size,
+                ROWS=8 * edge_size,
+                DENSE=self.tuning.dense,
                 PRECISION=self.precision,
+                OVERLAP=overlap,
                 num_warps=edge_warps,
+                launch_pdl=overlap,
             )
             cell_forward[self._blocks(rows, size)](
                 block.cell[m],
@@ -476,5 +493,7 @@ class Engine:
                 WIDTH=self.width,
                 BLOCK=size,
                 PRECISION=self.precision,
+                OVERLAP=overlap and size == self.tuning.small_block,
                 num_warps=warps,
+                launch_pdl=overlap and size == self.tuning.small_block,
             )

@@ -11,6 +11,7 @@ import triton.language as tl
 
 from hgn.kernels.blocks import (
     added,
+    inside,
     leaky,
     leaky_backward,
     matrix,
@@ -68,6 +69,12 @@ def pairs_forward(
     if tl.program_id(0) * PARTICLES >= count:
         return
     column = tl.arange(0, WIDTH)
+    # vectors once: in the loop each would be waited for again
+    bias, second_bias = tl.load(values + bias_at + column), tl.load(values + second_bias_at + column)
+    gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
+    offset_0 = tl.load(values + offset_at + column)
+    offset_1 = tl.load(values + offset_at + WIDTH + column)
+    offset_2 = tl.load(values + offset_at + 2 * WIDTH + column)
     second = transposed(weights + second_at, WIDTH, WIDTH)
     tile = tl.program_id(0)
     while tile * PARTICLES < count:
@@ -80,22 +87,21 @@ def pairs_forward(
         h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
         if not TO_CELL:
             h = added(h, tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0))
-        h = h.to(tl.float32) + tl.load(values + bias_at + column)[None, :]
-        for axis in tl.static_range(3):
-            side = _offset(fraction, owner, corner, live, axis)
-            if not TO_CELL:
-                side = -side
-            h += side[:, None] * tl.load(values + offset_at + axis * WIDTH + column)[None, :]
+        sign = 1.0 if TO_CELL else -1.0
+        h = h.to(tl.float32) + inside(bias, tile)[None, :]
+        h += (sign * _offset(fraction, owner, corner, live, 0))[:, None] * inside(offset_0, tile)[None, :]
+        h += (sign * _offset(fraction, owner, corner, live, 1))[:, None] * inside(offset_1, tile)[None, :]
+        h += (sign * _offset(fraction, owner, corner, live, 2))[:, None] * inside(offset_2, tile)[None, :]
         a = leaky(h)
         pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
         if SAVE:
             tl.store(hidden + pair_at, a, mask=here)
         z = product(a, second, PRECISION)
-        z, scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
+        z, scale = normalise(z + inside(second_bias, tile)[None, :], WIDTH)
         if SAVE:
             tl.store(normalised + pair_at, z, mask=here)
             tl.store(deviation + owner * 8 + corner, scale, mask=live)
-        z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
+        z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
         weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
         z = z * weight[:, None]
         if TO_CELL:
@@ -111,7 +117,7 @@ def pairs_forward(
             else:
                 mine = tile * PARTICLES + tl.arange(0, SUMS)
                 ends = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
-                summed = weighted_sums(members(SUMS, ROWS), z, PRECISION)
+                summed = weighted_sums(members(SUMS, ROWS, 8), z, PRECISION)
             at = mine[:, None] * WIDTH + column[None, :]
             tl.store(out + at, summed + tl.load(particle + at, mask=ends, other=0.0), mask=ends)
         tile += tl.num_programs(0)
@@ -154,6 +160,7 @@ def pairs_backward(
         return
     column = tl.arange(0, WIDTH)
     second = matrix(weights + second_at, WIDTH, WIDTH)
+    gain = tl.load(values + gain_at + column)
     sums = tl.arange(0, SUMS)
     gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
     side_total = tl.zeros((SUMS, WIDTH), tl.float32)
@@ -178,7 +185,7 @@ def pairs_backward(
         dy, z = dy * weight[:, None], z.to(tl.float32)
         gain_total += tl.sum(dy * z, 0)
         shift_total += tl.sum(dy, 0)
-        dz = normalise_backward(dy, z, scale, tl.load(values + gain_at + column), WIDTH)
+        dz = normalise_backward(dy, z, scale, inside(gain, tile), WIDTH)
         tl.store(second_gradient + pair_at, dz, mask=here)
         dh = product(dz, second, PRECISION)
         dh = leaky_backward(dh, a.to(tl.float32))
@@ -186,7 +193,7 @@ def pairs_backward(
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
         # the sums over a particle's pairs, and in the last rows those of the offsets' weights
-        chosen = members(SUMS, ROWS)
+        chosen = members(SUMS, ROWS, 8)
         for axis in tl.static_range(3):
             side = _offset(fraction, owner, corner, live, axis)
             chosen = tl.where((sums == SUMS - 3 + axis)[:, None], side[None, :], chosen)
