@@ -59,12 +59,13 @@ class WorkerPlan:
 
 
 def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float) -> WorkerPlan:
-    """One solver for two cores on a CPU; on GPUs one solver, with scene makers on the cores."""
+    """One solver for two cores on a CPU; one for each GPU, with scene makers on the cores."""
     workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
     if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
-        launch = launch or gpu_scenes_per_launch(config, memory_bytes)
+        solvers = workers or max(1, len(gpus))
+        launch = launch or gpu_scenes_per_launch(config, memory_bytes / solvers)
         makers = max(1, min(MAXIMUM_MAKERS, cpu_count - 1))
-        return WorkerPlan(workers or 1, None, makers, launch, gpu_first_launch(config, launch), gpus)
+        return WorkerPlan(solvers, None, makers, launch, gpu_first_launch(config, launch), gpus)
     solvers = workers or max(1, cpu_count // 2)
     threads = max(1, cpu_count // solvers)
     return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
@@ -148,7 +149,8 @@ class Pool:
     ) -> None:
         self._config, self._writer, self._progress = config, writer, progress
         self._plan, self._crew, self._should_stop = plan, crew, should_stop
-        self._launch_size = plan.first_launch
+        self._launch_size = self._largest_launch = plan.first_launch
+        self._launches = 0
         self._deaths_in_a_row = 0
         self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
         self._group: dict[str, int] = {}  # keys whose worker died: which others they are tried again with
@@ -189,6 +191,12 @@ class Pool:
         # a solver needs seconds to start, so all start before the first scene is asked for
         self._solvers = [self._crew.start_solver(i) for i in range(min(self._plan.solvers, missing))]
         self._makers = [self._crew.start_maker() for _ in range(min(self._plan.makers, missing))]
+        self._launch_size = min(self._largest_launch, self._share(0))
+
+    def _share(self, taken: int) -> int:
+        """Scenes for each solver of those that none has, `taken` of which are about to be given to one."""
+        left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
+        return max(1, math.ceil(left / len(self._solvers)))
 
     def _claim(self) -> None:
         """Claims shards as the makers need them, so that other generators on the folder find work too."""
@@ -218,9 +226,12 @@ class Pool:
         return shard is not None
 
     def _hand_out(self) -> None:
-        for solver in self._solvers:
-            if solver.idle and (batch := self._next_batch(solver)):
+        # a GPU's solver asks for more as soon as it has some: first those that have none, also while they start
+        for solver in sorted(self._solvers, key=lambda solver: (bool(solver.tasks), solver.given)):
+            others_first = solver.tasks and any(other.idle and not other.tasks for other in self._solvers)
+            if solver.idle and not others_first and (batch := self._next_batch(solver)):
                 solver.tasks.update((made.task.key, made) for made in batch)
+                solver.given += len(batch)
                 solver.give(batch)
         for maker in self._makers:
             if maker.idle and (task := self._next_task()):
@@ -261,11 +272,14 @@ class Pool:
         if not self._ready or (unmade and len(self._ready) < size):
             return []
         # training waits for the first shards in order, so small launches must not overtake a scene still being made
-        growing = size < self._plan.scenes_per_launch
+        growing = self._largest_launch < self._plan.scenes_per_launch
         if growing and any(self._place(task) < self._place(self._ready[size - 1].task) for task in unmade):
             return []
-        self._launch_size = min(_LAUNCH_GROWTH * size, self._plan.scenes_per_launch)
         batch, self._ready = self._ready[:size], self._ready[size:]
+        self._launches += 1
+        if self._launches % len(self._solvers) == 0:  # each has had one of this size
+            self._largest_launch = min(_LAUNCH_GROWTH * self._largest_launch, self._plan.scenes_per_launch)
+            self._launch_size = min(self._largest_launch, self._share(len(batch)))
         return batch
 
     def _receive(self, timeout: float) -> None:

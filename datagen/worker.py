@@ -88,6 +88,7 @@ class Worker(ABC):
     def __init__(self) -> None:
         self.idle = False
         self.tasks: dict[str, SceneTask | MadeScene | GridTask] = {}  # what it has and has not answered for, by key
+        self.given = 0  # scenes to simulate, in all
 
     @abstractmethod
     def give(self, message: object) -> None:

@@ -158,7 +158,7 @@ class DatasetConfig:
     seed: int = 0
     early_episodes: bool = False  # a GPU begins with few scenes, because training waits for them
     episodes_per_shard: int = 8  # the first training shards are smaller, so that training can start early
-    workers: int | None = None  # none: one on a GPU, one per two cores on a CPU
+    workers: int | None = None  # none: one for each GPU, or for two cores of a CPU
     maximum_attempts: int = 3  # per scene before it is quarantined and replaced
     pool: str = "local"  # processes of this machine; or ray: of a Ray cluster
     ray_address: str | None = None  # of the cluster; none: what RAY_ADDRESS says, else the one of this machine

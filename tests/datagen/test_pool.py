@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from datagen.plan import scene_seed
 from datagen.pool import LocalCrew, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
 from datagen.progress import Progress
-from datagen.worker import Backend
+from datagen.worker import Backend, Worker
 from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
@@ -79,6 +80,35 @@ def test_batches(make_config: MakeConfig, backend: Backend, control: Path) -> No
     recorder = generate(config, backend, WorkerPlan(1, None, 2, 4, 2))
     assert recorder.launches == [2, 4, 3]
     assert sorted(simulated(control)) == sorted(scene_seed(0, "train", i, 0) for i in range(9))
+
+
+def test_scenes_are_spread_over_solvers(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+    """Each of three solvers gets a launch of the same size, though those on a GPU ask for more as soon as they have
+    one, and some take long to start.
+    """
+    config = make_config(training_scenes=11, validation_scenes=0, test_scenes=0)
+    batches: dict[int, list[int]] = {}
+
+    class Crew(LocalCrew):
+        def start_solver(self, number: int) -> Worker:
+            worker = super().start_solver(number)
+            give = worker.give
+
+            def recorded(message: Any) -> None:
+                batches.setdefault(number, []).append(len(message))
+                give(message)
+                worker.idle = True  # asks for more before any other has started
+
+            worker.give = recorded  # type: ignore[method-assign]
+            return worker
+
+    for first, expected in ((9, {0: [4], 1: [4], 2: [3]}), (1, {0: [1, 3], 1: [1, 3], 2: [1, 2]})):
+        shutil.rmtree(config.dataset.folder, ignore_errors=True)
+        batches.clear()
+        plan = WorkerPlan(3, None, 1, 9, first)
+        with DatasetWriter(config) as writer:
+            Pool(config, writer, Recorder(), plan, Crew(config, backend, plan)).run()
+        assert batches == expected
 
 
 def test_first_launch_waits_for_the_first_scenes(make_config: MakeConfig, backend: Backend, control: Path) -> None:
@@ -198,7 +228,7 @@ def test_every_scene_fails(make_config: MakeConfig, backend: Backend, control: P
 
 
 def test_worker_plans() -> None:
-    """One solver for two cores; on a GPU one solver with full launches and makers in front; settings win."""
+    """One solver for two cores; one for each GPU, with full launches and makers in front; settings win."""
     default = DatagenConfig()
     assert plan_workers(default, (), 8, 2**36) == WorkerPlan(4, 2, 1, 1, 1)
     assert plan_workers(default, (), 1, 2**36) == WorkerPlan(1, 1, 1, 1, 1)
@@ -212,6 +242,10 @@ def test_worker_plans() -> None:
     assert plan_workers(early, ("0",), 8, 2**36) == WorkerPlan(1, None, 7, 832, 2, ("0",))
     assert plan_workers(many, (), 8, 2**36) == WorkerPlan(3, 2, 1, 2, 2)
     assert plan_workers(many, ("4", "5"), 8, 2**36) == WorkerPlan(3, None, 7, 2, 2, ("4", "5"))
+    assert plan_workers(default, ("4", "5"), 8, 2**40) == WorkerPlan(2, None, 7, 832, 264, ("4", "5"))
+    assert plan_workers(default, ("4", "5"), 8, 2**33).scenes_per_launch == 138  # each holds its own frames
+    alone = DatagenConfig(dataset=DatasetConfig(workers=1))
+    assert plan_workers(alone, ("4", "5"), 8, 2**40).solvers == 1
 
 
 def test_hidden_gpus_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
