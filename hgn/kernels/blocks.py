@@ -11,6 +11,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from hgn.kernels.keys import settle_keys
+
 LEAKY = tl.constexpr(0.01)  # hgn.network.fcn.LEAKY_SLOPE
 EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
 
@@ -148,3 +150,6 @@ def added(x, y):
     Of a plain sum the compiler takes each part to the matrix units' layout by itself, one after the other.
     """
     return tl.sum(tl.join(x.to(tl.float32), y.to(tl.float32)), 2)
+
+
+settle_keys(globals())

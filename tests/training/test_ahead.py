@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -70,9 +71,24 @@ def test_an_interruption_ends_them(started: list[AheadCompilation]) -> None:
 def test_the_launches_are_those_of_an_update(tmp_path: Path) -> None:
     """Without memory and without a GPU the same kernels with the same specialisations are found as on tensors that
     exist, and one of them is compiled into Triton's cache."""
-    program = Path(__file__).with_name("ahead_program.py")
-    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
-    environment |= {"TRITON_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(CHECKOUT)}
-    done = subprocess.run([sys.executable, str(program)], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    run_compiled(tmp_path, "ahead_program.py")
     assert list(tmp_path.glob("*/*.cubin"))
+
+
+def test_every_process_looks_under_the_same_keys(tmp_path: Path) -> None:
+    """A kernel's key in the cache on disk does not depend on which kernels the process saw before: those that a share
+    compiles are found by a training, which begins with others."""
+    with ThreadPoolExecutor() as pool:
+        texts = pool.map(lambda order: run_compiled(tmp_path, "ahead_keys.py", order), ("launch", "behind"))
+    keys = [text.split("\n") for text in texts]
+    assert len(keys[0]) > 30 and keys[0] == keys[1][::-1]
+
+
+def run_compiled(folder: Path, program: str, *arguments: str) -> str:
+    """Runs a program of this folder with Triton compiling into `folder`, not interpreting; what it printed."""
+    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
+    environment |= {"TRITON_CACHE_DIR": str(folder), "PYTHONPATH": str(CHECKOUT)}
+    command = [sys.executable, str(Path(__file__).with_name(program)), *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()

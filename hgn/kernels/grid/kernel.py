@@ -13,6 +13,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from hgn.kernels.keys import settle_keys
+
 GEOMETRY_COLUMNS = tl.constexpr(8)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 OVERFLOW = tl.constexpr(1)  # more active cells than capacity
@@ -325,3 +327,6 @@ def prepare_particles(
     material = tl.load(material_of + row, mask=live, other=0)
     value = tl.where((column[None, :] - (WALLS + 6)) == material[:, None], 1.0, value)
     tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
+
+
+settle_keys(globals())

@@ -29,6 +29,7 @@ from hgn.kernels.blocks import (
     transposed,
     weighted_sums,
 )
+from hgn.kernels.keys import settle_keys
 
 FIRST_WAVE = tl.constexpr(128)  # programs that run at once on an H100, one on each processor
 
@@ -432,3 +433,6 @@ def edge_backward(
         axis = tl.arange(0, 16)[:, None]
         at = totals + own_at + axis * WIDTH + column[None, :]
         tl.atomic_add(at, side_total * unscale, mask=axis < 3, sem="relaxed")
+
+
+settle_keys(globals())

@@ -22,6 +22,7 @@ from hgn.kernels.blocks import (
     transposed,
     weighted_sums,
 )
+from hgn.kernels.keys import settle_keys
 
 
 @triton.jit
@@ -209,3 +210,6 @@ def pairs_backward(
     sign = unscale if TO_CELL else -unscale
     at = totals + offset_at + axis * WIDTH + column[None, :]
     tl.atomic_add(at, side_total * sign, mask=axis >= 0, sem="relaxed")
+
+
+settle_keys(globals())

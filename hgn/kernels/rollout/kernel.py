@@ -8,6 +8,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from hgn.kernels.keys import settle_keys
+
 DIVERGED = tl.constexpr(4)
 
 
@@ -68,3 +70,6 @@ def advance(status, lost, frame):
         tl.store(frame, tl.load(frame) + 1)
         if tl.load(lost) > 0:
             tl.store(status, DIVERGED)
+
+
+settle_keys(globals())

@@ -19,6 +19,7 @@ from hgn.kernels.blocks import (
     product,
     transposed,
 )
+from hgn.kernels.keys import settle_keys
 
 
 @triton.jit
@@ -273,3 +274,6 @@ def gather_project_backward(
     if ADD:
         result += tl.load(gradient + at, mask=live, other=0.0)
     tl.store(gradient + at, result, mask=live)
+
+
+settle_keys(globals())

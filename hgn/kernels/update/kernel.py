@@ -12,6 +12,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import nearest_tf32
+from hgn.kernels.keys import settle_keys
 
 SAMPLE_COLUMNS = tl.constexpr(10)
 OBSTACLE_COLUMNS = tl.constexpr(5)
@@ -298,3 +299,6 @@ def finish_update(status, update, step, loss, norm, loss_sum, counters):
             tl.store(counters + 4, tl.maximum(tl.load(counters + 4), row))
     tl.store(loss, 0.0)
     tl.store(norm, 0.0)
+
+
+settle_keys(globals())

@@ -9,6 +9,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from hgn.kernels.keys import settle_keys
+
 JOB_COLUMNS = 8
 
 
@@ -61,3 +63,6 @@ def weight_gradient(
     at = out_at + column[:, None] * b_width + column[None, :]
     mask = (column < a_width)[:, None] & (column < b_width)[None, :]
     tl.atomic_add(totals + at, total * unscale, mask=mask, sem="relaxed")
+
+
+settle_keys(globals())
