@@ -297,7 +297,7 @@ class TrainingConfig:
     weights: str | None = None  # what a new run begins with: a file of python -m hgn.export, or a shipped name
     ema_decay: float = 0.0  # of the moving average of the weights, an update; 0: none
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
-    noise_smooth: float = 0.0  # share of its variance that neighbours have in common
+    noise_smooth: float = 0.1  # share of its variance that neighbours have in common; 0: the paper's
     grid_jitter: bool = True
     symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
     seed: int = 0

@@ -35,7 +35,7 @@ def smooth_walk(
     shortest, longest = (cells * cell_size for cells in SMOOTH_CELLS)
     number_K = 2 * math.pi / shortest * torch.exp(-math.log(longest / shortest) * length_K)
     wave_K3 = direction_K3 * (number_K / direction_K3.norm(dim=1))[:, None]
-    height_NK = torch.cos(position_N3 @ wave_K3.T + phase_K)
+    height_NK = torch.cos(position_N3.float() @ wave_K3.T + phase_K)
     amplitude_MK3 = random_walk((history, waves, 3), std_last * math.sqrt(2 / waves), generator)
     return height_NK @ amplitude_MK3
 

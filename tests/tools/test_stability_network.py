@@ -15,11 +15,13 @@ from network.states import network_of
 from PIL import Image
 
 from hgn.config import SceneConfig
+from hgn.network.features import ParticleState
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.schema import ConfigError, from_mapping
 from tools.stability.network import case_row, case_trials, energy_growth, main
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
+from tools.stability.network_free_fall import free_fall_rows
 from tools.stability.row import Row
 from tools.trial import Trial
 
@@ -58,7 +60,13 @@ def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.Captu
     alone = [f"{name} alone" for name in ("water", "sand", "snow")]
     thrown = f"thrown at up to {8 * (2 * 9.8) ** 0.5:.1f} a second"
     held = ["5 frames", "particles x10", "domain x4", *singles, *alone, "at the end of 64000 cells"]
-    assert list(rows) == [*held[:3], thrown, *held[3:], "a weight that explodes"]
+    falls = [
+        f"{case}, {name}" for name in ("water", "sand", "snow") for case in ("free fall", "a body's velocity error")
+    ]
+    assert list(rows) == [*falls, *held[:3], thrown, *held[3:], "a weight that explodes"]
+    # what never accelerates misses all of gravity, and answers to nothing
+    assert all(rows[name]["measured"] == pytest.approx(1.0, rel=1e-3) and not rows[name]["held"] for name in falls[::2])
+    assert all(abs(rows[name]["measured"]) < 1e-6 for name in falls[1::2])
     keys = {"part", "case", "predicted", "measured", "held", "beyond"}
     assert all(keys <= row.keys() and row["part"] == "network" for row in rows.values())
     for name in held:
@@ -69,6 +77,30 @@ def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.Captu
     broken = rows["a weight that explodes"]
     assert broken["held"] and broken["guard"] == "raised" and "diverged at frame 1" in broken["beyond"]
     assert "a weight that explodes" in capsys.readouterr().out
+
+
+class Repeats(torch.nn.Module):
+    """Accelerates as in the frame before, plus what `share` says of the last velocity along x."""
+
+    def __init__(self, network: torch.nn.Module, share: float) -> None:
+        super().__init__()
+        self.config, self.share, self.weight = network.config, share, torch.nn.Parameter(torch.zeros(1))
+
+    def forward(self, state: ParticleState) -> torch.Tensor:
+        acceleration_N3 = state.velocity_NM3[:, 0] - state.velocity_NM3[:, 1]
+        return acceleration_N3 * torch.tensor([self.share, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(("share", "held"), [(1.0, False), (-1.0, True)])
+def test_free_fall(share: float, held: bool) -> None:
+    """What goes on as it was falls rightly; it repeats a body's velocity error, or takes it back, and is told so."""
+    network = network_of(torch.float32, width=8, material_embedding=2, message_passing_steps=1, levels=2)
+    simulator = Simulator(Repeats(network, share), 60.0)  # type: ignore[arg-type]
+    fall, error = free_fall_rows(simulator, SceneConfig(), "sand")
+    assert fall.held and fall.measured == pytest.approx(0.0, abs=1e-3)
+    assert error.held is held and error.measured == pytest.approx(share, rel=1e-3)
+    assert error.more["of_a_constant_velocity"] == pytest.approx(0.0, abs=1e-3)
+    assert error.more["of_a_particle"] == pytest.approx(share, rel=1e-3)
 
 
 def row_of(simulator: Simulator, case: Case, energy_bound: float) -> Row:
@@ -120,7 +152,7 @@ def test_scenes_follow_the_network() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"cases": ["wide"]}, r"cases\[0\] must be one of long"),
+        ({"cases": ["wide"]}, r"cases\[0\] must be one of free_fall"),
         ({"domain_factors": [5]}, r"domain_factors\[0\] must be a square"),
         ({"frames": 1}, "frames must be at least 2"),
         ({"energy_bound": 0.0}, "energy_bound must be a finite number > 0"),

@@ -31,6 +31,7 @@ from hgn.scene.rollout_file import Rollout
 from hgn.schema import from_mapping, to_mapping
 from tools.measures import energies, energy_scale, outside_domain
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
+from tools.stability.network_free_fall import free_fall_rows
 from tools.stability.row import Row, table
 from tools.trial import FrameClock, Trial, network_trials
 
@@ -60,6 +61,10 @@ def main(mapping: dict[str, Any]) -> int:
         if config.picture is not None and pictures:
             write_picture(config.picture, stacked(pictures))
 
+    if "free_fall" in (config.cases or CASES):
+        for material in network.config.materials:
+            rows += free_fall_rows(simulator, config.scene, material)
+        keep()
     made = list(cases(config, network.config))
     with bar("cases", total=len(made), unit="case") as progress:
         for case in made:

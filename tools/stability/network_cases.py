@@ -17,7 +17,7 @@ from hgn.scene.random_scene import generate_scene
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, require, require_one_of, require_positive
 
-CASES = ("long", "particles", "domain", "speed", "single", "material", "far", "guard")
+CASES = ("free_fall", "long", "particles", "domain", "speed", "single", "material", "far", "guard")
 SEED = 1_000_000  # beyond those of any data set's first scenes; a scene's own seed is added
 ATTEMPTS = 20  # at scenes that turn out to be too full
 
