@@ -297,6 +297,7 @@ class TrainingConfig:
     weights: str | None = None  # what a new run begins with: a file of python -m hgn.export, or a shipped name
     ema_decay: float = 0.0  # of the moving average of the weights, an update; 0: none
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
+    huber: float | None = None  # normalised error from which the loss grows linearly, each axis apart; none: squared
     noise_smooth: float = 0.1  # share of its variance that neighbours have in common; 0: the paper's
     grid_jitter: bool = True
     symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
@@ -346,8 +347,9 @@ class TrainingConfig:
             f"at most learning_rate ({self.learning_rate})",
             self.final_learning_rate,
         )
-        if self.maximum_minutes is not None:
-            require_positive(self, "maximum_minutes")
+        for name in ("maximum_minutes", "huber"):
+            if getattr(self, name) is not None:
+                require_positive(self, name)
         for name in ("devices", "nodes"):
             if getattr(self, name) is not None:
                 require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))

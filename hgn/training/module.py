@@ -93,7 +93,9 @@ class TrainingModule(LightningModule):
             torch._foreach_lerp_(averaged, weights, self._average_share(update))
 
     def loss(self, batch: Batch) -> torch.Tensor:
-        """Mean squared error of the normalised acceleration: over axes, over particles, over scenes."""
+        """Mean squared error of the normalised acceleration: over axes, over particles, over scenes; with
+        `training.huber` large errors count linearly (Huber 1964, twice its loss).
+        """
         config = self.training_config
         if config.symmetry != "none":
             batch = under_symmetries(batch, drawn_symmetries(batch))
@@ -101,7 +103,11 @@ class TrainingModule(LightningModule):
         origin_S3 = jittered_origin(batch, self.network.config.cell_size) if config.grid_jitter else None
         target_N3 = self.network.normaliser.normalise_acceleration(batch.acceleration(window_WN3))
         predicted_N3 = self.network.normalised_acceleration(batch.state(window_WN3), origin_S3)
-        return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
+        error_N3 = predicted_N3 - target_N3
+        if config.huber is None:
+            return batch.mean_over_scenes(error_N3.square().mean(-1))
+        clipped_N3 = error_N3.clamp(-config.huber, config.huber)
+        return batch.mean_over_scenes((clipped_N3 * (2 * error_N3 - clipped_N3)).mean(-1))
 
     def on_train_start(self) -> None:
         if not self.automatic_optimization:

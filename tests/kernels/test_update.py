@@ -9,6 +9,7 @@ import pytest
 import torch
 from kernels.engines import device
 from network.states import network_of, random_grid
+from torch.nn.functional import huber_loss
 
 from hgn.data.chunk import WholeEpisode
 from hgn.kernels.grid.op import ObstacleHash
@@ -39,7 +40,9 @@ def episode(seed: int, particles: int, obstacles: bool, spread: float = 0.12) ->
     return made, [grid] if obstacles else []
 
 
-def plain_updates(network: HierarchicalGraphNetwork, chunk: list, grids: list, rates: list[float]) -> list[float]:
+def plain_updates(
+    network: HierarchicalGraphNetwork, chunk: list, grids: list, rates: list[float], huber: float = math.inf
+) -> list[float]:
     """The same with autograd and torch's Adam, without noise and jitter; the losses."""
     optimizer = torch.optim.Adam(network.parameters(), lr=1.0)
     losses = []
@@ -58,7 +61,9 @@ def plain_updates(network: HierarchicalGraphNetwork, chunk: list, grids: list, r
             )
             acceleration = (window[-1] - window[-2]) - (window[-2] - window[-3])
             target = network.normaliser.normalise_acceleration(acceleration)
-            loss = loss + (network.normalised_acceleration(state) - target).square().mean() / len(samples)
+            error = network.normalised_acceleration(state) - target
+            squared = error.square() if math.isinf(huber) else 2 * huber_loss(error, error * 0, "none", huber)
+            loss = loss + squared.mean() / len(samples)
         losses.append(float(loss.detach()))
         optimizer.zero_grad()
         loss.backward()
@@ -87,9 +92,11 @@ def parameters_of(updates: Updates) -> torch.Tensor:
     return torch.cat([tensor.flatten() for tensor in found]).cpu().double()
 
 
-def test_updates_are_those_of_torch() -> None:
-    """Two updates of two scenes, with and without obstacles, at different rates: losses and parameters are those
-    of autograd in float64 with torch's Adam; an update that needs more room than there is gets it, and is repeated."""
+@pytest.mark.parametrize("huber", [math.inf, 0.5])
+def test_updates_are_those_of_torch(huber: float) -> None:
+    """Two updates of two scenes, with and without obstacles, at different rates, squared or Huber's loss: losses and
+    parameters are those of autograd in float64 with torch's Adam; an update that needs more room than there is gets
+    it, and is repeated."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.1)
     small, grid = episode(1, 5, True)
     open_space, none = episode(2, 3, False)
@@ -99,11 +106,11 @@ def test_updates_are_those_of_torch() -> None:
         [(wide, 2, 3), (open_space, 0, 4)],
     ]
     rates = [1e-3, 3e-4]
-    updates = updates_of(network, 2, capacities=(32, 16))
+    updates = updates_of(network, 2, capacities=(32, 16), huber=huber)
     updates.run(chunk, rates)
     assert updates.growths >= 1
     reference = copy.deepcopy(network)
-    losses = plain_updates(reference, chunk, [[grid, none], [other, none]], rates)
+    losses = plain_updates(reference, chunk, [[grid, none], [other, none]], rates, huber)
     total, count = updates.loss_sum.tolist()
     assert count == 2 and total == pytest.approx(sum(losses), rel=1e-5)
     expected = torch.cat([p.detach().flatten() for p in reference.parameters()])

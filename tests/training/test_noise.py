@@ -8,10 +8,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from hgn.config import NetworkConfig
+from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import make_batch
+from hgn.network.build import build_network
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.training.checkpoint import DataInfo
+from hgn.training.module import TrainingModule
 from hgn.training.noise import jittered_origin, perturbed_window, random_walk
 
 STD = 0.000848528
@@ -144,6 +147,25 @@ def test_jitter_fills_a_cell():
     torch.testing.assert_close(origins.mean(0), torch.full((3,), -0.0175), rtol=0.05, atol=0)
     again = jittered_origin(batch_of(stored, seeds=(5,)), 0.035)
     assert torch.equal(again[0], origins[5])
+
+
+def test_hubers_loss():
+    """Errors above training.huber count linearly: twice torch's Huber loss; above all errors it is the squared one."""
+    batch = batch_of(episode(40), episode(40, seed=1))
+    network = build_network(NetworkConfig(width=8, levels=2, message_passing_steps=1, material_embedding=2))
+    kept = {"noise_std": 0.0, "grid_jitter": False}
+    data = DataInfo("", 60.0, 1 / 64)
+
+    def loss(huber: float | None) -> torch.Tensor:
+        return TrainingModule(network, TrainingConfig(**kept, huber=huber), data).loss(batch)
+
+    predicted = network.normalised_acceleration(batch.state(batch.window_WN3), None).detach()
+    target = network.normaliser.normalise_acceleration(batch.acceleration(batch.window_WN3))
+    scale = float((predicted - target).abs().median())
+    expected = 2 * torch.nn.functional.huber_loss(predicted, target, delta=scale)
+    torch.testing.assert_close(loss(scale), expected)
+    torch.testing.assert_close(loss(1e3), loss(None))
+    assert float(loss(scale)) < 0.99 * float(loss(None))
 
 
 def test_loss_weighs_scenes_alike():

@@ -60,6 +60,7 @@ class UpdateSettings:
     obstacle_cell_size: float
     symmetry: bool = False
     noise_smooth: float = 0.0
+    huber: float = math.inf  # normalised error from which the loss grows linearly
 
     @staticmethod
     def of(training: TrainingConfig, obstacle_cell_size: float) -> UpdateSettings:
@@ -70,6 +71,7 @@ class UpdateSettings:
             obstacle_cell_size,
             training.symmetry != "none",
             training.noise_smooth,
+            math.inf if training.huber is None else training.huber,
         )
 
 
@@ -241,6 +243,7 @@ class Updates:
             engine.output_gradient,
             self.loss,
             1.0 / engine.unscale,
+            self.settings.huber,
             OUT=OUT,
             BLOCK=BLOCK,
         )
