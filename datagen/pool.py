@@ -33,8 +33,8 @@ from hgn.config import DatagenConfig
 from hgn.schema import ConfigError
 
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
+_PACKING_SECONDS = 0.02  # at most until a packed shard is published
 _LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
-GPU_SCENES_AT_A_TIME = 264  # on an H100: two teams on each of its processors
 GPU_SCENES_PER_LAUNCH = 832  # all of the paper's data set: long scenes begin first, and short ones fill the gaps
 GPU_NODES_PER_LAUNCH = GPU_SCENES_PER_LAUNCH * 64**3  # of the grids of all scenes, about 30 bytes each
 GPU_EARLY_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
@@ -83,8 +83,10 @@ def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
 
 
 def gpu_first_launch(config: DatagenConfig, launch: int) -> int:
-    """Few scenes where something waits for the first episodes; else as many as run at a time, while others are made."""
-    return min(launch, GPU_EARLY_LAUNCH if config.dataset.early_episodes else GPU_SCENES_AT_A_TIME)
+    """Few scenes where something waits for the first episodes; else all: a launch of few lasts as long as its longest
+    scene, which costs more than it takes to make the others.
+    """
+    return min(launch, GPU_EARLY_LAUNCH) if config.dataset.early_episodes else launch
 
 
 def visible_gpus() -> tuple[str, ...]:
@@ -180,7 +182,7 @@ class Pool:
                 published = self._publish()
                 if not published and self._writer.complete:
                     return
-                self._receive(0.0 if published else _WAIT_SECONDS)
+                self._receive(0.0 if published else _PACKING_SECONDS if self._writer.packing else _WAIT_SECONDS)
         finally:
             for worker in (*self._makers, *self._solvers):
                 worker.kill()
@@ -220,7 +222,7 @@ class Pool:
             self._progress.message("other generators make the rest; waiting for them")
 
     def _publish(self) -> bool:
-        shard = self._writer.publish_next()
+        shard = self._writer.publish_next(wait=False)  # more episodes are staged while it is packed
         if shard is not None:
             self._progress.shard(shard.name, len(shard.episodes), self._writer.manifest.revision)
         return shard is not None

@@ -186,8 +186,14 @@ class DatasetWriter:
         """Whether a staged file is there, told or not: a worker may die between the two."""
         return staged_path(self.folder, split, index).is_file()
 
-    def publish_next(self) -> ShardEntry | None:
-        """Publishes one claimed shard whose episodes are all staged; None when there is no such shard.
+    @property
+    def packing(self) -> bool:
+        """Whether shards are being packed, for `publish_next` to publish."""
+        return bool(self._packing)
+
+    def publish_next(self, wait: bool = True) -> ShardEntry | None:
+        """Publishes one claimed shard whose episodes are all staged; None when there is no such shard, or, unless it
+        is to `wait`, while they are being packed.
 
         Raises: OSError (a full disk): nothing half-written is left and what was published stays untouched.
         """
@@ -197,9 +203,13 @@ class DatasetWriter:
         if not ready:
             return None
         # two rounds, so that no packer waits while this thread lists what is packed
-        for shard in ready[: 2 * PACKED_AT_ONCE] if len(ready) > 1 else []:
+        for shard in ready[: 2 * PACKED_AT_ONCE] if len(ready) > 1 or not wait else []:
             if shard not in self._packing:
                 self._packing[shard] = self._packers.submit(self._pack, shard)
+        if not wait:
+            ready = [shard for shard in ready if shard in self._packing and self._packing[shard].done()]
+            if not ready:
+                return None
         entry = self._publish(ready[0])
         self._forget(ready[0])
         self._plan()

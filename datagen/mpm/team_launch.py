@@ -17,7 +17,7 @@ import taichi as ti  # isort: skip
 
 from datagen.mpm import team_kernel  # isort: skip
 
-LAUNCH_SECONDS = 1.0  # aimed at: one launch runs as many frames as fit in
+LAUNCH_SECONDS = 3.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
 MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
 PAUSE = 0.8  # of the time that a launch is expected to take
 

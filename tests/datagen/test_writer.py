@@ -12,7 +12,7 @@ import subprocess
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from threading import Lock, current_thread
+from threading import Event, Lock, current_thread
 from typing import Any
 
 import ballistic_solver
@@ -22,7 +22,7 @@ import webdataset
 
 import datagen.shard
 import datagen.writer
-from datagen.plan import scene_seed
+from datagen.plan import ShardRange, scene_seed
 from datagen.shard import locate_members
 from datagen.writer import MAXIMUM_REPLACEMENTS, DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
@@ -534,6 +534,29 @@ def test_default_dataset_is_the_papers() -> None:
     """800 training, 5 validation and 20 test scenes."""
     assert [DatasetConfig().scenes(split) for split in ("train", "validation", "test")] == [800, 5, 20]
     assert ballistic_solver.simulate([], MpmConfig(), 2, 60.0) == []
+
+
+def test_packing_is_not_waited_for(make_config: MakeConfig, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pool goes on listening to its workers while shards are packed, and publishes what is packed first."""
+    with DatasetWriter(make_config(validation_scenes=0, test_scenes=0)) as writer:
+        shards = list(iter(writer.claim_next, None))
+        for split, index in writer.remaining():
+            stage(writer, split, index)
+        going_on = Event()
+
+        def pack(shard: ShardRange, own: Callable[[ShardRange], Any] = writer._pack) -> Any:
+            assert shard != shards[0] or going_on.wait(60)
+            return own(shard)
+
+        monkeypatch.setattr(writer, "_pack", pack)
+        published: list[str] = []
+        while len(published) < len(shards):
+            entry = writer.publish_next(wait=False)
+            published += [entry.name] if entry else []
+            if len(published) == len(shards) - 1:
+                assert shards[0].name not in published and writer.packing and not writer.complete
+                going_on.set()
+        assert published[-1] == shards[0].name and writer.complete and not writer.packing
 
 
 def test_shards_that_wait_are_packed_together(
