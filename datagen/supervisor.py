@@ -6,11 +6,9 @@ finished. One whose configuration is at fault is not: the service says so and go
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
@@ -19,8 +17,9 @@ from typing import Any
 
 from datagen.generate import StopRequest, generate
 from datagen.progress import Progress
-from datagen.worker import PR_SET_PDEATHSIG, Backend, error_message
+from datagen.worker import Backend, error_message
 from hgn.config import DatagenConfig
+from hgn.parent import die_with_parent
 from hgn.schema import ConfigError
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
@@ -149,9 +148,7 @@ class _PipeProgress(Progress):
 
 def _generate(connection: Connection, config: DatagenConfig, backend: Backend | None) -> None:
     with StopRequest() as stop:
-        if sys.platform == "linux":
-            # should the service be killed, the pool ends as it would at Ctrl-C
-            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+        die_with_parent(signal.SIGTERM)  # should the service be killed, the pool ends as it would at Ctrl-C
         parent = multiprocessing.parent_process()
         if parent is None or os.getppid() != parent.pid:
             return

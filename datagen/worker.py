@@ -7,7 +7,6 @@ terminal to it. Whatever goes wrong inside is sent to the parent; a worker that 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import multiprocessing
 import os
 import pkgutil
@@ -33,6 +32,7 @@ from datagen.plan import SceneTask
 from datagen.shard import stage_episode
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash, physics_settings
+from hgn.parent import die_with_parent
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
@@ -40,7 +40,6 @@ from hgn.schema import ConfigError
 
 _FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
 _STAGING_THREADS = 8
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 @dataclass(frozen=True)
@@ -174,7 +173,7 @@ def receive(workers: Iterable[LocalWorker], timeout: float) -> Iterator[tuple[Lo
 
 
 def _run(target: Callable[..., None], connection: Connection, *arguments: Any) -> None:
-    _die_with_parent()
+    _end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     send = _Sender(connection)
     with _errors_sent(send):
@@ -401,10 +400,10 @@ def _received(connection: Connection) -> Iterator[Any]:
             return
 
 
-def _die_with_parent() -> None:
+def _end_with_parent() -> None:
     # on Linux the kernel does it; elsewhere a worker ends when it next touches its closed pipe
+    die_with_parent(signal.SIGKILL)
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         parent = multiprocessing.parent_process()
         if parent is None or os.getppid() != parent.pid:
             os._exit(0)

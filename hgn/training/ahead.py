@@ -14,12 +14,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from hgn.config import SceneConfig, TrainConfig
 from hgn.kernels.ahead import AheadJob, job_text
 from hgn.kernels.update.op import UpdateSettings
+from hgn.parent import die_with_parent
 from hgn.runtime.path import KERNEL_PRECISION
-from hgn.training.parent import die_with_parent
 
 MOST_PROCESSES = 12
 COMMAND = (sys.executable, "-m", "hgn.kernels.ahead")
@@ -41,7 +42,7 @@ class AheadCompilation:
                 stdin=subprocess.PIPE,
                 stdout=message,
                 stderr=message,
-                preexec_fn=die_with_parent,
+                preexec_fn=partial(die_with_parent, signal.SIGINT),
                 process_group=0,
             )
             for share, message in enumerate(self._messages)

@@ -8,14 +8,15 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from hgn.config import DatagenConfig
+from hgn.parent import die_with_parent
 from hgn.schema import ConfigError, to_mapping
-from hgn.training.parent import die_with_parent
 
 STOP_PATIENCE_S = 60.0
 
@@ -49,7 +50,12 @@ class Generator:
             ]
             # Its own process group: Ctrl-C reaches the trainer, which then ends the generator in order.
             self._process = subprocess.Popen(
-                command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, preexec_fn=die_with_parent, process_group=0
+                command,
+                stdout=log,
+                stderr=log,
+                stdin=subprocess.DEVNULL,
+                preexec_fn=partial(die_with_parent, signal.SIGINT),
+                process_group=0,
             )
 
     @property
