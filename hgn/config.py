@@ -291,6 +291,7 @@ class TrainingConfig:
     maximum_updates: int = 20_000_000
     maximum_minutes: float | None = None  # wall time of this start; none: no limit
     batch_scenes: int = 1  # frames of random scenes in one update, on each device
+    optimizer: str = "adam"  # or muon: hidden matrices step along their orthogonalised momentum
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
     warmup_updates: int = 0  # first updates, over which the rate grows linearly to what it is without
@@ -338,6 +339,7 @@ class TrainingConfig:
         require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
         require(0 <= self.noise_smooth <= 1, "noise_smooth", "0 to 1", self.noise_smooth)
         require_one_of(self, "symmetry", SYMMETRIES)
+        require_one_of(self, "optimizer", ("adam", "muon"))
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
         require_one_of(self, "precision", PRECISIONS)
         require_one_of(self, "path", PATHS)

@@ -29,6 +29,7 @@ from hgn.training.checkpoint import (
     cursor_of_checkpoint,
     updates_of_checkpoint,
 )
+from hgn.training.muon import Muon
 from hgn.training.noise import jittered_origin, perturbed_window
 from hgn.training.ranks import sum_over_ranks
 from hgn.training.symmetry import drawn_symmetries, under_symmetries
@@ -176,8 +177,11 @@ class TrainingModule(LightningModule):
 
     def configure_optimizers(self) -> Any:
         config = self.training_config
-        # One launch instead of several for each group of tensors; and only the fused kind can skip a step by itself.
-        optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=True)
+        if config.optimizer == "muon":
+            optimizer: torch.optim.Adam = Muon(self.network, config.learning_rate)
+        else:
+            # One launch instead of several for each group of tensors; only the fused kind can skip a step by itself.
+            optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=True)
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate_factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 

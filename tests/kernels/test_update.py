@@ -19,6 +19,7 @@ from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.schema import ConfigError
 from hgn.training.agreement import require_agreement
+from hgn.training.muon import Muon
 
 HISTORY = 5
 CELL_SIZE = 1 / 64
@@ -41,10 +42,15 @@ def episode(seed: int, particles: int, obstacles: bool, spread: float = 0.12) ->
 
 
 def plain_updates(
-    network: HierarchicalGraphNetwork, chunk: list, grids: list, rates: list[float], huber: float = math.inf
+    network: HierarchicalGraphNetwork,
+    chunk: list,
+    grids: list,
+    rates: list[float],
+    huber: float = math.inf,
+    optimizer: torch.optim.Optimizer | None = None,
 ) -> list[float]:
-    """The same with autograd and torch's Adam, without noise and jitter; the losses."""
-    optimizer = torch.optim.Adam(network.parameters(), lr=1.0)
+    """The same with autograd and torch's Adam (or `optimizer`), without noise and jitter; the losses."""
+    optimizer = optimizer or torch.optim.Adam(network.parameters(), lr=1.0)
     losses = []
     for samples, obstacles, rate in zip(chunk, grids, rates, strict=True):
         loss = torch.zeros((), dtype=torch.float64)
@@ -92,11 +98,11 @@ def parameters_of(updates: Updates) -> torch.Tensor:
     return torch.cat([tensor.flatten() for tensor in found]).cpu().double()
 
 
-@pytest.mark.parametrize("huber", [math.inf, 0.5])
-def test_updates_are_those_of_torch(huber: float) -> None:
+@pytest.mark.parametrize(("huber", "optimizer"), [(math.inf, "adam"), (0.5, "adam"), (math.inf, "muon")])
+def test_updates_are_those_of_torch(huber: float, optimizer: str) -> None:
     """Two updates of two scenes, with and without obstacles, at different rates, squared or Huber's loss: losses and
-    parameters are those of autograd in float64 with torch's Adam; an update that needs more room than there is gets
-    it, and is repeated."""
+    parameters are those of autograd in float64 with torch's Adam or with Muon; an update that needs more room than
+    there is gets it, and is repeated."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.1)
     small, grid = episode(1, 5, True)
     open_space, none = episode(2, 3, False)
@@ -106,11 +112,12 @@ def test_updates_are_those_of_torch(huber: float) -> None:
         [(wide, 2, 3), (open_space, 0, 4)],
     ]
     rates = [1e-3, 3e-4]
-    updates = updates_of(network, 2, capacities=(32, 16), huber=huber)
+    updates = updates_of(network, 2, capacities=(32, 16), huber=huber, optimizer=optimizer)
     updates.run(chunk, rates)
     assert updates.growths >= 1
     reference = copy.deepcopy(network)
-    losses = plain_updates(reference, chunk, [[grid, none], [other, none]], rates, huber)
+    muon = Muon(reference, 1.0) if optimizer == "muon" else None
+    losses = plain_updates(reference, chunk, [[grid, none], [other, none]], rates, huber, muon)
     total, count = updates.loss_sum.tolist()
     assert count == 2 and total == pytest.approx(sum(losses), rel=1e-5)
     expected = torch.cat([p.detach().flatten() for p in reference.parameters()])

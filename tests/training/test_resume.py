@@ -26,7 +26,7 @@ from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
 UPDATES = 16  # of 2 samples, where an epoch has 25
-MORE = {"symmetry": "gravity", "warmup_updates": 6, "ema_decay": 0.8}
+MORE = {"optimizer": "muon", "symmetry": "gravity", "warmup_updates": 6, "ema_decay": 0.8}
 FRAMES = st.lists(st.integers(2, 9), min_size=1, max_size=6)
 
 

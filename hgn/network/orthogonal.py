@@ -1,0 +1,66 @@
+"""Square blocks of the weights, and the orthogonal matrix nearest to one: what the Muon optimiser steps along.
+
+Shape legend: K blocks, W width.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from hgn.network.base import ParticleNetwork
+from hgn.network.fcn import FCN
+
+# Keller Jordan 2024 (Muon): the slope at zero is the steepest that keeps singular values between 0.7 and 1.2
+COEFFICIENTS = (3.4445, -4.7750, 2.0315)
+ITERATIONS = 5
+EPSILON = 1e-7
+MOMENTUM = 0.95
+RELATIVE_STEP = 0.2  # rms of a step in learning rates, as Adam's is in practice (Liu et al. 2025): rates mean the same
+
+
+def square_blocks(network: ParticleNetwork) -> torch.Tensor:
+    """Places of all blocks from latent to latent in the concatenated parameters, int64 [K, W, W].
+
+    A first layer on several parts is several matrices side by side, each a map of its own; the encoder's is none.
+    """
+    width = network.config.width
+    start, total = {}, 0
+    for parameter in network.parameters():
+        start[id(parameter)] = total
+        total += parameter.numel()
+
+    def places(weight: torch.Tensor) -> torch.Tensor:
+        return torch.arange(weight.numel()).view(weight.shape) + start[id(weight)]
+
+    blocks = []
+    for module in network.modules():
+        if isinstance(module, FCN):
+            first = () if module is network.encode else places(module.first.weight).split(module.parts, dim=1)
+            blocks += [piece for piece in (*first, places(module.second.weight)) if piece.shape == (width, width)]
+    return torch.stack(blocks) if blocks else torch.zeros(0, width, width, dtype=torch.int64)
+
+
+def step_size(width: int) -> float:
+    """Of a step along an orthogonal matrix, in learning rates: the matrix's own elements have an rms of width^-1/2."""
+    return RELATIVE_STEP * math.sqrt(width)
+
+
+def normalised(matrix_KWW: torch.Tensor) -> torch.Tensor:
+    """With Frobenius norm 1, so that no singular value is above 1."""
+    return matrix_KWW / (matrix_KWW.norm(dim=(1, 2), keepdim=True) + EPSILON)
+
+
+def orthogonalised(matrix_KWW: torch.Tensor) -> torch.Tensor:
+    """Singular values of matrices of norm 1 brought near 1, singular vectors kept: U V^T of their SVD, roughly.
+
+    Newton-Schulz iterations of odd degree five: three products each.
+    """
+    a, b, c = COEFFICIENTS
+    x_KWW = matrix_KWW
+    for _ in range(ITERATIONS):
+        square_KWW = torch.bmm(x_KWW, x_KWW.mT)
+        factor_KWW = torch.baddbmm(square_KWW, square_KWW, square_KWW, beta=b, alpha=c)
+        x_KWW = torch.baddbmm(x_KWW, factor_KWW, x_KWW, beta=a)
+    return x_KWW
