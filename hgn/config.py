@@ -301,6 +301,7 @@ class TrainingConfig:
     huber: float | None = None  # normalised error from which the loss grows linearly, each axis apart; none: squared
     noise_smooth: float = 0.1  # share of its variance that neighbours have in common; 0: the paper's
     grid_jitter: bool = True
+    frame_importance: float = 0.0  # share of an episode's samples drawn by how much happens in a frame; weighted
     symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
     seed: int = 0
     accelerator: str = "auto"  # or cpu, gpu
@@ -338,6 +339,7 @@ class TrainingConfig:
         require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates")
         require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
         require(0 <= self.noise_smooth <= 1, "noise_smooth", "0 to 1", self.noise_smooth)
+        require(0 <= self.frame_importance < 1, "frame_importance", "0 or more and below 1", self.frame_importance)
         require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "optimizer", ("adam", "muon"))
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))

@@ -36,6 +36,7 @@ class Batch:
     seeds_S: tuple[int, ...]  # of noise, jitter and symmetry
     cursor: Cursor | None = None  # the order's state once this batch is trained on
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene: what training may show instead of it
+    weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
         names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
@@ -66,8 +67,10 @@ class Batch:
         return (window_WN3[-1] - window_WN3[-2]) - (window_WN3[-2] - window_WN3[-3])
 
     def mean_over_scenes(self, value_N: torch.Tensor) -> torch.Tensor:
-        """The mean over scenes of each scene's mean over its particles: a scalar."""
-        share_S = torch.tensor([1 / (len(self.particles_S) * max(count, 1)) for count in self.particles_S])
+        """The mean over scenes of each scene's mean over its particles times its weight: a scalar."""
+        weight_S = self.weight_S or (1.0,) * len(self.particles_S)
+        pairs = zip(weight_S, self.particles_S, strict=True)
+        share_S = torch.tensor([weight / (len(weight_S) * max(count, 1)) for weight, count in pairs])
         return (value_N * share_S.to(value_N)[self.scene_N]).sum()
 
 
@@ -76,6 +79,7 @@ def make_batch(
     network: NetworkConfig,
     seeds: Sequence[int] | None = None,
     cursor: Cursor | None = None,
+    weights: Sequence[float] = (),
 ) -> Batch:
     """Reads the windows of (episode, frame) pairs and joins them, with what the network sees of the obstacles."""
     windows = [window(episode, frame, network.velocity_history) for episode, frame in samples]
@@ -93,5 +97,6 @@ def make_batch(
         surface=SurfaceParticles.of([episode_surface(e) for e in episodes]) if network.obstacle_particles else None,
         seeds_S=tuple(seeds) if seeds is not None else (0,) * len(episodes),
         cursor=cursor,
+        weight_S=tuple(weights),
         symmetries_S=tuple(scene_symmetries(e.gravity, e.domain_size, e.obstacle_grid.cell_size) for e in episodes),
     )

@@ -31,6 +31,7 @@ class Sample:
     episode: int
     frame: int
     seed: int  # of its noise, grid jitter and symmetry
+    weight: float = 1.0  # of its loss
 
 
 def epoch_permutation(seed: int, epoch: int, sample_count: int) -> np.ndarray:

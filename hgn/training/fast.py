@@ -13,7 +13,7 @@ import torch
 from hgn.config import TrainingConfig
 from hgn.data.chunk import Chunk, WholeEpisode
 from hgn.kernels.grid.op import ObstacleHash
-from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
+from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import kernel_precision
 from hgn.scene.symmetry import drawn_symmetry
@@ -69,7 +69,9 @@ class FastTraining:
             if self.symmetric:
                 shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
             self.agreement = require_agreement(self.updates, episodes, shown)
-        samples = [[(self._episodes[s.episode], s.frame, s.seed) for s in u] for u in chunk.samples]
+        samples = [
+            [DeviceSample(self._episodes[s.episode], s.frame, s.seed, s.weight) for s in u] for u in chunk.samples
+        ]
         self.updates.run(samples, rates, shares)
         self._write_back()
 

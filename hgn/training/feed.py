@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
@@ -15,6 +16,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch, make_batch
 from hgn.data.chunk import Chunk, whole_episode
+from hgn.data.importance import FrameImportance
 from hgn.data.order import Cursor, Sample, SampleOrder
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import without_patience
@@ -49,6 +51,7 @@ class Feed(LightningDataModule):
         self.hands_out_chunks = chunks
         self.interrupted = interrupted
         self.cursor = Cursor()  # where to begin; set from the checkpoint on a resume
+        self._importance: dict[int, FrameImportance] = {}
         self.waited_s = 0.0  # time that the training has waited for a batch
 
     def train_dataloader(self) -> DataLoader[Batch | Chunk]:
@@ -65,8 +68,10 @@ class Feed(LightningDataModule):
         order = self._order()
 
         def read(samples: Sequence[Sample], cursor: Cursor) -> Batch:
+            samples = self._by_importance(samples)
             pairs = [(self.store.episodes[sample.episode], sample.frame) for sample in samples]
-            return make_batch(pairs, self.network, [sample.seed for sample in samples], cursor)
+            seeds, weights = [sample.seed for sample in samples], [sample.weight for sample in samples]
+            return make_batch(pairs, self.network, seeds, cursor, weights)
 
         yield from self._ahead(lambda: (order.next_batch(), order.cursor), read)
 
@@ -86,9 +91,23 @@ class Feed(LightningDataModule):
             new = sorted({sample.episode for batch in samples for sample in batch} - known)
             known.update(new)
             episodes = {index: whole_episode(self.store.episodes[index], self.network) for index in new}
-            return Chunk(tuple(samples), episodes, cursor)
+            return Chunk(tuple(self._by_importance(update) for update in samples), episodes, cursor)
 
         yield from self._ahead(draw, read)
+
+    def _by_importance(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
+        """The same samples with frames drawn as `training.frame_importance` says, and their weights."""
+        share = self.training.frame_importance
+        if share == 0:
+            return tuple(samples)
+        drawn = []
+        for sample in samples:
+            if sample.episode not in self._importance:
+                episode = self.store.episodes[sample.episode]
+                self._importance[sample.episode] = FrameImportance.of(episode, share)
+            frame, weight = self._importance[sample.episode].draw(sample.frame, sample.seed)
+            drawn.append(replace(sample, frame=frame, weight=weight))
+        return tuple(drawn)
 
     def _order(self) -> SampleOrder:
         rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)

@@ -54,7 +54,7 @@ def plain_updates(
     losses = []
     for samples, obstacles, rate in zip(chunk, grids, rates, strict=True):
         loss = torch.zeros((), dtype=torch.float64)
-        for (made, frame, _), grid in zip(samples, obstacles, strict=True):
+        for (made, frame, _, *weight), grid in zip(samples, obstacles, strict=True):
             window = made.position_TN3[frame : frame + HISTORY + 2].cpu().double()
             velocity = (window[1:-1] - window[:-2]).flip(0).transpose(0, 1)
             state = ParticleState(
@@ -69,7 +69,7 @@ def plain_updates(
             target = network.normaliser.normalise_acceleration(acceleration)
             error = network.normalised_acceleration(state) - target
             squared = error.square() if math.isinf(huber) else 2 * huber_loss(error, error * 0, "none", huber)
-            loss = loss + squared.mean() / len(samples)
+            loss = loss + squared.mean() * math.prod(weight) / len(samples)
         losses.append(float(loss.detach()))
         optimizer.zero_grad()
         loss.backward()
@@ -100,16 +100,16 @@ def parameters_of(updates: Updates) -> torch.Tensor:
 
 @pytest.mark.parametrize(("huber", "optimizer"), [(math.inf, "adam"), (0.5, "adam"), (math.inf, "muon")])
 def test_updates_are_those_of_torch(huber: float, optimizer: str) -> None:
-    """Two updates of two scenes, with and without obstacles, at different rates, squared or Huber's loss: losses and
-    parameters are those of autograd in float64 with torch's Adam or with Muon; an update that needs more room than
-    there is gets it, and is repeated."""
+    """Two updates of two scenes, with and without obstacles, at different rates, weighted, squared or Huber's loss:
+    losses and parameters are those of autograd in float64 with torch's Adam or with Muon; an update that needs more
+    room than there is gets it, and is repeated."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.1)
     small, grid = episode(1, 5, True)
     open_space, none = episode(2, 3, False)
     wide, other = episode(3, 5, True, spread=0.6)
     chunk = [
-        [(small, 0, 1), (open_space, 1, 2)],
-        [(wide, 2, 3), (open_space, 0, 4)],
+        [(small, 0, 1, 0.3), (open_space, 1, 2)],
+        [(wide, 2, 3), (open_space, 0, 4, 1.7)],
     ]
     rates = [1e-3, 3e-4]
     updates = updates_of(network, 2, capacities=(32, 16), huber=huber, optimizer=optimizer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -27,18 +28,19 @@ def folder(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[Da
     return make_dataset(make_config())
 
 
-def streamed(folder: Path | str) -> list[Batch]:
-    return list(islice(Feed(EpisodeStore(folder, "train"), *SETTINGS).batches(), UPDATES))
+def streamed(folder: Path | str, training: TrainingConfig = SETTINGS[1]) -> list[Batch]:
+    return list(islice(Feed(EpisodeStore(folder, "train"), SETTINGS[0], training).batches(), UPDATES))
 
 
-def test_resident_feeding_equals_streaming(folder: Path) -> None:
+@pytest.mark.parametrize("importance", [0.0, 0.5])
+def test_resident_feeding_equals_streaming(folder: Path, importance: float) -> None:
     """Whole episodes, which stay in a GPU's memory, hold the windows that streaming reads, bitwise, for samples of the
-    same order and seeds; each episode comes once, and the cursors agree wherever a chunk ends."""
-    network, _ = SETTINGS
-    expected = streamed(folder)
+    same order, seeds and weights; each episode comes once, and the cursors agree wherever a chunk ends."""
+    network, training = SETTINGS[0], replace(SETTINGS[1], frame_importance=importance)
+    expected = streamed(folder, training)
     resident: dict[int, WholeEpisode] = {}
     update = 0
-    for chunk in Feed(EpisodeStore(folder, "train"), *SETTINGS, chunks=True).chunks():
+    for chunk in Feed(EpisodeStore(folder, "train"), network, training, chunks=True).chunks():
         assert not resident.keys() & chunk.episodes.keys()
         resident |= chunk.episodes
         for samples in chunk.samples[: UPDATES - update]:
@@ -50,6 +52,8 @@ def test_resident_feeding_equals_streaming(folder: Path) -> None:
             assert torch.equal(torch.cat(windows, dim=1), batch.window_WN3)
             assert torch.equal(torch.cat([resident[s.episode].material_N for s in samples]).long(), batch.material_N)
             assert tuple(sample.seed for sample in samples) == batch.seeds_S
+            assert tuple(sample.weight for sample in samples) == batch.weight_S
+            assert (batch.weight_S == (1.0, 1.0)) == (importance == 0)
             update += 1
         if update == UPDATES:
             break

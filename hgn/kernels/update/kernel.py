@@ -1,8 +1,8 @@
 """What a training step needs around the network: assembling a batch, loss, Adam, bookkeeping; all on the device.
 
 Row of the sample table, int64, one for each scene of each update: address of the window's first frame of positions,
-particles, first row in the batch, seed, address of the materials (int32), and the scene's row of the obstacle table,
-whose last column is the symmetry that the scene is shown under.
+particles, first row in the batch, seed, address of the materials (int32), weight of the loss (the bits of a float64),
+and the scene's row of the obstacle table, whose last column is the symmetry that the scene is shown under.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -14,7 +14,7 @@ import triton.language as tl
 from hgn.kernels.blocks import nearest_tf32
 from hgn.kernels.keys import settle_keys
 
-SAMPLE_COLUMNS = tl.constexpr(10)
+SAMPLE_COLUMNS = tl.constexpr(11)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
@@ -128,7 +128,8 @@ def assemble_batch(
     tl.store(scene_of + row, scene_row, mask=live)
     materials = tl.load(line + 4, mask=live, other=0).to(tl.pointer_type(tl.int32))
     tl.store(material_of + row, tl.load(materials + own, mask=live, other=0), mask=live)
-    tl.store(share_of + row, 1.0 / (scenes * particles.to(tl.float32)), mask=live)
+    weight = tl.load(line + 5, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
+    tl.store(share_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
     first = address.to(tl.pointer_type(tl.float32)) + own * 3
     frame = particles * 3
     if SYMMETRY:

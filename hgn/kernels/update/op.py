@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from hgn.network.orthogonal import EPSILON, MOMENTUM, orthogonalised, square_blo
 from hgn.scene.symmetry import Symmetry, drawn_symmetry
 from hgn.schema import ConfigError
 
-SAMPLE_COLUMNS = 10
+SAMPLE_COLUMNS = 11
 GROWTH = 1.25
 BLOCK = 128
 FLAT_BLOCK = 1024
@@ -49,6 +50,18 @@ class DeviceEpisode:
     @property
     def particles(self) -> int:
         return len(self.material_N)
+
+
+class DeviceSample(NamedTuple):
+    """A frame of an episode to train on."""
+
+    episode: DeviceEpisode
+    frame: int
+    seed: int  # of noise, jitter and symmetry
+    weight: float = 1.0  # of the loss
+
+
+AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
 
 
 @dataclass(frozen=True)
@@ -151,11 +164,11 @@ class Updates:
 
     def run(
         self,
-        chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]],
+        chunk: Sequence[Sequence[AnySample]],
         rates: Sequence[float],
         shares: Sequence[float] | None = None,
     ) -> None:
-        """One update for each entry of `chunk`, which lists episode, frame and seed of every scene.
+        """One update for each entry of `chunk`, which lists the sample of every scene.
 
         `shares` are those of the new values in `average`. Raises: ConfigError when positions are not finite.
         """
@@ -172,7 +185,7 @@ class Updates:
                 return
             self._make_room(status, needed)
 
-    def predict(self, samples: Sequence[tuple[DeviceEpisode, int, int]]) -> None:
+    def predict(self, samples: Sequence[AnySample]) -> None:
         """Assembles the batch of one update and leaves the network's output of it in `engine.output`."""
         self._prepare([samples], [0.0])
         while True:
@@ -184,7 +197,7 @@ class Updates:
                 return
             self._make_room(status, needed)
 
-    def _prepare(self, chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]], rates: Sequence[float]) -> None:
+    def _prepare(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> None:
         """Uploads what is to be computed, and makes room."""
         assert len(chunk) == len(rates)
         particles = self._upload(chunk, rates)
@@ -192,7 +205,7 @@ class Updates:
             self.particles = max(self.particles, 16 * math.ceil(particles / 16))
             self._build()
 
-    def _upload(self, chunk: Sequence[Sequence[tuple[DeviceEpisode, int, int]]], rates: Sequence[float]) -> int:
+    def _upload(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> int:
         """Writes the chunk's tables; the most particles of an update."""
         scenes, most = self.settings.scenes, 0
         table = np.zeros((len(chunk), scenes, SAMPLE_COLUMNS), np.int64)
@@ -200,13 +213,15 @@ class Updates:
         for k, samples in enumerate(chunk):
             assert len(samples) == scenes
             first = 0
-            for s, (episode, frame, seed) in enumerate(samples):
+            for s, sample in enumerate(samples):
+                episode, frame, seed, weight = DeviceSample(*sample)
                 count = episode.particles
                 at = episode.position_TN3.data_ptr() + frame * count * 12
                 row = episode.obstacles.row() if episode.obstacles is not None else [0] * OBSTACLE_COLUMNS
                 if self.settings.symmetry:
                     row[-1] = drawn_symmetry(episode.symmetries, seed).code
-                table[k, s] = [at, count, first, seed, episode.material_N.data_ptr(), *row]
+                bits = int(np.float64(weight).view(np.int64))
+                table[k, s] = [at, count, first, seed, episode.material_N.data_ptr(), bits, *row]
                 domain[k, s] = episode.domain_size
                 first += count
             most = max(most, first)
