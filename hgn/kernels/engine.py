@@ -111,7 +111,9 @@ class Engine:
         self.device = values.device
         rounded = precision in ("half", "tf32")
         self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
-        self.encode_weights = torch.zeros(self.width, grid.features, dtype=self.operand, device=self.device)
+        # Falling particles show the encoder the same features frame by frame: its rounding pulls all of them one way.
+        self.fine = rounded and not training
+        self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
         self.tuning = tuning or Tuning.of(precision)
         self._allocate()
         self.refresh()
@@ -187,9 +189,10 @@ class Engine:
         first, embedding, bias = self._encode_views(self.values)
         used = self.config.feature_width - self.config.material_embedding
         materials = len(self.config.materials)
-        self.encode_weights[:, :used].copy_(self._rounded(first[:, :used]))
-        table = torch.addmm(bias[:, None], first[:, used:], embedding.T)
-        self.encode_weights[:, used : used + materials].copy_(self._rounded(table))
+        self.encode_weights[:, :used].copy_(first[:, :used])
+        torch.addmm(bias[:, None], first[:, used:], embedding.T, out=self.encode_weights[:, used : used + materials])
+        if self.precision == "tf32" and not self.fine:
+            self.encode_weights.copy_(self._rounded(self.encode_weights))
 
     def _rounded(self, weights: torch.Tensor) -> torch.Tensor:
         """To the nearest that TF32 can hold, as hgn.kernels.blocks.nearest_tf32; as they are at other precisions."""
@@ -220,6 +223,7 @@ class Engine:
             bias=False,
             following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
             products=(self.by_particle_down, self.by_particle_up),
+            fine=self.fine,
         )
         self.down[0].cell[0].zero_()
         self._pairs(
@@ -319,6 +323,7 @@ class Engine:
         residual: bool = False,
         following: tuple[int, ...] = (),
         products: tuple[torch.Tensor, ...] = (),
+        fine: bool = False,
     ) -> None:
         first = first or (self.weights, fcn.parts[0])
         block, warps = self._row_block(len(x))
@@ -356,6 +361,7 @@ class Engine:
             RESIDUAL=residual,
             NEXT=len(following),
             SAVE=self.training,
+            FINE=fine,
             BLOCK=block,
             PRECISION=self.precision,
             num_warps=warps,

@@ -10,6 +10,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import (
+    finer_product,
     gathered_sum,
     leaky,
     leaky_backward,
@@ -67,9 +68,11 @@ def rows_forward(
     RESIDUAL: tl.constexpr,
     NEXT: tl.constexpr,
     SAVE: tl.constexpr,
+    FINE: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
+    """With FINE the FCN's own products are finer than PRECISION, and read the weights themselves."""
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -79,7 +82,8 @@ def rows_forward(
     at = row[:, None] * WIDTH + column[None, :]
     inputs = tl.arange(0, INPUT)
     x_tile = tl.load(x + row[:, None] * INPUT + inputs[None, :], mask=live, other=0.0).to(tl.float32)
-    h = product(x_tile, transposed(first_weights + first_at, WIDTH, INPUT), PRECISION)
+    first = transposed(first_weights + first_at, WIDTH, INPUT)
+    h = finer_product(x_tile, first, PRECISION) if FINE else product(x_tile, first, PRECISION)
     if GATHER:
         where = tl.load(index + row, mask=row < count, other=0)
         h += tl.load(gathered + where[:, None] * WIDTH + column[None, :], mask=live, other=0.0).to(tl.float32)
@@ -91,7 +95,10 @@ def rows_forward(
     if SAVE:
         tl.store(hidden + at, a, mask=live)
     outs = tl.arange(0, OUT)
-    z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
+    if FINE:
+        z = finer_product(a, transposed(values + second_at, OUT, WIDTH), PRECISION)
+    else:
+        z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
     z += tl.load(values + second_bias_at + outs)[None, :]
     if NORM:
         z, _scale = normalise(z, OUT)
