@@ -303,6 +303,11 @@ class TrainingConfig:
     grid_jitter: bool = True
     frame_importance: float = 0.0  # share of an episode's samples drawn by how much happens in a frame; weighted
     symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
+    rollout_share: float = 0.0  # of the scenes, which are taken from the network's own simulations; 0: none are made
+    rollout_every: int = 500  # updates between such simulations
+    rollout_scenes: int = 64  # simulated at once, on each device, from random frames of the training data on …
+    rollout_frames: int = 16  # … for so many frames, each of which can be trained on
+    rollout_pull: float = 0.1  # share of its distance from the truth that the network is to take back in a frame
     seed: int = 0
     accelerator: str = "auto"  # or cpu, gpu
     devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
@@ -335,8 +340,13 @@ class TrainingConfig:
             "monitor_scenes",
             "monitor_frame_stride",
             "monitor_particles_per_batch",
+            "rollout_every",
+            "rollout_scenes",
+            "rollout_frames",
         )
         require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates")
+        require(0 <= self.rollout_share < 1, "rollout_share", "0 or more and below 1", self.rollout_share)
+        require(0 <= self.rollout_pull <= 1, "rollout_pull", "0 to 1", self.rollout_pull)
         require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
         require(0 <= self.noise_smooth <= 1, "noise_smooth", "0 to 1", self.noise_smooth)
         require(0 <= self.frame_importance < 1, "frame_importance", "0 or more and below 1", self.frame_importance)
@@ -378,6 +388,13 @@ class TrainConfig:
             "true for scenes with obstacles",
             False,
             "or set scene.obstacle_count=0",
+        )
+        training, frames = self.training, self.dataset.frames
+        require(
+            training.rollout_share == 0 or training.rollout_frames <= frames - 2,
+            "training.rollout_frames",
+            f"at most dataset.frames - 2 = {frames - 2} where rollout_share > 0",
+            training.rollout_frames,
         )
         unknown = [name for name in self.scene.materials if name not in self.network.materials]
         require(not unknown, "network.materials", "all of scene.materials", list(self.network.materials))

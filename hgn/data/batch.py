@@ -37,6 +37,8 @@ class Batch:
     cursor: Cursor | None = None  # the order's state once this batch is trained on
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene: what training may show instead of it
     weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
+    samples_S: tuple[tuple[Episode, int], ...] = ()  # episode and frame n of each scene
+    starts: tuple[tuple[Episode, int], ...] = ()  # where the network is to simulate from before it trains on this batch
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
         names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
@@ -80,9 +82,13 @@ def make_batch(
     seeds: Sequence[int] | None = None,
     cursor: Cursor | None = None,
     weights: Sequence[float] = (),
+    windows: Sequence[np.ndarray] | None = None,
 ) -> Batch:
-    """Reads the windows of (episode, frame) pairs and joins them, with what the network sees of the obstacles."""
-    windows = [window(episode, frame, network.velocity_history) for episode, frame in samples]
+    """Reads the windows of (episode, frame) pairs, where they are not given, and joins them, with what the network sees
+    of the obstacles.
+    """
+    if windows is None:
+        windows = [window(episode, frame, network.velocity_history) for episode, frame in samples]
     episodes = [episode for episode, _ in samples]
     particles = tuple(len(episode.material_N) for episode in episodes)
     gravity_S3 = np.array([np.asarray(e.gravity) / e.frame_rate_hz**2 for e in episodes], np.float32)
@@ -99,4 +105,5 @@ def make_batch(
         cursor=cursor,
         weight_S=tuple(weights),
         symmetries_S=tuple(scene_symmetries(e.gravity, e.domain_size, e.obstacle_grid.cell_size) for e in episodes),
+        samples_S=tuple(samples),
     )

@@ -37,6 +37,7 @@ class Chunk:
     samples: tuple[tuple[Sample, ...], ...]
     episodes: dict[int, WholeEpisode]
     cursor: Cursor  # the order's state once these are trained on
+    starts: tuple[tuple[int, int], ...] = ()  # episodes and frames that the network is to simulate from before it
 
 
 def whole_episode(episode: Episode, network: NetworkConfig) -> WholeEpisode:

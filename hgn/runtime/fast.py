@@ -47,42 +47,76 @@ class FastRollout:
         state: ParticleState,
         precision: str,
         capacities: tuple[int, ...] | None = None,
+        room: int = 0,
+        obstacles: ObstacleTable | None = None,
     ) -> None:
-        """`precision` is highest, high or half; `capacities` are cells of each level to begin with."""
+        """`precision` is highest, high or half; `capacities` are cells of each level to begin with.
+
+        `room` is for particles of states that `begin` brings later. `obstacles` replace those of the state.
+        """
         self.config, self.device = network.config, state.position_N3.device
         self.precision = kernel_precision(precision, self.device)
         self.packed = pack_network(network)
         self.values = self.packed.gather(list(network.parameters()))
-        self.particles = len(state.position_N3)
+        self.particles = max(room, len(state.position_N3))
         self.scenes = state.scene_count
 
         def integers(value: int) -> torch.Tensor:
             return torch.full((1,), value, dtype=torch.int32, device=self.device)
 
-        self.count, self.lost, self.frame = integers(self.particles), integers(0), integers(0)
-        self.position_N3 = state.position_N3.float().clone()
-        self.velocity_NV = state.velocity_NM3.float().flatten(1).contiguous().clone()
-        self.scene_N, self.material_N = state.scene_N.int(), state.material_N.int()
-        self.domain_S3 = state.domain_S3.float().contiguous()
+        self.count, self.lost, self.frame = integers(0), integers(0), integers(0)
+        self.position_N3 = torch.zeros(self.particles, 3, device=self.device)
+        self.velocity_NV = torch.zeros(self.particles, 3 * self.config.velocity_history, device=self.device)
+        self.scene_N = torch.zeros(self.particles, dtype=torch.int32, device=self.device)
+        self.material_N = torch.zeros(self.particles, dtype=torch.int32, device=self.device)
+        self.domain_S3 = torch.zeros(self.scenes, 3, device=self.device)
         self.origin_S3 = torch.zeros_like(self.domain_S3)
-        self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count) if state.obstacles is not None else None
+        self.obstacles = obstacles
+        if obstacles is None and state.obstacles is not None:
+            self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
         self.path_TN3 = torch.zeros(LOOK_FRAMES, self.particles, 3, device=self.device)
         normaliser = network.normaliser
         self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.frames_done = 0
         self.growths = 0
+        self._fill(state)
         self._build(capacities or self._first_capacities())
+
+    def begin(self, state: ParticleState) -> None:
+        """Goes on with another state of as many scenes and at most as many particles as there is room for.
+
+        Obstacles are those of the rows of `self.obstacles`, which the caller may write.
+        """
+        self._fill(state)
+        self.frames_done = 0
+        self.lost.zero_()
+        self.grid.status.zero_()
+
+    def _fill(self, state: ParticleState) -> None:
+        count = self.live = len(state.position_N3)
+        assert count <= self.particles and state.scene_count == self.scenes
+        self.count.fill_(count)
+        self.position_N3[:count].copy_(state.position_N3)
+        self.velocity_NV[:count].copy_(state.velocity_NM3.flatten(1))
+        self.scene_N[:count].copy_(state.scene_N)
+        self.material_N[:count].copy_(state.material_N)
+        self.domain_S3.copy_(state.domain_S3)
+
+    def use_values(self, values: torch.Tensor) -> None:
+        """Takes over parameters in the packed layout."""
+        self.values.copy_(values)
+        self.engine.refresh()
 
     def _first_capacities(self) -> tuple[int, ...]:
         """Room for the cells of now several times over; what falls spreads."""
-        grid = build_hierarchy(
-            self.position_N3, self.scene_N.long(), self.origin_S3, self.config.cell_size, self.config.levels
-        )
+        position_N3, scene_N = self.position_N3[: self.live], self.scene_N[: self.live].long()
+        grid = build_hierarchy(position_N3, scene_N, self.origin_S3, self.config.cell_size, self.config.levels)
         return tuple(max(256 >> i, int(GROWTH * level.cell_count)) for i, level in enumerate(grid.levels))
 
     def _window(self) -> Window:
-        box = torch.stack([self.position_N3.amin(0), self.position_N3.amax(0)]).cpu()
+        position_N3 = self.position_N3[: self.live]
+        box = torch.stack([position_N3.amin(0), position_N3.amax(0)]).cpu()
         size = self.domain_S3.amax(0).cpu()
         lower, upper = torch.minimum(box[0], torch.zeros(3)), torch.maximum(box[1], size)
         config = self.config
@@ -118,20 +152,21 @@ class FastRollout:
             self.frame_launches()
         return graph
 
-    def require_agreement(self, network: HierarchicalGraphNetwork, state: ParticleState) -> None:
-        """Compares the first output with the plain network's, as `state` and all kernels still stand at the start.
+    def require_agreement(self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "path") -> None:
+        """Compares the first output with the plain network's, as all kernels still stand at the start: `state` is that
+        of the start, or its first scenes.
 
         Both round; kernels that are wrong differ by far more. Raises: ConfigError.
         """
         if self.graph is None:
             self._network_pass()
-        found_N3 = self.engine.output[:, :3]
+        found_N3 = self.engine.output[: len(state.position_N3), :3]
         with torch.no_grad():
             error = relative_error(found_N3, network.normalised_acceleration(state))
         if not error <= OUTPUT_BOUND:  # NaN fails
             raise ConfigError(
-                f"path must be plain on this machine, got fast: its output differs by {error:.1e} "
-                f"from the plain network's (at most {OUTPUT_BOUND}); set path=plain, and report device and versions"
+                f"{field} must be plain on this machine, got fast: its output differs by {error:.1e} "
+                f"from the plain network's (at most {OUTPUT_BOUND}); set {field}=plain, and report device and versions"
             )
 
     def frame_launches(self) -> None:
@@ -184,31 +219,44 @@ class FastRollout:
 
         Raises: LeftDomainError, with the number of the frame.
         """
-        kept = np.empty((frames, self.particles, 3), np.float32)
+        kept = np.empty((frames, self.live, 3), np.float32)
         done = 0
         while done < frames:
-            self.frame.zero_()
-            for _ in range(min(LOOK_FRAMES, frames - done)):
-                if self.graph is None:
-                    self.frame_launches()
-                else:
-                    self.graph.replay()
-            taken, status = torch.cat([self.frame, self.grid.status]).tolist()
-            kept[done : done + taken] = self.path_TN3[:taken].cpu().numpy()
+            path_TN3, status = self.look(frames - done)
+            taken = len(path_TN3)
+            kept[done : done + taken] = path_TN3.cpu().numpy()
             if on_frame is not None:
                 for frame in range(done, done + taken):
-                    on_frame(self.frames_done + frame - done + 1)
+                    on_frame(self.frames_done - taken + frame - done + 1)
             done += taken
-            self.frames_done += taken
             if status & DIVERGED.value:
                 raise LeftDomainError(self.frames_done, self._lost())
-            if status & (OVERFLOW | OUT_OF_WINDOW):
-                self._grow()
+            self.make_room(status)
         return kept
 
+    def look(self, frames: int) -> tuple[torch.Tensor, int]:
+        """Simulates up to `frames` more frames: those taken, at most LOOK_FRAMES of them, and the status after them.
+
+        They are a view of what the next call writes to. Where the status is not zero, it must be dealt with first.
+        """
+        self.frame.zero_()
+        for _ in range(min(LOOK_FRAMES, frames)):
+            if self.graph is None:
+                self.frame_launches()
+            else:
+                self.graph.replay()
+        taken, status = torch.cat([self.frame, self.grid.status]).tolist()
+        self.frames_done += taken
+        return self.path_TN3.view(-1)[: 3 * taken * self.live].view(taken, self.live, 3), status
+
+    def make_room(self, status: int) -> None:
+        """Grows the buffers where the status says that they were too small."""
+        if status & (OVERFLOW | OUT_OF_WINDOW):
+            self._grow()
+
     def _lost(self) -> int:
-        domain_N3 = self.domain_S3[self.scene_N.long()]
-        inside = (self.position_N3 > -domain_N3) & (self.position_N3 < 2 * domain_N3)
+        position_N3, domain_N3 = self.position_N3[: self.live], self.domain_S3[self.scene_N[: self.live].long()]
+        inside = (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)
         return int(inside.logical_not().any(-1).sum())
 
     def _grow(self) -> None:

@@ -42,15 +42,15 @@ def frames_before(episode: Episode, first: int) -> np.ndarray:
     )
 
 
-def window(episode: Episode, frame: int, history: int) -> np.ndarray:
-    """Positions x^{n-H} … x^{n+1} around frame n of an episode, float32 [H + 2, N, 3], a fresh array.
+def window(episode: Episode, frame: int, history: int, ahead: int = 1) -> np.ndarray:
+    """Positions x^{n-H} … x^{n+ahead} around frame n of an episode, float32 [H + 1 + ahead, N, 3], a fresh array.
 
-    0 <= frame <= T - 2. Frames before 0 are the ballistic back-extrapolation.
+    0 <= frame <= T - 1 - ahead. Frames before 0 are the ballistic back-extrapolation.
     """
     frame_count = len(episode.position_TN3)
-    assert 0 <= frame <= frame_count - 2, (frame, frame_count)
+    assert 0 <= frame <= frame_count - 1 - ahead, (frame, frame_count)
     first = frame - history
-    stored = np.array(episode.position_TN3[max(first, 0) : frame + 2], np.float32)
+    stored = np.array(episode.position_TN3[max(first, 0) : frame + 1 + ahead], np.float32)
     if first >= 0:
         return stored
     return np.concatenate([frames_before(episode, first), stored])

@@ -238,6 +238,7 @@ class LogLines(Callback):
             "epoch": float(pl_module.cursor.epoch),
         }
         self._time, self._update, self._waited_s = now, trainer.global_step, waited_s
+        values |= pl_module.own_states
         if pl_module.device.type == "cuda":
             values["gpu_memory_gb"] = torch.cuda.max_memory_allocated() / 1e9
         log(trainer, self.run, values)

@@ -18,6 +18,7 @@ from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import kernel_precision
 from hgn.scene.symmetry import drawn_symmetry
 from hgn.training.agreement import require_agreement
+from hgn.training.fast_states import FastOwnStates
 
 DATA_SHARE = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
 
@@ -36,6 +37,7 @@ class FastTraining:
         reduce: Callable[[torch.Tensor], None] | None = None,
         ranks: int = 1,
         averaged: HierarchicalGraphNetwork | None = None,
+        rank: int = 0,
     ) -> None:
         """`averaged` holds the moving average of the weights.
 
@@ -50,12 +52,16 @@ class FastTraining:
         self._read_moments()
         self._averaged = None if averaged is None else self._take_over_average(averaged)
         self._episodes: dict[int, DeviceEpisode] = {}
+        self.own: FastOwnStates | None = None
+        if training.rollout_share > 0:
+            self.own = FastOwnStates(averaged or network, training, obstacle_cell_size, rank)
         self.agreement: tuple[float, float] | None = None  # with the plain network, see hgn.training.agreement
 
-    def run(self, chunk: Chunk, rates: list[float], shares: list[float] | None = None) -> None:
+    def run(self, chunk: Chunk, rates: list[float], shares: list[float] | None = None, first_update: int = 0) -> None:
         """Makes an update for each entry of the chunk, at these learning rates.
 
-        `shares` are those of the new weights in their moving average, where there is one.
+        `shares` are those of the new weights in their moving average, where there is one. `first_update` is the number
+        of the first update.
 
         Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong here.
         """
@@ -69,9 +75,15 @@ class FastTraining:
             if self.symmetric:
                 shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
             self.agreement = require_agreement(self.updates, episodes, shown)
+        if self.own is not None and chunk.starts:
+            average = self.updates.average
+            values = self.updates.values if average is None else average
+            self.own.refresh([(self._episodes[i], frame) for i, frame in chunk.starts], values)
         samples = [
             [DeviceSample(self._episodes[s.episode], s.frame, s.seed, s.weight) for s in u] for u in chunk.samples
         ]
+        if self.own is not None:
+            samples = [self.own.mixed(update, first_update + i) for i, update in enumerate(samples)]
         self.updates.run(samples, rates, shares)
         self._write_back()
 

@@ -21,6 +21,7 @@ from hgn.data.order import Cursor, Sample, SampleOrder
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import without_patience
 from hgn.schema import ConfigError
+from hgn.training.own_states import drawn_starts
 
 T = TypeVar("T")
 SHARED_FOLDER_PATIENCE_S = 300.0
@@ -66,34 +67,57 @@ class Feed(LightningDataModule):
     def batches(self) -> Iterator[Batch]:
         """This rank's batches, without end."""
         order = self._order()
+        begun = update = self._update()
 
-        def read(samples: Sequence[Sample], cursor: Cursor) -> Batch:
-            samples = self._by_importance(samples)
+        def draw() -> tuple[tuple[list[Sample], tuple[tuple[int, int], ...]], Cursor]:
+            nonlocal update
+            starts = self._starts(order, begun, update)
+            update += 1
+            return (order.next_batch(), starts), order.cursor
+
+        def read(drawn: tuple[Sequence[Sample], tuple[tuple[int, int], ...]], cursor: Cursor) -> Batch:
+            samples, starts = self._by_importance(drawn[0]), drawn[1]
             pairs = [(self.store.episodes[sample.episode], sample.frame) for sample in samples]
             seeds, weights = [sample.seed for sample in samples], [sample.weight for sample in samples]
-            return make_batch(pairs, self.network, seeds, cursor, weights)
+            batch = make_batch(pairs, self.network, seeds, cursor, weights)
+            return replace(batch, starts=tuple((self.store.episodes[index], frame) for index, frame in starts))
 
-        yield from self._ahead(lambda: (order.next_batch(), order.cursor), read)
+        yield from self._ahead(draw, read)
 
     def chunks(self) -> Iterator[Chunk]:
         """The same samples, those of many updates at once. A chunk ends wherever something is due between updates."""
         order = self._order()
-        begun = update = self.trainer.global_step if self.trainer is not None else 0
+        begun = update = self._update()
         known: set[int] = set()
 
-        def draw() -> tuple[list[tuple[Sample, ...]], Cursor]:
+        def draw() -> tuple[tuple[list[tuple[Sample, ...]], tuple[tuple[int, int], ...]], Cursor]:
             nonlocal update
+            starts = self._starts(order, begun, update)
             count = chunk_length(self.training, begun, update)
             update += count
-            return [tuple(order.next_batch()) for _ in range(count)], order.cursor
+            return ([tuple(order.next_batch()) for _ in range(count)], starts), order.cursor
 
-        def read(samples: list[tuple[Sample, ...]], cursor: Cursor) -> Chunk:
-            new = sorted({sample.episode for batch in samples for sample in batch} - known)
+        def read(drawn: tuple[list[tuple[Sample, ...]], tuple[tuple[int, int], ...]], cursor: Cursor) -> Chunk:
+            samples, starts = drawn
+            asked = {sample.episode for batch in samples for sample in batch} | {index for index, _ in starts}
+            new = sorted(asked - known)
             known.update(new)
             episodes = {index: whole_episode(self.store.episodes[index], self.network) for index in new}
-            return Chunk(tuple(self._by_importance(update) for update in samples), episodes, cursor)
+            return Chunk(tuple(self._by_importance(update) for update in samples), episodes, cursor, starts)
 
         yield from self._ahead(draw, read)
+
+    def _update(self) -> int:
+        """The number of the next update."""
+        return self.trainer.global_step if self.trainer is not None else 0
+
+    def _starts(self, order: SampleOrder, begun: int, update: int) -> tuple[tuple[int, int], ...]:
+        """Episodes and frames that the network is to simulate from before this update; none where that is not due."""
+        due = update == begun or update % self.training.rollout_every == 0
+        if self.training.rollout_share == 0 or not due:
+            return ()
+        frames = [entry.frames for entry in self.store.entries[: order.cursor.episodes]]
+        return drawn_starts(self.training, update, order.rank, frames)
 
     def _by_importance(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
         """The same samples with frames drawn as `training.frame_importance` says, and their weights."""
@@ -158,7 +182,9 @@ def chunk_length(training: TrainingConfig, begun: int, update: int) -> int:
 
     The first chunks are short: they bring the most episodes that are not in memory yet.
     """
-    due = (training.log_every, training.checkpoint_every, training.monitor_every)
+    due = [training.log_every, training.checkpoint_every, training.monitor_every]
+    if training.rollout_share > 0:
+        due.append(training.rollout_every)
     until_due = min([every - update % every for every in due])
     until_end = max(training.maximum_updates - update, 1)
     return min(until_due, until_end, UPDATES_AT_ONCE, max(1, update - begun))

@@ -31,6 +31,7 @@ from hgn.training.checkpoint import (
 )
 from hgn.training.muon import Muon
 from hgn.training.noise import jittered_origin, perturbed_window
+from hgn.training.own_states import OwnStates
 from hgn.training.ranks import sum_over_ranks
 from hgn.training.symmetry import drawn_symmetries, under_symmetries
 
@@ -54,6 +55,7 @@ class TrainingModule(LightningModule):
         self.gradient_counters: torch.Tensor
         self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
         self._fast: Any = None
+        self._own: OwnStates | None = None
 
     def set_statistics(self, statistics: Statistics) -> None:
         """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
@@ -110,7 +112,16 @@ class TrainingModule(LightningModule):
         clipped_N3 = error_N3.clamp(-config.huber, config.huber)
         return batch.mean_over_scenes((clipped_N3 * (2 * error_N3 - clipped_N3)).mean(-1))
 
+    @property
+    def own_states(self) -> dict[str, float]:
+        """What is to be logged of the network's own states."""
+        own = self._own if self._fast is None else self._fast.own
+        return {} if own is None else dict(own.figures)
+
     def on_train_start(self) -> None:
+        config = self.training_config
+        if self.automatic_optimization and config.rollout_share > 0:
+            self._own = OwnStates(self.result, config, self.data.frame_rate_hz, self.trainer.global_rank)
         if not self.automatic_optimization:
             # Triton, which the plain path does without, is loaded here.
             from hgn.training.fast import FastTraining
@@ -129,12 +140,17 @@ class TrainingModule(LightningModule):
                 sum_over_ranks if self.trainer.world_size > 1 else None,
                 self.trainer.world_size,
                 self.averaged,
+                self.trainer.global_rank,
             )
 
     def training_step(self, batch: Batch | Chunk, batch_index: int) -> torch.Tensor | None:
         if isinstance(batch, Chunk):
             self._train_chunk(batch)
             return None
+        if self._own is not None:
+            if batch.starts:
+                self._own.refresh(batch.starts)
+            batch = self._own.mixed(batch, self.global_step)
         loss = self.loss(batch)
         known = loss.detach()
         self.loss_sum += torch.where(known.isfinite(), torch.stack([known, torch.ones_like(known)]), 0)
@@ -147,7 +163,7 @@ class TrainingModule(LightningModule):
         new = self._fast.agreement is None
         updates = range(first, first + count)
         shares = [self._average_share(update) for update in updates] if self.averaged is not None else None
-        self._fast.run(chunk, [self._rate(update) for update in updates], shares)
+        self._fast.run(chunk, [self._rate(update) for update in updates], shares, first)
         if new and self.trainer.is_global_zero:
             outputs, gradients = self._fast.agreement
             text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"

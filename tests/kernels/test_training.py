@@ -94,9 +94,11 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
 
 
 def test_chunks_end_where_something_is_due() -> None:
-    """Chunks meet every multiple of the log, checkpoint and monitor intervals and the last update, whatever update a
-    training begins at, and the first ones are short."""
-    training = TrainingConfig(maximum_updates=1000, log_every=50, checkpoint_every=70, monitor_every=300)
+    """Chunks meet every multiple of the log, checkpoint, monitor and rollout intervals and the last update, whatever
+    update a training begins at, and the first ones are short."""
+    training = TrainingConfig(
+        maximum_updates=1000, log_every=50, checkpoint_every=70, monitor_every=300, rollout_share=0.2, rollout_every=32
+    )
     for begun in (0, 37, 999):
         update, ends = begun, []
         while update < 1000:
@@ -104,7 +106,7 @@ def test_chunks_end_where_something_is_due() -> None:
             assert 1 <= count <= UPDATES_AT_ONCE
             update += count
             ends.append(update)
-        due = {n for every in (50, 70, 300) for n in range(every, 1001, every) if n > begun} | {1000}
+        due = {n for every in (50, 70, 300, 32) for n in range(every, 1001, every) if n > begun} | {1000}
         assert due <= set(ends) and ends[-1] == 1000 and ends[0] == begun + 1
     assert chunk_length(training, 0, 1000) >= 1
 

@@ -94,6 +94,11 @@ class ObstacleTable:
         self.row_S5 = torch.tensor(rows, dtype=torch.int64, device=device)
         self.cell_size = cell_size
 
+    def take(self, other: ObstacleTable) -> None:
+        """Makes its rows those of another table, in place."""
+        self.row_S5.copy_(other.row_S5)
+        self._hashes = other._hashes
+
     @staticmethod
     def of(cells: ObstacleCells, scenes: int) -> ObstacleTable:
         """Of a batch's obstacle cells, on their device."""
