@@ -144,7 +144,7 @@ class Shared:
     """What a feed asks of the trainer of one rank of several, when all see the same data set."""
 
     def __init__(self, rank: int, world_size: int) -> None:
-        self.global_rank, self.world_size, self.strategy = rank, world_size, self
+        self.global_rank, self.world_size, self.strategy, self.global_step = rank, world_size, self, 0
 
     def broadcast(self, count: int) -> int:
         return count
