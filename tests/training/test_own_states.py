@@ -156,7 +156,7 @@ def test_lost_scenes_are_dropped() -> None:
     own.refresh([(small, 2), (large, 2)])
     assert [made is small for made, _, _ in own._entries] == [True, False, False, False]
     assert own.figures["own_states/dropped"] == 2
-    network.config = replace(network.config, cell_size=0.04)  # (0.02 sqrt(3) < 0.08 < 0.06 sqrt(3))
+    network.config = replace(network.config, cell_size=0.1)  # 0.02 sqrt(3) < 0.05 < 0.06 sqrt(3)
     own.refresh([(small, 2), (large, 2)])
     assert [made is small for made, _, _ in own._entries] == [True, False]
     with torch.no_grad():
