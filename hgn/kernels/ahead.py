@@ -18,8 +18,12 @@ import triton
 from triton.backends.compiler import GPUTarget
 
 from hgn.config import NetworkConfig
+from hgn.kernels.grid.op import ObstacleTable, Window
 from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.fast import GROWTH, FastRollout
+from hgn.runtime.path import KERNEL_PRECISION
 from hgn.schema import from_mapping
 
 NICENESS = 10
@@ -37,6 +41,7 @@ class AheadJob:
     particles: int  # of an update, about
     cells: tuple[int, ...]  # of each level, about
     capability: int  # of the GPU: 90 for an H100
+    rollout_scenes: int = 0  # that the network simulates to train on; 0: it does not
 
 
 def launches_of(job: AheadJob, device: str = "meta") -> dict[str, tuple[Any, str]]:
@@ -58,9 +63,39 @@ def launches_of(job: AheadJob, device: str = "meta") -> dict[str, tuple[Any, str
         updates.average = torch.zeros_like(updates.values) if job.averages else None
         updates.allocate(job.particles, job.cells)
         updates.launches()
+        if job.rollout_scenes:
+            _rollout_launches(job, network, device)
     finally:
         triton.knobs.runtime.jit_cache_hook = None
     return found
+
+
+class _Unplaced(FastRollout):
+    """A simulation of particles that are nowhere."""
+
+    def _window(self) -> Window:
+        return Window.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
+
+
+def _rollout_launches(job: AheadJob, network: HierarchicalGraphNetwork, device: str) -> None:
+    """Those of a frame of hgn.training.fast_states."""
+    config, scenes = job.network, job.rollout_scenes
+    share = scenes / job.settings.scenes
+    particles = round(share * job.particles)
+    state = ParticleState(
+        torch.zeros(particles, 3, device=device),
+        torch.zeros(particles, config.velocity_history, 3, device=device),
+        torch.zeros(particles, dtype=torch.int32, device=device),
+        torch.zeros(particles, dtype=torch.int64, device=device),
+        torch.zeros(scenes, 3, device=device),
+        None,
+    )
+    obstacles = None
+    if config.obstacle_features:
+        obstacles = ObstacleTable([None] * scenes, job.settings.obstacle_cell_size, torch.device(device))
+    precision = next(name for name, kernels in KERNEL_PRECISION.items() if kernels == job.precision)
+    capacities = tuple(int(GROWTH * share * cells) for cells in job.cells)
+    _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
 
 
 def compile_share(job: AheadJob, share: int, shares: int) -> int:

@@ -100,6 +100,7 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
         training.batch_scenes * particles,
         tuple(training.batch_scenes * count for count in cells),
         10 * capability[0] + capability[1],
+        training.rollout_scenes if training.rollout_share > 0 else 0,
     )
 
 

@@ -126,6 +126,8 @@ class FastOwnStates:
             first = self._first_scenes(episodes, state)
             if first is not None:
                 made.require_agreement(self.network, first, "training.path")
+                if device.type == "cuda":
+                    torch.cuda.empty_cache()  # what is free decides where episodes are kept
         made.use_values(values)
         self._rollout = made
         return made
