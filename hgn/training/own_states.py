@@ -27,8 +27,8 @@ from hgn.scene.history import window
 from hgn.schema import ConfigError
 
 START_STREAM, ENTRY_STREAM = 0x57A7, 0xE217
-# finest cells; farther from the truth (rms over a scene) its motion is no answer any more, and the loss would be made of
-# such frames alone: they are dropped, and with an untrained network most are
+# finest cells; farther from the truth (rms over a scene) its motion is no answer any more, and the loss would be made
+# of such frames alone: they are dropped, and with an untrained network most are
 DROPPED_BEYOND = 0.5
 PULLED_WITHIN = 1.0  # finest cells on an axis; no particle is pulled as if it were farther away
 
