@@ -97,7 +97,9 @@ class MpmConfig:
     time_step: str = "adaptive"  # or fixed
     fixed_time_step_s: float = 0.02 / 64
     stability_fraction: float = 0.5  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
-    speed_fraction: float = 0.3  # of a cell that the fastest particle may cross in a step
+    speed_fraction: float = 0.3  # of a cell that the fastest particle may cross between two transfers
+    # particles and grid exchange velocities every cell_size / this, in the adaptive mode; none: at every step
+    transfer_speed_m_s: float | None = 30.0
     wall_cells: int = 3  # grid nodes at each face of the domain that stop outgoing motion
     wall_contact: str = "slip"  # or stick
     collider_band_cells: float = 0.5  # from a sheet, where nodes stop motion
@@ -129,6 +131,8 @@ class MpmConfig:
             "collider_friction",
             "sand_friction_angle_deg",
         )
+        speed = self.transfer_speed_m_s
+        require(speed is None or 0 < speed < math.inf, "transfer_speed_m_s", "> 0 or none", speed)
         require(self.stability_fraction <= 1, "stability_fraction", "at most 1", self.stability_fraction)
         require(self.speed_fraction <= 1, "speed_fraction", "at most 1", self.speed_fraction)
         require(0 <= self.poisson_ratio < 0.5, "poisson_ratio", "in [0, 0.5)", self.poisson_ratio)

@@ -42,6 +42,7 @@ def _particle_to_grid(
     label: ti.template(),
     law_row: ti.template(),
     node: ti.template(),
+    gain: ti.template(),
     scene_value: ti.template(),
     counter: ti.template(),
     setting: ti.template(),
@@ -49,7 +50,9 @@ def _particle_to_grid(
     shape: ti.template(),
     variant: ti.template(),
 ):
-    """Updates the particle's deformation and adds its mass and momentum to its nodes in one copy of the grid."""
+    """Updates the particle's deformation and adds what it gives to its nodes to one copy of the grid: momentum and mass
+    in the first substep of an interval, later what its stress changes alone.
+    """
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
     material = label[p] & 3
@@ -60,9 +63,21 @@ def _particle_to_grid(
     if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
         if ti.static(not variant & VARIANT.water) or material != WATER:
             F = deformation[p]
-    A, new_F, new_volume, stiffness = respond(
-        affine[p], F, volume[p], material, row, step, scene, counter, setting, law, variant
+    begins = scene_value[scene, VALUE.begins]
+    C = affine[p]
+    stretch = ti.Matrix.zero(ti.f32, 3, 3)
+    if begins == 0.0:
+        stretch = affine[p]  # which holds it until the interval ends
+        v_now, C_now = interpolate(
+            position[p], scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, node, inverse_dx, shape, 1
+        )
+        C = C_now
+        raise_maximum(counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
+    A, new_stretch, new_F, new_volume, stiffness = respond(
+        C, stretch, F, volume[p], material, row, step, begins, scene, counter, setting, law, variant
     )
+    if scene_value[scene, VALUE.interval_remaining] > 0.0:
+        affine[p] = new_stretch
     volume[p] = new_volume
     if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
         if ti.static(not variant & VARIANT.water) or material != WATER:
@@ -77,29 +92,31 @@ def _particle_to_grid(
     index_x, index_y, index_z = node_places(base, first_node, shape, 1)
     w = ti.static((w0, w1, w2))
     A *= dx
-    v = velocity[p] - A @ fx
+    v = begins * velocity[p] - A @ fx
     for i, j in ti.static(ti.ndrange(3, 3)):
         wxy = w[i][0] * w[j][1]
         vxy = ti.Vector([v[a] + A[a, 0] * i + A[a, 1] * j for a in range(3)])
         for k in ti.static(range(3)):
             weight = wxy * w[k][2]
             vxyz = ti.Vector([vxy[a] + A[a, 2] * k for a in range(3)])
-            share = ti.Vector([weight * vxyz[0], weight * vxyz[1], weight * vxyz[2], weight])
+            share = ti.Vector([weight * vxyz[0], weight * vxyz[1], weight * vxyz[2], weight * begins])
             if ti.static(bool(variant & VARIANT.several_laws)):
                 share *= law[row + CONSTANT.mass]
             target = index_x[i] + index_y[j] + index_z[k]
             if ti.static(bool(variant & VARIANT.atomic)):
-                ti.atomic_add(node[target], share)
+                for a in ti.static(range(3)):
+                    ti.atomic_add(gain[target][a], share[a])
+                if begins == 1.0:
+                    ti.atomic_add(gain[target][3], share[3])
             else:
-                old = node[target]
-                node[target] = old + share
+                old = gain[target]
+                gain[target] = old + share
 
 
 @ti.func
 def _grid_to_particle(
     p: ti.i32,
     scene: ti.i32,
-    step: ti.f32,
     position: ti.template(),
     velocity: ti.template(),
     affine: ti.template(),
@@ -117,7 +134,7 @@ def _grid_to_particle(
     first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
     v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape, 1)
     moved, speed, speed_square = move(
-        x, v, C, step, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
+        x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
     )
     raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
     position[p] = moved
@@ -140,6 +157,7 @@ def substep(
     law: Scalars,
     shape: Integers,
     node: Nodes,
+    gain: Nodes,
     block: Integers,
     contact: Integers,
     contact_normal: Vectors,
@@ -147,29 +165,26 @@ def substep(
 ):
     """Advances every scene that has time left by one substep of its own length.
 
-    Order: time step, mark and clear blocks, particles to grid (deformation, plasticity, stress), gravity,
-    colliders, walls, grid to particles, advection. `label` holds scene * 4 + material of each particle, `node`
-    [parts * scenes * blocks * 64] holds a copy of the grid for each part. `contact` begins with twice the index of
+    Order: time step; in the first substep of an interval mark blocks; particles to grid (deformation, plasticity,
+    stress), gravity, colliders, walls; in the last grid to particles, advection. `label` holds scene * 4 + material of
+    each particle, `node` [scenes * blocks * 64] velocity and mass of nodes, `gain` [parts * scenes * blocks * 64] what
+    comes to them, a copy of the grid for each part. `block` ends with the length of the list of touched blocks, and
+    whether it is made anew, for all scenes, because an interval begins in one. `contact` begins with twice the index of
     each node's normal plus 1 where motion is stopped both ways, or -1; then comes, for each cell, where its list of
     triangles begins in `contact` itself, or -1; then those lists, each headed by its length. An entry is the place in
     `contact_normal` of the triangle's four vectors.
     """
     for scene in range(scene_value.shape[0]):
         choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
-        if scene == 0:
+        if scene_value[scene, VALUE.time_step] > 0.0 and scene_value[scene, VALUE.begins] == 1.0:
             block[3 * shape[SHAPE.all_blocks]] = 0
+            block[3 * shape[SHAPE.all_blocks] + 1] = 1
 
     for p in range(position.shape[0]):
         scene = label[p] >> 2
-        if scene_value[scene, VALUE.time_step] > 0.0:
+        if block[3 * shape[SHAPE.all_blocks] + 1] == 1 and scene_value[scene, VALUE.time_step] > 0.0:
             blocks = shape[SHAPE.all_blocks]
             mark(position[p], scene, setting[SETTING.inverse_cell_size], shape, block, blocks, block, 3 * blocks)
-
-    for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
-        blocks = shape[SHAPE.all_blocks]
-        place = block[blocks + (n >> 6)] * BLOCK_NODES + (n & 63)
-        for part in ti.static(range(variant // VARIANT.parts)):
-            node[place + part * blocks * BLOCK_NODES] = ti.Vector([0.0, 0.0, 0.0, 0.0])
 
     if ti.static(bool(variant & VARIANT.atomic)):
         for p in range(position.shape[0]):
@@ -177,7 +192,7 @@ def substep(
             step = scene_value[scene, VALUE.time_step]
             if step > 0.0:
                 _particle_to_grid(
-                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, law_row, node,
+                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, law_row, node, gain,
                     scene_value, counter, setting, law, shape, variant,
                 )  # fmt: skip
     else:
@@ -190,30 +205,38 @@ def substep(
                 for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
                     _particle_to_grid(
                         p, copy, scene, step, position, velocity, affine, deformation, volume, label, law_row, node,
-                        scene_value, counter, setting, law, shape, variant,
+                        gain, scene_value, counter, setting, law, shape, variant,
                     )  # fmt: skip
 
     for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
         global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
         if n & 63 == 0:
             block[global_block] = 0
+            block[3 * shape[SHAPE.all_blocks] + 1] = 0
         place = global_block * BLOCK_NODES + (n & 63)
-        total = node[place]
-        for part in ti.static(range(1, variant // VARIANT.parts)):  # what copies hold is summed in order
-            total += node[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
-        v = node_velocity(
-            ti.Vector([total[0], total[1], total[2]]), total[3], place, global_block // shape[SHAPE.scene_blocks],
-            block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value, setting, shape, contact, contact_normal,
-            variant,
-        )  # fmt: skip
-        node[place] = ti.Vector([v[0], v[1], v[2], total[3]])
+        scene = global_block // shape[SHAPE.scene_blocks]
+        if scene_value[scene, VALUE.time_step] > 0.0:
+            before = ti.Vector([0.0, 0.0, 0.0, 0.0])
+            if scene_value[scene, VALUE.begins] == 0.0:
+                before = node[place]
+            total = gain[place]
+            for part in ti.static(range(1, variant // VARIANT.parts)):  # what copies hold is summed in order
+                total += gain[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
+            for part in ti.static(range(variant // VARIANT.parts)):
+                gain[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+            mass = before[3] + total[3]
+            v = node_velocity(
+                ti.Vector([before[0], before[1], before[2]]), ti.Vector([total[0], total[1], total[2]]), mass, place,
+                scene, block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value, setting, shape, contact,
+                contact_normal, variant,
+            )  # fmt: skip
+            node[place] = ti.Vector([v[0], v[1], v[2], mass])
 
     for p in range(position.shape[0]):
         scene = label[p] >> 2
-        step = scene_value[scene, VALUE.time_step]
-        if step > 0.0:
+        if scene_value[scene, VALUE.time_step] > 0.0 and scene_value[scene, VALUE.interval_remaining] == 0.0:
             _grid_to_particle(
-                p, scene, step, position, velocity, affine, node, scene_value, counter, setting, shape, contact,
+                p, scene, position, velocity, affine, node, scene_value, counter, setting, shape, contact,
                 contact_normal, variant,
             )  # fmt: skip
 

@@ -34,17 +34,20 @@ class GridLaunch(Launch):
         solid = self.present[SAND] or self.present[SNOW]
         self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, self.particles if solid else 1)
         self.volume = ti.ndarray(ti.f32, self.particles)
-        self.block = device_array(np.zeros(3 * self.all_blocks + 1, np.int32))
+        self.block = device_array(np.zeros(3 * self.all_blocks + 2, np.int32))
         grid_kernel.start(
             self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter,
             self.law,
         )  # fmt: skip
 
     def _node_array(self, nodes: int) -> ti.VectorNdarray:
-        return ti.Vector.ndarray(4, ti.f32, nodes)
+        self.gain = ti.Vector.ndarray(4, ti.f32, nodes)
+        self.gain.fill(0)
+        return ti.Vector.ndarray(4, ti.f32, nodes // self.copies)
 
     def _vector_arrays(self) -> list[Any]:
-        return [*super()._vector_arrays(), self.node, self.position, self.velocity, self.affine, self.deformation]
+        own = [self.node, self.gain, self.position, self.velocity, self.affine, self.deformation]
+        return super()._vector_arrays() + own
 
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         completed = np.zeros(len(self.scenes), np.int64)
@@ -62,7 +65,7 @@ class GridLaunch(Launch):
                 grid_kernel.substep(
                     self.position, self.velocity, self.affine, self.deformation, self.volume, self.label,
                     self.law_row, self.scene_value, self.counter, self.setting, self.law, self.shape, self.node,
-                    self.block, self.contact, self.contact_normal, self.variant,
+                    self.gain, self.block, self.contact, self.contact_normal, self.variant,
                 )  # fmt: skip
             value = self.scene_value.to_numpy()
             busy = value[:, VALUE.remaining] > 0

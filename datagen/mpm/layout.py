@@ -36,22 +36,23 @@ class Count(NamedTuple):
     """Positions in the int64 state of each scene: what is counted and reported, then what runs the scene."""
 
     substeps: int = 0
-    water_volume_floors: int = 1
-    singular_value_floors: int = 2
-    hardening_caps: int = 3
-    plastic_volume_bounds: int = 4
-    position_clamps: int = 5
-    surface_projections: int = 6
-    status: int = 7
-    frame_substeps: int = 8  # taken in the present frame
+    transfers: int = 1
+    water_volume_floors: int = 2
+    singular_value_floors: int = 3
+    hardening_caps: int = 4
+    plastic_volume_bounds: int = 5
+    position_clamps: int = 6
+    surface_projections: int = 7
+    status: int = 8
+    frame_substeps: int = 9  # taken in the present frame
     # Maxima of the last step, the bits of a float32 that is not negative: such bits are ordered like the numbers, and
     # a GPU has no maximum of floats that many threads may take at once.
-    stiffness_bits: int = 9  # of (3 lambda + 2 mu) / density, m²/s²
-    speed_square_bits: int = 10
-    length: int = 11
+    stiffness_bits: int = 10  # of (3 lambda + 2 mu) / density, m²/s²
+    speed_square_bits: int = 11
+    length: int = 12
 
 
-REPORTED = Count._fields[:7]
+REPORTED = Count._fields[:8]
 
 
 class SceneValue(NamedTuple):
@@ -64,7 +65,11 @@ class SceneValue(NamedTuple):
     gravity: int = 4  # 4, 5, 6
     substeps_ahead: int = 7  # estimated, after the present one
     largest_speed_square: int = 8  # of the steps before the present one
-    length: int = 9
+    interval: int = 9  # as planned, from the last transfer to the next, s
+    interval_elapsed: int = 10  # with the present substep, s
+    interval_remaining: int = 11  # after the present substep, s; at 0 velocities go back to the particles
+    begins: int = 12  # 1 where the present substep is the first of its interval, else 0
+    length: int = 13
 
 
 class Status(NamedTuple):
@@ -87,7 +92,8 @@ class Setting(NamedTuple):
     low: int = 7  # 7, 8, 9: smallest coordinates of a particle
     high: int = 10  # 10, 11, 12: largest
     size: int = 13  # 13, 14, 15: of the domain
-    length: int = 16
+    transfer_interval: int = 16  # s; 0 where every substep is a transfer
+    length: int = 17
 
 
 class Shape(NamedTuple):
@@ -128,7 +134,8 @@ class Field(NamedTuple):
     volume: int = 15
     fluid: int = 16  # fields of particles without a deformation gradient
     deformation: int = 16
-    solid: int = 25  # fields of particles with one
+    stretch: int = 25  # xx, yy, zz, xy, xz, yz: see mls_mpm.respond
+    solid: int = 31  # fields of particles with a deformation gradient
 
 
 class Tag(NamedTuple):

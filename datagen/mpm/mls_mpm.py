@@ -2,10 +2,18 @@
 
 APIC transfers with quadratic B-splines (Jiang et al. 2015; Hu et al. 2018): a particle at x touches the nodes
 base .. base + 2 with base = floor(x / dx - 1/2); node I lies at I dx. Nodes are stored by blocks of 4 x 4 x 4,
-[scene, block, node in block], as (momentum or velocity, mass). Only blocks that a particle touches are cleared
-and updated. Masses are in units of a particle of the config's density.
+[scene, block, node in block]. Only blocks that a particle touches are updated; what particles give to nodes is added
+up apart from the nodes' velocities, and is zero between substeps. Masses are in units of a particle of the config's
+density.
 
-Everything is per scene: time step, remaining time, state, counters. A scene that is done, or failed, idles.
+Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
+as the stiffest material needs. In its first substep particles give mass and momentum to the nodes and force; in the
+others they stay where they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give
+force alone, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity
+and gradient, and move by the interval times that velocity: momentum and angular momentum are kept, as stresses are
+symmetric and each particle moves along its velocity. Within an interval no velocity is smoothed.
+
+Everything is per scene: time step, interval, remaining time, state, counters. A scene that is done, or failed, idles.
 """
 
 import taichi as ti
@@ -26,7 +34,7 @@ from datagen.mpm.surface_kernel import meet_collider, stop_at_surface
 from hgn.scene.material import SNOW, WATER
 
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
-
+SPEED_MARGIN = 1.25  # times the way planned for an interval, which a particle that gains speed may go
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
@@ -84,6 +92,12 @@ def _maximum(counter: ti.template(), scene: ti.i32, entry: ti.template()) -> ti.
 
 
 @ti.func
+def _parts(whole: ti.f32, longest: ti.f32) -> ti.f32:
+    """Into how many equal parts, none longer than `longest`, a time is cut."""
+    return ti.max(ti.ceil(ti.min(whole / longest, 1e9) - 1e-4), 1.0)
+
+
+@ti.func
 def choose_time_step(
     scene: ti.i32,
     scene_value: ti.template(),
@@ -106,29 +120,53 @@ def choose_time_step(
         )
         gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
         fixed = setting[SETTING.fixed_time_step]
-        limit = fixed
-        if fixed == 0.0:
-            limit = setting[SETTING.stability_fraction] * dx / ti.sqrt(stiffness)
-            # the fall within the step counts too
-            speed = ti.sqrt(speed_square) + gravity.norm() * ti.min(limit, remaining)
-            limit = ti.min(limit, setting[SETTING.speed_fraction] * dx / ti.max(speed, 1e-20))
-        # equal steps to the end of the frame: no sliver at its end
-        ahead = ti.max(ti.ceil(ti.min(remaining / limit, 1e9) - 1e-4), 1.0)
+        limit = setting[SETTING.stability_fraction] * dx / ti.sqrt(stiffness)
+        interval = scene_value[scene, VALUE.interval]
+        elapsed = scene_value[scene, VALUE.interval_elapsed]
+        left = scene_value[scene, VALUE.interval_remaining]
+        begins = left == 0.0
+        if begins:
+            elapsed = 0.0
+            longest = ti.max(limit, setting[SETTING.transfer_interval])
+            # the fall within the interval counts too
+            speed = ti.sqrt(speed_square) + gravity.norm() * ti.min(longest, remaining)
+            longest = ti.min(longest, setting[SETTING.speed_fraction] * dx / ti.max(speed, 1e-20))
+            # equal intervals to the end of the frame: no sliver at its end
+            interval = remaining / _parts(remaining, longest)
+            left = interval
+        # steps in this interval, and with those after it
+        ahead = _parts(left, limit)
+        total = ahead
+        if remaining > left:
+            total += _parts(remaining - left, interval) * _parts(interval, limit)
         done = ti.cast(counter[scene, COUNT.frame_substeps], ti.i32)
         if fixed > 0.0:
-            ahead = setting[SETTING.fixed_substeps] - ti.cast(done, ti.f32)
-        if not ahead <= ti.cast(maximum_substeps - done, ti.f32):
+            ahead = 1.0
+            total = setting[SETTING.fixed_substeps] - ti.cast(done, ti.f32)
+        if not total <= ti.cast(maximum_substeps - done, ti.f32):
             counter[scene, COUNT.status] = ti.cast(STATUS.too_many_substeps, ti.i64)
             scene_value[scene, VALUE.remaining] = 0.0
         else:
-            step = remaining / ahead
+            step = left / ahead
             if fixed > 0.0:
                 step = fixed
+                interval = fixed
             remaining -= step
-            if ahead <= 1.0:
+            left -= step
+            elapsed += step
+            # an interval also ends where material has become much faster in it
+            reach = SPEED_MARGIN * setting[SETTING.speed_fraction] * dx
+            if ahead <= 1.0 or (not begins and elapsed * ti.sqrt(speed_square) > reach):
+                left = 0.0
+            if total <= 1.0:
                 remaining = 0.0
             scene_value[scene, VALUE.remaining] = remaining
-            scene_value[scene, VALUE.substeps_ahead] = ahead - 1.0
+            scene_value[scene, VALUE.interval] = interval
+            scene_value[scene, VALUE.interval_elapsed] = elapsed
+            scene_value[scene, VALUE.interval_remaining] = left
+            scene_value[scene, VALUE.begins] = ti.cast(begins, ti.f32)
+            scene_value[scene, VALUE.substeps_ahead] = total - 1.0
+            counter[scene, COUNT.transfers] += ti.cast(begins, ti.i64)
             scene_value[scene, VALUE.smallest_time_step] = ti.min(scene_value[scene, VALUE.smallest_time_step], step)
             counter[scene, COUNT.frame_substeps] = ti.cast(done + 1, ti.i64)
             counter[scene, COUNT.substeps] += ti.cast(1, ti.i64)
@@ -194,28 +232,34 @@ def node_places(base, first_node: ti.i32, shape: ti.template(), components: ti.t
 @ti.func
 def respond(
     C,
+    stretch,
     F,
     volume: ti.f32,
     material: ti.i32,
     row: ti.i32,
     step: ti.f32,
+    carried: ti.f32,
     scene: ti.i32,
     counter: ti.template(),
     setting: ti.template(),
     law: ti.template(),
     variant: ti.template(),
 ):
-    """The material's answer to a step of the gradient C.
+    """The material's answer to a step of the gradient C, taken on the grid as it was when the interval began.
 
-    Returns what the particle adds to the momentum around it, A = C - dt V0 (4 / dx²) stress / mass; its new F
-    (as it was for water) and volume; and its present (3 lambda + 2 mu) / density.
+    `stretch` is the sum of dt (C + Cᵀ) / 2 over the interval's steps so far: per length of now C - (C + Cᵀ) / 2 stretch
+    is the gradient, in first order, so that the steps of an interval together stretch F as one step would.
+    Returns what the particle adds to the momentum around it, A = carried C - dt V0 (4 / dx²) stress / mass, where
+    `carried` is 1 in the interval's first step, which brings momentum to the nodes, and 0 later; the new stretch, F
+    (both as they were for water) and volume; and its present (3 lambda + 2 mu) / density.
     """
     has_water = ti.static(bool(variant & VARIANT.water))
     has_solid = ti.static(bool(variant & (VARIANT.sand | VARIANT.snow)))
     inverse_dx = setting[SETTING.inverse_cell_size]
     density = law[row + CONSTANT.density]
     scale = -step * 4.0 * inverse_dx * inverse_dx / density  # V0 / mass = 1 / density
-    A = C
+    A = carried * C
+    new_stretch = stretch
     new_F = F
     new_volume = volume
     stiffness = 0.0
@@ -233,7 +277,10 @@ def respond(
                 A[i, i] += scale * pressure
     if ti.static(has_solid):
         if ti.static(not has_water) or material != WATER:
-            trial_F = F + step * (C @ F)
+            rate = 0.5 * (C + C.transpose())
+            new_stretch = stretch + step * rate
+            gradient = C - rate @ stretch
+            trial_F = F + step * (gradient @ F)
             solid_F, solid_volume, stress, solid_stiffness = solid(
                 trial_F,
                 volume,
@@ -250,11 +297,12 @@ def respond(
             new_volume = solid_volume
             stiffness = solid_stiffness
             A += scale * stress
-    return A, new_F, new_volume, stiffness / density
+    return A, new_stretch, new_F, new_volume, stiffness / density
 
 
 @ti.func
 def node_velocity(
+    before,
     momentum,
     mass: ti.f32,
     place: ti.i32,
@@ -267,14 +315,14 @@ def node_velocity(
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """Momentum to velocity; gravity, colliders and walls.
+    """The node's velocity from the one before and what came to its momentum: gravity, colliders and walls too.
 
     `corner` is the block's place along x, y, z, in ten bits each.
     """
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
         gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
-        v = momentum / mass + scene_value[scene, VALUE.time_step] * gravity
+        v = before + momentum / mass + scene_value[scene, VALUE.time_step] * gravity
         if ti.static(bool(variant & VARIANT.contact)):
             entry = contact[place]
             if entry >= 0:
@@ -353,7 +401,6 @@ def move(
     x,
     v,
     C,
-    step: ti.f32,
     scene: ti.i32,
     scene_value: ti.template(),
     counter: ti.template(),
@@ -366,7 +413,7 @@ def move(
     """The particle's new position and velocity; stops a scene that is not finite or leaves the domain. Also v² (0 if
     so).
     """
-    out = x + step * v
+    out = x + scene_value[scene, VALUE.interval_elapsed] * v
     speed = v
     if ti.static(bool(variant & VARIANT.sweep)):
         cell = ti.floor(x * setting[SETTING.inverse_cell_size], ti.i32)

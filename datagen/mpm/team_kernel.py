@@ -9,6 +9,8 @@ Within a step particles are put in order by cell (a counting sort over the occup
 the grid are taken by cell: nine threads hold the 27 nodes that a cell's particles touch, add up all particles of the
 cell, and then add each node's sum once. That leaves one atomic sum a node and cell instead of one a particle.
 
+In the later steps of an interval particles stay in their cells: only strain, sums of forces and nodes are left to do.
+
 Nodes are stored by blocks of 4 x 4 x 4 as [block, component, node in block]: what the threads of a warp add to nodes
 next to each other falls into few sectors of memory, and the L2 cache of a GPU takes sums sector by sector.
 
@@ -52,7 +54,11 @@ from datagen.mpm.mls_mpm import (
 from hgn.scene.material import SAND
 
 LANES = 9  # threads that share a cell; each holds the three nodes of one y and z
-COMPONENTS = 4  # of a node
+# Components of a node: what comes to its momentum in a step, from 0 on; its mass; its velocity, from VELOCITY on. The
+# first are zero between steps, the mass between intervals.
+MASS = 3
+VELOCITY = 4
+COMPONENTS = 7
 
 
 @ti.func
@@ -82,6 +88,19 @@ def _put_vector(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.t
 def _put_matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
     for i, j in ti.static(ti.ndrange(3, 3)):
         state[place + (field + 3 * i + j) * stride] = value[i, j]
+
+
+@ti.func
+def _symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
+    """A matrix from xx, yy, zz, xy, xz, yz."""
+    s = ti.Vector([state[place + (field + i) * stride] for i in range(6)])
+    return ti.Matrix([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
+
+
+@ti.func
+def _put_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
+    for i, row, column in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
+        state[place + (field + i) * stride] = value[row, column]
 
 
 @ti.func
@@ -147,6 +166,7 @@ def _strain_and_sort(
     cell_list: ti.template(),
     block: ti.template(),
     live: ti.template(),
+    node: ti.template(),
     scene_value: ti.template(),
     counter: ti.template(),
     setting: ti.template(),
@@ -155,39 +175,56 @@ def _strain_and_sort(
     variant: ti.template(),
     threads: ti.template(),
 ):
-    """The materials' answer of each particle (left in place of C), and its rank among the particles of its cell."""
+    """The materials' answer of each particle (left in place of C), and in the first step of an interval its rank among
+    the particles of its cell.
+    """
     solid = ti.static(bool(variant & (VARIANT.sand | VARIANT.snow)))
+    begins = scene_value[scene, VALUE.begins]
+    velocities = _first_node(scene, shape) + VELOCITY * BLOCK_NODES
     largest = 0.0
+    fastest = 0.0
     p = lane
     while p < count:
         place = particles + p
         x = _vector(state, place, stride, FIELD.position)
-        cell = _cell(x, scene, setting, shape)
-        rank_here = ti.atomic_add(cell_count[cell], 1)
-        rank[first + p] = rank_here
-        if rank_here == 0:
-            cell_list[first + ti.atomic_add(live[scene * LIVE.length + LIVE.cells], 1)] = cell
-            mark(
-                x, scene, setting[SETTING.inverse_cell_size], shape, block,
-                shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks], live,
-                scene * LIVE.length + LIVE.blocks,
-            )  # fmt: skip
-        C = _matrix(state, place, stride, FIELD.affine)
+        C = ti.Matrix.zero(ti.f32, 3, 3)
+        stretch = ti.Matrix.zero(ti.f32, 3, 3)
+        if begins == 1.0:
+            cell = _cell(x, scene, setting, shape)
+            rank_here = ti.atomic_add(cell_count[cell], 1)
+            rank[first + p] = rank_here
+            if rank_here == 0:
+                cell_list[first + ti.atomic_add(live[scene * LIVE.length + LIVE.cells], 1)] = cell
+                mark(
+                    x, scene, setting[SETTING.inverse_cell_size], shape, block,
+                    shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks], live,
+                    scene * LIVE.length + LIVE.blocks,
+                )  # fmt: skip
+            C = _matrix(state, place, stride, FIELD.affine)
+        else:
+            v_now, C_now = interpolate(x, velocities, node, setting[SETTING.inverse_cell_size], shape, COMPONENTS)
+            C = C_now
+            fastest = ti.max(fastest, v_now.dot(v_now))
+            if ti.static(solid):
+                stretch = _symmetric(state, place, stride, FIELD.stretch)
         F = ti.Matrix.identity(ti.f32, 3)
         material = tag[tags + TAG.material * stride + p]
         row = tag[tags + TAG.law_row * stride + p]
         if ti.static(solid):
             F = _matrix(state, place, stride, FIELD.deformation)
-        A, new_F, volume, stiffness = respond(
-            C, F, state[place + FIELD.volume * stride], material, row, step, scene, counter, setting, law, variant
-        )
+        A, new_stretch, new_F, volume, stiffness = respond(
+            C, stretch, F, state[place + FIELD.volume * stride], material, row, step, begins, scene, counter, setting,
+            law, variant,
+        )  # fmt: skip
         _put_matrix(state, place, stride, FIELD.affine, A)
         if ti.static(solid):
             _put_matrix(state, place, stride, FIELD.deformation, new_F)
+            _put_symmetric(state, place, stride, FIELD.stretch, new_stretch)
         state[place + FIELD.volume * stride] = volume
         largest = ti.max(largest, stiffness)
         p += threads
     raise_maximum(counter, scene, COUNT.stiffness_bits, largest)
+    raise_maximum(counter, scene, COUNT.speed_square_bits, fastest)
 
 
 @ti.func
@@ -204,13 +241,17 @@ def _scatter(
     cell_begin: ti.template(),
     live: ti.template(),
     node: ti.template(),
+    scene_value: ti.template(),
     setting: ti.template(),
     law: ti.template(),
     shape: ti.template(),
     variant: ti.template(),
     threads: ti.template(),
 ):
-    """Adds mass and momentum of each cell's particles to its 27 nodes."""
+    """Adds what each cell's particles give to its 27 nodes: mass and momentum, in later steps of an interval what
+    forces change in it.
+    """
+    begins = scene_value[scene, VALUE.begins]
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
     tasks = live[scene * LIVE.length + LIVE.cells] * LANES
@@ -239,7 +280,7 @@ def _scatter(
                 weight *= law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
             A = _matrix(state, place, stride, FIELD.affine) * dx
             ahead = ti.Vector([A[0, 0], A[1, 0], A[2, 0]])
-            v_0 = _vector(state, place, stride, FIELD.velocity) + A @ ti.Vector([away[0], away_y, away_z])
+            v_0 = begins * _vector(state, place, stride, FIELD.velocity) + A @ ti.Vector([away[0], away_y, away_z])
             v_1 = v_0 + ahead
             v_2 = v_1 + ahead
             weight_0 = weight * spline(away[0])
@@ -253,10 +294,14 @@ def _scatter(
             base + ti.Vector([0, offset_y, offset_z]), _first_node(scene, shape), shape, COMPONENTS
         )
         row = index_y[0] + index_z[0]
-        for c in ti.static(range(COMPONENTS)):
+        for c in ti.static(range(MASS)):
             ti.atomic_add(node[index_x[0] + row + c * BLOCK_NODES], sum_0[c])
             ti.atomic_add(node[index_x[1] + row + c * BLOCK_NODES], sum_1[c])
             ti.atomic_add(node[index_x[2] + row + c * BLOCK_NODES], sum_2[c])
+        if begins == 1.0:
+            ti.atomic_add(node[index_x[0] + row + MASS * BLOCK_NODES], sum_0[MASS])
+            ti.atomic_add(node[index_x[1] + row + MASS * BLOCK_NODES], sum_1[MASS])
+            ti.atomic_add(node[index_x[2] + row + MASS * BLOCK_NODES], sum_2[MASS])
         task += threads
 
 
@@ -268,7 +313,6 @@ def _gather(
     count: ti.i32,
     particles: ti.i32,
     stride: ti.i32,
-    step: ti.f32,
     state: ti.template(),
     order: ti.template(),
     node: ti.template(),
@@ -282,15 +326,15 @@ def _gather(
     threads: ti.template(),
 ):
     """New velocity, gradient and position of each particle."""
-    first_node = _first_node(scene, shape)
+    velocities = _first_node(scene, shape) + VELOCITY * BLOCK_NODES
     largest = 0.0
     s = lane
     while s < count:
         place = particles + order[first + s]
         x = _vector(state, place, stride, FIELD.position)
-        v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape, COMPONENTS)
+        v, C = interpolate(x, velocities, node, setting[SETTING.inverse_cell_size], shape, COMPONENTS)
         moved, speed, speed_square = move(
-            x, v, C, step, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
+            x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
         )
         _put_vector(state, place, stride, FIELD.position, moved)
         _put_vector(state, place, stride, FIELD.velocity, speed)
@@ -329,8 +373,8 @@ def advance(
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
     Arrays, with P particles and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, order,
-    cell_list [P], cell_begin [2 P] and node [4 G] are work space; cell_count [G] and the flags in block
-    [3 * G / 64] are zero between steps; turn [scenes] says which scene comes when (long ones first). A scene that
+    cell_list [P], cell_begin [2 P] and node [7 G] (see COMPONENTS) are work space; cell_count [G] and the flags in
+    block [3 * G / 64] are zero between steps; turn [scenes] says which scene comes when (long ones first). A scene that
     failed keeps still.
     """
     ti.loop_config(block_dim=threads)
@@ -362,46 +406,44 @@ def advance(
             going = 1
             while going == 1:
                 if lane == 0:
-                    live[own + LIVE.cells] = 0
-                    live[own + LIVE.blocks] = 0
-                    live[own + LIVE.cursor] = 0
                     choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
+                    if scene_value[scene, VALUE.begins] == 1.0:
+                        live[own + LIVE.cells] = 0
+                        live[own + LIVE.blocks] = 0
+                        live[own + LIVE.cursor] = 0
                 _wait(threads)
                 step = scene_value[scene, VALUE.time_step]
                 if step > 0.0:
+                    begins = scene_value[scene, VALUE.begins] == 1.0
+                    ends = scene_value[scene, VALUE.interval_remaining] == 0.0
                     _strain_and_sort(
                         lane, scene, first, count, particles, tags, stride, step, state, tag, rank, cell_count,
-                        cell_list, block, live, scene_value, counter, setting, law, shape, variant, threads,
+                        cell_list, block, live, node, scene_value, counter, setting, law, shape, variant, threads,
                     )  # fmt: skip
                     _wait(threads)
                     blocks = live[own + LIVE.blocks]
                     block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
                     cells = live[own + LIVE.cells]
-                    c = lane
-                    while c < cells:
-                        cell = cell_list[first + c]
-                        length = cell_count[cell]
-                        begin = ti.atomic_add(live[own + LIVE.cursor], length)
-                        cell_begin[2 * (first + c)] = begin
-                        cell_begin[2 * (first + c) + 1] = length
-                        cell_count[cell] = begin
-                        c += threads
-                    n = lane
-                    while n < blocks * BLOCK_NODES:
-                        place = _planar(block[block_list + n // BLOCK_NODES], n % BLOCK_NODES)
-                        for c in ti.static(range(COMPONENTS)):
-                            node[place + c * BLOCK_NODES] = 0.0
-                        n += threads
-                    _wait(threads)
-                    p = lane
-                    while p < count:
-                        cell = _cell(_vector(state, particles + p, stride, FIELD.position), scene, setting, shape)
-                        order[first + cell_count[cell] + rank[first + p]] = p
-                        p += threads
-                    _wait(threads)
+                    if begins:
+                        c = lane
+                        while c < cells:
+                            cell = cell_list[first + c]
+                            length = cell_count[cell]
+                            begin = ti.atomic_add(live[own + LIVE.cursor], length)
+                            cell_begin[2 * (first + c)] = begin
+                            cell_begin[2 * (first + c) + 1] = length
+                            cell_count[cell] = begin
+                            c += threads
+                        _wait(threads)
+                        p = lane
+                        while p < count:
+                            cell = _cell(_vector(state, particles + p, stride, FIELD.position), scene, setting, shape)
+                            order[first + cell_count[cell] + rank[first + p]] = p
+                            p += threads
+                        _wait(threads)
                     _scatter(
-                        lane, scene, first, particles, tags, stride, state, tag, order, cell_begin, live, node, setting,
-                        law, shape, variant, threads,
+                        lane, scene, first, particles, tags, stride, state, tag, order, cell_begin, live, node,
+                        scene_value, setting, law, shape, variant, threads,
                     )  # fmt: skip
                     _wait(threads)
                     n = lane
@@ -410,25 +452,33 @@ def advance(
                         if n % BLOCK_NODES == 0:
                             block[touched] = 0
                         place = _planar(touched, n % BLOCK_NODES)
-                        momentum = ti.Vector([node[place + c * BLOCK_NODES] for c in range(3)])
+                        gain = ti.Vector([node[place + c * BLOCK_NODES] for c in range(3)])
+                        before = ti.Vector([0.0, 0.0, 0.0])
+                        if not begins:
+                            before = ti.Vector([node[place + (VELOCITY + c) * BLOCK_NODES] for c in range(3)])
                         v = node_velocity(
-                            momentum, node[place + 3 * BLOCK_NODES], touched * BLOCK_NODES + n % BLOCK_NODES, scene,
-                            block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES], scene_value, setting,
+                            before, gain, node[place + MASS * BLOCK_NODES], touched * BLOCK_NODES + n % BLOCK_NODES,
+                            scene, block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES], scene_value, setting,
                             shape, contact, contact_normal, variant,
                         )  # fmt: skip
                         for c in ti.static(range(3)):
-                            node[place + c * BLOCK_NODES] = v[c]
+                            node[place + c * BLOCK_NODES] = 0.0
+                            node[place + (VELOCITY + c) * BLOCK_NODES] = v[c]
+                        if ends:
+                            node[place + MASS * BLOCK_NODES] = 0.0
                         n += threads
-                    c = lane
-                    while c < cells:
-                        cell_count[cell_list[first + c]] = 0
-                        c += threads
+                    if begins:
+                        c = lane
+                        while c < cells:
+                            cell_count[cell_list[first + c]] = 0
+                            c += threads
                     _wait(threads)
-                    _gather(
-                        lane, scene, first, count, particles, stride, step, state, order, node, scene_value, counter,
-                        setting, shape, contact, contact_normal, variant, threads,
-                    )  # fmt: skip
-                    _wait(threads)
+                    if ends:
+                        _gather(
+                            lane, scene, first, count, particles, stride, state, order, node, scene_value, counter,
+                            setting, shape, contact, contact_normal, variant, threads,
+                        )  # fmt: skip
+                        _wait(threads)
                 else:
                     going = 0
             if lane == 0 and counter[scene, COUNT.status] == STATUS.running:

@@ -39,7 +39,7 @@ class TeamLaunch(Launch):
         self.cell_begin = ti.ndarray(ti.i32, 2 * self.particles)
         self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
-        for array in (self.cell_count, self.block):
+        for array in (self.cell_count, self.block, self.node):
             array.fill(0)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))

@@ -45,9 +45,10 @@ def update_volumes(
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2), variant: ti.template(),
 ):  # fmt: skip
     for n in range(volume.shape[0]):
-        _, _, v, _ = respond(
-            C[n], ti.Matrix.identity(ti.f32, 3), volume[n], WATER, 0, step, 0, counter, setting, constant, variant
-        )
+        _, _, _, v, _ = respond(
+            C[n], ti.Matrix.zero(ti.f32, 3, 3), ti.Matrix.identity(ti.f32, 3), volume[n], WATER, 0, step, 1.0, 0,
+            counter, setting, constant, variant,
+        )  # fmt: skip
         volume[n] = v
 
 

@@ -1,0 +1,107 @@
+"""Transfers between particles and grid come at a rate of their own, with steps of stress between them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from datagen.mpm.solver import Simulated, simulate
+from hgn.config import MpmConfig
+from hgn.scene.material import SAND, SNOW, WATER
+from hgn.scene.scene import Scene
+from hgn.schema import ConfigError
+from tools.stability.solver_scenes import block, height_cells
+
+CELL = 1 / 16
+CONFIG = MpmConfig(device="cpu")
+EVERY_STEP = dataclasses.replace(CONFIG, transfer_speed_m_s=None)
+
+
+def cube(velocity: tuple, stiffness: float = 1.0, cell: float = CELL) -> Scene:
+    """200 particles of all materials at random places above the floor; all tests share the kernel compiled for them."""
+    place = np.random.default_rng(0).uniform((0.4, 0.25, 0.4), (0.55, 0.4, 0.55), (200, 3)).astype(np.float32)
+    kinds = np.arange(200) % 3
+    modulus = np.full(200, 1e6 * stiffness, np.float32)
+    return Scene(
+        place, np.tile(np.float32(velocity), (200, 1)), kinds.astype(np.uint8), cell_size=cell,
+        material_parameters={"youngs_modulus_pa": modulus},
+    )  # fmt: skip
+
+
+def run(scene: Scene, config: MpmConfig, frames: int, rate_hz: float = 60.0) -> Simulated:
+    (outcome,) = simulate([scene], config, frames, rate_hz)
+    assert isinstance(outcome, Simulated), outcome
+    return outcome
+
+
+def test_stiffness_changes_steps_and_not_transfers() -> None:
+    """Slow scenes take cell_size / transfer_speed_m_s between transfers, eight times a frame here, however many steps
+    of stress they need; fast ones transfer more often, so that nothing goes further than a part of a cell.
+    """
+    soft, hard, fast = (
+        run(cube(velocity, stiffness), CONFIG, 3)
+        for velocity, stiffness in (((0, -1, 0), 1), ((0, -1, 0), 30), ((12, -12, 0), 1))
+    )
+    assert soft.counters["transfers"] == hard.counters["transfers"] == 2 * 8
+    assert hard.counters["substeps"] > 3 * soft.counters["substeps"] > 3 * 16
+    assert fast.counters["transfers"] > 1.5 * 16
+
+
+def test_a_transfer_at_every_step() -> None:
+    """With intervals no longer than steps each step is a transfer: the same bits as with transfer_speed_m_s none."""
+    scene = cube((1, -3, 0))
+    none = run(scene, EVERY_STEP, 7)
+    often = run(scene, dataclasses.replace(CONFIG, transfer_speed_m_s=1e4), 7)
+    assert none.counters == often.counters
+    assert none.counters["transfers"] == none.counters["substeps"]
+    assert np.array_equal(none.position_TN3, often.position_TN3)
+    with pytest.raises(ConfigError, match="transfer_speed_m_s"):
+        MpmConfig(transfer_speed_m_s=0.0)
+
+
+def test_momentum_is_kept_over_intervals() -> None:
+    """Without gravity blocks that collide keep their momentum to 1e-5 over intervals of many steps of stress."""
+    scene = dataclasses.replace(cube((0, 0, 0), 30.0), gravity=(0.0, 0.0, 0.0))
+    towards = np.where(scene.position_N3[:, :1] > 0.475, np.float32([[-2, 0.3, 0]]), np.float32([[2, 0, 0.1]]))
+    outcome = run(dataclasses.replace(scene, velocity_N3=towards.astype(np.float32)), CONFIG, 7)
+    moved = np.diff(outcome.position_TN3.astype(float), axis=0).sum(axis=1)
+    assert outcome.counters["substeps"] > 4 * outcome.counters["transfers"]
+    assert np.abs(moved - moved[0]).max() < 1e-5 * np.abs(towards).sum() / 60
+
+
+def test_what_is_stiff_leaves_water_as_it_is() -> None:
+    """Water splashes as it does alone where something far away asks for several times as many steps; with a transfer
+    at each step it would be smoothed several times as much.
+    """
+    water = block(WATER, (30, 4, 30), (5, 5, 5), (0, -4.5, 0))
+    far = [block(kind, (6, 30, 6 + 4 * kind), (1, 1, 1)) for kind in (SAND, SNOW)]
+    both = [
+        Scene(
+            np.concatenate([s.position_N3 for s in (water, *far)]),
+            np.concatenate([s.velocity_N3 for s in (water, *far)]),
+            np.concatenate([s.material_N for s in (water, *far)]),
+            cell_size=water.cell_size,
+            material_parameters={
+                "youngs_modulus_pa": np.repeat(np.float32([1e6, modulus]), [water.particle_count, 16])
+            },
+        )
+        for modulus in (1e6, 1e8)
+    ]
+    changes = []
+    for config in (CONFIG, EVERY_STEP):
+        alone, beside = (run(scene, config, 9, 240.0) for scene in both)
+        assert beside.counters["substeps"] > 4 * alone.counters["substeps"]
+        heights = [height_cells(o.position_TN3[-1][: water.particle_count]) for o in (alone, beside)]
+        changes.append(abs(heights[1] / heights[0] - 1))
+    assert changes[0] < 0.03 < changes[1], changes
+
+
+def test_half_the_step() -> None:
+    """Half the step changes the height of a block on the floor by less than 3 %, as its transfers stay as many."""
+    half = dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / 2)
+    blocks = [(SAND, 4.5), (SAND, 10.0), (WATER, 4.5)]
+    scenes = [block(material, (30, 4, 30), (6, 6, 6), (0, -speed, 0)) for material, speed in blocks]
+    outcomes = [simulate([*scenes, cube((0, 0, 0), cell=1 / 64)], config, 6, 240.0) for config in (CONFIG, half)]
+    for whole, fine in zip(*(outcome[:3] for outcome in outcomes), strict=True):
+        assert isinstance(whole, Simulated) and isinstance(fine, Simulated)
+        assert abs(height_cells(fine.position_TN3[-1]) / height_cells(whole.position_TN3[-1]) - 1) < 0.03
