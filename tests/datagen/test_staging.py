@@ -1,0 +1,303 @@
+"""Claims, staged episodes and quarantine: whatever interrupts a writer, the next goes on to the same shards."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from written_files import MakeConfig, MakeDataset, Stage, claim_all, hashes, snapshot
+
+import datagen.shard
+import datagen.writer
+from datagen.plan import scene_seed
+from datagen.writer import MAXIMUM_REPLACEMENTS, DatasetWriter
+from hgn.config import DatagenConfig, MpmConfig, SceneConfig
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.schema import ConfigError
+
+
+class InterruptionError(Exception):
+    """A stand-in for a crash."""
+
+
+@pytest.mark.parametrize("call", [1, 2, 3, 4, 5, 8, 13, 18, 23])
+def test_resume_after_a_crash_makes_the_same_shards(
+    make_config: MakeConfig,
+    make_dataset: MakeDataset,
+    stage: Stage,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    control: Path,
+    call: int,
+) -> None:
+    """Wherever a run stops, running again gives bitwise the same shards and simulates no staged episode twice."""
+    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
+    (control / "simulated.log").unlink()
+    config = make_config(folder=str(tmp_path / "cut"))
+    calls = 0
+
+    def crash(path: Path) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            raise InterruptionError
+
+    stage_parts = datagen.shard.stage_parts
+
+    def stage_and_crash(folder: Path, key: str, parts: Iterable[bytes]) -> None:
+        stage_parts(folder, key, parts)
+        crash(folder)
+
+    with monkeypatch.context() as patch:
+        # the last step of each staging and of each shard, so a crash there is a crash between files
+        patch.setattr(datagen.shard, "stage_parts", stage_and_crash)
+        patch.setattr(datagen.writer, "sync_folder", crash)
+        patch.setattr("hgn.files.sync_folder", crash)
+        try:
+            make_dataset(config)
+        except InterruptionError:
+            assert Path(config.dataset.folder).exists()
+    make_dataset(config)
+    assert hashes(Path(config.dataset.folder)) == hashes(whole)
+    assert Manifest.load(config.dataset.folder).complete
+    seeds = (control / "simulated.log").read_text().split()
+    assert len(seeds) == len(set(seeds)) == 8
+
+
+def test_growth_keeps_what_is_there(
+    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, control: Path
+) -> None:
+    """Asking for more scenes later adds just those; shards that were published keep their bytes and places."""
+    small, large = (make_config(training_scenes=count, folder=str(tmp_path / "grown")) for count in (3, 9))
+    folder = make_dataset(small)
+    before, published = hashes(folder), Manifest.load(folder).shards
+    make_dataset(large)
+    after = Manifest.load(folder)
+    assert after.shards[: len(published)] == published
+    assert before.items() <= hashes(folder).items()
+    assert [(shard.first, shard.stop) for shard in after.shards_of("train")] == [
+        (0, 1),
+        (1, 2),
+        (2, 3),
+        (3, 4),
+        (4, 8),
+        (8, 9),
+    ]
+    assert after.requested["train"] == 9 and after.complete
+    seeds = (control / "simulated.log").read_text().split()
+    assert len(seeds) == len(set(seeds)) == 9 + 2 + 1
+    direct = make_dataset(make_config(training_scenes=9, folder=str(tmp_path / "direct")))
+    for grown, made in zip(EpisodeStore(folder, "train").episodes, EpisodeStore(direct, "train").episodes, strict=True):
+        assert np.array_equal(grown.position_TN3, made.position_TN3) and grown.seed == made.seed
+
+
+@pytest.mark.parametrize("count", [5, 3])
+def test_complete_folder_stays_untouched(make_config: MakeConfig, make_dataset: MakeDataset, count: int) -> None:
+    """Asking again for what is there, or for less of it, changes no file."""
+    folder = make_dataset(make_config())
+    before = snapshot(folder)
+    with DatasetWriter(make_config(training_scenes=count)) as writer:
+        assert writer.complete and writer.claim_next() is None
+    assert snapshot(folder) == before
+
+
+def test_asking_for_less_ends_an_unfinished_dataset(make_config: MakeConfig, stage: Stage) -> None:
+    """A folder begun for five episodes and asked for one is complete when that one is there."""
+    with DatasetWriter(make_config()) as writer:
+        stage(writer, "train", 0)
+        writer.publish_next()
+    with DatasetWriter(make_config(training_scenes=1, validation_scenes=0, test_scenes=0)) as writer:
+        assert writer.complete
+    assert Manifest.load(writer.folder).complete
+
+
+OTHER_CONFIGS: list[tuple[dict[str, Any], str]] = [
+    ({"scene": SceneConfig(obstacle_count=3)}, "scene.obstacle_count is 5 there, 3 is asked for"),
+    ({"mpm": MpmConfig(snow_hardening=5.0)}, "mpm.snow_hardening is 10.0 there, 5.0 is asked for"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), OTHER_CONFIGS)
+def test_other_settings_are_refused(
+    make_config: MakeConfig, make_dataset: MakeDataset, changes: dict[str, Any], message: str
+) -> None:
+    """A folder takes no episodes of another distribution, and the message names the keys and the remedy."""
+    config = make_config()
+    folder = make_dataset(config)
+    before = snapshot(folder)
+    with (
+        pytest.raises(ConfigError, match=f"holds another data set: {message}; choose another folder"),
+        DatasetWriter(dataclasses.replace(config, **changes)),
+    ):
+        pass
+    assert snapshot(folder) == before
+
+
+@pytest.mark.parametrize("changes", [{"seed": 1}, {"frames": 7}, {"frame_rate_hz": 30.0}])
+def test_other_dataset_settings_are_refused(
+    make_config: MakeConfig, make_dataset: MakeDataset, changes: dict[str, Any]
+) -> None:
+    """Seed, length and frame rate belong to the data set's identity."""
+    make_dataset(make_config())
+    with pytest.raises(ConfigError, match=next(iter(changes))), DatasetWriter(make_config(**changes)):
+        pass
+
+
+def test_where_and_how_fast_is_no_identity(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+    """Device, launch size, workers, attempts and shard size may change between runs of one data set."""
+    config = make_config()
+    make_dataset(config)
+    dataset = dataclasses.replace(config.dataset, workers=3, maximum_attempts=1, episodes_per_shard=2)
+    mpm = MpmConfig(device="gpu", scenes_per_launch=64)
+    with DatasetWriter(DatagenConfig(dataset=dataset, mpm=mpm)) as writer:
+        assert writer.complete
+
+
+def test_data_of_another_schema_is_refused(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+    """A manifest of another version is refused with the remedy, and stays as it is."""
+    folder = make_dataset(make_config())
+    mapping = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}
+    (folder / "manifest.json").write_text(json.dumps(mapping))
+    with pytest.raises(ConfigError, match=r"schema_version must be 1, got 99; .* or use the version that made it"):
+        make_dataset(make_config())
+
+
+def test_generators_share_a_folder(
+    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, tmp_path: Path, control: Path
+) -> None:
+    """Each of two generators makes the shards that it claims; what one leaves behind the other makes; each sees what
+    the other published."""
+    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
+    (control / "simulated.log").unlink()
+    with DatasetWriter(make_config()) as other:
+        with DatasetWriter(make_config()) as writer:
+            first, second = writer.claim_next(), other.claim_next()
+            assert first and second and not set(writer.remaining()) & set(other.remaining())
+            stage(writer, first.split, first.first)
+            partial = writer.folder / f".{second.name}.77.partial"
+            partial.touch()
+            assert writer.publish_next()
+            assert claim_all(writer) and other.claim_next() is None and not other.complete
+        assert partial.exists() and (other.folder / ".staging").exists()
+        other.refresh()
+        assert other.done == 1
+        for split, index in claim_all(other):
+            stage(other, split, index)
+        while other.publish_next():
+            pass
+        assert other.complete
+    assert not partial.exists() and not (other.folder / ".staging").exists()
+    assert hashes(other.folder) == hashes(whole) and Manifest.load(other.folder).complete
+    seeds = (control / "simulated.log").read_text().split()
+    assert len(seeds) == len(set(seeds)) == 8
+
+
+def test_first_writer_wins(make_config: MakeConfig, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where locks do not hold, two generators make a shard; the second copy is dropped, and it is listed once."""
+    monkeypatch.setattr("datagen.claims.Claims.take", lambda self, shard: True)
+    messages: list[str] = []
+    with DatasetWriter(make_config()) as writer, DatasetWriter(make_config(), messages.append) as other:
+        assert writer.claim_next() == other.claim_next()
+        stage(writer, "train", 0)
+        stage(other, "train", 0)
+        assert writer.publish_next()
+        before = snapshot(writer.folder)
+        assert other.publish_next() == writer.manifest.shards[0]
+        assert snapshot(writer.folder) == before
+    assert messages == ["train-000000-000001.tar was published by another generator; this copy is dropped"]
+    assert len(Manifest.load(writer.folder).shards) == 1
+
+
+def test_array_tasks_make_one_dataset(
+    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, control: Path
+) -> None:
+    """Three tasks of an array make all shards once between them, each knowing nothing of the others."""
+    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
+    (control / "simulated.log").unlink()
+    for task in range(3):
+        folder = make_dataset(make_config(array_task=task, array_tasks=3))
+        assert Manifest.load(folder).complete == (task == 2)
+    assert hashes(folder) == hashes(whole)
+    seeds = (control / "simulated.log").read_text().split()
+    assert len(seeds) == len(set(seeds)) == 8
+
+
+@pytest.mark.parametrize("seconds", [0, 2**33])
+def test_no_clock_is_asked(
+    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, tmp_path: Path, seconds: int
+) -> None:
+    """Machines whose clocks stand in 1970 or far in the future, beside others', make the same data set: no time of a
+    file says whether it is whole, left behind or new."""
+    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
+
+    def turn_back(folder: Path) -> None:
+        for path in (*folder.rglob("*"), folder):
+            os.utime(path, (seconds, seconds))
+
+    with DatasetWriter(make_config()) as writer:
+        store = None
+        for index in range(2):
+            with DatasetWriter(make_config()) as other:
+                stage(other, "train", index)
+                (writer.folder / ".staging" / f".train-00000{index}.tar.77.partial").touch()
+                turn_back(writer.folder)
+                other.publish_next()
+                turn_back(writer.folder)
+            store = store or EpisodeStore(writer.folder, "train")
+            store.refresh()
+            writer.refresh()
+            assert len(store) == len(store.episodes[:]) == writer.done == index + 1
+    make_dataset(make_config())
+    turn_back(writer.folder)
+    assert hashes(make_dataset(make_config())) == hashes(whole)
+    assert not list(writer.folder.rglob("*.partial"))
+
+
+def test_broken_staged_file_is_made_again(make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage) -> None:
+    """A staged file that does not read back is dropped and its episode made again."""
+    with DatasetWriter(make_config()) as writer:
+        stage(writer, "train", 1)
+    staged = writer.folder / ".staging" / "train-000001.tar"
+    staged.write_bytes(staged.read_bytes()[:2000])
+    messages: list[str] = []
+    with DatasetWriter(make_config(), messages.append) as writer:
+        assert ("train", 1) in claim_all(writer)
+    assert "the episode is made again" in messages[0]
+    make_dataset(make_config())
+
+
+def test_quarantined_seed_is_replaced(make_config: MakeConfig, stage: Stage) -> None:
+    """The next attempt's seed takes the place, the manifest keeps seed and cause, and a later run goes on there."""
+    config = make_config()
+    with DatasetWriter(config) as writer:
+        replacement = writer.quarantine(writer.task("train", 0), "diverged")
+        assert replacement.seed == scene_seed(0, "train", 0, attempt=1)
+    with DatasetWriter(config) as writer:
+        assert writer.task("train", 0) == replacement
+        stage(writer, "train", 0)
+        writer.publish_next()
+    manifest = Manifest.load(writer.folder)
+    (failure,) = manifest.quarantined
+    assert (failure.key, failure.seed, failure.cause) == (
+        "train-000000",
+        scene_seed(0, "train", 0, attempt=0),
+        "diverged",
+    )
+    (entry,) = manifest.shards[0].episodes
+    assert (entry.attempt, entry.seed) == (1, replacement.seed)
+
+
+def test_scenes_that_never_work_end_in_an_error(make_config: MakeConfig) -> None:
+    """A distribution none of whose scenes can be simulated ends with the cause, not in an endless loop."""
+    with DatasetWriter(make_config()) as writer:
+        task = writer.task("train", 0)
+        with pytest.raises(ConfigError, match=r"train-000000 could not be simulated with 20 seeds, .*: too stiff;"):
+            for _ in range(MAXIMUM_REPLACEMENTS):
+                task = writer.quarantine(task, "too stiff")

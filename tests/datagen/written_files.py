@@ -1,0 +1,32 @@
+"""What the tests of the writer share: the bytes of shards, every file of a data set, and all claims."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+from datagen.writer import DatasetWriter
+from hgn.config import DatagenConfig
+
+MakeConfig = Callable[..., DatagenConfig]
+MakeDataset = Callable[[DatagenConfig], Path]
+Stage = Callable[[DatasetWriter, str, int], None]
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("*.tar"))}
+
+
+def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
+    return {
+        str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def claim_all(writer: DatasetWriter) -> list[tuple[str, int]]:
+    while writer.claim_next():
+        pass
+    return writer.remaining()
