@@ -316,7 +316,7 @@ class TrainingConfig:
     accelerator: str = "auto"  # or cpu, gpu
     devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
     nodes: int | None = None  # machines; none: as launched, without a launcher one
-    precision: str = "high"  # matrix products: highest (float32), high (TF32 where there is one), half (fast path only)
+    precision: str = "high"  # matrix products: highest (float32), high (TF32 on a GPU), half (fast path and GNS only)
     path: str = "auto"  # plain (PyTorch), fast (kernels in CUDA graphs); auto: fast where it runs
     minimum_episodes: int = 1  # training starts once that many training episodes are published
     generate: bool = True  # start the generator where the data set is missing or incomplete
@@ -431,7 +431,7 @@ class RolloutConfig:
     frames: int = 300
     device: str = "auto"  # or cpu, cuda, cuda:1, …
     path: str = "auto"  # plain (PyTorch), fast (kernels in CUDA graphs); auto: fast where it runs
-    precision: str = "high"  # matrix products: highest (float32), high (TF32 where there is one), half (fast path only)
+    precision: str = "high"  # matrix products: highest (float32), high (TF32 on a GPU), half (fast path and GNS only)
 
     def __post_init__(self) -> None:
         require(self.frames >= 2, "frames", "at least 2", self.frames)
@@ -463,7 +463,7 @@ class EvaluateConfig:
     particles_per_batch: int = 32_768
     device: str = "auto"
     path: str = "auto"  # of the rollouts: plain, fast; auto: fast where it runs
-    precision: str = "high"  # matrix products: highest, high, half (rollouts on the fast path only)
+    precision: str = "high"  # matrix products: highest, high, half (rollouts on the fast path, and GNS)
     json: str | None = None  # also write the figures to this file
 
     def __post_init__(self) -> None:

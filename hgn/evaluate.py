@@ -17,6 +17,7 @@ from hgn.files import write_json
 from hgn.network.base import ParticleNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
+from hgn.runtime.gns_edges import use_edges
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import find_weights, load_weights, require_frame_rate
@@ -41,6 +42,7 @@ def main(mapping: dict[str, Any]) -> int:
     network, info = load_weights(find_weights(config.weights), device)
     path, text = path_on(device, network.config, config.path, config.precision)
     set_matmul_precision(config.precision)
+    use_edges(network, config.precision)
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     require_frame_rate(info, episodes[0].frame_rate_hz)

@@ -17,6 +17,7 @@ from torch import nn
 
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
+from hgn.network.edges import Edges, Ends, Graph, encoded_edges, passed_messages, scaling_gradients
 from hgn.network.fcn import FCN
 from hgn.network.features import ParticleState
 from hgn.network.neighbours import NeighbourList, neighbour_list
@@ -50,6 +51,8 @@ class GraphNetworkSimulator(ParticleNetwork):
         self.encode_edges = FCN((3, 1), width, width, slope=RELU)
         self.steps = nn.ModuleList(InteractionStep(width) for _ in range(config.message_passing_steps))
         self.decode = FCN((width,), width, 3, layer_norm=False, slope=RELU)
+        # What works on the edges, as hgn.runtime.gns_edges chooses it; none: PyTorch and its own gradients.
+        self.edges: Edges | None = None
 
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
         """The network's raw output [N, 3] of the moving particles. There is no grid for `origin_S3` to move.
@@ -93,7 +96,9 @@ class GraphNetworkSimulator(ParticleNetwork):
         """The raw output [N, 3] of a state and its graph."""
         node_NW = self.encode_particles(state)[neighbours.order_N]
         position_N3 = state.position_N3[neighbours.order_N]
-        if torch.is_grad_enabled():
+        if self.edges is not None:
+            node_NW = self._steps_of_edges(self.edges, node_NW, position_N3, neighbours)
+        elif torch.is_grad_enabled():
             node_NW = self._steps(node_NW, position_N3, neighbours)
         else:
             node_NW = self._steps_in_blocks(node_NW, position_N3, neighbours)
@@ -118,6 +123,20 @@ class GraphNetworkSimulator(ParticleNetwork):
             if i + 1 < len(self.steps):
                 edge_EW = edge_EW + message_EW
         return node_NW
+
+    def _steps_of_edges(
+        self, edges: Edges, node_NW: torch.Tensor, position_N3: torch.Tensor, neighbours: NeighbourList
+    ) -> torch.Tensor:
+        """The same with `edges` at work."""
+        graph = Graph(neighbours, position_N3 / self.config.cell_size)
+        edge_EW = encoded_edges(edges, graph, self.encode_edges)
+        for i, step in enumerate(self.steps):
+            assert isinstance(step, InteractionStep)
+            receive_NW = step.edge.project(1, node_NW) + step.edge.first.bias
+            ends = Ends(step.edge.project(0, node_NW), receive_NW)
+            sum_NW, edge_EW = passed_messages(edges, graph, step.edge, ends, edge_EW, i + 1 == len(self.steps))
+            node_NW = step.update(node_NW, sum_NW)
+        return scaling_gradients(graph, node_NW)
 
     def _steps_in_blocks(
         self, node_NW: torch.Tensor, position_N3: torch.Tensor, neighbours: NeighbourList

@@ -6,6 +6,7 @@ import math
 
 import torch
 
+GRADIENT_BOUND = 0.3  # relative error of all gradients, of the norm
 OUTPUT_BOUND = 0.05  # relative error of the network's outputs; both round, and wrong kernels miss it by far
 
 

@@ -36,15 +36,18 @@ def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "
     return None
 
 
-def choose_path(field: str, path: str, precision: str, reason: str | None) -> tuple[str, str]:
+def choose_path(
+    field: str, path: str, precision: str, reason: str | None, half_plainly: bool = False
+) -> tuple[str, str]:
     """`plain` or `fast`, and a line that says so; `reason` is what keeps the fast one from running.
 
+    `half_plainly`: the plain path knows half precision too.
     Raises: ConfigError when the fast path is asked for and cannot run, or half precision without it.
     """
     if path == "fast" and reason is not None:
         raise ConfigError(f"{field} must be plain or auto here, got fast: {reason}")
     chosen = "fast" if path != "plain" and reason is None else "plain"
-    if chosen == "plain" and precision == "half":
+    if chosen == "plain" and precision == "half" and not half_plainly:
         raise ConfigError(
             f"precision must be high or highest on the plain path, got half; {reason or f'{field}=plain was asked for'}"
         )
@@ -55,8 +58,8 @@ def choose_path(field: str, path: str, precision: str, reason: str | None) -> tu
 def path_on(
     device: torch.device, network: NetworkConfig, path: str, precision: str, field: str = "path"
 ) -> tuple[str, str]:
-    """What choose_path answers for a network on a device."""
-    return choose_path(field, path, precision, why_not_fast(device, network, precision))
+    """What choose_path answers for a network on a device; GNS has half precision of its own, see gns_edges."""
+    return choose_path(field, path, precision, why_not_fast(device, network, precision), network.kind != "hgn")
 
 
 def set_matmul_precision(precision: str) -> None:

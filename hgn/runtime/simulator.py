@@ -13,11 +13,13 @@ import numpy as np
 import torch
 
 from hgn.network.base import ParticleNetwork
+from hgn.network.edges import PlainEdges
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import GridRangeError
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.runtime.gns_edges import require_agreement, use_edges
 from hgn.runtime.gns_graph import GnsGraphs
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_positions
@@ -86,14 +88,17 @@ class Simulator:
     def __init__(
         self, network: ParticleNetwork, frame_rate_hz: float, path: str = "plain", precision: str = "high"
     ) -> None:
-        """`path` is plain or fast, as hgn.runtime.path chooses it; `precision` is that of the fast path."""
+        """`path` is plain or fast, as hgn.runtime.path chooses it; `precision` is that of the fast path, and
+        of a GNS, which works on its edges accordingly from now on."""
         self.network = network
         self.frame_rate_hz = frame_rate_hz
         self.path, self.precision = path, precision
         self.device = next(network.parameters()).device
         self.predict: Callable[[ParticleState], torch.Tensor] = network
+        use_edges(network, precision)
         if isinstance(network, GraphNetworkSimulator) and self.device.type == "cuda":
-            self.predict = GnsGraphs(network)
+            roomy = not isinstance(network.edges, PlainEdges)  # which take no room to spare
+            self.predict = GnsGraphs(network) if roomy else network
 
     def start(self, scenes: Sequence[InitialState]) -> ParticleState:
         """The state at frame 0, with a ballistic history.
@@ -148,6 +153,7 @@ class Simulator:
         counts = [len(scene.position_N3) for scene in scenes]
         if self.path == "fast":
             return np.split(self._fast_rollout(state, frames, on_frame), np.cumsum(counts)[:-1], axis=1)
+        require_agreement(self.network, state, gradients=False)
         positions = [state.position_N3.cpu().numpy()]
         for frame in range(1, frames):
             try:

@@ -17,12 +17,11 @@ from hgn.kernels.update.op import Updates
 from hgn.network.features import ParticleState
 from hgn.network.keys import pack
 from hgn.network.obstacles import ObstacleCells
-from hgn.runtime.agreement import OUTPUT_BOUND, relative_error
+from hgn.runtime.agreement import GRADIENT_BOUND, OUTPUT_BOUND, relative_error
 from hgn.scene.symmetry import Symmetry
 from hgn.schema import ConfigError
 from hgn.training.symmetry import obstacles_under
 
-GRADIENT_BOUND = 0.3  # relative error of the norm
 CHECKED_PARTICLES = 200_000  # at most; the plain network needs memory
 
 

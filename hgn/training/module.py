@@ -20,6 +20,7 @@ from hgn.data.order import Cursor
 from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
 from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.gns_edges import require_agreement, use_edges
 from hgn.schema import to_mapping
 from hgn.training.checkpoint import (
     AVERAGED,
@@ -56,6 +57,7 @@ class TrainingModule(LightningModule):
         self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
         self._fast: Any = None
         self._own: OwnStates | None = None
+        self._unchecked = True  # whether kernels compute on this machine what they should
 
     def set_statistics(self, statistics: Statistics) -> None:
         """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
@@ -118,6 +120,10 @@ class TrainingModule(LightningModule):
         own = self._own if self._fast is None else self._fast.own
         return {} if own is None else dict(own.figures)
 
+    def on_fit_start(self) -> None:
+        use_edges(self.network, self.training_config.precision)  # by the device that it is on by now
+        use_edges(self.result, self.training_config.precision)
+
     def on_train_start(self) -> None:
         config = self.training_config
         if self.automatic_optimization and config.rollout_share > 0:
@@ -147,6 +153,9 @@ class TrainingModule(LightningModule):
         if isinstance(batch, Chunk):
             self._train_chunk(batch)
             return None
+        if self._unchecked:
+            require_agreement(self.network, batch.state(), gradients=True, field="training.precision")
+            self._unchecked = False
         if self._own is not None:
             if batch.starts:
                 self._own.refresh(batch.starts)

@@ -32,13 +32,14 @@ def test_every_command_takes_a_baseline(
     tmp_path: Path,
     kind: str,
 ) -> None:
-    """A baseline is trained, resumed, exported, simulated and evaluated by the commands of the HGN."""
+    """A baseline is trained, resumed, exported, simulated and evaluated, in half precision, by the HGN's commands."""
     config = make_config()
     make_dataset(config)
     network = GNS | {"kind": kind, "obstacle_features": kind == "gns"}
     run = tmp_path / "run"
     for updates in (2, 4):
-        assert train.main(train_mapping(config, run, maximum_updates=updates) | {"network": network}) == 0
+        mapping = train_mapping(config, run, maximum_updates=updates, precision="half")
+        assert train.main(mapping | {"network": network}) == 0
     with pytest.raises(ConfigError, match=r"network\.kind must be '.*' to go on with"):
         train.main(train_mapping(config, run))
     weights = tmp_path / "weights.safetensors"
@@ -46,7 +47,7 @@ def test_every_command_takes_a_baseline(
     loaded, info = load_weights(weights)
     assert type(loaded).__name__ == "GraphNetworkSimulator" and info.network.kind == kind and info.updates == 4
     data = config.dataset.folder
-    place = {"weights": str(weights), "data": data}
+    place = {"weights": str(weights), "data": data, "precision": "half"}
     out = tmp_path / "rollout.vtkhdf"
     assert rollout.main(place | {"episode": "validation-000000", "frames": 4, "out": str(out)}) == 0
     report = tmp_path / "errors.json"

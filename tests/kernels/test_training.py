@@ -13,7 +13,7 @@ from training.runs import metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
-from hgn.runtime.path import choose_path, why_not_fast
+from hgn.runtime.path import choose_path, path_on, why_not_fast
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.feed import UPDATES_AT_ONCE, chunk_length
@@ -129,6 +129,14 @@ def test_the_path_is_chosen_and_said(path: str, precision: str, reason: str | No
     else:
         with pytest.raises(ConfigError, match=expected):
             choose_path("training.path", path, precision, reason)
+
+
+def test_gns_has_half_precision_on_the_plain_path() -> None:
+    """What other networks are refused there."""
+    assert choose_path("path", "auto", "half", "it computes hgn", True)[0] == "plain"
+    assert path_on(torch.device("cpu"), NetworkConfig(kind="gns", levels=1), "auto", "half")[0] == "plain"
+    with pytest.raises(ConfigError, match="got half; it needs a CUDA device"):
+        path_on(torch.device("cpu"), NetworkConfig(), "auto", "half")
 
 
 def test_why_the_fast_path_does_not_run() -> None:

@@ -108,6 +108,15 @@ def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:
     assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
 
 
+def test_gns_in_half_precision(tmp_path: Path) -> None:
+    """Our GNS is checked and timed in half precision where there is no fast path either, and nothing else is."""
+    path = tmp_path / "bench.json"
+    assert main(SMALL | {"scenes": [1], "precisions": ["fp16"], "json": str(path)}) == 0
+    rows = json.loads(path.read_text())["rows"]
+    assert [row["case"] for row in rows] == ["gns_frame", "gns_train"]
+    assert all(row["check"] == "pass" and row["precision"] == "fp16" for row in rows)
+
+
 def test_the_fast_path_is_checked_like_the_plain_one() -> None:
     """Frames, loss and gradients of the fast path pass in float32 (in Triton's interpreter), and a wrong weight not."""
     config = NetworkConfig(width=16, levels=1, message_passing_steps=1)

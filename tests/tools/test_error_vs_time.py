@@ -178,12 +178,13 @@ def test_the_fast_path_tells_its_own_errors(data: str) -> None:
 
 def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Half precision off the fast path is left out, and that is said; the fast path must run where it is asked for."""
-    file = weights_file(tmp_path / "gns.safetensors", "gns")
-    options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": [str(file)]}
+    files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
+    options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": files}
     config = from_mapping(ErrorVsTimeConfig, options | {"precisions": ["fp32", "fp16"]})
     (episode,) = EpisodeStore(data, "test").episodes
-    (only,) = network_contenders(config, CPU, [episode])
-    assert only.row["precision"] == "fp32" and "left out: gns.safetensors at fp16" in capsys.readouterr().err
+    found = [(c.row["system"], c.row["precision"]) for c in network_contenders(config, CPU, [episode])]
+    assert found == [("hgn", "fp32"), ("gns", "fp32"), ("gns", "fp16")]
+    assert "left out: hgn.safetensors at fp16" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="path must be plain or auto here, got fast"):
         network_contenders(replace(config, path="fast"), CPU, [episode])
 

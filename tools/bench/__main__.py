@@ -162,11 +162,12 @@ def _maker(
         return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
     if case in ("frame", "train") and why_not_fast(device, config.network, PATH_PRECISION[precision]) is None:
         return functools.partial(FastFrame if frame else FastTrain, precision), "fast"
-    return Frame if frame else Train, None if "gns" in case else "plain"
+    made = functools.partial(Frame if frame else Train, precision=PATH_PRECISION[precision])
+    return made, None if "gns" in case else "plain"
 
 
 def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tuple[str, ...]) -> list[str]:
-    """Those of `cases` that are asked for and mean something; half precision is the fast path's alone."""
+    """Those of `cases` that are asked for and mean something; half precision is the fast path's and our GNS's alone."""
     fast = why_not_fast(device, config.network, PATH_PRECISION[precision]) is None
     wanted = config.cases or tuple(
         case
@@ -174,7 +175,8 @@ def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tu
         if (fast or case not in PLAIN_CASES) and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
     )
     if precision == "fp16":
-        wanted = tuple(case for case in ("frame", "train") if fast and case in wanted)
+        known = (("frame", "train") if fast else ()) + ("gns_frame", "gns_train")
+        wanted = tuple(case for case in known if case in wanted)
     return [case for case in cases if case in wanted]
 
 

@@ -23,6 +23,7 @@ from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import build_hierarchy
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.agreement import relative_error
+from hgn.runtime.gns_edges import use_edges
 from hgn.runtime.simulator import Simulator
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
@@ -59,10 +60,10 @@ def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwor
 class Frame:
     """One frame of a simulation: features, grid or neighbours, network, integration."""
 
-    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device) -> None:
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "highest") -> None:
         self.device = device
         self.network = bench_network(config, device)
-        self.simulator = Simulator(self.network, FRAME_RATE_HZ)
+        self.simulator = Simulator(self.network, FRAME_RATE_HZ, precision=precision)
         self.state = state_of(work, config, device)
 
     def run(self) -> ParticleState:
@@ -111,10 +112,11 @@ class Frame:
 class Train:
     """One training step on data that is on the device: noise, jitter, forward, backward, Adam."""
 
-    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device) -> None:
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "highest") -> None:
         self.device = device
         training = TrainingConfig(batch_scenes=work.scenes)
         self.module = TrainingModule(bench_network(config, device).train(), training, _data_info()).to(device)
+        use_edges(self.module.network, precision)
         self.batch = batch_of(work, config, device)
         self.optimizer = self.module.configure_optimizers()["optimizer"]
 
@@ -184,7 +186,7 @@ def _double(batch: Batch) -> Batch:
 
 def reference_gradients(network: ParticleNetwork, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
     """The float64 network's loss without noise and jitter, and the gradients of all parameters, end to end."""
-    reference = copy.deepcopy(network).double()
+    reference = _reference(network)
     reference.zero_grad()
     target_N3 = reference.normaliser.normalise_acceleration(_double(batch).acceleration())
     predicted_N3 = reference_output(reference, batch.state())
@@ -195,8 +197,16 @@ def reference_gradients(network: ParticleNetwork, batch: Batch) -> tuple[torch.T
 
 def reference_acceleration(network: ParticleNetwork, state: ParticleState) -> torch.Tensor:
     """What the float64 network predicts."""
-    reference = copy.deepcopy(network).double()
+    reference = _reference(network)
     return reference.normaliser.restore_acceleration(reference_output(reference, state))
+
+
+def _reference(network: ParticleNetwork) -> ParticleNetwork:
+    """A copy in float64; of GNS one by plain autograd."""
+    reference = copy.deepcopy(network).double()
+    if isinstance(reference, GraphNetworkSimulator):
+        reference.edges = None
+    return reference
 
 
 def reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.Tensor:

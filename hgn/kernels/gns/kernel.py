@@ -1,0 +1,369 @@
+"""The edges of GNS, forward and backward: an encoder, a message-passing step, their gradients by weights and senders.
+
+Edges lie grouped by receiver. A program of a step takes one particle after the other, reads its weights once, and sums
+what belongs to a receiver in its registers: no atomic additions, a fixed order. Forward, a step reads and writes each
+edge's state once and nothing else of that size; backward, it computes the hidden layer and the norm again.
+Rows of edges beyond the last offset belong to none: they are neither read nor written.
+What of a program's results must be summed over programs stands in `partial`, a row of them each.
+Shape legend: N particles, E edges, W width.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from hgn.kernels.blocks import inside, matrix, normalise, normalise_backward, product, transposed, weighted_sums
+from hgn.kernels.keys import settle_keys
+
+
+@triton.jit
+def _offset(position, near, here, live, axis: tl.constexpr):
+    """Of senders from receivers along one axis; both are places in `position`."""
+    return tl.load(position + near + axis, mask=live, other=0.0) - tl.load(position + here + axis, mask=live, other=0.0)
+
+
+@triton.jit
+def _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WIDTH: tl.constexpr):
+    """The hidden layer [rows, W] of offset and distance; `first` is [W, 4]."""
+    column = tl.arange(0, WIDTH)
+    near = tl.load(sender + row, mask=live, other=0) * 3
+    here = tl.load(receiver + row, mask=live, other=0) * 3
+    h = tl.zeros((row.shape[0], WIDTH), tl.float32) + tl.load(first_bias + column)[None, :]
+    square = tl.zeros((row.shape[0],), tl.float32)
+    for axis in tl.static_range(3):
+        difference = _offset(position, near, here, live, axis)
+        square += difference * difference
+        h += difference[:, None] * tl.load(first + column * 4 + axis)[None, :]
+    distance = tl.sqrt(square)
+    return h + distance[:, None] * tl.load(first + column * 4 + 3)[None, :], distance
+
+
+@triton.jit
+def encode_forward(
+    position,
+    sender,
+    receiver,
+    offset,
+    particles,
+    first,
+    first_bias,
+    second,
+    second_bias,
+    gain,
+    shift,
+    edge,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """edge [E, W] from sender minus receiver and their distance."""
+    count = tl.load(offset + particles)
+    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    column = tl.arange(0, WIDTH)
+    h, _ = _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WIDTH)
+    z = product(tl.maximum(h, 0.0), transposed(second, WIDTH, WIDTH), PRECISION)
+    z, _ = normalise(z + tl.load(second_bias + column)[None, :], WIDTH)
+    z = z * tl.load(gain + column)[None, :] + tl.load(shift + column)[None, :]
+    tl.store(edge + row[:, None] * WIDTH + column[None, :], z, mask=live[:, None])
+
+
+@triton.jit
+def encode_backward(
+    gradient,
+    position,
+    sender,
+    receiver,
+    offset,
+    particles,
+    first,
+    first_bias,
+    second,
+    second_bias,
+    gain,
+    activation,
+    second_gradient,
+    partial,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """From the edges' gradient [E, W]: activation and second_gradient [E, W], whose product is that of the second
+    layer; in `partial` [programs, 19, W] those of gain, shift, second bias and of the first layer."""
+    count = tl.load(offset + particles)
+    column = tl.arange(0, WIDTH)
+    second_t = transposed(second, WIDTH, WIDTH)
+    second_w = matrix(second, WIDTH, WIDTH)
+    gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
+    bias_total = tl.zeros((WIDTH,), tl.float32)
+    axis = tl.arange(0, 16)[:, None]
+    first_total = tl.zeros((16, WIDTH), tl.float32)
+    tile = tl.program_id(0).to(tl.int64)
+    while tile * BLOCK < count:
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = row < count
+        at = row[:, None] * WIDTH + column[None, :]
+        h, distance = _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WIDTH)
+        a = tl.maximum(h, 0.0)
+        tl.store(activation + at, a, mask=live[:, None])
+        z = product(a, second_t, PRECISION) + tl.load(second_bias + column)[None, :]
+        z, scale = normalise(z, WIDTH)
+        dm = tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
+        gain_total += tl.sum(dm * z, 0)
+        shift_total += tl.sum(dm, 0)
+        dz = normalise_backward(dm, z, scale, inside(tl.load(gain + column), tile), WIDTH)
+        bias_total += tl.sum(dz, 0)
+        tl.store(second_gradient + at, dz, mask=live[:, None])
+        dh = tl.where(a > 0, product(dz, second_w, PRECISION), 0.0)
+        near = tl.load(sender + row, mask=live, other=0) * 3
+        here = tl.load(receiver + row, mask=live, other=0) * 3
+        side = tl.where(axis == 3, distance[None, :], tl.where(axis == 4, 1.0, 0.0))
+        for i in tl.static_range(3):
+            side = tl.where(axis == i, _offset(position, near, here, live, i)[None, :], side)
+        first_total += weighted_sums(side, dh, PRECISION)
+        tile += tl.num_programs(0)
+    mine = partial + tl.program_id(0) * 19 * WIDTH + column
+    tl.store(mine, gain_total)
+    tl.store(mine + WIDTH, shift_total)
+    tl.store(mine + 2 * WIDTH, bias_total)
+    tl.store(partial + (tl.program_id(0) * 19 + 3 + axis) * WIDTH + column[None, :], first_total)
+
+
+@triton.jit
+def step_forward(
+    edge,
+    edge_out,
+    send,
+    receive,
+    sender,
+    offset,
+    particles,
+    own,
+    second,
+    second_bias,
+    gain,
+    shift,
+    total,
+    LAST: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """total [N, W]: each receiver's sum of messages. edge_out [E, W] is edge with the messages added, unless LAST.
+
+    send and receive [N, W] are the particles' products with the first layer, its bias in `receive`.
+    """
+    column = tl.arange(0, WIDTH)
+    own_t = transposed(own, WIDTH, WIDTH)
+    second_t = transposed(second, WIDTH, WIDTH)
+    bias = tl.load(second_bias + column)
+    gain_row = tl.load(gain + column)
+    shift_row = tl.load(shift + column)
+    # neighbouring receivers run at the same time: they share senders
+    particle = tl.program_id(0)
+    while particle < particles:
+        block = tl.load(offset + particle)
+        end = tl.load(offset + particle + 1)
+        received = tl.load(receive + particle * WIDTH + column)
+        sums = tl.zeros((WIDTH,), tl.float32)
+        while block < end:
+            row = block + tl.arange(0, BLOCK)
+            live = row < end
+            at = row[:, None] * WIDTH + column[None, :]
+            near = tl.load(sender + row, mask=live, other=0)
+            state = tl.load(edge + at, mask=live[:, None], other=0.0)
+            sent = tl.load(send + near[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+            h = product(state, own_t, PRECISION) + sent.to(tl.float32) + inside(received, block)[None, :]
+            z = product(tl.maximum(h, 0.0), second_t, PRECISION) + inside(bias, block)[None, :]
+            z, _ = normalise(z, WIDTH)
+            z = z * inside(gain_row, block)[None, :] + inside(shift_row, block)[None, :]
+            message = tl.where(live[:, None], z, 0.0)
+            if not LAST:
+                # read again: registers are dearer than a cache
+                state = tl.load(edge + at, mask=live[:, None], other=0.0)
+                tl.store(edge_out + at, state.to(tl.float32) + message, mask=live[:, None])
+            sums += tl.sum(message, 0)
+            block += BLOCK
+        tl.store(total + particle * WIDTH + column, sums)
+        particle += tl.num_programs(0)
+
+
+@triton.jit
+def norm_backward(
+    sum_gradient,
+    gradient,
+    scale_ptr,
+    edge,
+    send,
+    receive,
+    sender,
+    offset,
+    particles,
+    own,
+    second,
+    second_bias,
+    gain,
+    activation,
+    second_gradient,
+    partial,
+    LAST: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """A step backward through its norm, from the gradients of the sums [N, W] and of edge_out (none if LAST).
+
+    activation and second_gradient [E, W] are the second layer's input and the gradient of its output; in `partial`
+    [programs, 2, W] are those of gain and shift. All gradients but sum_gradient are multiplied by the
+    scale, a power of two for float16.
+    """
+    column = tl.arange(0, WIDTH)
+    own_t = transposed(own, WIDTH, WIDTH)
+    second_t = transposed(second, WIDTH, WIDTH)
+    bias = tl.load(second_bias + column)
+    gain_row = tl.load(gain + column)
+    factor = tl.load(scale_ptr)
+    gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
+    particle = tl.program_id(0)
+    while particle < particles:
+        block = tl.load(offset + particle)
+        end = tl.load(offset + particle + 1)
+        received = tl.load(receive + particle * WIDTH + column)
+        summed = tl.load(sum_gradient + particle * WIDTH + column) * factor
+        while block < end:
+            row = block + tl.arange(0, BLOCK)
+            live = row < end
+            at = row[:, None] * WIDTH + column[None, :]
+            near = tl.load(sender + row, mask=live, other=0)
+            state = tl.load(edge + at, mask=live[:, None], other=0.0)
+            sent = tl.load(send + near[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+            h = product(state, own_t, PRECISION) + sent.to(tl.float32) + inside(received, block)[None, :]
+            a = tl.maximum(h, 0.0)
+            tl.store(activation + at, a, mask=live[:, None])
+            z = product(a, second_t, PRECISION) + inside(bias, block)[None, :]
+            z, scale = normalise(z, WIDTH)
+            dm = tl.where(live[:, None], inside(summed, block)[None, :], 0.0)
+            if not LAST:
+                dm += tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
+            gain_total += tl.sum(dm * z, 0)
+            shift_total += tl.sum(dm, 0)
+            dz = normalise_backward(dm, z, scale, inside(gain_row, block), WIDTH)
+            tl.store(second_gradient + at, dz, mask=live[:, None])
+            block += BLOCK
+        particle += tl.num_programs(0)
+    mine = partial + tl.program_id(0) * 2 * WIDTH + column
+    tl.store(mine, gain_total)
+    tl.store(mine + WIDTH, shift_total)
+
+
+@triton.jit
+def layers_backward(
+    second_gradient,
+    activation,
+    gradient,
+    offset,
+    particles,
+    own,
+    second,
+    hidden_gradient,
+    edge_gradient,
+    receive_gradient,
+    partial,
+    LAST: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """The rest of the step backward: hidden_gradient [E, W] is that before the activation, receive_gradient [N, W] each
+    receiver's sum of it, edge_gradient [E, W] that of the edges that came in; in `partial` [programs, W] is the second
+    bias's."""
+    column = tl.arange(0, WIDTH)
+    own_w = matrix(own, WIDTH, WIDTH)
+    second_w = matrix(second, WIDTH, WIDTH)
+    bias_total = tl.zeros((WIDTH,), tl.float32)
+    particle = tl.program_id(0)
+    while particle < particles:
+        block = tl.load(offset + particle)
+        end = tl.load(offset + particle + 1)
+        sums = tl.zeros((WIDTH,), tl.float32)
+        while block < end:
+            row = block + tl.arange(0, BLOCK)
+            live = row < end
+            at = row[:, None] * WIDTH + column[None, :]
+            dz = tl.load(second_gradient + at, mask=live[:, None], other=0.0)
+            bias_total += tl.sum(dz.to(tl.float32), 0)
+            a = tl.load(activation + at, mask=live[:, None], other=0.0)
+            if not LAST:
+                de = tl.load(gradient + at, mask=live[:, None], other=0.0)
+            dh = tl.where(a > 0, product(dz, second_w, PRECISION), 0.0)
+            tl.store(hidden_gradient + at, dh, mask=live[:, None])
+            sums += tl.sum(dh, 0)
+            result = product(dh, own_w, PRECISION)
+            if not LAST:
+                result += de.to(tl.float32)
+            tl.store(edge_gradient + at, result, mask=live[:, None])
+            block += BLOCK
+        tl.store(receive_gradient + particle * WIDTH + column, sums)
+        particle += tl.num_programs(0)
+    tl.store(partial + tl.program_id(0) * WIDTH + column, bias_total)
+
+
+@triton.jit
+def sender_sums(
+    hidden_gradient,
+    order,
+    sender_offset,
+    total,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """total [N, W]: the sum of each sender's edges; `order` lists the edges by sender."""
+    particle = tl.program_id(0)
+    column = tl.arange(0, WIDTH)
+    block = tl.load(sender_offset + particle)
+    end = tl.load(sender_offset + particle + 1)
+    sums = tl.zeros((BLOCK, WIDTH), tl.float32)
+    while block < end:
+        row = block + tl.arange(0, BLOCK)
+        live = row < end
+        edge = tl.load(order + row, mask=live, other=0).to(tl.int64)
+        part = tl.load(hidden_gradient + edge[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+        sums += part.to(tl.float32)
+        block += BLOCK
+    tl.store(total + particle * WIDTH + column, tl.sum(sums, 0))
+
+
+@triton.jit
+def weight_products(
+    left,
+    right,
+    offset,
+    particles,
+    partial,
+    WIDTH: tl.constexpr,
+    STEP: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """partial [programs, W, W]: of left^T right over the rows of edges, what the program's share of them gives."""
+    count = tl.load(offset + particles)
+    column = tl.arange(0, WIDTH)
+    total = tl.zeros((WIDTH, WIDTH), tl.float32)
+    block = tl.program_id(0).to(tl.int64) * STEP
+    while block < count:
+        row = block + tl.arange(0, STEP)
+        at = row[:, None] * WIDTH + column[None, :]
+        live = (row < count)[:, None]
+        a = tl.load(left + at, mask=live, other=0.0)
+        b = tl.load(right + at, mask=live, other=0.0)
+        if PRECISION == "half":
+            total = tl.dot(tl.trans(a), b, total)
+        else:
+            total = tl.dot(tl.trans(a), b, total, input_precision=PRECISION)
+        block += tl.num_programs(0) * STEP
+    row = tl.arange(0, WIDTH)
+    mine = partial + tl.program_id(0).to(tl.int64) * WIDTH * WIDTH
+    tl.store(mine + row[:, None] * WIDTH + column[None, :], total)
+
+
+settle_keys(globals())

@@ -1,0 +1,104 @@
+"""GNS's fused kernels against the plain network: in Triton's interpreter on a CPU, natively on a GPU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from kernels.engines import device
+from network.states import gns_of, random_state
+from network.test_edges import output_and_gradients
+
+from hgn.kernels.gns.op import FusedEdges, Tuning, fits
+from hgn.network.edges import PlainEdges
+from hgn.network.features import ParticleState
+from hgn.runtime.agreement import relative_error
+from hgn.runtime.gns_edges import edges_for, require_agreement
+from hgn.runtime.gns_graph import padded
+from hgn.schema import ConfigError
+
+SMALL = Tuning(block=16, backward_block=16, product_rows=16)
+NATIVE = torch.cuda.is_available()
+
+
+def on_device(state: ParticleState) -> ParticleState:
+    names = ("position_N3", "velocity_NM3", "material_N", "scene_N", "domain_S3")
+    moved = {name: getattr(state, name).to(device()) for name in names}
+    return replace(state, **moved, obstacles=state.obstacles and state.obstacles.to(device()))
+
+
+@pytest.mark.parametrize(
+    ("counts", "width", "precision", "output_bound", "gradient_bound"),
+    [
+        ((23, 9), 16, "half", 2e-3, 2e-2),
+        ((1,), 32, "half", 2e-3, 2e-2),
+        pytest.param((23, 9), 16, "ieee", 1e-5, 1e-3, marks=pytest.mark.skipif(NATIVE, reason="the interpreter's")),
+        pytest.param(
+            (300, 1, 80), 128, "half", 2e-3, 5e-2, marks=pytest.mark.skipif(not NATIVE, reason="needs a CUDA device")
+        ),
+    ],
+)
+def test_fused_edges_equal_the_plain_network(counts, width, precision, output_bound, gradient_bound):
+    """Outputs, with gradients wanted and without, and the gradients of all parameters agree with float64."""
+    steps = 2 if width < 128 else 10
+    expected = output_and_gradients(
+        gns_of(width=width, message_passing_steps=steps), None, random_state(counts, spread=0.1), 1e-5
+    )
+    network = gns_of(torch.float32, width=width, message_passing_steps=steps).to(device())
+    state = on_device(random_state(counts, spread=0.1, dtype=torch.float32))
+    edges = FusedEdges(precision, Tuning() if NATIVE else SMALL)
+    found = output_and_gradients(network, edges, state, 1e-5)
+    with torch.no_grad():
+        again = network.normalised_acceleration(state)
+    assert relative_error(found[0].cpu(), expected[0]) < output_bound
+    assert relative_error(again.cpu().double(), expected[0]) < output_bound
+    assert relative_error(found[1].cpu(), expected[1]) < gradient_bound
+
+
+def test_room_to_spare_changes_nothing():
+    """Rows of edges beyond the last offset, as CUDA graphs have them, leave the output as it is."""
+    network = gns_of(torch.float32, message_passing_steps=1).to(device())
+    network.edges = FusedEdges(tuning=SMALL)
+    state = on_device(random_state((19, 4), spread=0.1, dtype=torch.float32))
+    neighbours = network.neighbours(state)
+    with torch.no_grad():
+        expected = network.propagate(state, neighbours)
+        inputs = padded(state, neighbours, 23, neighbours.edge_count + 70)
+        assert torch.equal(network.propagate(inputs.state, inputs.neighbours), expected)
+
+
+def test_wrong_kernels_are_refused(monkeypatch):
+    """What differs from plain autograd in outputs or gradients is refused, saying what to set; what is right passes."""
+    network = gns_of(torch.float32, message_passing_steps=1).to(device())
+    state = on_device(random_state((9, 4), spread=0.05, dtype=torch.float32))
+    network.edges = edges = FusedEdges(tuning=SMALL)
+    require_agreement(network, state, gradients=True)
+    step, backward = FusedEdges.step, FusedEdges.encode_backward
+
+    def wrong_step(*arguments, **named):
+        total, out = step(*arguments, **named)
+        return 2 * total, out
+
+    def wrong_backward(*arguments):
+        bias, weights = backward(*arguments)
+        return bias, weights._replace(second=weights.second + 100)
+
+    for name, wrong, gradients, what in (
+        ("step", wrong_step, False, "outputs"),
+        ("encode_backward", wrong_backward, True, "gradients"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(FusedEdges, name, wrong)
+            with pytest.raises(ConfigError, match=f"precision must be high on this machine, got half: its {what}"):
+                require_agreement(network, state, gradients)
+    assert network.edges is edges
+
+
+def test_what_works_where():
+    """Half precision takes the kernels on a GPU for widths of matrix units, else PyTorch; float32 autograd there."""
+    cpu, cuda = torch.device("cpu"), torch.device("cuda")
+    assert fits(64) and not fits(24) and not fits(8)
+    assert edges_for(cpu, 128, "high") == PlainEdges() and edges_for(cpu, 128, "half") == PlainEdges(torch.float16)
+    assert edges_for(cuda, 128, "half") == FusedEdges() and edges_for(cuda, 24, "half") == PlainEdges(torch.float16)
+    assert edges_for(cuda, 128, "high") is None
