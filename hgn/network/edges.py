@@ -237,10 +237,9 @@ def encoded_edges(edges: Edges, graph: Graph, network: FCN) -> torch.Tensor:
 
 
 def passed_messages(
-    edges: Edges, graph: Graph, network: FCN, ends: Ends, edge_EW: torch.Tensor, last: bool
+    edges: Edges, graph: Graph, ends: Ends, weights: Weights, edge_EW: torch.Tensor, last: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Each receiver's sum of messages, and the edges with their messages added (as they were, if `last`)."""
-    weights = Weights.of(network, network.first.weight[:, 2 * edge_EW.shape[1] :])
     if not torch.is_grad_enabled():
         sum_NW, out_EW = edges.step(graph, ends, weights, edge_EW, last, in_place=True)
         return sum_NW, edge_EW if out_EW is None else out_EW

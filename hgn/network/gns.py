@@ -17,8 +17,8 @@ from torch import nn
 
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
-from hgn.network.edges import Edges, Ends, Graph, encoded_edges, passed_messages, scaling_gradients
-from hgn.network.fcn import FCN
+from hgn.network.edges import Edges, Ends, Graph, Weights, encoded_edges, passed_messages, scaling_gradients
+from hgn.network.fcn import FCN, linear
 from hgn.network.features import ParticleState
 from hgn.network.neighbours import NeighbourList, neighbour_list
 
@@ -37,7 +37,8 @@ class InteractionStep(nn.Module):
 
     def update(self, node_NW: torch.Tensor, sum_NW: torch.Tensor) -> torch.Tensor:
         """The particles' new state [N, W]."""
-        hidden_NH = self.node.project(0, node_NW) + self.node.project(1, sum_NW) + self.node.first.bias
+        own, total = self.node.first.weight.split(self.node.parts, dim=1)
+        hidden_NH = linear(node_NW, own, self.node.first.bias) + linear(sum_NW, total)
         return node_NW + self.node.finish(hidden_NH)
 
 
@@ -132,9 +133,10 @@ class GraphNetworkSimulator(ParticleNetwork):
         edge_EW = encoded_edges(edges, graph, self.encode_edges)
         for i, step in enumerate(self.steps):
             assert isinstance(step, InteractionStep)
-            receive_NW = step.edge.project(1, node_NW) + step.edge.first.bias
-            ends = Ends(step.edge.project(0, node_NW), receive_NW)
-            sum_NW, edge_EW = passed_messages(edges, graph, step.edge, ends, edge_EW, i + 1 == len(self.steps))
+            send, receive, own = step.edge.first.weight.split(step.edge.parts, dim=1)
+            ends = Ends(linear(node_NW, send), linear(node_NW, receive, step.edge.first.bias))
+            weights = Weights.of(step.edge, own)
+            sum_NW, edge_EW = passed_messages(edges, graph, ends, weights, edge_EW, i + 1 == len(self.steps))
             node_NW = step.update(node_NW, sum_NW)
         return scaling_gradients(graph, node_NW)
 

@@ -35,8 +35,7 @@ def _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WI
         difference = _offset(position, near, here, live, axis)
         square += difference * difference
         h += difference[:, None] * tl.load(first + column * 4 + axis)[None, :]
-    distance = tl.sqrt(square)
-    return h + distance[:, None] * tl.load(first + column * 4 + 3)[None, :], distance
+    return h + tl.sqrt(square)[:, None] * tl.load(first + column * 4 + 3)[None, :]
 
 
 @triton.jit
@@ -62,7 +61,7 @@ def encode_forward(
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
     column = tl.arange(0, WIDTH)
-    h, _ = _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WIDTH)
+    h = _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WIDTH)
     z = product(tl.maximum(h, 0.0), transposed(second, WIDTH, WIDTH), PRECISION)
     z, _ = normalise(z + tl.load(second_bias + column)[None, :], WIDTH)
     z = z * tl.load(gain + column)[None, :] + tl.load(shift + column)[None, :]
@@ -70,7 +69,7 @@ def encode_forward(
 
 
 @triton.jit
-def encode_backward(
+def encode_norm_backward(
     gradient,
     position,
     sender,
@@ -89,22 +88,19 @@ def encode_backward(
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """From the edges' gradient [E, W]: activation and second_gradient [E, W], whose product is that of the second
-    layer; in `partial` [programs, 19, W] those of gain, shift, second bias and of the first layer."""
+    """The encoder backward through its norm, from the edges' gradient [E, W]: activation and second_gradient [E, W] are
+    the second layer's input and the gradient of its output; in `partial` [programs, 8, W] come first those of gain and
+    shift."""
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     second_t = transposed(second, WIDTH, WIDTH)
-    second_w = matrix(second, WIDTH, WIDTH)
     gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
-    bias_total = tl.zeros((WIDTH,), tl.float32)
-    axis = tl.arange(0, 16)[:, None]
-    first_total = tl.zeros((16, WIDTH), tl.float32)
     tile = tl.program_id(0).to(tl.int64)
     while tile * BLOCK < count:
         row = tile * BLOCK + tl.arange(0, BLOCK)
         live = row < count
         at = row[:, None] * WIDTH + column[None, :]
-        h, distance = _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WIDTH)
+        h = _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WIDTH)
         a = tl.maximum(h, 0.0)
         tl.store(activation + at, a, mask=live[:, None])
         z = product(a, second_t, PRECISION) + tl.load(second_bias + column)[None, :]
@@ -113,21 +109,59 @@ def encode_backward(
         gain_total += tl.sum(dm * z, 0)
         shift_total += tl.sum(dm, 0)
         dz = normalise_backward(dm, z, scale, inside(tl.load(gain + column), tile), WIDTH)
-        bias_total += tl.sum(dz, 0)
         tl.store(second_gradient + at, dz, mask=live[:, None])
+        tile += tl.num_programs(0)
+    mine = partial + tl.program_id(0) * 8 * WIDTH + column
+    tl.store(mine, gain_total)
+    tl.store(mine + WIDTH, shift_total)
+
+
+@triton.jit
+def encode_layers_backward(
+    second_gradient,
+    activation,
+    position,
+    sender,
+    receiver,
+    offset,
+    particles,
+    second,
+    partial,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """The rest of the encoder backward: in `partial` [programs, 8, W] come last the gradients of the second bias, the
+    first layer's four columns and its bias."""
+    count = tl.load(offset + particles)
+    column = tl.arange(0, WIDTH)
+    second_w = matrix(second, WIDTH, WIDTH)
+    bias_total = tl.zeros((WIDTH,), tl.float32)
+    axis = tl.arange(0, 16)[:, None]
+    first_total = tl.zeros((16, WIDTH), tl.float32)
+    tile = tl.program_id(0).to(tl.int64)
+    while tile * BLOCK < count:
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = row < count
+        at = row[:, None] * WIDTH + column[None, :]
+        dz = tl.load(second_gradient + at, mask=live[:, None], other=0.0)
+        a = tl.load(activation + at, mask=live[:, None], other=0.0)
+        bias_total += tl.sum(dz.to(tl.float32), 0)
         dh = tl.where(a > 0, product(dz, second_w, PRECISION), 0.0)
         near = tl.load(sender + row, mask=live, other=0) * 3
         here = tl.load(receiver + row, mask=live, other=0) * 3
-        side = tl.where(axis == 3, distance[None, :], tl.where(axis == 4, 1.0, 0.0))
+        side = tl.where(axis == 4, 1.0, tl.zeros((16, BLOCK), tl.float32))
+        square = tl.zeros((BLOCK,), tl.float32)
         for i in tl.static_range(3):
-            side = tl.where(axis == i, _offset(position, near, here, live, i)[None, :], side)
+            difference = _offset(position, near, here, live, i)
+            square += difference * difference
+            side = tl.where(axis == i, difference[None, :], side)
+        side = tl.where(axis == 3, tl.sqrt(square)[None, :], side)
         first_total += weighted_sums(side, dh, PRECISION)
         tile += tl.num_programs(0)
-    mine = partial + tl.program_id(0) * 19 * WIDTH + column
-    tl.store(mine, gain_total)
-    tl.store(mine + WIDTH, shift_total)
-    tl.store(mine + 2 * WIDTH, bias_total)
-    tl.store(partial + (tl.program_id(0) * 19 + 3 + axis) * WIDTH + column[None, :], first_total)
+    mine = partial + (tl.program_id(0) * 8 + 2) * WIDTH
+    tl.store(mine + column, bias_total)
+    tl.store(mine + (1 + axis) * WIDTH + column[None, :], first_total, mask=axis < 5)
 
 
 @triton.jit
@@ -215,7 +249,7 @@ def norm_backward(
     """A step backward through its norm, from the gradients of the sums [N, W] and of edge_out (none if LAST).
 
     activation and second_gradient [E, W] are the second layer's input and the gradient of its output; in `partial`
-    [programs, 2, W] are those of gain and shift. All gradients but sum_gradient are multiplied by the
+    [programs, 3, W] come first those of gain and shift. All gradients but sum_gradient are multiplied by the
     scale, a power of two for float16.
     """
     column = tl.arange(0, WIDTH)
@@ -252,7 +286,7 @@ def norm_backward(
             tl.store(second_gradient + at, dz, mask=live[:, None])
             block += BLOCK
         particle += tl.num_programs(0)
-    mine = partial + tl.program_id(0) * 2 * WIDTH + column
+    mine = partial + tl.program_id(0) * 3 * WIDTH + column
     tl.store(mine, gain_total)
     tl.store(mine + WIDTH, shift_total)
 
@@ -270,17 +304,19 @@ def layers_backward(
     edge_gradient,
     receive_gradient,
     partial,
+    scale_ptr,
     LAST: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
     """The rest of the step backward: hidden_gradient [E, W] is that before the activation, receive_gradient [N, W] each
-    receiver's sum of it, edge_gradient [E, W] that of the edges that came in; in `partial` [programs, W] is the second
-    bias's."""
+    receiver's sum of it, no longer scaled, edge_gradient [E, W] that of the edges that came in; in `partial`
+    [programs, 3, W] comes last the second bias's."""
     column = tl.arange(0, WIDTH)
     own_w = matrix(own, WIDTH, WIDTH)
     second_w = matrix(second, WIDTH, WIDTH)
+    unscale = 1.0 / tl.load(scale_ptr)
     bias_total = tl.zeros((WIDTH,), tl.float32)
     particle = tl.program_id(0)
     while particle < particles:
@@ -304,9 +340,9 @@ def layers_backward(
                 result += de.to(tl.float32)
             tl.store(edge_gradient + at, result, mask=live[:, None])
             block += BLOCK
-        tl.store(receive_gradient + particle * WIDTH + column, sums)
+        tl.store(receive_gradient + particle * WIDTH + column, sums * unscale)
         particle += tl.num_programs(0)
-    tl.store(partial + tl.program_id(0) * WIDTH + column, bias_total)
+    tl.store(partial + (tl.program_id(0) * 3 + 2) * WIDTH + column, bias_total)
 
 
 @triton.jit
@@ -315,10 +351,11 @@ def sender_sums(
     order,
     sender_offset,
     total,
+    scale_ptr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """total [N, W]: the sum of each sender's edges; `order` lists the edges by sender."""
+    """total [N, W]: the sum of each sender's edges, no longer scaled; `order` lists the edges by sender."""
     particle = tl.program_id(0)
     column = tl.arange(0, WIDTH)
     block = tl.load(sender_offset + particle)
@@ -331,22 +368,11 @@ def sender_sums(
         part = tl.load(hidden_gradient + edge[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
         sums += part.to(tl.float32)
         block += BLOCK
-    tl.store(total + particle * WIDTH + column, tl.sum(sums, 0))
+    tl.store(total + particle * WIDTH + column, tl.sum(sums, 0) / tl.load(scale_ptr))
 
 
 @triton.jit
-def weight_products(
-    left,
-    right,
-    offset,
-    particles,
-    partial,
-    WIDTH: tl.constexpr,
-    STEP: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
-    """partial [programs, W, W]: of left^T right over the rows of edges, what the program's share of them gives."""
-    count = tl.load(offset + particles)
+def _weight_product(left, right, count, partial, WIDTH: tl.constexpr, STEP: tl.constexpr, PRECISION: tl.constexpr):
     column = tl.arange(0, WIDTH)
     total = tl.zeros((WIDTH, WIDTH), tl.float32)
     block = tl.program_id(0).to(tl.int64) * STEP
@@ -361,9 +387,30 @@ def weight_products(
         else:
             total = tl.dot(tl.trans(a), b, total, input_precision=PRECISION)
         block += tl.num_programs(0) * STEP
-    row = tl.arange(0, WIDTH)
-    mine = partial + tl.program_id(0).to(tl.int64) * WIDTH * WIDTH
-    tl.store(mine + row[:, None] * WIDTH + column[None, :], total)
+    tl.store(partial + tl.arange(0, WIDTH)[:, None] * WIDTH + column[None, :], total)
+
+
+@triton.jit
+def weight_products(
+    second_gradient,
+    activation,
+    hidden_gradient,
+    edge,
+    offset,
+    particles,
+    partial,
+    BOTH: tl.constexpr,
+    WIDTH: tl.constexpr,
+    STEP: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """partial [programs, 1 or 2, W, W]: the gradients of the second and, with BOTH, of the first layer's part for the
+    edge, of the program's share of the edges."""
+    count = tl.load(offset + particles)
+    mine = partial + tl.program_id(0).to(tl.int64) * (2 if BOTH else 1) * WIDTH * WIDTH
+    _weight_product(second_gradient, activation, count, mine, WIDTH, STEP, PRECISION)
+    if BOTH:
+        _weight_product(hidden_gradient, edge, count, mine + WIDTH * WIDTH, WIDTH, STEP, PRECISION)
 
 
 settle_keys(globals())

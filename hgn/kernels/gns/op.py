@@ -11,8 +11,9 @@ import torch
 import triton
 
 from hgn.kernels.gns.kernel import (
-    encode_backward,
     encode_forward,
+    encode_layers_backward,
+    encode_norm_backward,
     layers_backward,
     norm_backward,
     sender_sums,
@@ -73,23 +74,35 @@ class FusedEdges(Edges):
         width, tuning = len(weights.second), self.tuning
         activation_EW, second_EW = torch.empty_like(gradient_EW), torch.empty_like(gradient_EW)
         programs = self._programs(tuning.backward_programs, triton.cdiv(len(gradient_EW), tuning.backward_block))
-        partial_PCW = weights.second.new_empty(programs, 19, width)
-        encode_backward[(programs,)](
+        partial_P8W = weights.second.new_empty(programs, 8, width)
+        encoder = self._encoder(graph, first_bias_W, weights)
+        encode_norm_backward[(programs,)](
             gradient_EW,
-            *self._encoder(graph, first_bias_W, weights),
+            *encoder,
             weights.gain,
             activation_EW,
             second_EW,
-            partial_PCW,
+            partial_P8W,
             WIDTH=width,
             BLOCK=tuning.backward_block,
             PRECISION=self.precision,
             num_warps=tuning.backward_warps,
         )
-        total_CW = partial_PCW.sum(0) / graph.scale
-        second_WW = self._weight_product(graph, second_EW, activation_EW)
-        found = Weights(total_CW[3:7].T.contiguous(), second_WW, total_CW[2], total_CW[0], total_CW[1])
-        return total_CW[7], found
+        encode_layers_backward[(programs,)](
+            second_EW,
+            activation_EW,
+            *encoder[:5],
+            encoder[7],
+            partial_P8W,
+            WIDTH=width,
+            BLOCK=tuning.backward_block,
+            PRECISION=self.precision,
+            num_warps=tuning.backward_warps,
+        )
+        total_8W = partial_P8W.sum(0) / graph.scale
+        (second_WW,) = self._weight_products(graph, second_EW, activation_EW, None)
+        found = Weights(total_8W[3:7].T.contiguous(), second_WW, total_8W[2], total_8W[0], total_8W[1])
+        return total_8W[7], found
 
     def step(
         self, graph: Graph, ends: Ends, weights: Weights, edge_EW: torch.Tensor, last: bool, in_place: bool
@@ -121,28 +134,25 @@ class FusedEdges(Edges):
         sum_gradient_NW: torch.Tensor,
         gradient_EW: torch.Tensor | None,
     ) -> tuple[Ends, Weights, torch.Tensor]:
-        tuning, scale = self.tuning, graph.scale
+        tuning = self.tuning
         count, width = ends.receive_NW.shape
         activation_EW, second_EW, hidden_EW, result_EW = (torch.empty_like(edge_EW) for _ in range(4))
         receive_NW, send_NW = torch.empty_like(ends.receive_NW), torch.empty_like(ends.receive_NW)
         programs = self._programs(tuning.backward_programs, count)
-        partial_P2W, partial_PW = (
-            weights.second.new_empty(programs, 2, width),
-            weights.second.new_empty(programs, width),
-        )
+        partial_P3W = weights.second.new_empty(programs, 3, width)
         last = gradient_EW is None
         gradient_EW = edge_EW if gradient_EW is None else gradient_EW.contiguous()
         step = self._step(graph, ends, weights)
         norm_backward[(programs,)](
             sum_gradient_NW.contiguous(),
             gradient_EW,
-            scale,
+            graph.scale,
             edge_EW,
             *step,
             weights.gain,
             activation_EW,
             second_EW,
-            partial_P2W,
+            partial_P3W,
             LAST=last,
             WIDTH=width,
             BLOCK=tuning.backward_block,
@@ -159,7 +169,8 @@ class FusedEdges(Edges):
             hidden_EW,
             result_EW,
             receive_NW,
-            partial_PW,
+            partial_P3W,
+            graph.scale,
             LAST=last,
             WIDTH=width,
             BLOCK=tuning.backward_block,
@@ -167,16 +178,19 @@ class FusedEdges(Edges):
             num_warps=tuning.backward_warps,
         )
         order_E, offset_N1 = graph.by_sender
-        sender_sums[(count,)](hidden_EW, order_E, offset_N1, send_NW, WIDTH=width, BLOCK=SENDER_BLOCK, num_warps=4)
-        own_WW = self._weight_product(graph, hidden_EW, edge_EW)
-        second_WW = self._weight_product(graph, second_EW, activation_EW)
-        gain_W, shift_W = (partial_P2W.sum(0) / scale).unbind(0)
-        found = Weights(own_WW, second_WW, partial_PW.sum(0) / scale, gain_W, shift_W)
-        return Ends(send_NW / scale, receive_NW / scale), found, result_EW
+        sender_sums[(count,)](
+            hidden_EW, order_E, offset_N1, send_NW, graph.scale, WIDTH=width, BLOCK=SENDER_BLOCK, num_warps=4
+        )
+        second_WW, own_WW = self._weight_products(graph, second_EW, activation_EW, (hidden_EW, edge_EW))
+        gain_W, shift_W, bias_W = (partial_P3W.sum(0) / graph.scale).unbind(0)
+        return Ends(send_NW, receive_NW), Weights(own_WW, second_WW, bias_W, gain_W, shift_W), result_EW
 
     @property
     def _dtype(self) -> torch.dtype:
         return torch.float16 if self.precision == "half" else torch.float32
+
+    def _stored(self, value: torch.Tensor) -> torch.Tensor:
+        return value.to(self._dtype, memory_format=torch.contiguous_format).contiguous()
 
     def _encoder(self, graph: Graph, first_bias_W: torch.Tensor, weights: Weights) -> tuple[object, ...]:
         receivers = graph.neighbours.receivers
@@ -188,40 +202,49 @@ class FusedEdges(Edges):
             receivers.count,
             weights.own.contiguous(),
             first_bias_W,
-            weights.second.to(self._dtype).contiguous(),
+            self._stored(weights.second),
             weights.bias,
         )
 
     def _step(self, graph: Graph, ends: Ends, weights: Weights) -> tuple[object, ...]:
         receivers = graph.neighbours.receivers
         return (
-            ends.send_NW.to(self._dtype).contiguous(),
+            self._stored(ends.send_NW),
             ends.receive_NW.contiguous(),
             graph.neighbours.sender_E,
             receivers.offset_N1,
             receivers.count,
-            weights.own.to(self._dtype).contiguous(),
-            weights.second.to(self._dtype).contiguous(),
+            self._stored(weights.own),
+            self._stored(weights.second),
             weights.bias,
         )
 
-    def _weight_product(self, graph: Graph, left_EW: torch.Tensor, right_EW: torch.Tensor) -> torch.Tensor:
-        """left^T right without the scale, float32 [W, W]."""
-        tuning, receivers, width = self.tuning, graph.neighbours.receivers, left_EW.shape[1]
-        programs = self._programs(tuning.product_programs, triton.cdiv(len(left_EW), tuning.product_rows))
-        partial_PWW = torch.empty(programs, width, width, dtype=torch.float32, device=left_EW.device)
+    def _weight_products(
+        self,
+        graph: Graph,
+        second_EW: torch.Tensor,
+        activation_EW: torch.Tensor,
+        own: tuple[torch.Tensor, torch.Tensor] | None,
+    ) -> tuple[torch.Tensor, ...]:
+        """second_EW^T activation_EW, and own[0]^T own[1], without the scale, float32 [W, W]."""
+        tuning, receivers, (edges, width) = self.tuning, graph.neighbours.receivers, second_EW.shape
+        programs = self._programs(tuning.product_programs, triton.cdiv(edges, tuning.product_rows))
+        shape = (programs, 1 if own is None else 2, width, width)
+        partial_PCWW = torch.empty(shape, dtype=torch.float32, device=second_EW.device)
         weight_products[(programs,)](
-            left_EW,
-            right_EW,
+            second_EW,
+            activation_EW,
+            *(own or (second_EW, activation_EW)),
             receivers.offset_N1,
             receivers.count,
-            partial_PWW,
+            partial_PCWW,
+            BOTH=own is not None,
             WIDTH=width,
             STEP=tuning.product_rows,
             PRECISION=self.precision,
             num_warps=tuning.product_warps,
         )
-        return partial_PWW.sum(0) / graph.scale
+        return (partial_PCWW.sum(0) / graph.scale).unbind(0)
 
     @staticmethod
     def _programs(each: int, wanted: int) -> int:
