@@ -14,7 +14,7 @@ import triton
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.message.kernel import cell_forward, edge_forward
-from hgn.kernels.packing import PackedFCN, PackedMessagePassing, PackedNetwork
+from hgn.kernels.packing import PackedFCN, PackedMessagePassing, PackedNetwork, rounded_to_tf32
 from hgn.kernels.pairs.kernel import pairs_forward
 from hgn.kernels.rows.kernel import gather_project, rows_forward
 
@@ -198,7 +198,7 @@ class Engine:
         """To the nearest that TF32 can hold, as hgn.kernels.blocks.nearest_tf32; as they are at other precisions."""
         if self.precision != "tf32":
             return weights
-        return ((weights.contiguous().view(torch.int32) + 0x1000) & -0x2000).view(torch.float32)
+        return rounded_to_tf32(weights)
 
     def _encode_views(self, flat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         config, packed, width = self.config, self.packed, self.width

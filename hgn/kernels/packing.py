@@ -140,3 +140,8 @@ def pack_network(network: HierarchicalGraphNetwork) -> PackedNetwork:
         packer.size,
         torch.cat(packer.pieces),
     )
+
+
+def rounded_to_tf32(weights: torch.Tensor) -> torch.Tensor:
+    """To the nearest that TF32 can hold, as hgn.kernels.blocks.nearest_tf32; contiguous float32."""
+    return ((weights.contiguous().view(torch.int32) + 0x1000) & -0x2000).view(torch.float32)

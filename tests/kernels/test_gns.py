@@ -33,9 +33,13 @@ def on_device(state: ParticleState) -> ParticleState:
     [
         ((23, 9), 16, "half", 2e-3, 2e-2),
         ((1,), 32, "half", 2e-3, 2e-2),
+        ((19,), 16, "tf32", 2e-3, 2e-2),
         pytest.param((23, 9), 16, "ieee", 1e-5, 1e-3, marks=pytest.mark.skipif(NATIVE, reason="the interpreter's")),
-        pytest.param(
-            (300, 1, 80), 128, "half", 2e-3, 5e-2, marks=pytest.mark.skipif(not NATIVE, reason="needs a CUDA device")
+        *(
+            pytest.param(
+                (300, 1, 80), 128, precision, 2e-3, 5e-2, marks=pytest.mark.skipif(not NATIVE, reason="needs a GPU")
+            )
+            for precision in ("half", "tf32")
         ),
     ],
 )
@@ -47,7 +51,8 @@ def test_fused_edges_equal_the_plain_network(counts, width, precision, output_bo
     )
     network = gns_of(torch.float32, width=width, message_passing_steps=steps).to(device())
     state = on_device(random_state(counts, spread=0.1, dtype=torch.float32))
-    edges = FusedEdges(precision, Tuning() if NATIVE else SMALL)
+    tuning = FusedEdges.in_tf32().tuning if precision == "tf32" else Tuning()
+    edges = FusedEdges(precision, tuning if NATIVE else SMALL)
     found = output_and_gradients(network, edges, state, 1e-5)
     with torch.no_grad():
         again = network.normalised_acceleration(state)

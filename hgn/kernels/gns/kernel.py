@@ -13,7 +13,16 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import inside, matrix, normalise, normalise_backward, product, transposed, weighted_sums
+from hgn.kernels.blocks import (
+    inside,
+    matrix,
+    nearest_tf32,
+    normalise,
+    normalise_backward,
+    product,
+    transposed,
+    weighted_sums,
+)
 from hgn.kernels.keys import settle_keys
 
 
@@ -384,6 +393,8 @@ def _weight_product(left, right, count, partial, WIDTH: tl.constexpr, STEP: tl.c
         b = tl.load(right + at, mask=live, other=0.0)
         if PRECISION == "half":
             total = tl.dot(tl.trans(a), b, total)
+        elif PRECISION == "tf32":
+            total = tl.dot(tl.trans(nearest_tf32(a)), nearest_tf32(b), total, input_precision=PRECISION)
         else:
             total = tl.dot(tl.trans(a), b, total, input_precision=PRECISION)
         block += tl.num_programs(0) * STEP

@@ -20,6 +20,7 @@ from hgn.kernels.gns.kernel import (
     step_forward,
     weight_products,
 )
+from hgn.kernels.packing import rounded_to_tf32
 from hgn.network.edges import Edges, Ends, Graph, Weights
 
 SENDER_BLOCK = 16
@@ -47,10 +48,15 @@ def fits(width: int) -> bool:
 
 @dataclass(frozen=True)
 class FusedEdges(Edges):
-    """On a CUDA device (or in Triton's interpreter). `precision` is half, or ieee: float32 edges, for tests."""
+    """On a CUDA device (or in Triton's interpreter). `precision` is half, tf32 (float32 edges), or ieee for tests."""
 
     precision: str = "half"
     tuning: Tuning = field(default_factory=Tuning)
+
+    @staticmethod
+    def in_tf32() -> FusedEdges:
+        """Weights take twice the shared memory: one program a multiprocessor."""
+        return FusedEdges("tf32", Tuning(warps=8, programs=1, backward_warps=8, backward_programs=1))
 
     def encode(self, graph: Graph, first_bias_W: torch.Tensor, weights: Weights) -> torch.Tensor:
         edges, width = graph.neighbours.edge_count, len(weights.second)
@@ -192,6 +198,9 @@ class FusedEdges(Edges):
     def _stored(self, value: torch.Tensor) -> torch.Tensor:
         return value.to(self._dtype, memory_format=torch.contiguous_format).contiguous()
 
+    def _operand(self, weight: torch.Tensor) -> torch.Tensor:
+        return rounded_to_tf32(weight) if self.precision == "tf32" else self._stored(weight)
+
     def _encoder(self, graph: Graph, first_bias_W: torch.Tensor, weights: Weights) -> tuple[object, ...]:
         receivers = graph.neighbours.receivers
         return (
@@ -202,7 +211,7 @@ class FusedEdges(Edges):
             receivers.count,
             weights.own.contiguous(),
             first_bias_W,
-            self._stored(weights.second),
+            self._operand(weights.second),
             weights.bias,
         )
 
@@ -214,8 +223,8 @@ class FusedEdges(Edges):
             graph.neighbours.sender_E,
             receivers.offset_N1,
             receivers.count,
-            self._stored(weights.own),
-            self._stored(weights.second),
+            self._operand(weights.own),
+            self._operand(weights.second),
             weights.bias,
         )
 
