@@ -15,17 +15,19 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch, make_batch
-from hgn.data.chunk import Chunk, whole_episode
+from hgn.data.chunk import Chunk, WholeEpisode, whole_episode
 from hgn.data.importance import FrameImportance
 from hgn.data.order import Cursor, Sample, SampleOrder
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import without_patience
+from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 from hgn.training.own_states import drawn_starts
 
 T = TypeVar("T")
 SHARED_FOLDER_PATIENCE_S = 300.0
 BATCHES_AHEAD = 2
+READERS = 8  # threads that copy whole episodes
 LOOK_S = 1.0  # between looks for a signal while there is no batch
 UPDATES_AT_ONCE = 64  # in a chunk, at most
 
@@ -102,7 +104,7 @@ class Feed(LightningDataModule):
             asked = {sample.episode for batch in samples for sample in batch} | {index for index, _ in starts}
             new = sorted(asked - known)
             known.update(new)
-            episodes = {index: whole_episode(self.store.episodes[index], self.network) for index in new}
+            episodes = self._whole(new)
             return Chunk(tuple(self._by_importance(update) for update in samples), episodes, cursor, starts)
 
         yield from self._ahead(draw, read)
@@ -118,6 +120,19 @@ class Feed(LightningDataModule):
             return ()
         frames = [entry.frames for entry in self.store.entries[: order.cursor.episodes]]
         return drawn_starts(self.training, update, order.rank, frames)
+
+    def _whole(self, indices: Sequence[int]) -> dict[int, WholeEpisode]:
+        """Reads episodes, several at once: a data set's first pass is gigabytes, and copies release Python's lock."""
+        share = self.training.frame_importance
+
+        def read(episode: Episode) -> tuple[WholeEpisode, FrameImportance | None]:
+            return whole_episode(episode, self.network), FrameImportance.of(episode, share) if share else None
+
+        opened = [self.store.episodes[index] for index in indices]
+        with ThreadPoolExecutor(READERS) as readers:
+            found = dict(zip(indices, readers.map(read, opened), strict=True))
+        self._importance.update({index: importance for index, (_, importance) in found.items() if importance})
+        return {index: whole for index, (whole, _) in found.items()}
 
     def _by_importance(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
         """The same samples with frames drawn as `training.frame_importance` says, and their weights."""
