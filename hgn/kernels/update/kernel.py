@@ -266,69 +266,6 @@ def adam(
 
 
 @triton.jit
-def momentum_directions(
-    starts,
-    gradient,
-    share,
-    first_moment,
-    direction,
-    status,
-    norm,
-    momentum,
-    epsilon,
-    WIDTH: tl.constexpr,
-):
-    """Momentum of square blocks (hgn.network.orthogonal), which begin at `starts`; Nesterov's, normalised, goes to
-    direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does nothing.
-    """
-    if tl.load(status) != 0:
-        return
-    if (tl.load(norm) < float("inf")) == 0:
-        return
-    block = tl.program_id(0)
-    place = tl.arange(0, WIDTH)[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :]
-    at = tl.load(starts + block) + place
-    g = tl.load(gradient + at) * share
-    m = tl.load(first_moment + at)
-    m += (g - m) * (1 - momentum)
-    tl.store(first_moment + at, m)
-    ahead = m + (g - m) * (1 - momentum)
-    length = tl.sqrt(tl.sum(tl.sum(ahead * ahead, 1), 0)) + epsilon
-    tl.store(direction + block * WIDTH * WIDTH + place, ahead / length)
-
-
-@triton.jit
-def step_blocks(
-    starts,
-    direction,
-    value,
-    weight,
-    rates,
-    update,
-    status,
-    norm,
-    step_size,
-    PRECISION: tl.constexpr,
-    WIDTH: tl.constexpr,
-):
-    """Moves square blocks against their directions by rate times `step_size`; as `adam` writes values and weights."""
-    if tl.load(status) != 0:
-        return
-    if (tl.load(norm) < float("inf")) == 0:
-        return
-    block = tl.program_id(0)
-    place = tl.arange(0, WIDTH)[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :]
-    at = tl.load(starts + block) + place
-    along = tl.load(direction + block * WIDTH * WIDTH + place).to(tl.float32)
-    x = tl.load(value + at) - tl.load(rates + tl.load(update)) * step_size * along
-    tl.store(value + at, x)
-    if PRECISION == "half":
-        tl.store(weight + at, x)
-    if PRECISION == "tf32":
-        tl.store(weight + at, nearest_tf32(x))
-
-
-@triton.jit
 def average_values(value, average, shares, update, status, size, BLOCK: tl.constexpr):
     """Moving average of the values, with the update's share, shares [updates], of the new ones.
 

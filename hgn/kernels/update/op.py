@@ -20,10 +20,10 @@ from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES, TrainingConfig
 from hgn.kernels.backward import TrainingEngine
 from hgn.kernels.engine import OUT, feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
-from hgn.kernels.packing import PackedNetwork, pack_network
+from hgn.kernels.muon.op import SquareBlocks
+from hgn.kernels.packing import pack_network
 from hgn.kernels.update import kernel
 from hgn.network.network import HierarchicalGraphNetwork
-from hgn.network.orthogonal import EPSILON, MOMENTUM, orthogonalised, square_blocks, step_size
 from hgn.scene.symmetry import Symmetry, drawn_symmetry
 from hgn.schema import ConfigError
 
@@ -89,24 +89,6 @@ class UpdateSettings:
             math.inf if training.huber is None else training.huber,
             training.optimizer,
         )
-
-
-class SquareBlocks:
-    """The weights that Muon steps (hgn.training.muon), in the packed layout, where each block is one piece."""
-
-    def __init__(self, network: HierarchicalGraphNetwork, packed: PackedNetwork, device: torch.device) -> None:
-        block_KWW = square_blocks(network)
-        place = torch.empty(int(packed.index.max()) + 1, dtype=torch.int64)
-        used = packed.index >= 0
-        place[packed.index[used]] = torch.nonzero(used).flatten()
-        packed_KE = place[block_KWW].flatten(1)
-        assert (packed_KE == packed_KE[:, :1] + torch.arange(packed_KE.shape[1])).all()
-        member = torch.zeros(packed.size, dtype=torch.int8)
-        member[packed_KE] = 1
-        self.starts, self.member = packed_KE[:, 0].contiguous().to(device), member.to(device)
-        # orthogonal to a hundredth, as the iterations are: products in bfloat16, summed in float32
-        dtype = torch.float32 if device.type == "cpu" else torch.bfloat16
-        self.direction_KWW = torch.zeros(block_KWW.shape, dtype=dtype, device=device)
 
 
 class Updates:
@@ -313,7 +295,18 @@ class Updates:
             BLOCK=FLAT_BLOCK,
         )
         if self.blocks is not None:
-            self._step_blocks(self.blocks, share)
+            self.blocks.step(
+                self.values,
+                engine.weights,
+                self.first_moment,
+                engine.totals,
+                share,
+                self._rates,
+                self.update,
+                self.grid.status,
+                self.norm,
+                self.precision,
+            )
         if self.average is not None:
             kernel.average_values[blocks](
                 self.values, self.average, self._shares, self.update, self.grid.status, size, BLOCK=FLAT_BLOCK
@@ -321,36 +314,6 @@ class Updates:
         engine.refresh_encoder()
         kernel.finish_update[(1,)](
             self.grid.status, self.update, self.step, self.loss, self.norm, self.loss_sum, self.counters
-        )
-
-    def _step_blocks(self, blocks: SquareBlocks, share: float) -> None:
-        engine, width = self.engine, self.config.width
-        kernel.momentum_directions[(len(blocks.starts),)](
-            blocks.starts,
-            engine.totals,
-            share,
-            self.first_moment,
-            blocks.direction_KWW,
-            self.grid.status,
-            self.norm,
-            MOMENTUM,
-            EPSILON,
-            WIDTH=width,
-            num_warps=8,
-        )
-        kernel.step_blocks[(len(blocks.starts),)](
-            blocks.starts,
-            orthogonalised(blocks.direction_KWW),
-            self.values,
-            engine.weights,
-            self._rates,
-            self.update,
-            self.grid.status,
-            self.norm,
-            step_size(width),
-            PRECISION=self.precision,
-            WIDTH=width,
-            num_warps=8,
         )
 
     def _assemble(self) -> None:
