@@ -415,7 +415,7 @@ class TrainingEngine(Engine):
         table = grid.neighbour(level)
         size, warps = self._row_block(rows)
         edge_size, edge_warps = self._edge_block(rows)
-        overlap = self.overlaps(rows)
+        overlap = self.overlaps()
         for m in reversed(range(steps)):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             later = m if last else m + 1
@@ -448,9 +448,10 @@ class TrainingEngine(Engine):
                 WIDTH=self.width,
                 BLOCK=size,
                 PRECISION=self.precision,
-                OVERLAP=overlap and size == self.tuning.small_block,
+                RESIDENT=overlap and not self._many(rows),
+                OVERLAP=overlap and not self._many(rows),
                 num_warps=warps,
-                launch_pdl=overlap and size == self.tuning.small_block,
+                launch_pdl=overlap and not self._many(rows),
             )
             edge_backward[self._programs(rows, self._edge_cells(edge_size))](
                 sum_gradient,

@@ -14,6 +14,7 @@ import triton.language as tl
 from hgn.kernels.keys import settle_keys
 
 LEAKY = tl.constexpr(0.01)  # hgn.network.fcn.LEAKY_SLOPE
+LAST_TILE = tl.constexpr(1 << 20)  # beyond all: elements are addressed in int32
 EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
 
 
@@ -96,6 +97,33 @@ def transposed(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 
 @triton.jit
+def vectors(pointer, at_0, at_1, at_2, at_3, at_4, WIDTH: tl.constexpr):
+    """Up to five vectors [WIDTH], as rows of a matrix [8, WIDTH] from which `vector` takes them, for a loop over tiles;
+    zeros where the place is below zero.
+
+    A plain load with fewer elements than threads the compiler repeats in each layout that it is used in, and each stays
+    in registers, of which there are too few. It does not repeat one of this size.
+    """
+    row = tl.arange(0, 8)
+    at = tl.where(row == 0, at_0, tl.where(row == 1, at_1, tl.where(row == 2, at_2, tl.where(row == 3, at_3, at_4))))
+    return tl.load(pointer + at[:, None] + tl.arange(0, WIDTH)[None, :], mask=(at >= 0)[:, None], other=0.0)
+
+
+@triton.jit
+def vector(matrix, number: tl.constexpr):
+    return tl.sum(tl.where(tl.arange(0, 8)[:, None] == number, matrix, 0.0), 0)
+
+
+@triton.jit
+def once_both(x, y, never):
+    """x, in the place where both x and y are loaded; `never` is false, but not known to be.
+
+    The compiler takes what it loaded to shared memory at once, and waits for it, before it begins the next load.
+    """
+    return added(x, tl.where(never, y.to(x.dtype), 0.0))
+
+
+@triton.jit
 def inside(vector, tile):
     """`vector`, as a value of the loop over tiles: else it is laid out for the matrix units before the loop, where each
     thread holds a quarter of it, and registers spill. Tiles are numbered from 0."""
@@ -103,8 +131,19 @@ def inside(vector, tile):
 
 
 @triton.jit
+def next_tile(tile, ONCE: tl.constexpr):
+    """The program's tile after this one. ONCE: there is none, and the compiler sees it: it drops the loop, before which
+    it would work out addresses that take up registers."""
+    if ONCE:
+        tile = tile * 0 + LAST_TILE
+    else:
+        tile += tl.num_programs(0)
+    return tile
+
+
+@triton.jit
 def leaky(h):
-    return tl.where(h > 0, h, LEAKY * h)
+    return tl.maximum(h, LEAKY * h)  # two instructions, where a choice by sign takes three
 
 
 @triton.jit
@@ -131,43 +170,48 @@ def normalise_backward(gradient, normalised, scale, gamma, WIDTH: tl.constexpr):
 
 
 @triton.jit
-def gathered_sum(
-    x,
-    table,
-    row,
-    count,
-    capacity,
-    SUM: tl.constexpr,
-    EDGES: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
-    """The sums [BLOCK, W] of x's rows that the table [SUM, capacity] lists for each of `row` (-1: none).
+def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
+    """For each of `row` the rows that the table [SUM, capacity] lists, as a tuple; below zero: none.
 
-    With EDGES, x is [capacity, SUM, W], and of the row listed for a direction the opposite direction's part is taken.
+    With EDGES they are rows of [capacity, SUM, W]: of the row listed for a direction the opposite direction's part.
     """
-    column = tl.arange(0, WIDTH)
-    even, odd = tl.zeros((BLOCK, WIDTH), tl.float32), tl.zeros((BLOCK, WIDTH), tl.float32)
+    found = ()
     for i in tl.static_range(SUM):
         where = tl.load(table + i * capacity + row, mask=row < count, other=-1)
-        there = (where >= 0)[:, None]
         if EDGES:
             where = where * SUM + (i ^ 1)
-        part = tl.load(x + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
-        if i % 2 == 0:
-            even += part
-        else:
-            odd += part
-    return added(even, odd)
+        found = found + (where,)  # noqa: RUF005 - Triton knows no unpacking here
+    return found
+
+
+@triton.jit
+def gathered_sum(x, found, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+    """The sums [BLOCK, W] of x's rows `found` by `listed`."""
+    column = tl.arange(0, WIDTH)
+    # so many reads begin before the first is waited for
+    TOGETHER: tl.constexpr = SUM if BLOCK <= 16 else 2
+    for start in tl.static_range(0, SUM, TOGETHER):
+        parts = ()
+        for i in tl.static_range(start, start + TOGETHER):
+            where = found[i]
+            part = tl.load(x + where[:, None] * WIDTH + column[None, :], mask=(where >= 0)[:, None], other=0.0)
+            parts = parts + (part,)  # noqa: RUF005
+        for i in tl.static_range(0, TOGETHER, 2):
+            two = added(parts[i].to(tl.float32), parts[i + 1].to(tl.float32))
+            if start + i == 0:
+                total = two
+            else:
+                total = added(total, two)
+    return total
 
 
 @triton.jit
 def added(x, y):
-    """x + y in float32, as a reduction: so they are added where they were loaded, after both loads began.
+    """x + y in their type, as a reduction: so they are added where they were loaded, after both loads began.
 
     Of a plain sum the compiler takes each part to the matrix units' layout by itself, one after the other.
     """
-    return tl.sum(tl.join(x.to(tl.float32), y.to(tl.float32)), 2)
+    return tl.sum(tl.join(x, y), 2)
 
 
 settle_keys(globals())

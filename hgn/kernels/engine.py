@@ -6,7 +6,7 @@ paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 import triton
@@ -23,6 +23,7 @@ PROCESSORS = 132  # an H100's
 RESIDENT_PROGRAMS = 2 * PROCESSORS
 FEW_ROWS = 64 * PROCESSORS
 OUT = 16  # the decoder's three outputs, padded
+NONE = -1  # where a product has no bias
 
 
 @dataclass(frozen=True)
@@ -38,21 +39,26 @@ class Tuning:
     row_backward_warps: int
     pair_particles: int  # eight rows each, at most 13
     pair_warps: int
+    few_cells: int = 0  # up to which a level's cells are few
     small_block: int = 16  # where there are few rows
     small_warps: int = 8
     dense: bool = False  # six rows a cell in the tiles of edges, not eight
-    overlap: bool = False  # on levels with few rows, kernels of a message step read their weights before their turn
+    overlap: bool = False  # kernels of a message step read their weights before their turn
+    loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
+    pair_programs: int = 2  # on a processor, in inference
+    pair_registers: int | None = None  # of a thread, so that as many fit
 
     @staticmethod
     def of(precision: str) -> Tuning:
         """What was fastest on an H100 at width 128."""
         if precision == "ieee":
-            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, dense=True)
+            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True)
         if precision == "tf32x3":
-            return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8)
+            return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8, 528)
         if precision == "tf32":  # operands of twice the size
-            return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8)
-        return Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, dense=True, overlap=True)
+            return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8, 528)
+        half = Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, 1056, dense=True, overlap=True, loops=True)
+        return replace(half, pair_programs=3, pair_registers=168)
 
 
 @dataclass
@@ -222,6 +228,7 @@ class Engine:
             first=(self.encode_weights, 0),
             bias=False,
             following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
+            following_bias=(packed.particle_to_cell.first_bias, packed.cell_to_particle.first_bias),
             products=(self.by_particle_down, self.by_particle_up),
             fine=self.fine,
         )
@@ -265,6 +272,7 @@ class Engine:
                 octant=grid.octant(i),
                 residual=True,
                 following=(edge.parts[0], edge.parts[1]),
+                following_bias=(NONE, edge.first_bias),
                 products=(block.send[0], block.receive[0]),
             )
             self._passing(block)
@@ -278,22 +286,34 @@ class Engine:
     def _blocks(self, rows: int, block: int) -> tuple[int]:
         return (triton.cdiv(rows, block),)
 
+    def _many(self, rows: int) -> bool:
+        return rows >= FEW_ROWS
+
     def _row_block(self, rows: int, backward: bool = False) -> tuple[int, int]:
         """Rows and warps of a program over so many rows."""
         tuning = self.tuning
-        if rows < FEW_ROWS:
+        if not self._many(rows):
             return tuning.small_block, tuning.small_warps
         return tuning.row_block, tuning.row_backward_warps if backward else tuning.row_warps
 
     def _edge_block(self, cells: int) -> tuple[int, int]:
-        """Cells and warps of a tile of edges: small tiles where there would be fewer than processors."""
+        """Cells and warps of a tile of edges: small tiles where there would be few."""
         tuning = self.tuning
-        few = cells <= PROCESSORS * tuning.few_cell_block
+        few = cells <= tuning.few_cells
         return (tuning.few_cell_block, tuning.few_cell_warps) if few else (tuning.cell_block, tuning.cell_warps)
 
-    def overlaps(self, rows: int) -> bool:
-        """Whether the kernels of a message step on so many cells start before the one before has ended."""
-        if not self.tuning.overlap or rows >= FEW_ROWS or triton.knobs.runtime.interpret:
+    def _loops(self, rows: int, block: int, least: int = 1) -> bool:
+        """Whether a program keeps all its weights and takes one block after the other, where each has `least`."""
+        return self.tuning.loops and self._many(rows) and rows >= (least - 1) * PROCESSORS * block
+
+    def _row_programs(self, rows: int, block: int, loops: bool) -> tuple[int]:
+        """Those that keep their weights fill a processor's shared memory each."""
+        programs = triton.cdiv(rows, block)
+        return (min(programs, PROCESSORS) if loops else programs,)
+
+    def overlaps(self) -> bool:
+        """Whether the kernels of a message step start before the one before has ended."""
+        if not self.tuning.overlap or triton.knobs.runtime.interpret:
             return False
         target = triton.runtime.driver.active.get_current_target()
         return target.backend == "cuda" and target.arch >= 90
@@ -302,9 +322,9 @@ class Engine:
         """Cells that a tile of edges takes where it has rows for `block` of eight each."""
         return 8 * block // 6 if self.tuning.dense else block
 
-    def _programs(self, rows: int, block: int) -> tuple[int]:
-        """Programs that take one block after the other: as many as run at once."""
-        return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS),)
+    def _programs(self, rows: int, block: int, at_once: int = 2) -> tuple[int]:
+        """Programs that take one block after the other: as many as run at once, `at_once` on a processor."""
+        return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS * at_once // 2),)
 
     def _rows(
         self,
@@ -322,14 +342,16 @@ class Engine:
         norm: bool = True,
         residual: bool = False,
         following: tuple[int, ...] = (),
+        following_bias: tuple[int, ...] = (),
         products: tuple[torch.Tensor, ...] = (),
         fine: bool = False,
     ) -> None:
         first = first or (self.weights, fcn.parts[0])
         block, warps = self._row_block(len(x))
-        at = (*following, 0, 0)
+        at, bias_at = (*following, 0, 0), (*following_bias, NONE, NONE)
         into = (*products, hidden, hidden)
-        rows_forward[self._blocks(len(x), block)](
+        loops = self._loops(len(x), block, 4)
+        rows_forward[self._row_programs(len(x), block, loops)](
             x,
             count,
             self.weights,
@@ -347,6 +369,8 @@ class Engine:
             octant if octant is not None else count,
             at[0],
             at[1],
+            bias_at[0],
+            bias_at[1],
             y,
             hidden,
             into[0],
@@ -364,6 +388,7 @@ class Engine:
             FINE=fine,
             BLOCK=block,
             PRECISION=self.precision,
+            LOOP=loops,
             num_warps=warps,
         )
 
@@ -376,8 +401,9 @@ class Engine:
         out: torch.Tensor,
         to_cell: bool,
     ) -> None:
-        grid = self.grid
-        pairs_forward[self._programs(grid.particles, self.tuning.pair_particles)](
+        grid, tuning = self.grid, self.tuning
+        at_once, registers = (2, None) if self.training else (tuning.pair_programs, tuning.pair_registers)
+        pairs_forward[self._programs(grid.particles, tuning.pair_particles, at_once)](
             by_particle,
             by_cell,
             self.latent,
@@ -388,7 +414,6 @@ class Engine:
             self.weights,
             self.values,
             fcn.parts[-1],
-            fcn.first_bias,
             fcn.second,
             fcn.second_bias,
             fcn.gain,
@@ -401,6 +426,7 @@ class Engine:
             PARTICLES=self.tuning.pair_particles,
             PRECISION=self.precision,
             num_warps=self.tuning.pair_warps,
+            maxnreg=registers,
         )
 
     def _begin(self, block: Block, from_children: bool) -> None:
@@ -413,8 +439,10 @@ class Engine:
             grid.children(level),
             grid.count(level),
             self.weights,
+            self.values,
             edge.parts[0],
             edge.parts[1],
+            edge.first_bias,
             block.cell[0],
             block.send[0],
             block.receive[0],
@@ -432,16 +460,17 @@ class Engine:
         rows = grid.capacities[level]
         size, warps = self._row_block(rows)
         edge_size, edge_warps = self._edge_block(rows)
-        overlap = self.overlaps(rows)
+        overlap, loops = self.overlaps(), self._loops(rows, size)
         for m in range(steps):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             if not last:
                 following = block.packed.edge[m + 1].parts
                 next_at, into = (following[0], following[1]), (block.send[(m + 1) % 2], block.receive[(m + 1) % 2])
-                products = 2
+                next_bias, products = block.packed.edge[m + 1].first_bias, 2
             else:
                 product = block.product if block.product is not None else block.send[(m + 1) % 2]
                 next_at, into, products = (block.next_at, 0), (product, product), int(block.product is not None)
+                next_bias = 0
             edge_forward[self._programs(rows, self._edge_cells(edge_size))](
                 block.send[m % 2],
                 block.receive[m % 2],
@@ -451,7 +480,6 @@ class Engine:
                 self.weights,
                 self.values,
                 edge.parts[2],
-                edge.first_bias,
                 edge.second,
                 edge.second_bias,
                 edge.gain,
@@ -473,7 +501,7 @@ class Engine:
                 num_warps=edge_warps,
                 launch_pdl=overlap,
             )
-            cell_forward[self._blocks(rows, size)](
+            cell_forward[self._row_programs(rows, size, loops)](
                 block.cell[m],
                 block.sum[m],
                 grid.count(level),
@@ -488,6 +516,7 @@ class Engine:
                 cell.shift,
                 next_at[0],
                 next_at[1],
+                next_bias,
                 block.cell[m + 1],
                 block.cell_hidden[m],
                 block.cell_normalised[m],
@@ -499,7 +528,9 @@ class Engine:
                 WIDTH=self.width,
                 BLOCK=size,
                 PRECISION=self.precision,
-                OVERLAP=overlap and size == self.tuning.small_block,
+                RESIDENT=overlap or loops,
+                LOOP=loops,
+                OVERLAP=overlap,
                 num_warps=warps,
-                launch_pdl=overlap and size == self.tuning.small_block,
+                launch_pdl=overlap,
             )

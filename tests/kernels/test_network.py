@@ -75,6 +75,9 @@ def test_outputs_and_gradients(
     cells, give the outputs and every gradient of the plain network to 1e-5. So few programs run that each takes several
     tiles, and the last has one fewer."""
     monkeypatch.setattr("hgn.kernels.engine.RESIDENT_PROGRAMS", 2)
+    if len(counts) > 1:
+        monkeypatch.setattr("hgn.kernels.engine.PROCESSORS", 2)
+        monkeypatch.setattr("hgn.kernels.engine.FEW_ROWS", 0)  # every level is one of many rows
     network = network_of(width=16, **changes)
     state = float32_state(counts, network.config.obstacle_features, spread)
     precision = "ieee" if device().type == "cpu" else "tf32x3"

@@ -4,8 +4,11 @@ A tile of the edge kernels has ROWS rows, eight for each cell of which six can h
 DENSE (64 rows: ten cells instead of eight). A program takes one tile after the other and reads its weights once.
 Edge arrays are [capacity, 6, W], [c, d] for the edge to cell c from its neighbour in direction d. Sums over edges are
 made inside the tile and by gathers in fixed order: no atomics, the same result every time.
-OVERLAP: a program starts while the kernel before still runs, reads its weights, and waits for that kernel's end before
-it reads or writes anything else; every program waits, so that a kernel has ended only when all before it have.
+OVERLAP: a program starts while the kernel before still runs, reads its weights and what the grid's kernels left (count,
+neighbours; at least one kernel without OVERLAP lies between), and waits for that kernel's end before it reads or writes
+anything else; a program that has rows, and the first one always, waits, so that a kernel has ended only when all before
+it have. The wait is inside the loop over tiles, where it costs nothing once it is over: the compiler then lays out the
+weights for the matrix units before it.
 Shape legend: C cells, W width.
 """
 
@@ -16,32 +19,32 @@ import triton.language as tl
 from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 
 from hgn.kernels.blocks import (
+    LAST_TILE,
     added,
     gathered_sum,
     inside,
     leaky,
     leaky_backward,
+    listed,
     matrix,
     members,
+    next_tile,
     normalise,
     normalise_backward,
+    once_both,
     product,
     transposed,
+    vector,
+    vectors,
     weighted_sums,
 )
 from hgn.kernels.keys import settle_keys
 
-FIRST_WAVE = tl.constexpr(128)  # programs that run at once on an H100, one on each processor
-
 
 @triton.jit
-def _nothing_to_do(count_ptr, BLOCK: tl.constexpr):
-    """Whether a program beyond the first wave has no rows: it waits to know, instead of reading weights for nothing."""
-    beyond = tl.program_id(0) >= FIRST_WAVE
-    if beyond:
-        gdc_wait()
-    count = tl.load(count_ptr, mask=beyond, other=2147483647)
-    return tl.program_id(0) * BLOCK >= count
+def _nothing_to_do(count, BLOCK: tl.constexpr):
+    """Whether a program has no rows. The first one stays: it waits for the kernel before where all others are idle."""
+    return (tl.program_id(0) * BLOCK >= count) & (tl.program_id(0) > 0)
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -54,7 +57,6 @@ def edge_forward(
     weights,
     values,
     own_at,
-    bias_at,
     second_at,
     second_bias_at,
     gain_at,
@@ -75,40 +77,42 @@ def edge_forward(
     OVERLAP: tl.constexpr,
 ):
     """The edges' new features and their sums by receiver [C, W]; send and receive [C, W] are the cells' products with
-    the edge network's first two parts.
+    the edge network's first two parts, receive with the bias.
 
     FIRST: edges have no features yet, their unit offset takes the place. The last iteration stores no edges. SAVE keeps
     what edge_backward reads: the hidden layer, the normalised output and one over its deviation.
     """
     if OVERLAP:
         gdc_launch_dependents()
-    else:
-        count = tl.load(count_ptr)
     SUMS: tl.constexpr = max(16, ROWS // 4)  # the least that the matrix units take
     SLOTS: tl.constexpr = 6 if DENSE else 8
     BLOCK: tl.constexpr = ROWS // SLOTS
     column = tl.arange(0, WIDTH)
-    if OVERLAP:
-        if _nothing_to_do(count_ptr, BLOCK):
-            return
-    else:
-        if tl.program_id(0) * BLOCK >= count:
-            return
+    count = tl.load(count_ptr)
+    if _nothing_to_do(count, BLOCK):
+        return
+    slot = tl.arange(0, ROWS) % SLOTS
+    used = (slot < 6) & (tl.arange(0, ROWS) < SLOTS * BLOCK)
+    owner = tl.program_id(0) * BLOCK + tl.arange(0, ROWS) // SLOTS
+    other = tl.load(neighbour + slot * capacity + owner, mask=used & (owner < count), other=-1)
     # vectors once: in the loop each would be waited for again
-    bias, second_bias = tl.load(values + bias_at + column), tl.load(values + second_bias_at + column)
+    second_bias = tl.load(values + second_bias_at + column)
     gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
     if not FIRST:
         own = transposed(weights + own_at, WIDTH, WIDTH)
     second = transposed(weights + second_at, WIDTH, WIDTH)
-    if OVERLAP:
-        gdc_wait()
-        count = tl.load(count_ptr)
     tile = tl.program_id(0)
     while tile * BLOCK < count:
-        owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
-        slot = tl.arange(0, ROWS) % SLOTS
-        holds = (owner < count) & (slot < 6) & (tl.arange(0, ROWS) < SLOTS * BLOCK)
-        other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
+        if OVERLAP:
+            gdc_wait()
+        holds = used & (owner < count)
+        # the next tile's, which says where its features lie; TF32 has no registers for it
+        later_owner = owner + tl.num_programs(0) * BLOCK
+        if PRECISION == "tf32":
+            other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
+            later = other
+        else:
+            later = tl.load(neighbour + slot * capacity + later_owner, mask=used & (later_owner < count), other=-1)
         there = (other >= 0)[:, None]
         if DENSE:
             place = tile * (6 * BLOCK) + tl.arange(0, ROWS)
@@ -120,7 +124,7 @@ def edge_forward(
         sent = tl.load(send + other[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
         if not FIRST:
             edge = tl.load(edge_in + edge_at, mask=there, other=0.0)
-        h = added(received, sent) + inside(bias, tile)[None, :]
+        h = added(received, sent).to(tl.float32)
         if FIRST:
             for axis in tl.static_range(3):
                 # receiver minus sender: the opposite of where the sender lies
@@ -130,8 +134,8 @@ def edge_forward(
             h += product(edge, own, PRECISION)
         a = leaky(h)
         if SAVE:
-            # zeros, not old values, where there is no edge: they meet zero gradients in the weights' products
-            tl.store(hidden + edge_at, tl.where(there, a, 0.0), mask=holds[:, None])
+            # also where there is no edge: what lies there meets zero gradients in the weights' products
+            tl.store(hidden + edge_at, a, mask=holds[:, None])
         z = product(a, second, PRECISION)
         z, scale = normalise(z + inside(second_bias, tile)[None, :], WIDTH)
         if SAVE:
@@ -156,7 +160,10 @@ def edge_forward(
             ends = ((tl.arange(0, SUMS) < BLOCK) & (mine < count))[:, None]
             total = weighted_sums(members(SUMS, ROWS, SLOTS), z, PRECISION)
         tl.store(sum_out + mine[:, None] * WIDTH + column[None, :], total, mask=ends)
+        owner, other = later_owner, later
         tile += tl.num_programs(0)
+    if OVERLAP:
+        gdc_wait()
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -175,6 +182,7 @@ def cell_forward(
     shift_at,
     next_at_0,
     next_at_1,
+    next_bias_at,
     cell_out,
     hidden,
     normalised,
@@ -186,13 +194,31 @@ def cell_forward(
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
+    RESIDENT: tl.constexpr,
+    LOOP: tl.constexpr,
     OVERLAP: tl.constexpr,
 ):
-    """The cells' new features from theirs and their edges' sums, both [C, W], and up to two products of them."""
+    """The cells' new features from theirs and their edges' sums, both [C, W], and up to two products of them, of which
+    the second with a bias.
+
+    RESIDENT: all weights are read before the first tile, and kept. LOOP: a program has more than one tile.
+    """
     if OVERLAP:
         gdc_launch_dependents()
-        if _nothing_to_do(count_ptr, BLOCK):
-            return
+    count = tl.load(count_ptr)
+    if _nothing_to_do(count, BLOCK):
+        return
+    column = tl.arange(0, WIDTH)
+    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # where many vectors would not fit into registers
+    if LOOP:
+        lines = vectors(values, bias_at, second_bias_at, gain_at, shift_at, next_bias_at, WIDTH)
+        bias, second_bias, gain, shift = vector(lines, 0), vector(lines, 1), vector(lines, 2), vector(lines, 3)
+        next_bias = vector(lines, 4)
+    elif not IN_PLACE:
+        bias, second_bias = tl.load(values + bias_at + column), tl.load(values + second_bias_at + column)
+        gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
+        next_bias = tl.load(values + next_bias_at + column)
+    if RESIDENT:
         first = transposed(weights + first_at, WIDTH, WIDTH)
         sum_first = transposed(weights + sum_first_at, WIDTH, WIDTH)
         second = transposed(weights + second_at, WIDTH, WIDTH)
@@ -200,42 +226,54 @@ def cell_forward(
             following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
         if NEXT > 1:
             following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
+    tile = tl.program_id(0)
+    while (tile * BLOCK < count) & (tile < LAST_TILE):
+        if OVERLAP:
+            gdc_wait()
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        here = (row < count)[:, None]
+        at = row[:, None] * WIDTH + column[None, :]
+        feature = tl.load(cell + at, mask=here, other=0.0)
+        summed = tl.load(total + at, mask=here, other=0.0)
+        if not IN_PLACE:
+            feature = once_both(feature, summed, count < 0)
+        if not RESIDENT:
+            first = transposed(weights + first_at, WIDTH, WIDTH)
+        h = product(feature, first, PRECISION)
+        if not RESIDENT:
+            sum_first = transposed(weights + sum_first_at, WIDTH, WIDTH)
+        h += product(summed, sum_first, PRECISION)
+        if IN_PLACE:
+            bias = tl.load(values + bias_at + column)
+        a = leaky(h + inside(bias, tile)[None, :])
+        if not RESIDENT:
+            second = transposed(weights + second_at, WIDTH, WIDTH)
+        z = product(a, second, PRECISION)
+        if IN_PLACE:
+            second_bias = tl.load(values + second_bias_at + column)
+        z, scale = normalise(z + inside(second_bias, tile)[None, :], WIDTH)
+        if SAVE:
+            tl.store(hidden + at, a, mask=here)
+            tl.store(normalised + at, z, mask=here)
+            tl.store(deviation + row, scale, mask=row < count)
+        if IN_PLACE:
+            gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
+        feature += z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
+        tl.store(cell_out + at, feature, mask=here)
+        if NEXT > 0:
+            if not RESIDENT:
+                following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
+            tl.store(next_0 + at, product(feature, following_0, PRECISION), mask=here)
+        if NEXT > 1:
+            if not RESIDENT:
+                following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
+            if IN_PLACE:
+                next_bias = tl.load(values + next_bias_at + column)
+            z = product(feature, following_1, PRECISION) + inside(next_bias, tile)[None, :]
+            tl.store(next_1 + at, z, mask=here)
+        tile = next_tile(tile, IN_PLACE)
+    if OVERLAP:
         gdc_wait()
-    count = tl.load(count_ptr)
-    if tl.program_id(0) * BLOCK >= count:
-        return
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = (row < count)[:, None]
-    column = tl.arange(0, WIDTH)
-    at = row[:, None] * WIDTH + column[None, :]
-    feature = tl.load(cell + at, mask=here, other=0.0).to(tl.float32)
-    summed = tl.load(total + at, mask=here, other=0.0).to(tl.float32)
-    if not OVERLAP:
-        first = transposed(weights + first_at, WIDTH, WIDTH)
-    h = product(feature, first, PRECISION)
-    if not OVERLAP:
-        sum_first = transposed(weights + sum_first_at, WIDTH, WIDTH)
-    h += product(summed, sum_first, PRECISION)
-    a = leaky(h + tl.load(values + bias_at + column)[None, :])
-    if not OVERLAP:
-        second = transposed(weights + second_at, WIDTH, WIDTH)
-    z = product(a, second, PRECISION)
-    z, scale = normalise(z + tl.load(values + second_bias_at + column)[None, :], WIDTH)
-    if SAVE:
-        tl.store(hidden + at, a, mask=here)
-        tl.store(normalised + at, z, mask=here)
-        tl.store(deviation + row, scale, mask=row < count)
-    z = z * tl.load(values + gain_at + column)[None, :] + tl.load(values + shift_at + column)[None, :]
-    feature += z
-    tl.store(cell_out + at, feature, mask=here)
-    if NEXT > 0:
-        if not OVERLAP:
-            following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
-        tl.store(next_0 + at, product(feature, following_0, PRECISION), mask=here)
-    if NEXT > 1:
-        if not OVERLAP:
-            following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
-        tl.store(next_1 + at, product(feature, following_1, PRECISION), mask=here)
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -268,62 +306,86 @@ def cell_backward(
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
+    RESIDENT: tl.constexpr,
     OVERLAP: tl.constexpr,
 ):
     """In place: `gradient` [C, W] comes in as the gradient of cell_out, less what reaches it through `send` and
     `receive` of the following iteration (added here unless LAST; what comes from the edges that start in a cell is left
     in send_gradient), and leaves as that of `cell`, again less what goes through its own.
 
-    sum_gradient [C, W] is that of the edges' sums.
+    sum_gradient [C, W] is that of the edges' sums. RESIDENT as in cell_forward.
     """
     if OVERLAP:
         gdc_launch_dependents()
-        if _nothing_to_do(count_ptr, BLOCK):
-            return
+    count = tl.load(count_ptr)
+    if _nothing_to_do(count, BLOCK):
+        return
+    column = tl.arange(0, WIDTH)
+    EARLY: tl.constexpr = BLOCK <= 16  # all loads first, where there are registers for it
+    if EARLY:
+        gain = tl.load(values + gain_at + column)
+    if RESIDENT:
         if not LAST:
             later_send = matrix(weights + later_send_at, WIDTH, WIDTH)
             later_receive = matrix(weights + later_receive_at, WIDTH, WIDTH)
         second = matrix(weights + second_at, WIDTH, WIDTH)
         sum_first = matrix(weights + sum_first_at, WIDTH, WIDTH)
         first = matrix(weights + first_at, WIDTH, WIDTH)
+    tile = tl.program_id(0)
+    while (tile * BLOCK < count) & (tile < LAST_TILE):
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        here = (row < count)[:, None]
+        at = row[:, None] * WIDTH + column[None, :]
+        if not LAST:
+            found = listed(neighbour, row, count, capacity, 6, True)
+        if OVERLAP:
+            gdc_wait()
+        df = tl.load(gradient + at, mask=here, other=0.0)
+        if EARLY:
+            z = tl.load(normalised + at, mask=here, other=0.0)
+            scale = tl.load(deviation + row, mask=row < count, other=0.0)
+            a = tl.load(hidden + at, mask=here, other=0.0)
+            if not LAST:
+                received = tl.load(later_receive_gradient + at, mask=here, other=0.0)
+        if not LAST:
+            # the edges that start here: each in its receiver's row, seen from there in the opposite direction
+            sent = gathered_sum(later_hidden_gradient, found, 6, WIDTH, BLOCK)
+            tl.store(send_gradient + at, sent, mask=here)
+            if not RESIDENT:
+                later_send = matrix(weights + later_send_at, WIDTH, WIDTH)
+            df += product(sent, later_send, PRECISION)
+            if not EARLY:
+                received = tl.load(later_receive_gradient + at, mask=here, other=0.0)
+            if not RESIDENT:
+                later_receive = matrix(weights + later_receive_at, WIDTH, WIDTH)
+            df += product(received, later_receive, PRECISION)
+        if not EARLY:
+            z = tl.load(normalised + at, mask=here, other=0.0)
+            scale = tl.load(deviation + row, mask=row < count, other=0.0)
+        z = z.to(tl.float32)
+        tl.atomic_add(totals + gain_at + column, tl.sum(df * z, 0) * unscale, sem="relaxed")
+        tl.atomic_add(totals + shift_at + column, tl.sum(df, 0) * unscale, sem="relaxed")
+        if not EARLY:
+            gain = tl.load(values + gain_at + column)
+        dz = normalise_backward(df, z, scale, gain, WIDTH)
+        tl.store(second_gradient + at, dz, mask=here)
+        if not RESIDENT:
+            second = matrix(weights + second_at, WIDTH, WIDTH)
+        dh = product(dz, second, PRECISION)
+        if not EARLY:
+            a = tl.load(hidden + at, mask=here, other=0.0)
+        dh = leaky_backward(dh, a.to(tl.float32))
+        tl.store(hidden_gradient + at, dh, mask=here)
+        if not RESIDENT:
+            sum_first = matrix(weights + sum_first_at, WIDTH, WIDTH)
+        tl.store(sum_gradient + at, product(dh, sum_first, PRECISION), mask=here)
+        if not RESIDENT:
+            first = matrix(weights + first_at, WIDTH, WIDTH)
+        df += product(dh, first, PRECISION)
+        tl.store(gradient + at, df, mask=here)
+        tile = next_tile(tile, not EARLY)
+    if OVERLAP:
         gdc_wait()
-    count = tl.load(count_ptr)
-    if tl.program_id(0) * BLOCK >= count:
-        return
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = (row < count)[:, None]
-    column = tl.arange(0, WIDTH)
-    at = row[:, None] * WIDTH + column[None, :]
-    df = tl.load(gradient + at, mask=here, other=0.0)
-    if not LAST:
-        # the edges that start here: each in its receiver's row, seen from there in the opposite direction
-        sent = gathered_sum(later_hidden_gradient, neighbour, row, count, capacity, 6, True, WIDTH, BLOCK)
-        tl.store(send_gradient + at, sent, mask=here)
-        if not OVERLAP:
-            later_send = matrix(weights + later_send_at, WIDTH, WIDTH)
-        df += product(sent, later_send, PRECISION)
-        received = tl.load(later_receive_gradient + at, mask=here, other=0.0).to(tl.float32)
-        if not OVERLAP:
-            later_receive = matrix(weights + later_receive_at, WIDTH, WIDTH)
-        df += product(received, later_receive, PRECISION)
-    z = tl.load(normalised + at, mask=here, other=0.0).to(tl.float32)
-    scale = tl.load(deviation + row, mask=row < count, other=0.0)
-    tl.atomic_add(totals + gain_at + column, tl.sum(df * z, 0) * unscale, sem="relaxed")
-    tl.atomic_add(totals + shift_at + column, tl.sum(df, 0) * unscale, sem="relaxed")
-    dz = normalise_backward(df, z, scale, tl.load(values + gain_at + column), WIDTH)
-    tl.store(second_gradient + at, dz, mask=here)
-    if not OVERLAP:
-        second = matrix(weights + second_at, WIDTH, WIDTH)
-    dh = product(dz, second, PRECISION)
-    dh = leaky_backward(dh, tl.load(hidden + at, mask=here, other=0.0).to(tl.float32))
-    tl.store(hidden_gradient + at, dh, mask=here)
-    if not OVERLAP:
-        sum_first = matrix(weights + sum_first_at, WIDTH, WIDTH)
-    tl.store(sum_gradient + at, product(dh, sum_first, PRECISION), mask=here)
-    if not OVERLAP:
-        first = matrix(weights + first_at, WIDTH, WIDTH)
-    df += product(dh, first, PRECISION)
-    tl.store(gradient + at, df, mask=here)
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -359,18 +421,13 @@ def edge_backward(
     leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`."""
     if OVERLAP:
         gdc_launch_dependents()
-    else:
-        count = tl.load(count_ptr)
     SUMS: tl.constexpr = max(16, ROWS // 4)  # the least that the matrix units take
     SLOTS: tl.constexpr = 6 if DENSE else 8
     BLOCK: tl.constexpr = ROWS // SLOTS
     column = tl.arange(0, WIDTH)
-    if OVERLAP:
-        if _nothing_to_do(count_ptr, BLOCK):
-            return
-    else:
-        if tl.program_id(0) * BLOCK >= count:
-            return
+    count = tl.load(count_ptr)
+    if _nothing_to_do(count, BLOCK):
+        return
     second = matrix(weights + second_at, WIDTH, WIDTH)
     if not FIRST:
         own = matrix(weights + own_at, WIDTH, WIDTH)
@@ -378,15 +435,14 @@ def edge_backward(
     gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
     if FIRST:
         side_total = tl.zeros((16, WIDTH), tl.float32)
-    if OVERLAP:
-        gdc_wait()
-        count = tl.load(count_ptr)
     tile = tl.program_id(0)
     while tile * BLOCK < count:
         owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
         slot = tl.arange(0, ROWS) % SLOTS
         holds = (owner < count) & (slot < 6) & (tl.arange(0, ROWS) < SLOTS * BLOCK)
         other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
+        if OVERLAP:
+            gdc_wait()
         there = (other >= 0)[:, None]
         if DENSE:
             place = tile * (6 * BLOCK) + tl.arange(0, ROWS)
@@ -402,7 +458,7 @@ def edge_backward(
         a = tl.load(hidden + edge_at, mask=there, other=0.0)
         scale = tl.load(deviation + place, mask=other >= 0, other=0.0)
         if not LAST:
-            de = added(de, later)
+            de = added(de.to(tl.float32), later.to(tl.float32))
         de, z = de.to(tl.float32), z.to(tl.float32)
         gain_total += tl.sum(de * z, 0)
         shift_total += tl.sum(de, 0)
@@ -427,6 +483,8 @@ def edge_backward(
         received = weighted_sums(members(SUMS, ROWS, SLOTS), dh, PRECISION)
         tl.store(receive_gradient + mine[:, None] * WIDTH + column[None, :], received, mask=ends)
         tile += tl.num_programs(0)
+    if OVERLAP:
+        gdc_wait()
     tl.atomic_add(totals + gain_at + column, gain_total * unscale, sem="relaxed")
     tl.atomic_add(totals + shift_at + column, shift_total * unscale, sem="relaxed")
     if FIRST:

@@ -44,7 +44,6 @@ def pairs_forward(
     weights,
     values,
     offset_at,
-    bias_at,
     second_at,
     second_bias_at,
     gain_at,
@@ -71,7 +70,7 @@ def pairs_forward(
         return
     column = tl.arange(0, WIDTH)
     # vectors once: in the loop each would be waited for again
-    bias, second_bias = tl.load(values + bias_at + column), tl.load(values + second_bias_at + column)
+    second_bias = tl.load(values + second_bias_at + column)
     gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
     offset_0 = tl.load(values + offset_at + column)
     offset_1 = tl.load(values + offset_at + WIDTH + column)
@@ -89,7 +88,7 @@ def pairs_forward(
         if not TO_CELL:
             h = added(h, tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0))
         sign = 1.0 if TO_CELL else -1.0
-        h = h.to(tl.float32) + inside(bias, tile)[None, :]
+        h = h.to(tl.float32)
         h += (sign * _offset(fraction, owner, corner, live, 0))[:, None] * inside(offset_0, tile)[None, :]
         h += (sign * _offset(fraction, owner, corner, live, 1))[:, None] * inside(offset_1, tile)[None, :]
         h += (sign * _offset(fraction, owner, corner, live, 2))[:, None] * inside(offset_2, tile)[None, :]

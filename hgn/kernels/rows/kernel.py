@@ -1,7 +1,7 @@
 """An FCN on rows, forward and backward: encoder, decoder, and the steps between levels.
 
 Forward of row r: h = x W + gathered[index_r] + offset_octant + b; a = leaky(h); y = norm(a W2 + b2) (+ x).
-Up to two products of y follow, for whoever reads it next. Shape legend: R rows, W width.
+Up to two products of y follow, with biases or without, for whoever reads it next. Shape legend: R rows, W width.
 """
 
 from __future__ import annotations
@@ -10,15 +10,21 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import (
+    LAST_TILE,
     finer_product,
     gathered_sum,
+    inside,
     leaky,
     leaky_backward,
+    listed,
     matrix,
+    next_tile,
     normalise,
     normalise_backward,
     product,
     transposed,
+    vector,
+    vectors,
 )
 from hgn.kernels.keys import settle_keys
 
@@ -54,6 +60,8 @@ def rows_forward(
     octant,
     next_at_0,
     next_at_1,
+    next_bias_at_0,
+    next_bias_at_1,
     y,
     hidden,
     next_0,
@@ -71,45 +79,84 @@ def rows_forward(
     FINE: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
+    LOOP: tl.constexpr,
 ):
-    """With FINE the FCN's own products are finer than PRECISION, and read the weights themselves."""
+    """With FINE the FCN's own products are finer than PRECISION, and read the weights themselves.
+
+    LOOP: a program takes one tile after the other, and reads its weights once.
+    """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = (row < count)[:, None]
-    column = tl.arange(0, WIDTH)
-    at = row[:, None] * WIDTH + column[None, :]
-    inputs = tl.arange(0, INPUT)
-    x_tile = tl.load(x + row[:, None] * INPUT + inputs[None, :], mask=live, other=0.0).to(tl.float32)
-    first = transposed(first_weights + first_at, WIDTH, INPUT)
-    h = finer_product(x_tile, first, PRECISION) if FINE else product(x_tile, first, PRECISION)
-    if GATHER:
-        where = tl.load(index + row, mask=row < count, other=0)
-        h += tl.load(gathered + where[:, None] * WIDTH + column[None, :], mask=live, other=0.0).to(tl.float32)
-    if OFFSET != 0:
-        h += _shift(values, offset_at, tl.load(octant + row, mask=row < count, other=0), OFFSET, WIDTH)
-    if BIAS:
-        h += tl.load(values + bias_at + column)[None, :]
-    a = leaky(h)
-    if SAVE:
-        tl.store(hidden + at, a, mask=live)
-    outs = tl.arange(0, OUT)
-    if FINE:
-        z = finer_product(a, transposed(values + second_at, OUT, WIDTH), PRECISION)
-    else:
-        z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
-    z += tl.load(values + second_bias_at + outs)[None, :]
-    if NORM:
-        z, _scale = normalise(z, OUT)
-        z = z * tl.load(values + gain_at + outs)[None, :] + tl.load(values + shift_at + outs)[None, :]
-    if RESIDUAL:
-        z += x_tile
-    tl.store(y + row[:, None] * OUT + outs[None, :], z, mask=live)
-    if NEXT > 0:
-        tl.store(next_0 + at, product(z, transposed(weights + next_at_0, WIDTH, WIDTH), PRECISION), mask=live)
-    if NEXT > 1:
-        tl.store(next_1 + at, product(z, transposed(weights + next_at_1, WIDTH, WIDTH), PRECISION), mask=live)
+    column, inputs, outs = tl.arange(0, WIDTH), tl.arange(0, INPUT), tl.arange(0, OUT)
+    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # where many vectors would not fit into registers
+    if LOOP:
+        lines = vectors(values, bias_at, next_bias_at_0, next_bias_at_1, bias_at, bias_at, WIDTH)
+        bias, next_bias_0, next_bias_1 = vector(lines, 0), vector(lines, 1), vector(lines, 2)
+        lines = vectors(values, second_bias_at, gain_at, shift_at, shift_at, shift_at, OUT)
+        second_bias, gain, shift = vector(lines, 0), vector(lines, 1), vector(lines, 2)
+        first = transposed(first_weights + first_at, WIDTH, INPUT)
+        second = transposed((values if FINE else weights) + second_at, OUT, WIDTH)
+        if NEXT > 0:
+            following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
+        if NEXT > 1:
+            following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
+    elif not IN_PLACE:
+        bias = tl.load(values + bias_at + column)
+        next_bias_0 = tl.load(values + next_bias_at_0 + column, mask=next_bias_at_0 >= 0, other=0.0)
+        next_bias_1 = tl.load(values + next_bias_at_1 + column, mask=next_bias_at_1 >= 0, other=0.0)
+        second_bias = tl.load(values + second_bias_at + outs)
+        gain, shift = tl.load(values + gain_at + outs), tl.load(values + shift_at + outs)
+    tile = tl.program_id(0)
+    while (tile * BLOCK < count) & (tile < LAST_TILE):
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = (row < count)[:, None]
+        at = row[:, None] * WIDTH + column[None, :]
+        x_tile = tl.load(x + row[:, None] * INPUT + inputs[None, :], mask=live, other=0.0).to(tl.float32)
+        if not LOOP:
+            first = transposed(first_weights + first_at, WIDTH, INPUT)
+        h = finer_product(x_tile, first, PRECISION) if FINE else product(x_tile, first, PRECISION)
+        if GATHER:
+            where = tl.load(index + row, mask=row < count, other=0)
+            h += tl.load(gathered + where[:, None] * WIDTH + column[None, :], mask=live, other=0.0).to(tl.float32)
+        if OFFSET != 0:
+            h += _shift(values, offset_at, tl.load(octant + row, mask=row < count, other=0), OFFSET, WIDTH)
+        if BIAS:
+            if IN_PLACE:
+                bias = tl.load(values + bias_at + column)
+            h += inside(bias, tile)[None, :]
+        a = leaky(h)
+        if SAVE:
+            tl.store(hidden + at, a, mask=live)
+        if not LOOP:
+            second = transposed((values if FINE else weights) + second_at, OUT, WIDTH)
+        z = finer_product(a, second, PRECISION) if FINE else product(a, second, PRECISION)
+        if IN_PLACE:
+            second_bias = tl.load(values + second_bias_at + outs)
+        z += inside(second_bias, tile)[None, :]
+        if NORM:
+            z, _scale = normalise(z, OUT)
+            if IN_PLACE:
+                gain, shift = tl.load(values + gain_at + outs), tl.load(values + shift_at + outs)
+            z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
+        if RESIDUAL:
+            z += x_tile
+        tl.store(y + row[:, None] * OUT + outs[None, :], z, mask=live)
+        if NEXT > 0:
+            if not LOOP:
+                following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
+            if IN_PLACE:
+                next_bias_0 = tl.load(values + next_bias_at_0 + column, mask=next_bias_at_0 >= 0, other=0.0)
+            later = product(z, following_0, PRECISION) + inside(next_bias_0, tile)[None, :]
+            tl.store(next_0 + at, later, mask=live)
+        if NEXT > 1:
+            if not LOOP:
+                following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
+            if IN_PLACE:
+                next_bias_1 = tl.load(values + next_bias_at_1 + column, mask=next_bias_at_1 >= 0, other=0.0)
+            later = product(z, following_1, PRECISION) + inside(next_bias_1, tile)[None, :]
+            tl.store(next_1 + at, later, mask=live)
+        tile = next_tile(tile, not LOOP)
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -207,8 +254,10 @@ def gather_project(
     table,
     count_ptr,
     weights,
+    values,
     at_0,
     at_1,
+    bias_at,
     y,
     next_0,
     next_1,
@@ -219,7 +268,8 @@ def gather_project(
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and products of y."""
+    """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and products of y, the
+    second with a bias."""
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -228,14 +278,15 @@ def gather_project(
     column = tl.arange(0, WIDTH)
     at = row[:, None] * WIDTH + column[None, :]
     if SUM > 0:
-        tile = gathered_sum(x, table, row, count, capacity, SUM, False, WIDTH, BLOCK)
+        tile = gathered_sum(x, listed(table, row, count, capacity, SUM, False), SUM, WIDTH, BLOCK)
         tl.store(y + at, tile, mask=live)
     else:
         tile = tl.load(x + at, mask=live, other=0.0).to(tl.float32)
     if NEXT > 0:
         tl.store(next_0 + at, product(tile, transposed(weights + at_0, WIDTH, WIDTH), PRECISION), mask=live)
     if NEXT > 1:
-        tl.store(next_1 + at, product(tile, transposed(weights + at_1, WIDTH, WIDTH), PRECISION), mask=live)
+        result = product(tile, transposed(weights + at_1, WIDTH, WIDTH), PRECISION)
+        tl.store(next_1 + at, result + tl.load(values + bias_at + column)[None, :], mask=live)
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -272,7 +323,7 @@ def gather_project_backward(
     if SUM == 0:
         tile = tl.load(x + at, mask=live, other=0.0).to(tl.float32)
     else:
-        tile = gathered_sum(x, table, row, count, capacity, SUM, EDGES, WIDTH, BLOCK)
+        tile = gathered_sum(x, listed(table, row, count, capacity, SUM, EDGES), SUM, WIDTH, BLOCK)
     tl.store(summed + at, tile, mask=live)
     result = product(tile, matrix(weights + at_0, WIDTH, WIDTH), PRECISION)
     if EDGES:
