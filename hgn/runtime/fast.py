@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from hgn.kernels.capture import captured
 from hgn.kernels.engine import OUT, Engine, feature_columns
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
@@ -137,20 +138,14 @@ class FastRollout:
             self.graph = self._capture()
 
     def _capture(self) -> torch.cuda.CUDAGraph:
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            # compile and warm up without moving anything: a status that is not zero stops the integration
-            self._network_pass()
-            self.grid.status.fill_(OVERFLOW)
-            self._integrate()
-            self.grid.status.zero_()
-        torch.cuda.current_stream().wait_stream(stream)
-        torch.cuda.synchronize()
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            self.frame_launches()
-        return graph
+        return captured([self.frame_launches], self._warm_up)[0]
+
+    def _warm_up(self) -> None:
+        """Compiles the kernels without moving anything: a status that is not zero stops the integration."""
+        self._network_pass()
+        self.grid.status.fill_(OVERFLOW)
+        self._integrate()
+        self.grid.status.zero_()
 
     def require_agreement(self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "path") -> None:
         """Compares the first output with the plain network's, as all kernels still stand at the start: `state` is that

@@ -6,13 +6,17 @@ so that checkpoints, monitoring and the other path find them where they belong.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.chunk import Chunk, WholeEpisode
 from hgn.kernels.grid.op import ObstacleHash
+from hgn.kernels.late import LateKernels
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import kernel_precision
@@ -20,6 +24,7 @@ from hgn.scene.symmetry import drawn_symmetry
 from hgn.training.agreement import require_agreement
 from hgn.training.fast_states import FastOwnStates
 
+REPORTED_UPDATES = 256  # the first ones, which take longest
 DATA_SHARE = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
 
 
@@ -42,6 +47,8 @@ class FastTraining:
         """`averaged` holds the moving average of the weights.
 
         loss_sum [2] and counters [5] are added to, as hgn.kernels.update.kernel.finish_update says."""
+        self._begun, self._made, self._late = time.monotonic(), 0, LateKernels()
+        self._seconds: dict[str, float] = defaultdict(float)
         self.network, self.optimizer = network, optimizer
         self.device = next(network.parameters()).device
         self.symmetric = training.symmetry != "none"
@@ -65,20 +72,17 @@ class FastTraining:
 
         Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong here.
         """
-        for index, episode in chunk.episodes.items():
-            self._episodes[index] = self._placed(episode)
+        with self._timed("placing episodes"):
+            for index, episode in chunk.episodes.items():
+                self._episodes[index] = self._placed(episode)
         if self.agreement is None:
-            first = chunk.samples[0]
-            self.updates.predict([(self._episodes[s.episode], s.frame, s.seed) for s in first])
-            episodes = [chunk.episodes[s.episode] for s in first]
-            shown = None
-            if self.symmetric:
-                shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
-            self.agreement = require_agreement(self.updates, episodes, shown)
+            with self._timed("checking the kernels"):
+                self._check(chunk)
         if self.own is not None and chunk.starts:
             average = self.updates.average
             values = self.updates.values if average is None else average
-            self.own.refresh([(self._episodes[i], frame) for i, frame in chunk.starts], values)
+            with self._timed("own states"):
+                self.own.refresh([(self._episodes[i], frame) for i, frame in chunk.starts], values)
         samples = [
             [DeviceSample(self._episodes[s.episode], s.frame, s.seed, s.weight) for s in u] for u in chunk.samples
         ]
@@ -86,6 +90,35 @@ class FastTraining:
             samples = [self.own.mixed(update, first_update + i) for i, update in enumerate(samples)]
         self.updates.run(samples, rates, shares)
         self._write_back()
+        self._made += len(chunk.samples)
+
+    def _check(self, chunk: Chunk) -> None:
+        first = chunk.samples[0]
+        self.updates.predict([(self._episodes[s.episode], s.frame, s.seed) for s in first])
+        episodes = [chunk.episodes[s.episode] for s in first]
+        shown = None
+        if self.symmetric:
+            shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
+        self.agreement = require_agreement(self.updates, episodes, shown)
+
+    @contextmanager
+    def _timed(self, what: str) -> Iterator[None]:
+        begun = time.monotonic()
+        yield
+        self._seconds[what] += time.monotonic() - begun
+
+    def report(self) -> str | None:
+        """Where the time of the first updates went: once, when REPORTED_UPDATES are made."""
+        if not self._begun or self._made < REPORTED_UPDATES:
+            return None
+        total, updates, late = time.monotonic() - self._begun, self.updates, self._late
+        self._begun = 0.0
+        parts = [f"{seconds:.1f} s {what}" for what, seconds in self._seconds.items()]
+        parts.append(f"{updates.capture_seconds:.1f} s capturing {updates.captures} times")
+        return (
+            f"fast path: the first {self._made} updates took {total:.1f} s, {', '.join(parts)}; "
+            f"in that {late.seconds:.1f} s for {late.count} kernels that were not compiled ahead"
+        )
 
     def _placed(self, episode: WholeEpisode) -> DeviceEpisode:
         """On the device while there is room, else in pinned memory, which the kernels read through the bus."""

@@ -177,6 +177,9 @@ class TrainingModule(LightningModule):
             outputs, gradients = self._fast.agreement
             text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"
             print(f"fast path: {text if math.isfinite(outputs) else 'batch too large to check'}", file=sys.stderr)
+        report = self._fast.report()
+        if report and self.trainer.is_global_zero:
+            print(report, file=sys.stderr)
         self.cursor = chunk.cursor
         # what an optimiser's and a scheduler's step leave behind, `count` times
         progress = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -111,9 +112,12 @@ def test_wrong_kernels_are_refused() -> None:
             fast.refresh(starts, values_of(network))
 
 
-def test_fast_training_is_the_plain_one(data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fast_training_is_the_plain_one(
+    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Both paths simulate the same scenes at the same updates and train on the same windows: weights, their average and
-    what is logged of the pool agree."""
+    what is logged of the pool agree. The fast one tells where the time of its first updates went."""
+    monkeypatch.setattr("hgn.training.fast.REPORTED_UPDATES", 2)
     if device().type == "cpu":
         monkeypatch.setattr("hgn.runtime.path.why_not_fast", lambda *_: None)  # kernels run in the interpreter
     same = {"noise_std": 0.0, "grid_jitter": False, "ema_decay": 0.7, "symmetry": "gravity"}
@@ -132,6 +136,7 @@ def test_fast_training_is_the_plain_one(data: DatagenConfig, tmp_path: Path, mon
         assert train.main(run_mapping(data, tmp_path / path, path=path, **same, **own, **counts)) == 0
         ends[path] = read_checkpoint(tmp_path / path / "checkpoints" / "last.ckpt")
         lines[path] = next(line for line in metrics(tmp_path / path) if "loss" in line)
+    assert re.findall(r"the first 2 updates took .* s own states, .* capturing 0 times", capsys.readouterr().err)
     # Adam's first steps are signs of gradients: where those are next to nothing, rounding decides
     for key, value in ends["plain"]["state_dict"].items():
         assert float((ends["fast"]["state_dict"][key] - value).double().abs().mean()) < 1e-5, key

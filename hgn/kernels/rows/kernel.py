@@ -117,8 +117,10 @@ def rows_forward(
             first = transposed(first_weights + first_at, WIDTH, INPUT)
         h = finer_product(x_tile, first, PRECISION) if FINE else product(x_tile, first, PRECISION)
         if GATHER:
-            where = tl.load(index + row, mask=row < count, other=0)
-            h += tl.load(gathered + where[:, None] * WIDTH + column[None, :], mask=live, other=0.0).to(tl.float32)
+            # a parent past the capacity is none (-1): the pass is void, and reads nothing in its place
+            where = tl.load(index + row, mask=row < count, other=-1)
+            there = (where >= 0)[:, None]
+            h += tl.load(gathered + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
         if OFFSET != 0:
             h += _shift(values, offset_at, tl.load(octant + row, mask=row < count, other=0), OFFSET, WIDTH)
         if BIAS:
@@ -210,8 +212,9 @@ def rows_backward(
     at = row[:, None] * WIDTH + column[None, :]
     out_at = row[:, None] * OUT + outs[None, :]
     if GATHER:
-        where = tl.load(gradient_index + row, mask=row < count, other=0)
-        dy = tl.load(gradient + where[:, None] * OUT + outs[None, :], mask=live, other=0.0).to(tl.float32)
+        where = tl.load(gradient_index + row, mask=row < count, other=-1)
+        there = (where >= 0)[:, None]
+        dy = tl.load(gradient + where[:, None] * OUT + outs[None, :], mask=there, other=0.0).to(tl.float32)
     else:
         dy = tl.load(gradient + out_at, mask=live, other=0.0).to(tl.float32)
     if NEXT > 0:

@@ -8,8 +8,10 @@ Shape legend: K updates, S scenes, N particles of all scenes.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ import triton
 
 from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES, TrainingConfig
 from hgn.kernels.backward import TrainingEngine
+from hgn.kernels.capture import captured
 from hgn.kernels.engine import OUT, feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
 from hgn.kernels.muon.op import SquareBlocks
@@ -29,6 +32,7 @@ from hgn.schema import ConfigError
 
 SAMPLE_COLUMNS = 11
 GROWTH = 1.25
+TABLE_UPDATES = 64  # that the tables hold at least: with tables that grow the graph would be captured anew
 BLOCK = 128
 FLAT_BLOCK = 1024
 TAIL = 16  # elements behind the gradient, of which the first tells the other ranks of an overflow
@@ -47,9 +51,20 @@ class DeviceEpisode:
     domain_size: tuple[float, float, float]
     symmetries: tuple[Symmetry, ...] = ()  # of which one is drawn for each sample, where that is asked
 
-    @property
+    def __post_init__(self) -> None:
+        position_TN3, material_N = self.position_TN3, self.material_N
+        assert position_TN3.dtype == torch.float32 and position_TN3.is_contiguous()
+        assert material_N.dtype == torch.int32 and material_N.is_contiguous()
+        assert position_TN3.shape[1:] == (len(material_N), 3)
+
+    @cached_property
     def particles(self) -> int:
         return len(self.material_N)
+
+    @cached_property
+    def frames(self) -> int:
+        """All of them, those before frame 0 too."""
+        return len(self.position_TN3)
 
 
 class DeviceSample(NamedTuple):
@@ -138,6 +153,7 @@ class Updates:
         self.capacities = capacities
         self.particles = 0
         self.growths = 0  # how often the buffers had to grow
+        self.captures, self.capture_seconds = 0, 0.0
         self._reach = (torch.zeros(3), torch.zeros(3))  # what the window must hold
         self._graphs: list[torch.cuda.CUDAGraph] = []
         self._samples = self._domains = self._rates = self._shares = torch.empty(0)
@@ -189,7 +205,7 @@ class Updates:
 
     def _upload(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> int:
         """Writes the chunk's tables; the most particles of an update."""
-        scenes, most = self.settings.scenes, 0
+        scenes, history, most = self.settings.scenes, self.config.velocity_history, 0
         table = np.zeros((len(chunk), scenes, SAMPLE_COLUMNS), np.int64)
         domain = np.ones((len(chunk), scenes, 3), np.float32)
         for k, samples in enumerate(chunk):
@@ -198,6 +214,8 @@ class Updates:
             for s, sample in enumerate(samples):
                 episode, frame, seed, weight = DeviceSample(*sample)
                 count = episode.particles
+                # kernels read raw addresses: what is not there would be read all the same
+                assert 0 <= frame <= episode.frames - history - 2, "a window reaches beyond its episode"
                 at = episode.position_TN3.data_ptr() + frame * count * 12
                 row = episode.obstacles.row() if episode.obstacles is not None else [0] * OBSTACLE_COLUMNS
                 if self.settings.symmetry:
@@ -208,7 +226,7 @@ class Updates:
                 first += count
             most = max(most, first)
         if len(chunk) > len(self._rates):
-            self._allocate_tables(len(chunk))
+            self._allocate_tables(max(len(chunk), TABLE_UPDATES))
         self._samples[: len(chunk)].copy_(torch.from_numpy(table))
         self._domains[: len(chunk)].copy_(torch.from_numpy(domain))
         self._rates[: len(chunk)].copy_(torch.tensor(rates, dtype=torch.float64))
@@ -439,23 +457,20 @@ class Updates:
         self._build()
 
     def _capture(self) -> None:
+        begun = time.monotonic()
         parts = (
             [self.launches] if self.reduce is None else [self.launches_before_reduction, self.launches_after_reduction]
         )
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            self.grid.status.fill_(kernel.REPEAT.value)  # compile and warm up without changing anything
+
+        def warm_up() -> None:
+            self.grid.status.fill_(kernel.REPEAT.value)  # compiles and changes nothing
             for part in parts:
                 part()
             self.grid.status.zero_()
-        torch.cuda.current_stream().wait_stream(stream)
-        torch.cuda.synchronize()
-        for part in parts:
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                part()
-            self._graphs.append(graph)
+
+        self._graphs = captured(parts, warm_up)
+        self.captures += 1
+        self.capture_seconds += time.monotonic() - begun
 
 
 def _rounded(needed: Sequence[int]) -> tuple[int, ...]:

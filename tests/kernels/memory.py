@@ -1,0 +1,110 @@
+"""A memory checker for kernels in Triton's interpreter: what compute-sanitizer is on a GPU.
+
+Inside `checked_memory` every access of a kernel, through an argument or a raw address in a table, must lie in the
+storage of a tensor that is alive when the kernel is launched.
+"""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import triton
+from triton.runtime import interpreter
+
+
+class IllegalAccessError(AssertionError):
+    """A kernel has read or written what is no tensor's memory."""
+
+
+def _tensors() -> list[torch.Tensor]:
+    return [thing for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor)]
+
+
+class Alive:
+    """The memory of all tensors that are alive now."""
+
+    def __init__(self, tensors: list[torch.Tensor] | None = None) -> None:
+        found = {}
+        for tensor in _tensors() if tensors is None else tensors:
+            if tensor.device.type == "cpu":
+                found[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        spans = np.array(sorted((at, at + size) for at, size in found.items() if at and size), np.uint64)
+        self._start, self._end = spans[:, 0].copy(), spans[:, 1].copy()
+
+    def holds(self, address: Any, size: int) -> np.ndarray:
+        """Of each address whether so many bytes from it on belong to one tensor."""
+        at = np.asarray(address, np.uint64)
+        index = np.searchsorted(self._start, at, side="right").astype(np.int64) - 1
+        return (index >= 0) & (at + np.uint64(size) <= self._end[np.maximum(index, 0)])
+
+
+class Checked:
+    """The interpreter's memory operations, each address looked up first."""
+
+    def __init__(self, module: Any) -> None:
+        self._module = module
+        self._launch = ""
+        # what is there at the start is looked for once, and leaves the collector's lists: they are long
+        self._old = [weakref.ref(tensor) for tensor in _tensors()]
+        gc.freeze()
+        self._alive = self._now()
+        self.launches: list[tuple[str, tuple[int, ...]]] = []  # each with the addresses of its tensors
+
+    def _now(self) -> Alive:
+        old = [tensor for tensor in (reference() for reference in self._old) if tensor is not None]
+        return Alive(old + _tensors())
+
+    def begin(self, launch: str, arguments: tuple[Any, ...]) -> None:
+        pointers = tuple(a.data_ptr() for a in arguments if isinstance(a, torch.Tensor))
+        self.launches.append((launch, pointers))
+        self._launch, self._alive = launch, self._now()
+
+    def _check(self, what: str, address: Any, mask: Any, size: int) -> None:
+        at = np.asarray(address).reshape(-1).astype(np.uint64)
+        if mask is not None:
+            at = at[np.broadcast_to(np.asarray(mask), np.asarray(address).shape).reshape(-1).astype(bool)]
+        wrong = int((~self._alive.holds(at, size)).sum())
+        if wrong:
+            raise IllegalAccessError(f"{self._launch}: {what} at {wrong} addresses that are no tensor's")
+
+    def load(self, address: Any, mask: Any, other: Any, dtype: Any) -> Any:
+        self._check("load", address, mask, np.dtype(dtype).itemsize)
+        return self._module.load(address, mask, other, dtype)
+
+    def store(self, address: Any, value: Any, mask: Any) -> Any:
+        self._check("store", address, mask, np.asarray(value).dtype.itemsize)
+        return self._module.store(address, value, mask)
+
+    def atomic_rmw(self, operation: Any, address: Any, value: Any, mask: Any, order: Any) -> Any:
+        self._check("atomic", address, mask, np.asarray(value).dtype.itemsize)
+        return self._module.atomic_rmw(operation, address, value, mask, order)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._module, name)
+
+
+@contextmanager
+def checked_memory() -> Iterator[Checked]:
+    """Raises IllegalAccessError (inside Triton's InterpreterError) in a launch that leaves the memory of tensors."""
+    assert triton.knobs.runtime.interpret
+    checked = Checked(interpreter._interpreter)
+    run = interpreter.GridExecutor.__call__
+
+    def launch(self: Any, *arguments: Any, **named: Any) -> None:
+        checked.begin(self.fn.__name__, arguments)
+        run(self, *arguments, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interpreter, "_interpreter", checked)
+        patch.setattr(interpreter.GridExecutor, "__call__", launch)
+        try:
+            yield checked
+        finally:
+            gc.unfreeze()

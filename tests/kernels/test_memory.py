@@ -1,0 +1,96 @@
+"""Kernels stay within the memory of living tensors: in buffers that are too small, at raw addresses of tables."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import replace
+
+import pytest
+import torch
+from kernels.engines import device, engine_of, inference_of, run_forward
+from kernels.memory import Alive, checked_memory
+from kernels.test_own_states import CELL_SIZE, placed, values_of
+from kernels.test_update import HISTORY, episode, updates_of
+from network.states import network_of, random_state
+from training.test_noise import episode as falling_episode
+from training.test_own_states import training_of
+from training.test_symmetry import scene_with_obstacles
+from triton.runtime.errors import InterpreterError
+
+from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW
+from hgn.kernels.update.op import DeviceSample
+from hgn.training.fast_states import FastOwnStates
+
+cpu_only = pytest.mark.skipif(device().type != "cpu", reason="the checker sees what the interpreter does")
+
+
+@cpu_only
+def test_the_checker_sees_what_has_gone() -> None:
+    """A window whose episode is no longer alive is noticed before it is read."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
+    updates = updates_of(network, 1, capacities=(64,))
+    made, _ = episode(1, 5, False)
+    gone = replace(made, position_TN3=made.position_TN3.clone())
+    updates.particles, updates._reach = 16, (torch.zeros(3), torch.ones(3))
+    for sample in (made, gone):
+        updates._upload([[(sample, 1, 3)]], [1e-3])
+        updates._build()
+        if sample is made:
+            with checked_memory():
+                updates._assemble()
+    del gone, sample
+    gc.collect()
+    with checked_memory(), pytest.raises(InterpreterError, match=r"assemble_batch: load at .* that are no"):
+        updates._assemble()
+
+
+@cpu_only
+@pytest.mark.parametrize("training", [True, False])
+def test_a_pass_without_room_stays_within_memory(training: bool) -> None:
+    """Where only the coarse level has too little room, cells of the fine one have no parent: the pass is void, and
+    reads nothing in its place. The same where particles are outside of the window, or nowhere."""
+    network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.05)
+    state = random_state((4, 3), obstacles=False, spread=0.9)
+    engine = engine_of(network, state, capacities=(64, 8))
+    state.position_N3[5] = 40.0
+    state.position_N3[6] = float("nan")
+    with checked_memory() as checked:
+        passes = engine if training else inference_of(engine, network)
+        run_forward(passes, network, state, torch.zeros(2, 3))
+        if training:
+            engine.output_gradient.fill_(1.0)
+            engine.backward()
+    needed, capacities = engine.grid.needed_L.tolist(), engine.grid.capacities
+    assert needed[0] <= capacities[0] and needed[1] > capacities[1]
+    assert int(engine.grid.status) == OVERFLOW | OUT_OF_WINDOW
+    assert (engine.grid.parent(0)[: needed[0]] < 0).any() and len(checked.launches) > 5
+
+
+@cpu_only
+def test_own_states_stay_within_memory() -> None:
+    """Simulation after simulation, larger and smaller ones, scenes that are lost among them: every address that an
+    update is given holds a whole window (or all materials and obstacles) of a living tensor, and each simulation in the
+    same buffers launches what was captured, on the same memory."""
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, cell_size=0.1)
+    scenes = [scene_with_obstacles(0, 4), falling_episode(3, seed=1), scene_with_obstacles(3, 14)]
+    own = FastOwnStates(network, training_of(precision="highest", rollout_frames=2, rollout_share=0.9), CELL_SIZE, 0)
+    episodes = [placed(scene, network) for scene in scenes]
+    updates = updates_of(network, 4)
+    frames: dict[object, set[tuple]] = {}
+    for turn, (starts, mean) in enumerate([((0, 1), 0.0), ((1, 1), float("nan")), ((2, 0), 0.0)]):
+        network.normaliser.acceleration_mean.fill_(mean)
+        with checked_memory() as checked:
+            own.refresh([(episodes[i], i) for i in starts], values_of(network))
+        last = max(i for i, (name, _) in enumerate(checked.launches) if name == "mark_cells")
+        frames.setdefault(own._rollout, set()).add(tuple(checked.launches[last:]))
+        samples = [DeviceSample(episodes[i % 3], i, 7 * i + turn) for i in range(4)]
+        mixed = [own.mixed(samples, 5 * turn + i) for i in range(3)]
+        assert any(sample.episode in own._entries for update in mixed for sample in update) or not own._entries
+        updates._upload(mixed, [0.0] * 3)
+        alive = Alive()
+        for row in updates._samples[:3].flatten(0, 1).tolist():
+            address, count, _, _, materials, _, buckets, keys, normals, mask, _ = row
+            assert alive.holds(address, (HISTORY + 2) * count * 12) and alive.holds(materials, 4 * count)
+            if buckets:
+                assert alive.holds(buckets, 4 * (mask + 2)) and alive.holds(keys, 8) and alive.holds(normals, 12)
+    assert len(frames) == 2 and all(len(launches) == 1 for launches in frames.values())
