@@ -415,7 +415,7 @@ class TrainingEngine(Engine):
         table = grid.neighbour(level)
         size, warps = self._row_block(rows)
         edge_size, edge_warps = self._edge_block(rows)
-        overlap = self.overlaps()
+        overlap = self.overlaps(rows)
         for m in reversed(range(steps)):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             later = m if last else m + 1

@@ -43,7 +43,8 @@ class Tuning:
     small_block: int = 16  # where there are few rows
     small_warps: int = 8
     dense: bool = False  # six rows a cell in the tiles of edges, not eight
-    overlap: bool = False  # kernels of a message step read their weights before their turn
+    overlap: bool = False  # kernels of a message step read their weights before their turn, where there are few rows
+    overlap_many: bool = False  # and where there are many: faster, and not yet compared with the plain network on a GPU
     loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
     pair_programs: int = 2  # on a processor, in inference
     pair_registers: int | None = None  # of a thread, so that as many fit
@@ -311,9 +312,10 @@ class Engine:
         programs = triton.cdiv(rows, block)
         return (min(programs, PROCESSORS) if loops else programs,)
 
-    def overlaps(self) -> bool:
-        """Whether the kernels of a message step start before the one before has ended."""
-        if not self.tuning.overlap or triton.knobs.runtime.interpret:
+    def overlaps(self, rows: int) -> bool:
+        """Whether the kernels of a message step on so many cells start before the one before has ended."""
+        wanted = self.tuning.overlap_many if self._many(rows) else self.tuning.overlap
+        if not wanted or triton.knobs.runtime.interpret:
             return False
         target = triton.runtime.driver.active.get_current_target()
         return target.backend == "cuda" and target.arch >= 90
@@ -460,7 +462,7 @@ class Engine:
         rows = grid.capacities[level]
         size, warps = self._row_block(rows)
         edge_size, edge_warps = self._edge_block(rows)
-        overlap, loops = self.overlaps(), self._loops(rows, size)
+        overlap, loops = self.overlaps(rows), self._loops(rows, size)
         for m in range(steps):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             if not last:
