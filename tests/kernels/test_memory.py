@@ -44,14 +44,14 @@ def test_the_checker_sees_what_has_gone() -> None:
         updates._assemble()
 
 
-@cpu_only
 @pytest.mark.parametrize("training", [True, False])
 def test_a_pass_without_room_stays_within_memory(training: bool) -> None:
     """Where only the coarse level has too little room, cells of the fine one have no parent: the pass is void, and
     reads nothing in its place. The same where particles are outside of the window, or nowhere."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.05)
     state = random_state((4, 3), obstacles=False, spread=0.9)
-    engine = engine_of(network, state, capacities=(64, 8))
+    precision = "ieee" if device().type == "cpu" else "tf32x3"
+    engine = engine_of(network, state, precision, capacities=(64, 8))
     state.position_N3[5] = 40.0
     state.position_N3[6] = float("nan")
     with checked_memory() as checked:
@@ -63,7 +63,8 @@ def test_a_pass_without_room_stays_within_memory(training: bool) -> None:
     needed, capacities = engine.grid.needed_L.tolist(), engine.grid.capacities
     assert needed[0] <= capacities[0] and needed[1] > capacities[1]
     assert int(engine.grid.status) == OVERFLOW | OUT_OF_WINDOW
-    assert (engine.grid.parent(0)[: needed[0]] < 0).any() and len(checked.launches) > 5
+    assert (engine.grid.parent(0)[: needed[0]] < 0).any()
+    assert len(checked.launches) > 5 or device().type != "cpu"
 
 
 @cpu_only
