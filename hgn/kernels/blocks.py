@@ -110,6 +110,13 @@ def vectors(pointer, at_0, at_1, at_2, at_3, at_4, WIDTH: tl.constexpr):
 
 
 @triton.jit
+def optional_vector(pointer, at, WIDTH: tl.constexpr):
+    """The vector [WIDTH] at place `at`, zeros where that is below zero."""
+    place = at + tl.zeros((WIDTH,), tl.int32)  # a mask of one number Triton 3.9's interpreter does not take
+    return tl.load(pointer + place + tl.arange(0, WIDTH), mask=place >= 0, other=0.0)
+
+
+@triton.jit
 def vector(matrix, number: tl.constexpr):
     return tl.sum(tl.where(tl.arange(0, 8)[:, None] == number, matrix, 0.0), 0)
 

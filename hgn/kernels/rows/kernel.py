@@ -21,6 +21,7 @@ from hgn.kernels.blocks import (
     next_tile,
     normalise,
     normalise_backward,
+    optional_vector,
     product,
     transposed,
     vector,
@@ -103,8 +104,8 @@ def rows_forward(
             following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
     elif not IN_PLACE:
         bias = tl.load(values + bias_at + column)
-        next_bias_0 = tl.load(values + next_bias_at_0 + column, mask=next_bias_at_0 >= 0, other=0.0)
-        next_bias_1 = tl.load(values + next_bias_at_1 + column, mask=next_bias_at_1 >= 0, other=0.0)
+        next_bias_0 = optional_vector(values, next_bias_at_0, WIDTH)
+        next_bias_1 = optional_vector(values, next_bias_at_1, WIDTH)
         second_bias = tl.load(values + second_bias_at + outs)
         gain, shift = tl.load(values + gain_at + outs), tl.load(values + shift_at + outs)
     tile = tl.program_id(0)
@@ -148,14 +149,18 @@ def rows_forward(
             if not LOOP:
                 following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
             if IN_PLACE:
-                next_bias_0 = tl.load(values + next_bias_at_0 + column, mask=next_bias_at_0 >= 0, other=0.0)
+                next_bias_0 = tl.load(
+                    values + next_bias_at_0 + column, mask=(next_bias_at_0 >= 0) & (column >= 0), other=0.0
+                )
             later = product(z, following_0, PRECISION) + inside(next_bias_0, tile)[None, :]
             tl.store(next_0 + at, later, mask=live)
         if NEXT > 1:
             if not LOOP:
                 following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
             if IN_PLACE:
-                next_bias_1 = tl.load(values + next_bias_at_1 + column, mask=next_bias_at_1 >= 0, other=0.0)
+                next_bias_1 = tl.load(
+                    values + next_bias_at_1 + column, mask=(next_bias_at_1 >= 0) & (column >= 0), other=0.0
+                )
             later = product(z, following_1, PRECISION) + inside(next_bias_1, tile)[None, :]
             tl.store(next_1 + at, later, mask=live)
         tile = next_tile(tile, not LOOP)
