@@ -22,6 +22,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.agreement import OUTPUT_BOUND, relative_error
+from hgn.runtime.divergence import lost
 from hgn.runtime.path import kernel_precision
 from hgn.schema import ConfigError
 
@@ -251,8 +252,7 @@ class FastRollout:
 
     def _lost(self) -> int:
         position_N3, domain_N3 = self.position_N3[: self.live], self.domain_S3[self.scene_N[: self.live].long()]
-        inside = (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)
-        return int(inside.logical_not().any(-1).sum())
+        return int(lost(position_N3, domain_N3).sum())
 
     def _grow(self) -> None:
         needed = self.grid.needed_L.tolist()

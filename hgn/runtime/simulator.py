@@ -19,6 +19,7 @@ from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import GridRangeError
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.runtime.divergence import lost
 from hgn.runtime.gns_edges import require_agreement, use_edges
 from hgn.runtime.gns_graph import GnsGraphs
 from hgn.scene.episode import Episode
@@ -183,10 +184,8 @@ class Simulator:
 
     @staticmethod
     def _check(state: ParticleState, frame: int) -> None:
-        domain_N3 = state.domain_S3[state.scene_N]
-        inside = (state.position_N3 > -domain_N3) & (state.position_N3 < 2 * domain_N3)  # NaN is outside
-        if not bool(inside.all()):
-            left = int(inside.logical_not().any(-1).sum())
+        left = int(lost(state.position_N3, state.domain_S3[state.scene_N]).sum())
+        if left:
             raise DivergenceError(frame, _left(left, len(state.position_N3)))
 
 

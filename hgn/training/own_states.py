@@ -21,6 +21,7 @@ import torch
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch, make_batch
 from hgn.network.base import ParticleNetwork
+from hgn.runtime.divergence import lost
 from hgn.runtime.simulator import Simulator
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
@@ -92,12 +93,6 @@ def frames_kept(
     good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~lost(simulated_FN3, domain_3).any(-1)  # NaN is not
     count = good_F.int().cumprod(0).sum()
     return count, square_F[(count - 1).clamp(min=0)]
-
-
-def lost(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
-    """Which particles are not finite or farther from the domain than its own size, bool [..., N]."""
-    inside = (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)  # NaN is outside
-    return ~inside.all(-1)
 
 
 def lost_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: torch.Tensor) -> torch.Tensor:
