@@ -512,14 +512,6 @@ class RenderConfig:
 
 
 @dataclass(frozen=True)
-class CurvesConfig:
-    """`python -m tools.curves`: learning curves of a run."""
-
-    run: str
-    out: str
-
-
-@dataclass(frozen=True)
 class KillsConfig:
     """`python -m tools.kills`: how often and when, beside what `python -m datagen` takes."""
 

@@ -1,0 +1,71 @@
+"""tools.curves: one run, several runs, a run that was stopped, and folders that are none."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from PIL import Image
+
+from hgn.schema import ConfigError
+from tools.curves import main, read_run
+
+SETTINGS = {
+    "training": {"batch_scenes": 2},
+    "dataset": {"folder": "data/obstacles"},
+    "provenance": {"device": "a device", "commit": "abc", "date": "2026-01-01T00:00:00+00:00"},
+}
+
+
+def make_run(folder: Path, updates: int = 40, pause: float = 0.0, repeated: int = 0) -> Path:
+    """A run that logs each second; `pause` seconds away after half of its updates, the last `repeated` then again."""
+    folder.mkdir(parents=True)
+    numbers = [*range(updates // 2), *range(updates // 2 - repeated, updates)]
+    lines, now = [], 100.0
+    for i, update in enumerate(numbers):
+        now += 1 + (pause if i == updates // 2 else 0)
+        lines.append({"update": update, "time": now, "loss": 1 / (i + 1), "episodes": 3})
+        if update % 10 == 9:
+            errors = {"one_step/validation": 1e-6 / update, "trivial/validation_constant_velocity": 1e-5}
+            lines.append({"update": update, "time": now, "rollout/mse_frame_10": 1e-4} | errors)
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "config.yaml").write_text(yaml.safe_dump(SETTINGS))
+    return folder
+
+
+def test_figure_and_rows_of_one_run(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "first")
+    assert main({"runs": [str(run)], "out": str(tmp_path / "curves")}) == 0
+    width, height = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).size
+    assert width > 1000 and height > 300
+    (written,) = json.loads((tmp_path / "curves.json").read_text())["runs"]
+    assert written["name"] == "first" and written["meta"]["device"] == "a device"
+    assert [row["update"] for row in written["rows"] if "loss" in row] == list(range(40))
+    assert [row["one_step/validation"] for row in written["rows"] if "one_step/validation" in row] == [
+        1e-6 / update for update in (9, 19, 29, 39)
+    ]
+
+
+def test_several_runs_have_a_colour_and_a_name_each(tmp_path: Path) -> None:
+    runs = [str(make_run(tmp_path / name)) for name in ("x", "y")]
+    assert main({"runs": runs, "names": ["ours", "theirs"], "out": str(tmp_path / "curves")}) == 0
+    assert [run["name"] for run in json.loads((tmp_path / "curves.json").read_text())["runs"]] == ["ours", "theirs"]
+    picture = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).convert("RGB")
+    colours = {colour for _, colour in picture.getcolors(1 << 24)}
+    assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines are drawn
+
+
+def test_time_of_a_stop_is_no_training(tmp_path: Path) -> None:
+    records = read_run(make_run(tmp_path / "run", pause=5000, repeated=3), "run").records
+    assert [record["update"] for record in records if "loss" in record] == list(range(40))
+    assert records[-1]["minutes"] * 60 == pytest.approx(42)  # 43 lines, a second apart; the repeated ones took time too
+
+
+def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"runs must be folders of python -m hgn.train, got .*empty"):
+        read_run(tmp_path / "empty", "empty")
+    with pytest.raises(ConfigError, match="names must be one for each of the 1 runs"):
+        main({"runs": ["a"], "names": ["x", "y"], "out": "curves"})
