@@ -161,7 +161,7 @@ def draw_several(runs: list[Run]) -> bytes:
     """Loss and validation error over updates, and the latter over minutes; PNG bytes."""
     figure, ((left, middle, right),) = new_figure(1, 3, (15, 4.5))
     for i, run in enumerate(runs):
-        label, color = f"{run.name}, {run.settings['training']['batch_scenes']} scenes an update", f"C{i}"
+        label, color = f"{run.name}, {run.settings['training']['batch_scenes']} scenes", f"C{i}"
         losses = [record for record in run.records if "loss" in record]
         _plot(left, _means(losses, "loss"), "loss", label, color)
         for axes, against in ((middle, "update"), (right, "minutes")):
@@ -169,7 +169,7 @@ def draw_several(runs: list[Run]) -> bytes:
     for axes in (middle, right):
         _trivial_lines(axes, _last(runs[0].records))
         axes.set_ylabel(ONE_STEP + ", validation")
-    left.set_ylabel(LOSS + ", noisy input, mean of neighbouring lines")
+    left.set_ylabel(LOSS)
     for axes, label in ((left, "updates"), (middle, "updates"), (right, "minutes of training")):
         _finish(axes, label)
     figure.suptitle("; ".join(sorted({_origin(run) for run in runs})), fontsize=10)
