@@ -475,43 +475,6 @@ class EvaluateConfig:
 
 
 @dataclass(frozen=True)
-class RenderConfig:
-    """`python -m tools.render`: pictures of a rollout file, or of an episode of a data set."""
-
-    out: str  # a folder, or one file that ends in .png or .gif
-    rollout: str | None = None
-    data: str | None = None  # folder of a data set
-    episode: str | None = None  # key of an episode in it, as in validation-000000
-    frames: tuple[int, ...] | None = None  # in the PNG; none: four, evenly spread
-    gif: bool = True
-    every: int = 3  # frames of the rollout for one picture of the GIF
-    fps: float | None = None  # pictures per second of the GIF; none: real time
-    size: int = 360  # width of one panel, pixels
-
-    def __post_init__(self) -> None:
-        require(self.out != "", "out", "a folder or a file name", self.out)
-        if self.rollout is None:
-            require(
-                self.data is not None and self.episode is not None,
-                "rollout",
-                "a file, or else data and episode given",
-                self.rollout,
-                "as in rollout=rollout.vtkhdf out=pictures",
-            )
-        else:
-            require(
-                self.data is None and self.episode is None,
-                "rollout",
-                "left out where data and episode are given",
-                self.rollout,
-            )
-        require(self.every >= 1, "every", "at least 1", self.every)
-        require(64 <= self.size <= 4096, "size", "64 to 4096 pixels", self.size)
-        if self.fps is not None:
-            require_positive(self, "fps")
-
-
-@dataclass(frozen=True)
 class KillsConfig:
     """`python -m tools.kills`: how often and when, beside what `python -m datagen` takes."""
 

@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
@@ -29,6 +30,7 @@ TEXT_COLOR = (45, 50, 60)
 FAINT_COLOR = (130, 136, 146)
 PALETTE_SAMPLES = 40_000
 Color = tuple[int, int, int]
+NO_OTHERS: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 def draw_frame(
@@ -54,20 +56,23 @@ def draw_frame(
     return picture
 
 
-def compare_picture(rollout: Rollout, frames: Sequence[int], size: int = 360, label: str = "prediction") -> Image.Image:
+def compare_picture(
+    rollout: Rollout,
+    frames: Sequence[int],
+    size: int = 360,
+    label: str = "prediction",
+    others: Mapping[str, np.ndarray] = NO_OTHERS,
+) -> Image.Image:
     """A grid: a column each frame, the prediction above, the ground truth below where there is one.
 
-    size: width of one panel in pixels. label: what stands beside the first row.
+    size: width of one panel in pixels. label: what stands beside the first row. others: positions
+    float32 [T, N, 3] of the same particles as simulated otherwise, by name: rows between these two.
 
-    Raises: ConfigError when a frame lies outside the rollout.
+    Raises: ConfigError when a frame lies outside the rollout, or others hold other particles.
     """
     check_frames(frames, rollout.frame_count)
     stage = _stage(rollout, size)
-    rows = [(label, rollout.position_TN3)]
-    if rollout.reference_TN3 is not None:
-        rows.append(("ground truth", rollout.reference_TN3))
-    elif "weights" not in rollout.source:
-        rows = [("", rollout.position_TN3)]
+    rows = _versions(rollout, label, others)
     width, height = stage.size
     gap, header, footer = size // 30, _header_height(size), _header_height(size)
     left = header if rows[0][0] else 0
@@ -109,13 +114,16 @@ def animate(
     every: int = 3,
     size: int = 360,
     progress: Callable[[int, int], None] | None = None,
+    label: str = "prediction",
+    others: Mapping[str, np.ndarray] = NO_OTHERS,
 ) -> None:
     """Writes a GIF of every `every`-th frame, the prediction beside the ground truth where there is one.
 
     fps: pictures per second, none for real time; GIF counts in hundredths of a second. size: width of one
-    panel in pixels. progress: called with (pictures drawn, pictures in all).
+    panel in pixels. progress: called with (pictures drawn, pictures in all). label, others: as in compare_picture.
 
-    Raises: ConfigError when fps is not in (0, 50], which viewers slow down, or every is below 1.
+    Raises: ConfigError when fps is not in (0, 50], which viewers slow down, every is below 1, or others hold other
+    particles.
     """
     if not every >= 1:
         raise ConfigError(f"every must be at least 1, got {every}")
@@ -125,8 +133,9 @@ def animate(
         raise ConfigError(f"fps must be in (0, 50], which GIF viewers keep, got {rate:g}; {remedy}")
     frames = range(0, rollout.frame_count, every)
     stage = _stage(rollout, size)
-    palette = _Palette([_animation_picture(stage, rollout, frames[i], size) for i in spread(len(frames), 6)])
-    pictures = _animation(stage, rollout, frames, size, palette, progress)
+    versions = _versions(rollout, label, others)
+    palette = _Palette([_animation_picture(stage, rollout, versions, frames[i], size) for i in spread(len(frames), 6)])
+    pictures = _animation(stage, rollout, versions, frames, size, palette, progress)
     buffer = io.BytesIO()
     next(pictures).save(
         buffer,
@@ -270,33 +279,43 @@ def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, material_N: np.nd
     return panel
 
 
+def _versions(rollout: Rollout, label: str, others: Mapping[str, np.ndarray]) -> list[tuple[str, np.ndarray]]:
+    """Names and positions of what is drawn side by side; an episode that stands alone needs no name."""
+    for name, position_TN3 in others.items():
+        if position_TN3.shape[1:] != rollout.position_TN3.shape[1:]:
+            raise ConfigError(
+                f"{name} must hold the same {rollout.position_TN3.shape[1]} particles, got {position_TN3.shape[1]}"
+            )
+    predicted = "weights" in rollout.source or rollout.reference_TN3 is not None or len(others) > 0
+    truth = [] if rollout.reference_TN3 is None else [("ground truth", rollout.reference_TN3)]
+    return [(label if predicted else "", rollout.position_TN3), *others.items(), *truth]
+
+
 def _animation(
     stage: Stage,
     rollout: Rollout,
+    versions: Sequence[tuple[str, np.ndarray]],
     frames: range,
     size: int,
     palette: _Palette,
     progress: Callable[[int, int], None] | None,
 ) -> Iterator[Image.Image]:
     for done, frame in enumerate(frames, start=1):
-        yield palette.apply(_animation_picture(stage, rollout, frame, size))
+        yield palette.apply(_animation_picture(stage, rollout, versions, frame, size))
         if progress is not None:
             progress(done, len(frames))
 
 
-def _animation_picture(stage: Stage, rollout: Rollout, frame: int, size: int) -> Image.Image:
-    panels = [_panel(stage, rollout.position_TN3, frame, rollout.material_N)]
-    labels = ["prediction" if "weights" in rollout.source else ""]
-    if rollout.reference_TN3 is not None:
-        panels.append(_panel(stage, rollout.reference_TN3, frame, rollout.material_N))
-        labels = ["prediction", "ground truth"]
+def _animation_picture(
+    stage: Stage, rollout: Rollout, versions: Sequence[tuple[str, np.ndarray]], frame: int, size: int
+) -> Image.Image:
     width, height = stage.size
     gap, header = size // 30, _header_height(size)
-    picture = Image.new("RGB", (len(panels) * (width + gap) - gap, height + 2 * header), _background())
+    picture = Image.new("RGB", (len(versions) * (width + gap) - gap, height + 2 * header), _background())
     seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
-    for column, (panel, label) in enumerate(zip(panels, labels, strict=True)):
+    for column, (label, position_TN3) in enumerate(versions):
         x = column * (width + gap)
-        picture.paste(panel, (x, header))
+        picture.paste(_panel(stage, position_TN3, frame, rollout.material_N), (x, header))
         text = f"{label}   {seconds}" if label else seconds
         _write(picture, (x + width / 2, header / 2), text, _text_size(size))
     _legend(picture, picture.height - header / 2, rollout, _text_size(size))

@@ -1,17 +1,20 @@
 """python -m tools.render rollout=FILE out=FOLDER_OR_FILE: pictures of a rollout, or of an episode of a data set.
 
 Into a folder go NAME.png (frames beside each other), NAME.gif (the animation) and, with ground truth,
-NAME_error.png (error over time); into a file that ends in .png or .gif goes that picture alone.
+NAME_error.png (error over time); into a file that ends in .png or .gif goes that picture alone. Other rollouts of the
+same scene (`others=[FILE,...]`) are drawn beside it, under `names`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hgn.command import run_command
-from hgn.config import RenderConfig
 from hgn.data.select import find_episode
 from hgn.picture import (
     animate,
@@ -24,9 +27,63 @@ from hgn.picture import (
 )
 from hgn.progress import bar
 from hgn.scene.rollout_file import Rollout, read_rollout
-from hgn.schema import ConfigError, from_mapping
+from hgn.schema import ConfigError, from_mapping, require, require_positive
 
 PICTURES = 4  # in the PNG, where frames does not say
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """The options of `python -m tools.render`. See conf/command/render.yaml."""
+
+    out: str
+    rollout: str | None = None
+    others: tuple[str, ...] = ()
+    names: tuple[str, ...] | None = None
+    data: str | None = None
+    episode: str | None = None
+    frames: tuple[int, ...] | None = None
+    gif: bool = True
+    every: int = 3
+    fps: float | None = None
+    size: int = 360
+
+    def __post_init__(self) -> None:
+        require(self.out != "", "out", "a folder or a file name", self.out)
+        if self.rollout is None:
+            require(
+                self.data is not None and self.episode is not None,
+                "rollout",
+                "a file, or else data and episode given",
+                self.rollout,
+                "as in rollout=rollout.vtkhdf out=pictures",
+            )
+            require(not self.others, "others", "left out where there is no rollout", self.others)
+        else:
+            require(
+                self.data is None and self.episode is None,
+                "rollout",
+                "left out where data and episode are given",
+                self.rollout,
+            )
+        if self.names is not None:
+            count = 1 + len(self.others)
+            rule = f"{count} different ones, of rollout and of each of others"
+            require(len(set(self.names)) == len(self.names) == count, "names", rule, self.names)
+        require(self.every >= 1, "every", "at least 1", self.every)
+        require(64 <= self.size <= 4096, "size", "64 to 4096 pixels", self.size)
+        if self.fps is not None:
+            require_positive(self, "fps")
+
+
+@dataclass(frozen=True)
+class Versions:
+    """A rollout, and others of the same scene by name."""
+
+    name: str  # of the files
+    rollout: Rollout
+    label: str
+    others: Mapping[str, np.ndarray]
 
 
 def main(mapping: Mapping[str, Any]) -> int:
@@ -35,18 +92,19 @@ def main(mapping: Mapping[str, Any]) -> int:
     Raises: ConfigError.
     """
     config = from_mapping(RenderConfig, mapping)
-    name, rollout = _load(config)
+    versions = _load(config)
+    name, rollout = versions.name, versions.rollout
     out = Path(config.out)
     if out.suffix == ".png":
-        _write_png(config, rollout, out)
+        _write_png(config, versions, out)
     elif out.suffix == ".gif":
-        _write_gif(config, rollout, out)
+        _write_gif(config, versions, out)
     elif out.suffix and not out.is_dir():
         raise ConfigError(f"out must be a folder or end in .png or .gif, got {config.out!r}")
     else:
-        _write_png(config, rollout, out / f"{name}.png")
+        _write_png(config, versions, out / f"{name}.png")
         if config.gif:
-            _write_gif(config, rollout, out / f"{name}.gif")
+            _write_gif(config, versions, out / f"{name}.gif")
         if rollout.reference_TN3 is not None:
             path = out / f"{name}_error.png"
             write_picture(path, error_curve(position_error(rollout), rollout.frame_rate_hz), rollout.source)
@@ -54,25 +112,47 @@ def main(mapping: Mapping[str, Any]) -> int:
     return 0
 
 
-def _load(config: RenderConfig) -> tuple[str, Rollout]:
-    if config.rollout is not None:
-        return Path(config.rollout).stem, read_rollout(config.rollout)
-    assert config.data is not None and config.episode is not None  # RenderConfig saw to it
-    return config.episode, rollout_of_episode(find_episode(config.data, config.episode))
+def _load(config: RenderConfig) -> Versions:
+    """Reads what is to be drawn.
+
+    Raises: ConfigError where another rollout shows other particles.
+    """
+    if config.rollout is None:
+        assert config.data is not None and config.episode is not None  # RenderConfig saw to it
+        rollout = rollout_of_episode(find_episode(config.data, config.episode))
+        return Versions(config.episode, rollout, config.names[0] if config.names else "", {})
+    rollout = read_rollout(config.rollout)
+    label, *rest = config.names or ("prediction", *(Path(other).stem for other in config.others))
+    others = {}
+    for i, (name, file) in enumerate(zip(rest, config.others, strict=True)):
+        other = read_rollout(file)
+        if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0]):
+            raise ConfigError(f"others[{i}] must begin with the same particles as {config.rollout}, got {file}")
+        others[name] = other.position_TN3
+    return Versions(Path(config.rollout).stem, rollout, label, others)
 
 
-def _write_png(config: RenderConfig, rollout: Rollout, path: Path) -> None:
-    frames = config.frames
+def _write_png(config: RenderConfig, versions: Versions, path: Path) -> None:
+    rollout, frames = versions.rollout, config.frames
     if frames is None:
         frames = tuple(spread(rollout.frame_count, PICTURES))
-    write_picture(path, compare_picture(rollout, frames, config.size), rollout.source)
+    write_picture(path, compare_picture(rollout, frames, config.size, versions.label, versions.others), rollout.source)
     print(path)
 
 
-def _write_gif(config: RenderConfig, rollout: Rollout, path: Path) -> None:
-    pictures = len(range(0, rollout.frame_count, config.every))
+def _write_gif(config: RenderConfig, versions: Versions, path: Path) -> None:
+    pictures = len(range(0, versions.rollout.frame_count, config.every))
     with bar("drawing", total=pictures, unit="picture") as progress:
-        animate(rollout, path, config.fps, config.every, config.size, lambda done, _: progress.update())
+        animate(
+            versions.rollout,
+            path,
+            config.fps,
+            config.every,
+            config.size,
+            lambda done, _: progress.update(),
+            versions.label,
+            versions.others,
+        )
     print(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hgn.config import DatagenConfig, RenderConfig
-from hgn.scene.rollout_file import Rollout, write_rollout
+from hgn.config import DatagenConfig
+from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
 from hgn.schema import ConfigError
-from tools.render import main
+from tools.render import RenderConfig, main
 
 FRAMES = 9
 
@@ -80,12 +81,34 @@ def test_episode_of_a_data_set(
         main(mapping | {"episode": "validation-000009"})
 
 
+def test_other_rollouts_stand_beside_it(tmp_path: Path) -> None:
+    """Each other rollout has a row and a column of its own; one of another scene is refused."""
+    path = rollout_file(tmp_path, True)
+    (tmp_path / "other").mkdir()
+    other = rollout_file(tmp_path / "other", False)
+    sizes = []
+    for others in ([], [str(other)]):
+        out = tmp_path / f"{len(others)}"
+        names = ["ours", "theirs"][: 1 + len(others)]
+        main({"rollout": str(path), "others": others, "names": names, "out": str(out), "size": 80})
+        with Image.open(out / "fall.png") as still, Image.open(out / "fall.gif") as moving:
+            sizes.append((still.height, moving.width))
+    assert sizes[1][0] > sizes[0][0] + 60 and sizes[1][1] > sizes[0][1] + 60
+    rollout = read_rollout(other)
+    write_rollout(other, dataclasses.replace(rollout, position_TN3=rollout.position_TN3 + np.float32(0.1)))
+    with pytest.raises(ConfigError, match=r"others\[0\] must begin with the same particles as"):
+        main({"rollout": str(path), "others": [str(other)], "out": str(tmp_path / "bad")})
+    assert not (tmp_path / "bad").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"rollout": None}, "rollout must be a file, or else data and episode given"),
         ({"data": "folder"}, "rollout must be left out where data and episode are given"),
         ({"rollout": "nothing.h5"}, "rollout must be an existing file"),
+        ({"names": ["a", "b"]}, "names must be 1 different ones"),
+        ({"rollout": None, "data": "d", "episode": "test-000000", "others": ["a"]}, "others must be left out"),
         ({"out": "picture.jpg"}, r"out must be a folder or end in \.png or \.gif, got 'picture\.jpg'"),
         ({"frames": [0, 9]}, r"frames\[1\] must be in \[0, 9\)"),
         ({"every": 0}, "every must be at least 1"),
@@ -110,4 +133,4 @@ def test_config_file_has_the_fields_of_the_dataclass() -> None:
 
     root = Path(__file__).resolve().parents[2]
     keys = yaml.safe_load((root / "conf" / "command" / "render.yaml").read_text())
-    assert keys | {"rollout": "file"} == vars(RenderConfig(rollout="file", out="pictures"))
+    assert keys | {"rollout": "file", "others": ()} == vars(RenderConfig(rollout="file", out="pictures"))
