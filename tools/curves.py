@@ -165,7 +165,7 @@ def draw_several(runs: list[Run]) -> bytes:
         losses = [record for record in run.records if "loss" in record]
         _plot(left, _means(losses, "loss"), "loss", label, color)
         for axes, against in ((middle, "update"), (right, "minutes")):
-            _plot(axes, run.records, "one_step/validation", label, color, marker="o", against=against)
+            _plot(axes, run.records, "one_step/validation", "", color, marker="o", against=against)
     for axes in (middle, right):
         _trivial_lines(axes, _last(runs[0].records))
         axes.set_ylabel(ONE_STEP + ", validation")

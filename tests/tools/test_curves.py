@@ -20,7 +20,7 @@ SETTINGS = {
 }
 
 
-def make_run(folder: Path, updates: int = 40, pause: float = 0.0, repeated: int = 0) -> Path:
+def make_run(folder: Path, updates: int = 40, pause: float = 0.0, repeated: int = 0, error: float = 1e-6) -> Path:
     """A run that logs each second; `pause` seconds away after half of its updates, the last `repeated` then again."""
     folder.mkdir(parents=True)
     numbers = [*range(updates // 2), *range(updates // 2 - repeated, updates)]
@@ -29,7 +29,7 @@ def make_run(folder: Path, updates: int = 40, pause: float = 0.0, repeated: int 
         now += 1 + (pause if i == updates // 2 else 0)
         lines.append({"update": update, "time": now, "loss": 1 / (i + 1), "episodes": 3})
         if update % 10 == 9:
-            errors = {"one_step/validation": 1e-6 / update, "trivial/validation_constant_velocity": 1e-5}
+            errors = {"one_step/validation": error / update, "trivial/validation_constant_velocity": 1e-5}
             lines.append({"update": update, "time": now, "rollout/mse_frame_10": 1e-4} | errors)
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (folder / "config.yaml").write_text(yaml.safe_dump(SETTINGS))
@@ -50,7 +50,7 @@ def test_figure_and_rows_of_one_run(tmp_path: Path) -> None:
 
 
 def test_several_runs_have_a_colour_and_a_name_each(tmp_path: Path) -> None:
-    runs = [str(make_run(tmp_path / name)) for name in ("x", "y")]
+    runs = [str(make_run(tmp_path / "x")), str(make_run(tmp_path / "y", error=1e-7))]
     assert main({"runs": runs, "names": ["ours", "theirs"], "out": str(tmp_path / "curves")}) == 0
     assert [run["name"] for run in json.loads((tmp_path / "curves.json").read_text())["runs"]] == ["ours", "theirs"]
     picture = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).convert("RGB")
