@@ -22,7 +22,6 @@ import numpy as np
 from datagen.claims import LOCK_NAME
 from datagen.generate import KEYS, datagen_config
 from hgn.command import run_command
-from hgn.config import KillsConfig
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import verify_file
@@ -30,13 +29,34 @@ from hgn.files import TEMPORARY_SUFFIX, write_json
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
 from hgn.scene.episode import Episode
-from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.schema import (
+    ConfigError,
+    from_mapping,
+    require,
+    require_non_negative,
+    require_positive,
+    to_mapping,
+)
 
 TARGETS = ("worker", "pool", "service", "all of them")
 EXIT_RED = 1
 _KEYS = ("kills", "interval_s", "kill_seed", "json")
 _LOOK_S = 0.02
 _PATIENCE_S = 600.0  # with a generation in which nothing gets published
+
+
+@dataclass(frozen=True)
+class KillsConfig:
+    """`python -m tools.kills`: how often and when, beside what `python -m datagen` takes."""
+
+    kills: int = 50
+    interval_s: float = 3.0  # between two, on average
+    kill_seed: int = 0
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "kills", "interval_s")
+        require_non_negative(self, "kill_seed")
 
 
 @dataclass(frozen=True)

@@ -19,23 +19,37 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import LoadConfig
 from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.statistics import merge_statistics
 from hgn.data.storage import file_sha256
 from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
-from hgn.schema import from_mapping, to_mapping
+from hgn.schema import from_mapping, require_positive, to_mapping
 
 HOST = "127.0.0.1"
 RANGE_BYTES = 16 * 2**20  # as the data set readers ask
 _BUFFER_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class LoadConfig:
+    """`python -m tools.load`: who reads how much."""
+
+    readers: int = 8
+    files: int = 4
+    file_mb: int = 64
+    rounds: int = 9  # each reader takes all files once a round, from each server in turn
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "readers", "files", "file_mb", "rounds")
 
 
 def main(mapping: dict[str, Any]) -> None:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from hgn.config import DatagenConfig, KillsConfig
+from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError
-from tools.kills import TARGETS, differences, equal_shards, generate_with_kills
+from tools.kills import TARGETS, KillsConfig, differences, equal_shards, generate_with_kills
 
 ROOT = Path(__file__).resolve().parents[2]
 MakeConfig = Callable[..., DatagenConfig]

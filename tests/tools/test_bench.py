@@ -17,7 +17,7 @@ import torch
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds
 from hgn.command import _with_json_as_override
-from hgn.config import BenchConfig, MpmConfig, NetworkConfig
+from hgn.config import MpmConfig, NetworkConfig
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import build_hierarchy
 from hgn.network.neighbours import neighbour_list
@@ -25,6 +25,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.schema import ConfigError, from_mapping
 from tools.bench import contenders
 from tools.bench.__main__ import main, workloads
+from tools.bench.config import BenchConfig
 from tools.bench.fast import FastFrame, FastTrain
 from tools.bench.states import TILE_PARTICLES, Workload, positions, scene_of
 from tools.bench.timing import Timed, alternate

@@ -14,10 +14,10 @@ import torch.distributed as dist
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hgn.config import ScalingConfig
 from hgn.schema import ConfigError, from_mapping
 from tools.scaling import measure
 from tools.scaling.__main__ import NODE_LAUNCH_S, NODE_LINK, SIZES, given_rows, main, model_table
+from tools.scaling.config import ScalingConfig
 from tools.scaling.model import (
     Cluster,
     Link,

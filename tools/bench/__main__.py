@@ -15,13 +15,13 @@ from typing import Any
 import torch
 
 from hgn.command import run_command
-from hgn.config import BENCH_CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
 from hgn.device import choose_device
 from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
 from hgn.runtime.path import why_not_fast
 from hgn.schema import from_mapping, to_mapping
+from tools.bench.config import CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
 from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, Train, checked_workload
 from tools.bench.fast import PATH_PRECISION, FastFrame, FastTrain
 from tools.bench.public_gns import PublicFrame, PublicTrain
@@ -171,7 +171,7 @@ def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tu
     fast = why_not_fast(device, config.network, PATH_PRECISION[precision]) is None
     wanted = config.cases or tuple(
         case
-        for case in BENCH_CASES
+        for case in CASES
         if (fast or case not in PLAIN_CASES) and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
     )
     if precision == "fp16":

@@ -23,7 +23,7 @@ from torch import nn
 from torch.distributed.algorithms.ddp_comm_hooks.default_hooks import allreduce_hook
 from torch.nn.parallel import DistributedDataParallel
 
-from hgn.config import ScalingConfig, TrainingConfig
+from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.agreement import relative_error
@@ -35,6 +35,7 @@ from hgn.training.ranks import averaging_options
 from tools.bench.contenders import FRAME_RATE_HZ, PASS, bench_network
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.timing import once
+from tools.scaling.config import ScalingConfig
 
 # Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
 # order each time, which turns the activations that lie next to their kink, and TF32 makes more of it.

@@ -1,0 +1,50 @@
+"""The options of `python -m tools.bench`. See conf/command/bench.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from hgn.config import NetworkConfig
+from hgn.schema import require, require_positive
+
+PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
+PLAIN_CASES = ("plain_frame", "plain_train")
+CASES = ("frame", "train", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
+PRECISIONS = ("fp32", "tf32", "fp16")
+
+
+def _bench_gns() -> NetworkConfig:
+    return NetworkConfig(kind="gns", levels=1, message_passing_steps=10)
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """`python -m tools.bench`: what is timed."""
+
+    cases: tuple[str, ...] | None = None  # none: all that differ here; of the public GNS where there is a copy of it
+    particles: tuple[int, ...] | None = None  # of one scene; none: by the device
+    scenes: tuple[int, ...] | None = None  # side by side, of the smallest number of particles; none: by the device
+    precisions: tuple[str, ...] | None = None  # none: TF32 and half on a GPU, float32 on a CPU
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    gns: NetworkConfig = field(default_factory=_bench_gns)
+    public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns
+    rounds: int = 50  # samples of each contender
+    seconds: float = 20.0  # at most for contenders that take turns, once five rounds are done
+    mpm_frames: int = 20  # of the solver in one sample
+    device: str = "auto"
+    json: str | None = None
+
+    def __post_init__(self) -> None:
+        require_positive(self, "rounds", "seconds")
+        require(self.mpm_frames >= 4, "mpm_frames", "at least 4", self.mpm_frames)
+        for name, known in (("cases", CASES), ("precisions", PRECISIONS)):
+            for i, value in enumerate(getattr(self, name) or ()):
+                require(value in known, f"{name}[{i}]", f"one of {', '.join(known)}", value)
+        for name in ("particles", "scenes"):
+            for i, value in enumerate(getattr(self, name) or ()):
+                require(value >= 1, f"{name}[{i}]", "at least 1", value)
+        require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
+        require(self.gns.kind == "gns", "gns.kind", "gns", self.gns.kind)
+        for case in PUBLIC_GNS_CASES:
+            given = self.public_gns is not None or case not in (self.cases or ())
+            require(given, "public_gns", f"a folder with the public code for {case}", None)
