@@ -43,7 +43,7 @@ from hgn.training.launch import default_run, first_on_machine, first_rank, layou
 from hgn.training.stop import StopRequest
 
 if TYPE_CHECKING:
-    from hgn.training.ahead import AheadCompilation
+    from hgn.runtime.ahead import AheadCompilation
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -162,7 +162,8 @@ def _compile_ahead(config: TrainConfig, stack: ExitStack) -> AheadCompilation | 
     if path != "fast" or not on_gpu or not first_on_machine():
         return None
     # Triton, which the plain path does without, is loaded here.
-    from hgn.training.ahead import AheadCompilation, job_of_training
+    from hgn.runtime.ahead import AheadCompilation
+    from hgn.training.ahead import job_of_training
 
     devices, nodes = layout(training)
     ahead = AheadCompilation(job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1))

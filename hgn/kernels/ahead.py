@@ -1,7 +1,9 @@
-"""python -m hgn.kernels.ahead: compiles a share of a training's kernels into Triton's cache on disk, and launches none.
+"""python -m hgn.kernels.ahead: compiles a share of the kernels of a training or of simulations into Triton's cache on
+disk, and launches none.
 
-The launches are those of Updates on tensors without memory, so that no kernel and no specialisation is named twice;
-only sizes are guessed (they choose between few variants), and what is guessed wrong is compiled when it is first used.
+The launches are those of Updates and FastRollout on tensors without memory, so that no kernel and no specialisation is
+named twice; only sizes are guessed (they choose between few variants), and what is guessed wrong is compiled when it is
+first used.
 """
 
 from __future__ import annotations
@@ -9,7 +11,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -22,7 +25,7 @@ from hgn.kernels.grid.op import ObstacleTable, Window
 from hgn.kernels.update.op import Updates, UpdateSettings
 from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.fast import GROWTH, FastRollout
+from hgn.runtime.fast import FastRollout, first_capacities
 from hgn.runtime.path import KERNEL_PRECISION
 from hgn.schema import from_mapping
 
@@ -44,9 +47,32 @@ class AheadJob:
     rollout_scenes: int = 0  # that the network simulates to train on; 0: it does not
 
 
-def launches_of(job: AheadJob, device: str = "meta") -> dict[str, tuple[Any, str]]:
-    """Every kernel of an update with what it is specialised for, by a key of both; Triton's driver needs a target."""
-    found: dict[str, tuple[Any, str]] = {}
+@dataclass(frozen=True)
+class FrameJob:
+    """What simulates, how precisely, and at which sizes: particles, and cells of the finest level."""
+
+    networks: tuple[tuple[NetworkConfig, str], ...]  # with the precision that the runtime knows: highest, high, half
+    sizes: tuple[tuple[int, int], ...]
+    capability: int  # of the GPU: 90 for an H100
+
+
+Launches = dict[str, tuple[Any, str]]
+
+
+def launches_of(job: AheadJob | FrameJob, device: str = "meta") -> Launches:
+    """Every kernel of a job with what it is specialised for, by a key of both; Triton's driver needs a target."""
+    with _noted() as found:
+        if isinstance(job, AheadJob):
+            _update_launches(job, device)
+        else:
+            for config, precision in job.networks:
+                _frame_launches(config, precision, job.sizes, device)
+    return found
+
+
+@contextmanager
+def _noted() -> Iterator[Launches]:
+    found: Launches = {}
 
     def note(*, fn: Any, compile: dict[str, Any], **_: Any) -> bool:
         data = compile["specialization_data"]
@@ -55,19 +81,33 @@ def launches_of(job: AheadJob, device: str = "meta") -> dict[str, tuple[Any, str
 
     triton.knobs.runtime.jit_cache_hook = note
     try:
-        with torch.device(device):
-            network = HierarchicalGraphNetwork(job.network)
-        nothing = torch.zeros(5, device=device)
-        reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if job.several_ranks else None
-        updates = Updates(network, job.settings, job.precision, nothing[:2], nothing, reduce)
-        updates.average = torch.zeros_like(updates.values) if job.averages else None
-        updates.allocate(job.particles, job.cells)
-        updates.launches()
-        if job.rollout_scenes:
-            _rollout_launches(job, network, device)
+        yield found
     finally:
         triton.knobs.runtime.jit_cache_hook = None
-    return found
+
+
+def _update_launches(job: AheadJob, device: str) -> None:
+    with torch.device(device):
+        network = HierarchicalGraphNetwork(job.network)
+    nothing = torch.zeros(5, device=device)
+    reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if job.several_ranks else None
+    updates = Updates(network, job.settings, job.precision, nothing[:2], nothing, reduce)
+    updates.average = torch.zeros_like(updates.values) if job.averages else None
+    updates.allocate(job.particles, job.cells)
+    updates.launches()
+    if job.rollout_scenes:
+        _rollout_launches(job, network, device)
+
+
+def _frame_launches(config: NetworkConfig, precision: str, sizes: tuple[tuple[int, int], ...], device: str) -> None:
+    """Those of a frame of hgn.runtime.simulator; a level has a quarter of the cells of the one below."""
+    with torch.device(device):
+        network = HierarchicalGraphNetwork(config)
+    obstacles = ObstacleTable([None], 1.0, torch.device(device)) if config.obstacle_features else None
+    for particles, cells in sizes:
+        capacities = tuple(max(1, cells >> 2 * level) for level in range(config.levels))
+        state = _nowhere(config, particles, 1, device)
+        _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
 
 
 class _Unplaced(FastRollout):
@@ -77,12 +117,8 @@ class _Unplaced(FastRollout):
         return Window.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
 
 
-def _rollout_launches(job: AheadJob, network: HierarchicalGraphNetwork, device: str) -> None:
-    """Those of a frame of hgn.training.fast_states."""
-    config, scenes = job.network, job.rollout_scenes
-    share = scenes / job.settings.scenes
-    particles = round(share * job.particles)
-    state = ParticleState(
+def _nowhere(config: NetworkConfig, particles: int, scenes: int, device: str) -> ParticleState:
+    return ParticleState(
         torch.zeros(particles, 3, device=device),
         torch.zeros(particles, config.velocity_history, 3, device=device),
         torch.zeros(particles, dtype=torch.int32, device=device),
@@ -90,15 +126,23 @@ def _rollout_launches(job: AheadJob, network: HierarchicalGraphNetwork, device: 
         torch.zeros(scenes, 3, device=device),
         None,
     )
+
+
+def _rollout_launches(job: AheadJob, network: HierarchicalGraphNetwork, device: str) -> None:
+    """Those of a frame of hgn.training.fast_states."""
+    config, scenes = job.network, job.rollout_scenes
+    share = scenes / job.settings.scenes
+    particles = round(share * job.particles)
     obstacles = None
     if config.obstacle_features:
         obstacles = ObstacleTable([None] * scenes, job.settings.obstacle_cell_size, torch.device(device))
     precision = next(name for name, kernels in KERNEL_PRECISION.items() if kernels == job.precision)
-    capacities = tuple(int(GROWTH * share * cells) for cells in job.cells)
+    capacities = first_capacities([round(share * cells) for cells in job.cells], particles)
+    state = _nowhere(config, particles, scenes, device)
     _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
 
 
-def compile_share(job: AheadJob, share: int, shares: int) -> int:
+def compile_share(job: AheadJob | FrameJob, share: int, shares: int) -> int:
     """Compiles every `shares`-th kernel from number `share` on; how many those are."""
     mine = list(launches_of(job).values())[share::shares]
     for function, data in mine:
@@ -107,12 +151,17 @@ def compile_share(job: AheadJob, share: int, shares: int) -> int:
     return len(mine)
 
 
-def job_text(job: AheadJob) -> str:
+def job_text(job: AheadJob | FrameJob) -> str:
     return json.dumps(asdict(job))
 
 
-def job_of(text: str) -> AheadJob:
+def job_of(text: str) -> AheadJob | FrameJob:
     mapping = json.loads(text)
+    if "networks" in mapping:
+        networks = tuple(
+            (from_mapping(NetworkConfig, network), precision) for network, precision in mapping["networks"]
+        )
+        return FrameJob(networks, tuple((n, cells) for n, cells in mapping["sizes"]), mapping["capability"])
     network = from_mapping(NetworkConfig, mapping.pop("network"))
     settings = UpdateSettings(**mapping.pop("settings"))
     return AheadJob(network, settings, **{**mapping, "cells": tuple(mapping["cells"])})

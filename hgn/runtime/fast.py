@@ -8,7 +8,7 @@ Shape legend: N particles of all scenes, S scenes, T frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -28,6 +28,9 @@ from hgn.schema import ConfigError
 
 LOOK_FRAMES = 32
 GROWTH = 2.0
+HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie spread need up to six times as many,
+SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # so many a particle at most, on each level; coarser ones as the last
+ROOMY_CELLS = 65_536  # up to which there is such headroom: beyond, memory counts
 CHECKED_PARTICLES = 50_000  # at most; the plain network needs memory
 INTEGRATE_BLOCK = 256
 
@@ -38,6 +41,16 @@ class LeftDomainError(RuntimeError):
     def __init__(self, frame: int, lost: int) -> None:
         super().__init__(f"{lost} particles at frame {frame}")
         self.frame, self.lost = frame, lost
+
+
+def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
+    """Room on each level for a scene that begins with so many cells: few simulations need more later."""
+    found = []
+    for level, count in enumerate(cells):
+        spread = SPREAD_CELLS[min(level, len(SPREAD_CELLS) - 1)] * particles
+        roomy = min(HEADROOM * count, spread, ROOMY_CELLS >> 2 * level)
+        found.append(max(256 >> level, int(GROWTH * count), int(roomy)))
+    return tuple(found)
 
 
 class FastRollout:
@@ -85,11 +98,22 @@ class FastRollout:
         self._fill(state)
         self._build(capacities or self._first_capacities())
 
-    def begin(self, state: ParticleState) -> None:
-        """Goes on with another state of as many scenes and at most as many particles as there is room for.
+    def fits(self, state: ParticleState) -> bool:
+        """Whether `begin` can go on with a state: as many scenes, in such domains, and not too many particles."""
+        if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
+            return False
+        seen, known = state.obstacles, self.obstacles
+        same = seen is known is None or (seen is not None and known is not None and seen.cell_size == known.cell_size)
+        return same and torch.equal(state.domain_S3, self.domain_S3)
 
-        Obstacles are those of the rows of `self.obstacles`, which the caller may write.
+    def begin(self, state: ParticleState, new_obstacles: bool = False) -> None:
+        """Goes on with another state that `fits`.
+
+        Obstacles are those of the rows of `self.obstacles`, which the caller may write, or those of the state.
         """
+        if new_obstacles and state.obstacles is not None:
+            assert self.obstacles is not None
+            self.obstacles.take(ObstacleTable.of(state.obstacles, state.scene_count))
         self._fill(state)
         self.frames_done = 0
         self.lost.zero_()
@@ -111,10 +135,9 @@ class FastRollout:
         self.engine.refresh()
 
     def _first_capacities(self) -> tuple[int, ...]:
-        """Room for the cells of now several times over; what falls spreads."""
         position_N3, scene_N = self.position_N3[: self.live], self.scene_N[: self.live].long()
         grid = build_hierarchy(position_N3, scene_N, self.origin_S3, self.config.cell_size, self.config.levels)
-        return tuple(max(256 >> i, int(GROWTH * level.cell_count)) for i, level in enumerate(grid.levels))
+        return first_capacities([level.cell_count for level in grid.levels], self.live)
 
     def _window(self) -> Window:
         position_N3 = self.position_N3[: self.live]
@@ -255,9 +278,8 @@ class FastRollout:
         return int(lost(position_N3, domain_N3).sum())
 
     def _grow(self) -> None:
+        # all levels: those that still had room are as full, and would have the same captured again soon
         needed = self.grid.needed_L.tolist()
-        capacities = [
-            max(c, int(GROWTH * n) if n > c else c) for c, n in zip(self.grid.capacities, needed, strict=True)
-        ]
+        capacities = [max(c, int(GROWTH * n)) for c, n in zip(self.grid.capacities, needed, strict=True)]
         self.growths += 1
         self._build(tuple(capacities))

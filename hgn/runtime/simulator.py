@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,6 +28,12 @@ from hgn.scene.history import ballistic_positions
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
 from hgn.scene.rollout_file import cell_obstacles, obstacles_of_episode
 from hgn.scene.scene import Obstacle, Scene
+
+if TYPE_CHECKING:
+    from hgn.runtime.fast import FastRollout
+
+KEPT = 2  # simulations of the fast path, of different numbers of scenes
+FILLED = 0.5  # of the room of one that is kept, at least: launches are as large as the room
 
 
 class DivergenceError(RuntimeError):
@@ -95,6 +102,8 @@ class Simulator:
         self.frame_rate_hz = frame_rate_hz
         self.path, self.precision = path, precision
         self.device = next(network.parameters()).device
+        self.growths = 0  # of the fast path's buffers, in all rollouts
+        self._kept: dict[int, FastRollout] = {}
         self.predict: Callable[[ParticleState], torch.Tensor] = network
         use_edges(network, precision)
         if isinstance(network, GraphNetworkSimulator) and self.device.type == "cuda":
@@ -173,14 +182,37 @@ class Simulator:
 
         assert isinstance(self.network, HierarchicalGraphNetwork)
         first_1N3 = state.position_N3[None].cpu().numpy()
-        try:
+        rollout = self._begun(state)
+        if rollout is None:
+            self._kept.pop(state.scene_count, None)  # before the new one is allocated
             rollout = FastRollout(self.network, state, self.precision)
             if len(state.position_N3) <= CHECKED_PARTICLES:
                 rollout.require_agreement(self.network, state)
+            if len(self._kept) == KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[state.scene_count] = rollout
+        before = rollout.growths
+        try:
             later_TN3 = rollout.run(frames - 1, on_frame)
         except LeftDomainError as error:
             raise DivergenceError(error.frame, _left(error.lost, len(state.position_N3))) from None
+        finally:
+            self.growths += rollout.growths - before
         return np.concatenate([first_1N3, later_TN3])
+
+    def _begun(self, state: ParticleState) -> FastRollout | None:
+        """An earlier simulation of the same network begun anew, its launches captured already; none that fits."""
+        known, count = self._kept.get(state.scene_count), len(state.position_N3)
+        if known is None or not known.fits(state) or count < FILLED * known.particles:
+            return None
+        assert isinstance(self.network, HierarchicalGraphNetwork)
+        known.use_values(known.packed.gather(list(self.network.parameters())))
+        known.begin(state, new_obstacles=True)
+        return known
+
+    def release(self) -> None:
+        """Gives back the buffers that simulations keep for those that follow."""
+        self._kept.clear()
 
     @staticmethod
     def _check(state: ParticleState, frame: int) -> None:

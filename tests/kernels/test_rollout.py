@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from kernels.engines import device
 from network.states import network_of, random_grid
 
 from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.fast import FastRollout
+from hgn.runtime.fast import FastRollout, first_capacities
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.schema import ConfigError
 
@@ -55,6 +57,37 @@ def test_overflow_loses_nothing() -> None:
     found = np.concatenate([tight.run(1), tight.run(2)])
     assert tight.growths > 0 and roomy.growths == 0
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+def test_later_simulations_begin_anew() -> None:
+    """What a simulator has captured it uses again, for a scene of fewer particles and other obstacles too; the frames
+    are bitwise those of a new simulator, after one that diverged as well."""
+    first, second = scene(5), scene(4, 1)
+    again = Simulator(network(2), 60.0, "fast", "highest")
+    again.rollout([first], 2)
+    kept = again._kept[1]
+    for one in (second, first):
+        (expected,) = Simulator(network(2), 60.0, "fast", "highest").rollout([one], 3)
+        (found,) = again.rollout([one], 3)
+        assert again._kept[1] is kept
+        np.testing.assert_array_equal(found, expected)
+    away = replace(first, velocity_N3=np.full_like(first.velocity_N3, 60.0))
+    with pytest.raises(DivergenceError):
+        again.rollout([away], 3)
+    np.testing.assert_array_equal(again.rollout([first], 3)[0], expected)
+    again.rollout([scene(1)], 2)  # too few for so much room
+    assert again._kept[1] is not kept
+    again.release()
+    assert not again._kept
+
+
+def test_first_room() -> None:
+    """Groups that fall have room to spread at once, up to what their particles can fill; where cells are many already,
+    or so many that memory counts, there is twice the room."""
+    assert first_capacities((246, 53, 18, 5), 2_763) == (1_657, 276, 96, 40)
+    assert first_capacities((1_398, 214, 56, 8), 4_296)[:2] == (2_796, 429)
+    assert first_capacities((128_529, 23_263, 4_373, 612), 400_000) == (257_058, 46_526, 8_746, 1_224)
+    assert first_capacities((8,) * 5, 1) == (256, 128, 64, 32, 16)
 
 
 def test_divergence_names_the_frame() -> None:

@@ -19,7 +19,7 @@ from hgn.network.features import ParticleState
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.schema import ConfigError, from_mapping
-from tools.stability.network import case_row, case_trials, energy_growth, main
+from tools.stability.network import case_row, case_trials, energy_growth, initial_states, main
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
 from tools.stability.network_free_fall import free_fall_rows
 from tools.stability.row import Row
@@ -104,7 +104,8 @@ def test_free_fall(share: float, held: bool) -> None:
 
 
 def row_of(simulator: Simulator, case: Case, energy_bound: float) -> Row:
-    return case_row(simulator, case, energy_bound, *case_trials(simulator, case))
+    states = initial_states(case)
+    return case_row(simulator, case, states, energy_bound, *case_trials(simulator, case, states))
 
 
 def test_failures_are_told(weights: str) -> None:

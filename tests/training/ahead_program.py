@@ -8,7 +8,7 @@ from typing import Any
 import triton
 
 from hgn.config import NetworkConfig
-from hgn.kernels.ahead import AheadJob, compile_share, launches_of, use_target
+from hgn.kernels.ahead import AheadJob, FrameJob, compile_share, launches_of, use_target
 from hgn.kernels.update.op import UpdateSettings
 
 
@@ -31,3 +31,10 @@ rolling = replace(job, rollout_scenes=3)
 with_frames = set(launches_of(rolling, "cpu"))
 assert set(launches_of(rolling)) == with_frames > expected, len(with_frames)
 assert compile_share(job, last, len(expected)) == 1
+# frames: of two precisions each has kernels of its own, and a network with fewer levels only tables of its own
+frames = FrameJob(((network, "half"),), ((300, 200), (40_000, 20_000)), 90)
+both = replace(frames, networks=(*frames.networks, (network, "high")))
+shallow = replace(frames, networks=(*frames.networks, (replace(network, levels=1), "half")))
+found = set(launches_of(frames, "cpu"))
+assert set(launches_of(frames)) == found and len(found) > len(set(launches_of(replace(frames, sizes=frames.sizes[:1]))))
+assert set(launches_of(both)) > found and len(set(launches_of(shallow)) - found) < 8

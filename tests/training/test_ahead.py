@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
-from hgn.kernels.ahead import AheadJob, job_of, job_text
-from hgn.training.ahead import AheadCompilation, job_of_training
+from hgn.kernels.ahead import AheadJob, FrameJob, job_of, job_text
+from hgn.runtime.ahead import AheadCompilation, frame_sizes
+from hgn.training.ahead import job_of_training
 
 CHECKOUT = Path(__file__).parents[2]
 
@@ -47,6 +48,17 @@ def test_the_job_follows_from_the_configuration() -> None:
     assert job_of(job_text(made)) == made
 
 
+def test_jobs_of_simulations() -> None:
+    """Networks keep their precisions through the job's text; few and many particles, dense and spread, are among the
+    sizes, and as many as there are cases change little."""
+    networks = ((NetworkConfig(width=16), "half"), (NetworkConfig(width=16, levels=2), "high"))
+    made = FrameJob(networks, frame_sizes([2_763, 30_000, 1, 30_000]), 90)
+    assert job_of(job_text(made)) == made
+    assert {particles for particles, _ in made.sizes} == {1, 2_763, 30_000} and len(made.sizes) == 9
+    assert min(made.sizes) == (1, 1) and max(made.sizes) == (30_000, 36_000)
+    assert len(frame_sizes(range(1, 1000))) == 9
+
+
 def test_what_was_compiled_is_counted(started: list[AheadCompilation]) -> None:
     """Each process gets its share and the job; the counts of all are told together."""
     ahead = start(started, "assert 'half' in sys.stdin.read(); print(10 + int(sys.argv[1]) + int(sys.argv[2]))")
@@ -56,7 +68,7 @@ def test_what_was_compiled_is_counted(started: list[AheadCompilation]) -> None:
 def test_a_failure_is_told(started: list[AheadCompilation]) -> None:
     """When a process fails, its exit code and last line are told, and that nothing is lost."""
     text = start(started, "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)").wait(lambda: False)
-    assert "1 of 2 processes" in text and "exit code 1: no ptxas" in text and "before the first update" in text
+    assert "1 of 2 processes" in text and "exit code 1: no ptxas" in text and "when it is first used" in text
 
 
 def test_an_interruption_ends_them(started: list[AheadCompilation]) -> None:

@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,11 +42,13 @@ from tools.trial import FrameClock, Trial, network_trials
 PART = "network"
 PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
 LONGEST = 100.0  # domain that is drawn whole, in heights
+DRAWN_EVERY_S = 5.0  # the picture of all cases so far, which takes longer with each
 FAR_DOMAINS = 100.0  # how far the guard's case throws particles
 
 
 def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; what does not hold is a finding, and the exit code is 0."""
+    begun = time.monotonic()
     config = from_mapping(StabilityNetworkConfig, mapping)
     device = choose_device(config.device)
     network, info = load_weights(find_weights(config.weights), device)
@@ -52,39 +58,83 @@ def main(mapping: dict[str, Any]) -> int:
     simulator = Simulator(network, info.frame_rate_hz, path, config.precision)
     rows: list[Row] = []
     pictures: list[Image.Image] = []
+    drawn = 0.0  # when the picture was last written
     meta = provenance(device) | {"config": without_folders(to_mapping(config)), "weights": Path(config.weights).name}
     meta |= {"updates": info.updates, "path": path, "network": to_mapping(info.network)}
 
-    def keep() -> None:  # after each case: a run that is cut off leaves the cases that it had
+    def keep(done: bool = False) -> None:  # a run that is cut off leaves the cases that it had
+        nonlocal drawn
         if config.json is not None:
             write_json(config.json, {"meta": meta, "rows": [row.mapping(PART) for row in rows]}, allow_nan=False)
-        if config.picture is not None and pictures:
+        if config.picture is not None and pictures and (done or time.monotonic() - drawn > DRAWN_EVERY_S):
             write_picture(config.picture, stacked(pictures))
+            drawn = time.monotonic()
 
-    if "free_fall" in (config.cases or CASES):
-        for material in network.config.materials:
-            rows += free_fall_rows(simulator, config.scene, material)
-        keep()
     made = list(cases(config, network.config))
+    with ThreadPoolExecutor(worker_threads()) as threads, ExitStack() as stack:
+        # What the runtime makes of obstacles takes seconds where there are many: the largest cases first.
+        order = sorted(range(len(made)), key=lambda i: -sum(len(scene.obstacles) for scene in made[i].scenes))
+        starts = {i: threads.submit(initial_states, made[i]) for i in order}
+        ahead = None
+        if path == "fast":
+            # Triton, which the plain path does without, is loaded here.
+            from hgn.runtime.ahead import frames_ahead
+
+            particles = [sum(len(scene.position_N3) for scene in case.scenes) for case in made]
+            ahead = frames_ahead([network.config], [config.precision], device, particles)
+        if ahead is not None:
+            stack.enter_context(ahead)
+        if "free_fall" in (config.cases or CASES):
+            for material in network.config.materials:
+                rows += free_fall_rows(simulator, config.scene, material)
+            keep()
+        initial = [starts[i].result() for i in range(len(made))]  # nothing runs beside what is timed
+        if ahead is not None:
+            print(ahead.wait(), file=sys.stderr)
+    meta["seconds_before_cases"] = time.monotonic() - begun
+    late = late_kernels(path)
     with bar("cases", total=len(made), unit="case") as progress:
-        for case in made:
-            trials = case_trials(simulator, case)
-            rows.append(case_row(simulator, case, config.energy_bound, *trials))
+        for case, states in zip(made, initial, strict=True):
+            started, growths, compiled = time.monotonic(), simulator.growths, late()
+            trials = case_trials(simulator, case, states)
+            row = case_row(simulator, case, states, config.energy_bound, *trials)
             if config.picture is not None:
                 pictures.append(case_picture(simulator, case, trials[0][0], Path(config.weights).name))
+            row.more["growths"], row.more["kernels_compiled"] = simulator.growths - growths, late() - compiled
+            row.more["seconds"] = time.monotonic() - started
+            rows.append(row)
             keep()
             progress.update()
     if "guard" in (config.cases or CASES):
         rows.append(guard_row(simulator, config))
+    meta["seconds"] = time.monotonic() - begun
     print(table(rows))
-    keep()
+    keep(done=True)
     return 0
 
 
-def case_trials(simulator: Simulator, case: Case) -> tuple[list[Trial], float | None]:
+def worker_threads() -> int:
+    """As many as this process has cores."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def late_kernels(path: str) -> Callable[[], int]:
+    """How many kernels were compiled in this process by now: each holds a simulation up for a second or more."""
+    if path != "fast":
+        return lambda: 0
+    from hgn.kernels.late import LateKernels
+
+    late = LateKernels()
+    return lambda: late.count
+
+
+def initial_states(case: Case) -> list[InitialState]:
+    return [InitialState.of_scene(scene) for scene in case.scenes]
+
+
+def case_trials(simulator: Simulator, case: Case, initial: Sequence[InitialState]) -> tuple[list[Trial], float | None]:
     """Simulates a case; the milliseconds of a frame too."""
     clock = FrameClock()
-    initial = [InitialState.of_scene(scene) for scene in case.scenes]
     return network_trials(simulator, initial, case.frames, clock), clock.milliseconds()
 
 
@@ -117,10 +167,14 @@ def _cut(rollout: Rollout) -> Rollout:
 
 
 def case_row(
-    simulator: Simulator, case: Case, energy_bound: float, trials: Sequence[Trial], milliseconds: float | None
+    simulator: Simulator,
+    case: Case,
+    initial: Sequence[InitialState],
+    energy_bound: float,
+    trials: Sequence[Trial],
+    milliseconds: float | None,
 ) -> Row:
     """Says whether a case held."""
-    initial = [InitialState.of_scene(scene) for scene in case.scenes]
     reached = min(trial.frame_count for trial in trials)
     finite = all(bool(np.isfinite(trial.position_TN3).all()) for trial in trials)
     growth = max(
