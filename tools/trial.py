@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -54,14 +55,15 @@ class FrameClock:
 def network_trials(
     simulator: Simulator, scenes: Sequence[InitialState], frames: int, on_frame: Callable[[int], None] | None = None
 ) -> list[Trial]:
-    """Rollouts side by side; one by one where one diverges, so that the others go on and it ends where it must."""
+    """Rollouts side by side; in halves where one diverges, so that the others go on and it ends where it must."""
     if not scenes:
         return []
     try:
         return [Trial(path_TN3) for path_TN3 in simulator.rollout(scenes, frames, on_frame)]
     except DivergenceError as error:
         if len(scenes) > 1:
-            return [trial for scene in scenes for trial in network_trials(simulator, [scene], frames)]
+            halves = scenes[: len(scenes) // 2], scenes[len(scenes) // 2 :]
+            return [trial for half in halves for trial in network_trials(simulator, half, frames)]
         # The same again up to there. On a GPU sums are in no fixed order, and it may end earlier.
         (trial,) = network_trials(simulator, scenes, error.frame)
         return [Trial(trial.position_TN3, trial.cause or str(error))]
@@ -87,11 +89,21 @@ def solver_trials(
     frames: int,
     frame_rate_hz: float,
     on_frame: Callable[[int], None] | None = None,
+    colliders: Sequence[Any] | None = None,
+    stability_fractions: Sequence[float] | None = None,
 ) -> list[Trial]:
     """The solver's trajectories; of a scene that it stops only the initial state is left."""
     from datagen.mpm.solver import SceneFailure, simulate
 
-    results = simulate(scenes, config, frames, frame_rate_hz, on_frame)
+    results = simulate(
+        scenes,
+        config,
+        frames,
+        frame_rate_hz,
+        on_frame,
+        colliders=colliders,
+        stability_fractions=stability_fractions,
+    )
     trials = []
     for scene, result in zip(scenes, results, strict=True):
         if isinstance(result, SceneFailure):

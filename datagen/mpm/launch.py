@@ -133,6 +133,7 @@ class Launch(ABC):
         config: MpmConfig,
         node_counts: tuple[int, int, int],
         frame_rate_hz: float,
+        stability_fractions: Sequence[float] | None = None,
     ) -> None:
         self.scenes, self.colliders, self.config, self.node_counts = scenes, colliders, config, node_counts
         self.frame_s = 1 / frame_rate_hz
@@ -176,7 +177,7 @@ class Launch(ABC):
         self.law_row = device_array(row * CONSTANT.length)
         self.law = device_array(laws.ravel())
         self.setting = device_array(self._settings(frame_rate_hz))
-        self.scene_value = device_array(self._scene_values(laws, row))
+        self.scene_value = device_array(self._scene_values(laws, row, stability_fractions))
         self.counter = device_array(np.zeros((len(scenes), COUNT.length), np.int64))
         self.shape = device_array(self._shape())
         self.node = self._node_array(nodes)
@@ -209,9 +210,12 @@ class Launch(ABC):
         for array in self._vector_arrays():
             program.delete_ndarray(array.arr)
 
-    def _scene_values(self, laws: np.ndarray, row: np.ndarray) -> np.ndarray:
+    def _scene_values(
+        self, laws: np.ndarray, row: np.ndarray, stability_fractions: Sequence[float] | None
+    ) -> np.ndarray:
         value = np.zeros((len(self.scenes), VALUE.length), np.float32)
         value[:, VALUE.smallest_time_step] = np.inf
+        value[:, VALUE.stability_fraction] = stability_fractions or self.config.stability_fraction
         shear, bulk = laws[:, CONSTANT.shear], laws[:, CONSTANT.bulk]
         # per kind and row; hardening may take all stiffness from snow
         least = np.stack([3 * bulk, 3 * bulk + 2 * shear, 0 * bulk]) / laws[:, CONSTANT.density]
@@ -247,7 +251,6 @@ class Launch(ABC):
         if config.time_step == "fixed":
             setting[SETTING.fixed_time_step] = config.fixed_time_step_s
             setting[SETTING.fixed_substeps] = fixed_substeps(config, frame_rate_hz)
-        setting[SETTING.stability_fraction] = config.stability_fraction
         setting[SETTING.speed_fraction] = config.speed_fraction
         setting[SETTING.transfer_interval] = cell_size / config.transfer_speed_m_s if config.transfer_speed_m_s else 0
         setting[SETTING.friction] = config.collider_friction

@@ -69,7 +69,8 @@ class SceneValue(NamedTuple):
     interval_elapsed: int = 10  # with the present substep, s
     interval_remaining: int = 11  # after the present substep, s; at 0 velocities go back to the particles
     begins: int = 12  # 1 where the present substep is the first of its interval, else 0
-    length: int = 13
+    stability_fraction: int = 13  # of the limit of stability: the longest step of stress
+    length: int = 14
 
 
 class Status(NamedTuple):
@@ -86,14 +87,13 @@ class Setting(NamedTuple):
     inverse_cell_size: int = 1
     fixed_time_step: int = 2  # s; 0 for the adaptive rule
     fixed_substeps: int = 3  # a frame, where the time step is fixed
-    stability_fraction: int = 4
-    speed_fraction: int = 5
-    friction: int = 6
-    low: int = 7  # 7, 8, 9: smallest coordinates of a particle
-    high: int = 10  # 10, 11, 12: largest
-    size: int = 13  # 13, 14, 15: of the domain
-    transfer_interval: int = 16  # s; 0 where every substep is a transfer
-    length: int = 17
+    speed_fraction: int = 4
+    friction: int = 5
+    low: int = 6  # 6, 7, 8: smallest coordinates of a particle
+    high: int = 9  # 9, 10, 11: largest
+    size: int = 12  # 12, 13, 14: of the domain
+    transfer_interval: int = 15  # s; 0 where every substep is a transfer
+    length: int = 16
 
 
 class Shape(NamedTuple):

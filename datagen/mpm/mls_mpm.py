@@ -120,7 +120,7 @@ def choose_time_step(
         )
         gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
         fixed = setting[SETTING.fixed_time_step]
-        limit = setting[SETTING.stability_fraction] * dx / ti.sqrt(stiffness)
+        limit = scene_value[scene, VALUE.stability_fraction] * dx / ti.sqrt(stiffness)
         interval = scene_value[scene, VALUE.interval]
         elapsed = scene_value[scene, VALUE.interval_elapsed]
         left = scene_value[scene, VALUE.interval_remaining]

@@ -42,6 +42,7 @@ def simulate(
     cpu_threads: int | None = None,
     colliders: Sequence[Collider] | None = None,
     team_threads: int | None = None,
+    stability_fractions: Sequence[float] | None = None,
 ) -> list[Simulated | SceneFailure]:
     """Simulates `scenes` side by side and returns `frames` frames of each, the initial state among them.
 
@@ -54,7 +55,7 @@ def simulate(
     `cpu_threads` counts from the process's first simulation; see `initialise`. `colliders` are the scenes' own from
     `build_collider`, where they were built before. `team_threads` chooses how scenes run: so many threads of a GPU
     for each (a multiple of 32; 1 works on a CPU too), or 0 for one launch a substep; none takes what suits the
-    device and the scenes.
+    device and the scenes. `stability_fractions` are the scenes' own where they differ from the config's.
 
     On a CPU the result of a scene is the same, bitwise, whatever its batch mates do, and depends on
     `cpu_threads` only through the number of parts that particles are summed in, min(cpu_threads, 4). On a GPU
@@ -77,6 +78,10 @@ def simulate(
     if colliders is None:
         colliders = [build_collider(scene, config.collider_band_cells) for scene in scenes]
     require(len(colliders) == len(scenes), "colliders", f"one for each of {len(scenes)} scenes", len(colliders))
+    fractions = [config.stability_fraction] * len(scenes) if stability_fractions is None else list(stability_fractions)
+    require(len(fractions) == len(scenes), "stability_fractions", f"one for each of {len(scenes)} scenes", fractions)
+    for index, fraction in enumerate(fractions):
+        require(0 < fraction <= 1, f"stability_fractions[{index}]", "above 0 and at most 1", fraction)
 
     device = initialise(config.device, cpu_threads)
     occupied = [index for index, scene in enumerate(scenes) if scene.particle_count]
@@ -84,7 +89,11 @@ def simulate(
         Simulated(np.empty((frames, 0, 3), np.float32), no_counters()) for _ in scenes
     ]
     if occupied:
-        batch = ([scenes[i] for i in occupied], [colliders[i] for i in occupied], config, node_counts, frame_rate_hz)
+        own_fractions = [fractions[i] for i in occupied]
+        batch = (
+            [scenes[i] for i in occupied], [colliders[i] for i in occupied], config, node_counts, frame_rate_hz,
+            own_fractions,
+        )  # fmt: skip
         threads = _team_threads(device, batch[0]) if team_threads is None else team_threads
         with _arrays_freed_here():
             outcomes = _launched(

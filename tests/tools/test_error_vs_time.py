@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from network.states import gns_of, network_of
+from network.states import gns_of, network_of, random_grid
 from PIL import Image
 
 import datagen.mpm.solver
@@ -21,16 +21,16 @@ from hgn.config import DatagenConfig, MpmConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.runtime.weights import WeightsInfo, save_weights, shipped_weights
 from hgn.scene.distance import share_inside
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, from_mapping
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import score
-from tools.error_vs_time.__main__ import main, network_contenders
+from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
 from tools.error_vs_time.contenders import FastPredictor, TrivialContender
 from tools.error_vs_time.settings import ErrorVsTimeConfig
-from tools.error_vs_time.sinkhorn import sinkhorn_divergence
+from tools.error_vs_time.sinkhorn import sinkhorn_divergence, sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
 from tools.trial import FrameClock, Trial, network_trials, other_grid
 
@@ -38,16 +38,16 @@ CPU = torch.device("cpu")
 FRAMES = 6
 
 
-def fake_simulate(scenes, config, frames, frame_rate_hz, on_frame=None):
+def fake_simulate(scenes, config, frames, frame_rate_hz, on_frame=None, colliders=None, stability_fractions=None):
     """Falls a little short of the data; the larger the step, the more; a whole step kills the first scene."""
     results: list[Any] = []
-    for i, scene in enumerate(scenes):
+    assert len(colliders) == len(scenes) == len(stability_fractions)
+    first = scenes[0].seed
+    for scene, step in zip(scenes, stability_fractions, strict=True):
         time_T = np.arange(frames)[:, None, None] / frame_rate_hz
-        fall_3 = (
-            0.5 * np.array(scene.gravity) * (1 - 0.1 * config.stability_fraction) * (32 / 64 * scene.cell_size * 64)
-        )
+        fall_3 = 0.5 * np.array(scene.gravity) * (1 - 0.1 * step) * (32 / 64 * scene.cell_size * 64)
         path_TN3 = (scene.position_N3 + scene.velocity_N3 * time_T + fall_3 * time_T**2).astype(np.float32)
-        failed = config.stability_fraction == 1.0 and i == 0
+        failed = step == 1.0 and scene.seed == first
         results.append(SceneFailure("too fast") if failed else Simulated(path_TN3, {}))
     for frame in range(frames):
         if on_frame is not None:
@@ -115,11 +115,11 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What has not begun by then is named, and the report is written without it; a shorter rollout of the solver is
     scored as far as it goes, and each setting is simulated once."""
-    calls: list[tuple[float, float, int]] = []
+    calls: list[tuple[float, list[float], int]] = []
 
-    def counted(scenes, config, frames, *more):
-        calls.append((scenes[0].cell_size, config.stability_fraction, frames))
-        return fake_simulate(scenes, config, frames, *more)
+    def counted(scenes, config, frames, *more, stability_fractions, **others):
+        calls.append((scenes[0].cell_size, sorted(set(stability_fractions)), frames))
+        return fake_simulate(scenes, config, frames, *more, stability_fractions=stability_fractions, **others)
 
     monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
     monkeypatch.setattr("tools.error_vs_time.__main__.shipped_weights", dict)
@@ -134,14 +134,15 @@ def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.Monkey
         "perturbation": 0.0,
     }
     assert main(options) == 0
-    assert [call for call in calls if call[2] == 3] == [(1 / 64, 1.0, 3), (1 / 64, 0.5, 3)]
-    assert {call[2] for call in calls} == {3, 4}
+    assert [call for call in calls if call[2] == 3] == [(1 / 64, [0.5, 1.0], 3)]  # of one grid side by side
+    assert {call[2] for call in calls} == {3, 4} and all(len(call[1]) == 1 for call in calls if call[2] == 4)
     rows = json.loads(Path(f"{out}.json").read_text())["rows"]
     assert [row["system"] for row in rows] == ["trivial"] * 3 + ["mpm", "mpm", "chaos"]
     assert rows[4]["scenes_reached"] == {"5": 0} and rows[4]["failed_scenes"] == 0
     assert main(options | {"seconds": 1e-9}) == 0
     report = json.loads(Path(f"{out}.json").read_text())
     assert report["rows"] == [] and len(report["meta"]["not_run"]) == 6
+    assert all(left["cause"] == "the time was over" for left in report["meta"]["not_run"])
 
 
 def test_the_data_can_be_the_reference(data: str, tmp_path: Path) -> None:
@@ -165,15 +166,24 @@ def test_trivial_errors_are_those_of_training(data: str) -> None:
 
 
 def test_the_fast_path_tells_its_own_errors(data: str) -> None:
-    """One-step errors of the fast path come from its kernels: in float32 they are the plain network's."""
+    """One-step errors of the fast path come from its kernels, several frames at once: in float32 they are the plain
+    network's; what is captured serves the next frames, and those of fewer particles too."""
     (episode,) = EpisodeStore(data, "test").episodes
+    fewer = replace(
+        episode,
+        key="fewer",
+        position_TN3=episode.position_TN3[:, 1:],
+        initial_velocity_N3=episode.initial_velocity_N3[1:],
+        material_N=episode.material_N[1:],
+    )
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1)
+    predict, made = FastPredictor(network, "highest"), []
     with torch.inference_mode():
-        for frame in (0, 3):
-            batch = make_batch([(episode, frame)], network.config)
-            if frame == 0:
-                predict = FastPredictor(network, "highest")
+        for samples in ([(episode, 0), (episode, 2)], [(fewer, 1), (fewer, 3)], [(episode, 3)]):
+            batch = make_batch(samples, network.config)
             torch.testing.assert_close(predict(batch), network(batch.state()), rtol=1e-4, atol=1e-8)
+            made.append(predict._rollout)
+    assert made[0] is made[1] is not made[2]
 
 
 def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -187,6 +197,80 @@ def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys:
     assert "left out: hgn.safetensors at fp16" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="path must be plain or auto here, got fast"):
         network_contenders(replace(config, path="fast"), CPU, [episode])
+
+
+def test_what_counts_most_comes_first(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Networks at the precision that tells most, then the solver on the data's grid, coarse grids, then other
+    precisions, whose rollouts off the fast path are short; the report keeps its order. What fails or is late is named
+    with the cause, and the others go on."""
+    monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
+    monkeypatch.setattr("tools.error_vs_time.__main__.GNS_ORDER", ("fp32", "fp16", "tf32"))
+    files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("gns", "hgn")]
+    order: list[str] = []
+
+    def noted(contender, *more):
+        order.append(score.label(contender.row))
+        if "48" in order[-1]:
+            raise ConfigError("grids of 48 are not liked")
+        return score.score(contender, *more)
+
+    monkeypatch.setattr("tools.error_vs_time.__main__.score", noted)
+    options = {"data": data, "out": str(tmp_path / "report"), "split": "validation", "weights": files, "device": "cpu"}
+    options |= {"frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1, "sinkhorn_scenes": 0}
+    options |= {"mpm_grids": [48, 64], "mpm_steps": [0.5], "precisions": ["tf32", "fp32"], "repeated_frames": 3}
+    assert main(options) == 0
+    assert [name.split(" (")[0] for name in order] == [
+        "HGN L = 3, M = 2, plain tf32",
+        "GNS M = 3, plain fp32",
+        *["constant velocity", "ballistic motion", "mean acceleration"],
+        *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
+        "MPM 48³, step 0.5",
+        "HGN L = 3, M = 2, plain fp32",
+        "GNS M = 3, plain tf32",
+    ]
+    report = json.loads((tmp_path / "report.json").read_text())
+    (left,) = report["meta"]["not_run"]
+    assert left["grid"] == 48 and left["cause"] == "grids of 48 are not liked"
+    assert report["meta"]["not_timed"] == ["MPM 64³, step 0.5"]  # whose frames come all at once here
+    assert "left out: MPM 48³, step 0.5: grids of 48 are not liked" in capsys.readouterr().err
+    rows = report["rows"]
+    assert [(row["system"], row["precision"]) for row in rows[:4]] == [
+        (kind, precision) for kind in ("gns", "hgn") for precision in ("tf32", "fp32")
+    ]
+    assert [row["scenes_reached"]["5"] for row in rows[:4]] == [0, 2, 2, 0]
+    assert all(row["ms"] > 0 and row["failed_scenes"] == 0 for row in rows[:4])
+
+
+def test_shipped_weights_that_fit(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By default all shipped weights are compared that are for such data; what is left out is said."""
+    (episode,) = EpisodeStore(data, "test").episodes
+    networks = {
+        "a": network_of(levels=3),
+        "b": gns_of(),
+        "blind": network_of(obstacle_features=False),
+        "slow": network_of(),
+        "coarse": network_of(),
+        "dry": network_of(materials=("snow",)),
+    }
+    paths = {}
+    for name, network in networks.items():
+        paths[name] = tmp_path / f"{name}.safetensors"
+        cell_size = 1 / 32 if name == "coarse" else random_grid(0, 10).cell_size
+        save_weights(paths[name], network, WeightsInfo(network.config, 30.0 if name == "slow" else 60.0, cell_size))
+    monkeypatch.setattr("tools.error_vs_time.__main__.shipped_weights", lambda: paths)
+    config = ErrorVsTimeConfig(data=data, out="x")
+    grid = random_grid(0, 10)
+    water = replace(episode, material_N=np.zeros_like(episode.material_N), obstacle_grid=grid)
+    assert [file.stem for file in fitting_weights([water])] == ["a", "b"]
+    told = capsys.readouterr().err
+    assert all(f"shipped weights {name}," in told for name in ("blind", "slow", "coarse", "dry"))
+    found = {c.row["weights"]: c.row["levels"] for c in network_contenders(config, CPU, [water])}
+    assert found == {"a.safetensors": 3, "b.safetensors": 1}
+    assert set(shipped_weights()) >= {"gns", "obstacles", "obstacles_small"}
 
 
 def test_ghost_acceleration_counts_particles_at_rest(data: str) -> None:
@@ -230,6 +314,12 @@ def test_sinkhorn_against_closed_forms() -> None:
     assert sinkhorn_divergence(cloud[:1], cloud[1:2], 0.01) == pytest.approx(
         float((cloud[0] - cloud[1]).square().sum()), rel=1e-5
     )
+    others = [(cloud[:50], cloud[50:100] + shift), (cloud[:50], cloud[:50]), (cloud[:3], cloud[3:6])]
+    together = sinkhorn_divergences(
+        [*others, (cloud[:50] * 0.1, cloud[50:100]), (cloud[:50] * math.nan, cloud[:50])], 0.05
+    )
+    assert together[:3] == pytest.approx([sinkhorn_divergence(*pair, 0.05) for pair in others], rel=1e-4, abs=1e-9)
+    assert together[3] > 0 and math.isnan(together[4])
     cloud[3, 0] = math.nan
     assert math.isnan(sinkhorn_divergence(cloud, cloud, 0.01))
 

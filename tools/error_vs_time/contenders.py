@@ -7,26 +7,35 @@ Shape legend: T frames, N particles of a scene.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 
-from hgn.config import MpmConfig, NetworkConfig
+from hgn.config import NetworkConfig
 from hgn.data.batch import Batch, make_batch
+from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError
-from tools.trial import FrameClock, Trial, network_trials, solver_scene, solver_trials
+from tools.error_vs_time.launches import Setting, SolverLaunches
+from tools.trial import FrameClock, Trial, network_trials
+
+if TYPE_CHECKING:
+    from hgn.runtime.fast import FastRollout
 
 PARTICLES_PER_BATCH = 32_768
+PARTICLES_AT_ONCE = 150_000  # of the fast path's one-step errors
+# What is scored first; what is last may be left out when the time is over.
+HGN_FIRST, GNS_FIRST, SAME_GRID, HGN_NEXT, COARSE_GRIDS, HGN_LAST, GNS_LAST = range(7)
 PRECISIONS = {"fp32": "highest", "tf32": "high", "fp16": "half"}  # names of the report, and of the paths
 
 
@@ -44,6 +53,7 @@ class Contender(Protocol):
 
     row: dict[str, Any]  # system and settings
     all_at_once: bool  # whether all scenes are simulated side by side, or so many as the command says
+    importance: int  # 0 is scored first
 
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep | None:
         """Errors of the accelerations of every stride-th frame; none where the contender has no such thing."""
@@ -51,19 +61,42 @@ class Contender(Protocol):
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
         """Rollouts from the episodes' first frames, side by side."""
 
+    def release(self) -> None:
+        """Gives back what is kept on the device for rollouts to come."""
+
 
 class NetworkContender:
     """A weights file at one precision of its matrix products, on the path that a simulation would take."""
 
     all_at_once = False
 
-    def __init__(self, file: Path, precision: str, path: str, device: torch.device, frame_rate_hz: float) -> None:
-        """Raises: ConfigError where the path does not take the network or the precision."""
+    def __init__(
+        self,
+        file: Path,
+        precision: str,
+        path: str,
+        device: torch.device,
+        frame_rate_hz: float,
+        rank: int = 0,
+        repeated_frames: int | None = None,
+    ) -> None:
+        """`rank` counts the precisions of these weights that tell more; but for the first, rollouts off the fast path
+        end at `repeated_frames`.
+
+        Raises: ConfigError where the path does not take the network or the precision.
+        """
         self.network, info = load_weights(file, device)
         require_frame_rate(info, frame_rate_hz)
         config = info.network
         self.device, self.precision = device, PRECISIONS[precision]
         self.path, _ = path_on(device, config, path, self.precision)
+        fast, hgn = self.path == "fast", config.kind == "hgn"
+        if rank == 0:
+            self.importance = HGN_FIRST if hgn else GNS_FIRST
+        else:
+            self.importance = HGN_NEXT if fast else HGN_LAST if hgn else GNS_LAST
+        self.frames = None if fast or rank == 0 else repeated_frames
+        self._fast: FastPredictor | None = None
         with self.matmul():
             self.simulator = Simulator(self.network, info.frame_rate_hz, self.path, self.precision)
         self.row: dict[str, Any] = {
@@ -91,13 +124,18 @@ class NetworkContender:
         with self.matmul():
             if self.path == "fast":
                 assert isinstance(self.network, HierarchicalGraphNetwork)
-                fast = FastPredictor(self.network, self.precision)
-                return one_step(fast, config, episode, stride, rest_speed, self.device, particles_per_batch=1)
+                self._fast = self._fast or FastPredictor(self.network, self.precision)
+                return one_step(self._fast, config, episode, stride, rest_speed, self.device, PARTICLES_AT_ONCE)
             return one_step(lambda b: self.network(b.state()), config, episode, stride, rest_speed, self.device)
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
+        frames = frames if self.frames is None or on_frame is not None else min(frames, self.frames)
         with self.matmul():
             return network_trials(self.simulator, [InitialState.of_episode(e) for e in episodes], frames, on_frame)
+
+    def release(self) -> None:
+        self._fast = None
+        self.simulator.release()
 
 
 class SolverContender:
@@ -105,28 +143,19 @@ class SolverContender:
 
     all_at_once = True  # a scene takes one of a GPU's many processors
 
-    def __init__(
-        self,
-        config: MpmConfig,
-        cell_size: float,
-        frame_rate_hz: float,
-        frames: int,
-        timed_frames: int,
-        perturbation: float = 0.0,
-    ) -> None:
-        """Rollouts end at `frames`, timed ones at `timed_frames`."""
-        self.config, self.cell_size, self.frame_rate_hz = config, cell_size, frame_rate_hz
-        self.frames, self.timed_frames, self.perturbation = frames, timed_frames, perturbation
-        self._known: dict[tuple[str, ...], list[Trial]] = {}
+    def __init__(self, launches: SolverLaunches, setting: Setting, frames: int, importance: int) -> None:
+        """Rollouts end at `frames`, where nobody takes the time."""
+        self.launches, self.setting = launches, launches.add(setting)
+        self.frames, self.importance = frames, importance
         self.row: dict[str, Any] = {
             "system": "mpm",
-            "grid": round(1 / cell_size),
-            "step": config.stability_fraction,
+            "grid": round(1 / launches.cell_size),
+            "step": setting.step,
             "precision": "fp32",
         }
 
     def named(self, **row: Any) -> SolverContender:
-        """The same in another row; what one has simulated the other need not."""
+        """The same in another row."""
         same = copy.copy(self)
         same.row = row
         return same
@@ -136,26 +165,18 @@ class SolverContender:
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
         if on_frame is not None:
-            return self._simulate(episodes, min(frames, self.timed_frames), on_frame)
-        keys = tuple(episode.key for episode in episodes)
-        if keys not in self._known:
-            self._known[keys] = self._simulate(episodes, min(frames, self.frames), None)
-        return self._known[keys]
+            return self.launches.timed(self.setting, episodes, frames, on_frame)
+        trials, most = self.launches.trials(self.setting, episodes), min(frames, self.frames)
+        return [Trial(trial.position_TN3[:most], trial.cause) for trial in trials]
 
-    def _simulate(
-        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
-    ) -> list[Trial]:
-        scenes = [solver_scene(episode, self.cell_size) for episode in episodes]
-        for scene in scenes if self.perturbation else ():
-            generator = np.random.default_rng(scene.seed)
-            scene.position_N3[:] += generator.uniform(-self.perturbation, self.perturbation, scene.position_N3.shape)
-        return solver_trials(scenes, self.config, frames, self.frame_rate_hz, on_frame)
+    def release(self) -> None:
+        """Nothing is kept on the device."""
 
 
 class TrivialContender:
     """The same acceleration for every particle, whatever happens: nothing is learned."""
 
-    all_at_once = False
+    all_at_once, importance = False, SAME_GRID
 
     def __init__(self, name: str, acceleration: Callable[[Episode], np.ndarray], device: torch.device) -> None:
         self.row: dict[str, Any] = {"system": "trivial", "predictor": name}
@@ -180,23 +201,33 @@ class TrivialContender:
             trials.append(Trial((episode.position_TN3[0] + path_TN3).astype(np.float32)))
         return trials
 
+    def release(self) -> None:
+        """Nothing is kept on the device."""
+
 
 class FastPredictor:
-    """Accelerations by the fast path's own launches: a frame simulated from each given state of one scene."""
+    """Accelerations by the fast path's own launches: a frame simulated from each given state."""
 
     def __init__(self, network: HierarchicalGraphNetwork, precision: str) -> None:
-        from hgn.runtime.fast import FastRollout  # loads Triton
-
-        self._make = lambda state: FastRollout(network, state, precision)
+        self.network, self.precision = network, precision
         self._rollout: FastRollout | None = None
 
     def __call__(self, batch: Batch) -> torch.Tensor:
         state = batch.state()
-        rollout = self._rollout = self._rollout or self._make(state)
-        rollout.position_N3.copy_(state.position_N3)
-        rollout.velocity_NV.copy_(state.velocity_NM3.flatten(1))
+        rollout = self._rollout
+        if rollout is not None and rollout.fits(state):
+            rollout.begin(state, new_obstacles=True)
+        else:
+            room = 0 if rollout is None else rollout.particles
+            self._rollout = rollout = None  # before the new one is allocated
+            rollout = self._rollout = self._made(state, room)
         rollout.run(1)
-        return rollout.velocity_NV[:, :3] - state.velocity_NM3[:, 0]
+        return rollout.velocity_NV[: len(state.position_N3), :3] - state.velocity_NM3[:, 0]
+
+    def _made(self, state: ParticleState, room: int) -> FastRollout:
+        from hgn.runtime.fast import FastRollout  # loads Triton
+
+        return FastRollout(self.network, state, self.precision, room=room)
 
 
 def one_step(
@@ -212,6 +243,7 @@ def one_step(
     result = OneStep()
     frames = list(range(0, len(episode.position_TN3) - 1, stride))
     together = max(1, particles_per_batch // max(1, len(episode.material_N)))
+    together = math.ceil(len(frames) / math.ceil(len(frames) / together))  # batches of about as many
     with torch.inference_mode():
         for first in range(0, len(frames), together):
             batch = make_batch([(episode, n) for n in frames[first : first + together]], network).to(device)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,11 @@ from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.training.errors import REPORTED_FRAMES, position_mse
 from tools.error_vs_time.contenders import Contender, OneStep, frame_milliseconds
 from tools.error_vs_time.settings import ErrorVsTimeConfig
-from tools.error_vs_time.sinkhorn import sinkhorn_divergence
+from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
-from tools.trial import FrameClock, Trial
+from tools.trial import Trial
+
+WARM_FRAMES, FAST_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
 
 
 def score(
@@ -69,15 +72,15 @@ def rollout_figures(
     """Everything that rollouts tell, and the position MSE of each frame."""
     frames = len(references[0].position_TN3)
     mse_ST = np.full((len(trials), frames), np.nan)
-    for mse_T, trial, reference in zip(mse_ST, trials, references, strict=True):
-        mse_T[: trial.frame_count] = position_mse(trial.position_TN3, reference.position_TN3[: trial.frame_count])
+    with ThreadPoolExecutor(torch.get_num_threads()) as threads:
+        for mse_T, found_T in zip(mse_ST, threads.map(_position_mse, trials, references), strict=True):
+            mse_T[: len(found_T)] = found_T
+        motions = list(threads.map(_motion, trials, references))
+        ends = list(threads.map(_end, trials, references))
     reached_T = np.isfinite(mse_ST).sum(0)
     curve_T = np.where(reached_T > 0, np.nansum(mse_ST, axis=0) / np.maximum(reached_T, 1), np.nan)
     reported = sorted({frame for frame in (*REPORTED_FRAMES, frames - 1) if frame < frames})
     told = [frame for frame in reported if reached_T[frame]]
-    with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-        motions = list(threads.map(_motion, trials, references))
-        ends = list(threads.map(_end, trials, references))
     failures = [trial for trial in trials if trial.cause is not None]
     row: dict[str, Any] = {
         "position_mse": {str(frame): float(curve_T[frame]) for frame in told},
@@ -98,47 +101,63 @@ def rollout_figures(
     return row, curve_T
 
 
+@dataclass(eq=False)
+class Stopwatch:
+    """The run times of a contender: how many frames it is timed over, and what was measured."""
+
+    contender: Contender
+    single_frames: int
+    batch_frames: int
+    memory_gb: float | None
+    single: list[float] = field(default_factory=list)
+    batched: list[float] = field(default_factory=list)
+
+    def row(self, batch_scenes: int) -> dict[str, Any]:
+        return {
+            "ms": float(np.median(self.single)) if self.single else None,
+            "ms_quartiles": _quartiles(self.single),
+            "ms_batched": float(np.median(self.batched)) if self.batched else None,
+            "batch_scenes": batch_scenes,
+            "timed_frames": self.single_frames,
+            "memory_gb": self.memory_gb,
+        }
+
+
 def time_in_turns(
     contenders: Sequence[Contender],
     references: Sequence[Episode],
     config: ErrorVsTimeConfig,
     device: torch.device,
     late: Callable[[], bool] = lambda: False,
-) -> list[dict[str, Any]]:
+    on_round: Callable[[list[dict[str, Any] | None]], None] = lambda _: None,
+) -> list[dict[str, Any] | None]:
     """Run times of all contenders in this process: each simulates the same scenes once to warm up, then in turns.
 
-    When it is late no other one is begun with (its times are none then), and no further round. `ms` is a frame of one
-    scene, `ms_batched` a frame of each of `batch_scenes` scenes side by side.
+    When it is late no other one is begun with (its row is none then), and no further round. `ms` is a frame of one
+    scene, `ms_batched` a frame of each of `batch_scenes` scenes side by side. `on_round` gets all rows after a round.
     """
-    frames = min(config.timed_frames, len(references[0].position_TN3))
-    singles = [[episode] for episode in references[: config.timed_scenes]]
-    batch = list(references[: config.batch_scenes])
-    memory: list[float | None] = [None] * len(contenders)
-    in_time = []
-    for i, contender in enumerate(contenders):
+    # The largest first: what is captured for it has room for the others.
+    some = sorted(references[: config.timed_scenes], key=lambda episode: -len(episode.material_N))
+    singles, batch = [[episode] for episode in some], list(references[: config.batch_scenes])
+    watches: list[Stopwatch | None] = [None] * len(contenders)
+    for i in sorted(range(len(contenders)), key=lambda i: contenders[i].importance):
         if not late():
-            memory[i] = _warm_up(contender, singles, batch, frames, device)
-            in_time.append(i)
-    single: list[list[float]] = [[] for _ in contenders]
-    batched: list[list[float]] = [[] for _ in contenders]
+            watches[i] = _warm_up(contenders[i], singles[0], batch, config, device)
+
+    def rows() -> list[dict[str, Any] | None]:
+        return [None if watch is None else watch.row(len(batch)) for watch in watches]
+
     for done in range(config.rounds):
         if done and late():
             break
         for scenes in (*singles, batch):
-            for i in in_time:
-                taken = frame_milliseconds(contenders[i], scenes, frames)
+            for watch in filter(None, watches):
+                frames = watch.batch_frames if scenes is batch else watch.single_frames
+                taken = frame_milliseconds(watch.contender, scenes, frames)
                 if taken is not None:
-                    (batched[i] if scenes is batch else single[i]).append(taken / len(scenes))
-    return [
-        {
-            "ms": float(np.median(one)) if one else None,
-            "ms_quartiles": _quartiles(one),
-            "ms_batched": float(np.median(many)) if many else None,
-            "batch_scenes": len(batch),
-            "memory_gb": used,
-        }
-        for one, many, used in zip(single, batched, memory, strict=True)
-    ]
+                    (watch.batched if scenes is batch else watch.single).append(taken / len(scenes))
+        on_round(rows())
+    return rows()
 
 
 def pay_back(
@@ -185,6 +204,10 @@ def report(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[s
     return {"meta": meta, "rows": _plain(list(rows))}
 
 
+def _position_mse(trial: Trial, reference: Episode) -> np.ndarray:
+    return position_mse(trial.position_TN3, reference.position_TN3[: trial.frame_count])
+
+
 def _motion(trial: Trial, reference: Episode) -> dict[str, float]:
     result = {"momentum_error": momentum_error(trial.position_TN3, reference.position_TN3)}
     if trial.frame_count < 2:
@@ -228,7 +251,7 @@ def _sinkhorn(
     config: ErrorVsTimeConfig,
     device: torch.device,
 ) -> dict[str, dict[str, float]]:
-    found: dict[str, dict[str, list[float]]] = {}
+    named, pairs = [], []
     for trial, reference in zip(trials, references, strict=True):
         for index in np.unique(reference.material_N):
             of_material = np.flatnonzero(reference.material_N == index)
@@ -240,31 +263,47 @@ def _sinkhorn(
                         torch.from_numpy(np.ascontiguousarray(path[frame, chosen])).to(device)
                         for path in (trial.position_TN3, reference.position_TN3)
                     )
-                    value = sinkhorn_divergence(first, second, config.sinkhorn_blur)
-                    found.setdefault(MATERIALS[index], {}).setdefault(str(frame), []).append(value)
+                    named.append((MATERIALS[index], str(frame)))
+                    pairs.append((first, second))
+    found: dict[str, dict[str, list[float]]] = {}
+    for (material, frame_text), value in zip(named, sinkhorn_divergences(pairs, config.sinkhorn_blur), strict=True):
+        found.setdefault(material, {}).setdefault(frame_text, []).append(value)
     return {name: {frame: float(np.mean(v)) for frame, v in values.items()} for name, values in found.items()}
 
 
 def _warm_up(
     contender: Contender,
-    singles: Sequence[Sequence[Episode]],
+    single: Sequence[Episode],
     batch: Sequence[Episode],
-    frames: int,
+    config: ErrorVsTimeConfig,
     device: torch.device,
-) -> float | None:
-    """Simulates everything once; returns the most GPU memory that one scene took, of what torch knows."""
+) -> Stopwatch:
+    """Simulates one scene and the batch for some frames, which say how many take `timed_seconds`; and the most GPU
+    memory that the one scene took, of what torch knows.
+    """
     network = contender.row["system"] in ("hgn", "gns", "gns_particles")
+    contender.release()
     before = 0
     if device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
-    clock = FrameClock() if contender.row["system"] == "mpm" else None  # the solver's short form
-    for scenes in singles:
-        contender.trials(scenes, frames, clock)
+    most = min(config.timed_frames, len(single[0].position_TN3))
+    if contender.row["system"] == "mpm":
+        most = min(most, config.mpm_timed_frames)
+    # what looks at its frames 32 at a time tells nothing of fewer
+    frames = FAST_WARM_FRAMES if contender.row.get("path") == "fast" else WARM_FRAMES
+    taken = frame_milliseconds(contender, single, min(frames, most))
     peak = torch.cuda.max_memory_allocated(device) - before if device.type == "cuda" else 0
-    contender.trials(batch, frames, clock)
-    return peak / 1e9 if network and device.type == "cuda" else None
+    together = frame_milliseconds(contender, batch, min(frames, most))
+
+    def affordable(milliseconds: float | None) -> int:
+        if milliseconds is None:
+            return most
+        return min(most, max(frames, int(1e3 * config.timed_seconds / milliseconds)))
+
+    memory = peak / 1e9 if network and device.type == "cuda" else None
+    return Stopwatch(contender, affordable(taken), affordable(together), memory)
 
 
 def _quartiles(values: Sequence[float] | np.ndarray) -> list[float] | None:

@@ -27,6 +27,7 @@ class ErrorVsTimeConfig:
     mpm_grids: tuple[int, ...] = (32, 48, 64)
     mpm_steps: tuple[float, ...] = (1.0, 0.5)
     reference_step: float = 0.25
+    repeated_frames: int = 51
     mpm_frames: int = 300
     mpm_timed_frames: int = 12
     resimulate: bool = True
@@ -34,7 +35,8 @@ class ErrorVsTimeConfig:
     batch_scenes: int = 8
     timed_scenes: int = 3
     timed_frames: int = 100
-    rounds: int = 3
+    timed_seconds: float = 0.5
+    rounds: int = 2
     sinkhorn_points: int = 1024
     sinkhorn_scenes: int = 20
     sinkhorn_blur: float = 0.01
@@ -54,6 +56,7 @@ class ErrorVsTimeConfig:
             "frame_stride",
             "batch_scenes",
             "timed_scenes",
+            "timed_seconds",
             "rounds",
             "sinkhorn_points",
             "sinkhorn_blur",
@@ -62,7 +65,8 @@ class ErrorVsTimeConfig:
         require(self.frames >= 2, "frames", "at least 2", self.frames)
         for name in ("timed_frames", "mpm_timed_frames"):
             require(getattr(self, name) >= 4, name, "at least 4", getattr(self, name))
-        require(self.mpm_frames >= 2, "mpm_frames", "at least 2", self.mpm_frames)
+        for name in ("mpm_frames", "repeated_frames"):
+            require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
         require_non_negative(self, "sinkhorn_scenes")
         if self.seconds is not None:
             require_positive(self, "seconds")

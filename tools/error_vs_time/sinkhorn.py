@@ -2,17 +2,19 @@
 
 An optimal-transport distance that does not care which particle is which: small where a rollout looks right although no
 particle is where the reference has it. S(a, b) = OT(a, b) - OT(a, a) / 2 - OT(b, b) / 2, each with entropy blur².
-Shape legend: N, M particles.
+Shape legend: B pairs of clouds, N, M particles.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 
 SCALING = 0.8  # the blur's ratio between steps, from the clouds' size down
 FINAL_STEPS = 20  # at the last blur
+ENTRIES_AT_ONCE = 1 << 26  # of costs
 
 
 def sinkhorn_divergence(first_N3: torch.Tensor, second_M3: torch.Tensor, blur: float) -> float:
@@ -21,41 +23,74 @@ def sinkhorn_divergence(first_N3: torch.Tensor, second_M3: torch.Tensor, blur: f
     Zero for equal clouds, the square of the shift for a shifted one. `blur` is the length below which matter may be
     mixed up. Costs memory and time of N x M.
     """
-    if not (bool(first_N3.isfinite().all()) and bool(second_M3.isfinite().all())):
-        return math.nan
-    both = torch.cat([first_N3, second_M3])
-    size = float((both.amax(0) - both.amin(0)).norm())
-    steps = max(0, math.ceil(math.log(blur / size) / math.log(SCALING))) if size > blur else 0
-    blurs = [size * SCALING**k for k in range(steps)] + [blur] * FINAL_STEPS
-    cost_NM = _squared(first_N3, second_M3)
-    f_N, g_M = _potentials(cost_NM, blurs)
-    own_N = _symmetric_potential(_squared(first_N3, first_N3), blurs)
-    own_M = _symmetric_potential(_squared(second_M3, second_M3), blurs)
-    return float((f_N - own_N).mean() + (g_M - own_M).mean())
+    return sinkhorn_divergences([(first_N3, second_M3)], blur)[0]
 
 
-def _potentials(cost_NM: torch.Tensor, blurs: list[float]) -> tuple[torch.Tensor, torch.Tensor]:
-    f_N, g_M = cost_NM.new_zeros(len(cost_NM)), cost_NM.new_zeros(cost_NM.shape[1])
-    for blur in blurs:
+def sinkhorn_divergences(pairs: Sequence[tuple[torch.Tensor, torch.Tensor]], blur: float) -> list[float]:
+    """Those of many pairs of clouds, pairs of equal numbers of particles at once: each as if it were alone."""
+    found = [math.nan] * len(pairs)
+    of_size: dict[tuple[int, int], list[int]] = {}
+    for i, (first_N3, second_M3) in enumerate(pairs):
+        of_size.setdefault((len(first_N3), len(second_M3)), []).append(i)
+    for (n, m), indices in of_size.items():
+        together = max(1, ENTRIES_AT_ONCE // (max(n, m) ** 2))
+        for start in range(0, len(indices), together):
+            some = indices[start : start + together]
+            first_BN3, second_BM3 = (torch.stack([pairs[i][side] for i in some]) for side in (0, 1))
+            for i, value in zip(some, _divergences(first_BN3, second_BM3, blur).tolist(), strict=True):
+                found[i] = value
+    return found
+
+
+def _divergences(first_BN3: torch.Tensor, second_BM3: torch.Tensor, blur: float) -> torch.Tensor:
+    both = torch.cat([first_BN3, second_BM3], dim=1)
+    sizes = (both.amax(1) - both.amin(1)).norm(dim=-1).tolist()
+    blur_SB = _blurs(sizes, blur, first_BN3)
+    cost_BNM = _squared(first_BN3, second_BM3)
+    f_BN, g_BM = _potentials(cost_BNM, blur_SB)
+    own_BN = _symmetric_potential(_squared(first_BN3, first_BN3), blur_SB)
+    own_BM = _symmetric_potential(_squared(second_BM3, second_BM3), blur_SB)
+    divergence_B = (f_BN - own_BN).mean(1) + (g_BM - own_BM).mean(1)
+    return torch.where(both.isfinite().flatten(1).all(1), divergence_B, math.nan)
+
+
+def _blurs(sizes: Sequence[float], blur: float, like: torch.Tensor) -> torch.Tensor:
+    """The blur of each pair at each step, [S, B]: from its clouds' size down; all end together, and are 0 before."""
+    columns = []
+    for size in sizes:
+        steps = max(0, math.ceil(math.log(blur / size) / math.log(SCALING))) if blur < size < math.inf else 0
+        columns.append([size * SCALING**k for k in range(steps)] + [blur] * FINAL_STEPS)
+    most = max(len(column) for column in columns)
+    padded = [[0.0] * (most - len(column)) + column for column in columns]
+    return like.new_tensor(padded).T.contiguous()
+
+
+def _potentials(cost_BNM: torch.Tensor, blur_SB: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    f_BN, g_BM = cost_BNM.new_zeros(cost_BNM.shape[:2]), cost_BNM.new_zeros(cost_BNM.shape[0], cost_BNM.shape[2])
+    turned_BMN = cost_BNM.transpose(1, 2)
+    for blur_B in blur_SB:
         # Both from the old ones, averaged: symmetric in the clouds, and it does not oscillate.
-        next_f_N, next_g_M = _soft_minimum(cost_NM, g_M, blur), _soft_minimum(cost_NM.T, f_N, blur)
-        f_N, g_M = 0.5 * (f_N + next_f_N), 0.5 * (g_M + next_g_M)
-    return _soft_minimum(cost_NM, g_M, blurs[-1]), _soft_minimum(cost_NM.T, f_N, blurs[-1])
+        next_f_BN, next_g_BM = _soft_minimum(cost_BNM, g_BM, blur_B), _soft_minimum(turned_BMN, f_BN, blur_B)
+        begun_B1 = (blur_B > 0)[:, None]
+        f_BN = torch.where(begun_B1, 0.5 * (f_BN + next_f_BN), f_BN)
+        g_BM = torch.where(begun_B1, 0.5 * (g_BM + next_g_BM), g_BM)
+    return _soft_minimum(cost_BNM, g_BM, blur_SB[-1]), _soft_minimum(turned_BMN, f_BN, blur_SB[-1])
 
 
-def _symmetric_potential(cost_NN: torch.Tensor, blurs: list[float]) -> torch.Tensor:
-    f_N = cost_NN.new_zeros(len(cost_NN))
-    for blur in blurs:
-        f_N = 0.5 * (f_N + _soft_minimum(cost_NN, f_N, blur))
-    return _soft_minimum(cost_NN, f_N, blurs[-1])
+def _symmetric_potential(cost_BNN: torch.Tensor, blur_SB: torch.Tensor) -> torch.Tensor:
+    f_BN = cost_BNN.new_zeros(cost_BNN.shape[:2])
+    for blur_B in blur_SB:
+        f_BN = torch.where((blur_B > 0)[:, None], 0.5 * (f_BN + _soft_minimum(cost_BNN, f_BN, blur_B)), f_BN)
+    return _soft_minimum(cost_BNN, f_BN, blur_SB[-1])
 
 
-def _soft_minimum(cost_NM: torch.Tensor, g_M: torch.Tensor, blur: float) -> torch.Tensor:
+def _soft_minimum(cost_BNM: torch.Tensor, g_BM: torch.Tensor, blur_B: torch.Tensor) -> torch.Tensor:
     """-ε log mean exp((g - c) / ε) over M, with ε = blur²."""
-    epsilon = blur * blur
-    return -epsilon * (torch.logsumexp((g_M - cost_NM) / epsilon, dim=1) - math.log(cost_NM.shape[1]))
+    epsilon_B11 = (blur_B * blur_B).clamp(min=1e-30)[:, None, None]
+    exponent_BNM = (g_BM[:, None] - cost_BNM).div_(epsilon_B11)
+    return -epsilon_B11[..., 0] * (torch.logsumexp(exponent_BNM, dim=2) - math.log(cost_BNM.shape[2]))
 
 
-def _squared(first_N3: torch.Tensor, second_M3: torch.Tensor) -> torch.Tensor:
+def _squared(first_BN3: torch.Tensor, second_BM3: torch.Tensor) -> torch.Tensor:
     # By differences: as a matrix product it would round in TF32.
-    return torch.cdist(first_N3, second_M3, compute_mode="donot_use_mm_for_euclid_dist").square()
+    return torch.cdist(first_BN3, second_BM3, compute_mode="donot_use_mm_for_euclid_dist").square()

@@ -196,7 +196,7 @@ def test_walls() -> None:
 
 
 def test_scenes_of_a_batch_equal_scenes_alone() -> None:
-    """A scene's trajectory is bitwise the same alone and beside scenes of other size, material and obstacles."""
+    """A scene's trajectory is bitwise the same alone and beside scenes of other size, material, obstacles and steps."""
     sheet = Obstacle(
         "sheet", np.array([[0.0, 0.3, 0], [1, 0.3, 0], [1, 0.3, 1], [0, 0.3, 1]]),
         np.array([[0, 1, 2], [0, 2, 3]], np.int32), False,
@@ -206,9 +206,10 @@ def test_scenes_of_a_batch_equal_scenes_alone() -> None:
         block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet,)),
         joined(block(SAND, (0.3, 0.2, 0.3), (0.4, 0.3, 0.4)), block(WATER, (0.5, 0.2, 0.3), (0.6, 0.3, 0.4))),
     ]
-    together = simulate(scenes, ADAPTIVE, 7, 60.0)
-    for scene, outcome in zip(scenes, together, strict=True):
-        (alone,) = simulate([scene], ADAPTIVE, 7, 60.0)
+    steps = (0.5, 1.0, 0.25)
+    together = simulate(scenes, ADAPTIVE, 7, 60.0, stability_fractions=steps)
+    for scene, step, outcome in zip(scenes, steps, together, strict=True):
+        (alone,) = simulate([scene], dataclasses.replace(ADAPTIVE, stability_fraction=step), 7, 60.0)
         assert np.array_equal(alone.position_TN3, outcome.position_TN3)
         assert alone.counters == outcome.counters
 
@@ -320,6 +321,8 @@ def test_bad_input_is_refused() -> None:
         simulate([good], ADAPTIVE, 0, 60.0)
     with pytest.raises(ConfigError, match="frame_rate_hz"):
         simulate([good], ADAPTIVE, 2, float("nan"))
+    with pytest.raises(ConfigError, match=r"stability_fractions\[1\] must be above 0"):
+        simulate([good, good], ADAPTIVE, 2, 60.0, stability_fractions=(1.0, 0.0))
 
 
 def test_memory_is_given_back() -> None:

@@ -1,0 +1,92 @@
+"""The solver's simulations for the report: all settings of one grid side by side, as a launch lasts as long as its
+longest scene, whatever runs beside it; each is simulated once, and scenes get their colliders once.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hgn.config import MpmConfig
+from hgn.scene.episode import Episode
+from hgn.scene.scene import Scene
+from tools.trial import Trial, solver_scene, solver_trials
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is varied on a grid: the share of the limit of stability, and how far particles start off at most."""
+
+    step: float
+    perturbation: float = 0.0  # domain units
+
+
+class SolverLaunches:
+    """Simulates scenes on one grid with every setting that was added."""
+
+    def __init__(self, config: MpmConfig, cell_size: float, frame_rate_hz: float, frames: int) -> None:
+        self.config, self.cell_size, self.frame_rate_hz, self.frames = config, cell_size, frame_rate_hz, frames
+        self._settings: list[Setting] = []
+        self._known: dict[tuple[Setting, str], Trial] = {}
+        self._colliders: dict[str, Any] = {}
+
+    def add(self, setting: Setting) -> Setting:
+        if setting not in self._settings:
+            self._settings.append(setting)
+        return setting
+
+    def trials(
+        self, setting: Setting, episodes: Sequence[Episode], on_frame: Callable[[int], None] | None = None
+    ) -> list[Trial]:
+        """Trajectories of `frames` frames from the episodes' first ones."""
+        missing = [episode for episode in episodes if (setting, episode.key) not in self._known]
+        if missing:
+            pairs = [(other, episode) for other in self._settings for episode in missing]
+            simulated = self._simulate(pairs, self.frames, on_frame)
+            self._known |= {(s, e.key): trial for (s, e), trial in zip(pairs, simulated, strict=True)}
+        return [self._known[setting, episode.key] for episode in episodes]
+
+    def timed(
+        self, setting: Setting, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None]
+    ) -> list[Trial]:
+        """A few frames with one setting alone, for the clock."""
+        return self._simulate([(setting, episode) for episode in episodes], frames, on_frame)
+
+    def _simulate(
+        self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: Callable[[int], None] | None
+    ) -> list[Trial]:
+        self._collide([episode for _, episode in pairs])
+        # a scene's steps are its own; where all are alike the config says so
+        alike = replace(self.config, stability_fraction=pairs[0][0].step)
+        return solver_trials(
+            [self._scene(setting, episode) for setting, episode in pairs],
+            alike,
+            frames,
+            self.frame_rate_hz,
+            on_frame,
+            [self._colliders[episode.key] for _, episode in pairs],
+            [setting.step for setting, _ in pairs],
+        )
+
+    def _scene(self, setting: Setting, episode: Episode) -> Scene:
+        scene = solver_scene(episode, self.cell_size)
+        if setting.perturbation:
+            draw = np.random.default_rng(scene.seed).uniform
+            scene.position_N3[:] += draw(-setting.perturbation, setting.perturbation, scene.position_N3.shape)
+        return scene
+
+    def _collide(self, episodes: Sequence[Episode]) -> None:
+        from datagen.mpm.collider import build_collider
+
+        missing = {episode.key: episode for episode in episodes if episode.key not in self._colliders}
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            built = threads.map(
+                lambda e: build_collider(solver_scene(e, self.cell_size), self.config.collider_band_cells),
+                missing.values(),
+            )
+            self._colliders |= dict(zip(missing, built, strict=True))
