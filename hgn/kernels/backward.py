@@ -42,7 +42,7 @@ class TrainingEngine(Engine):
         Behind the gradients `totals` has the encoder's combined first layer, and `tail` elements for other use.
         """
         super().__init__(config, packed, values, grid, particle_count, precision, True, tuning)
-        self.unscale = 1.0 / loss_scale
+        self.unscale, self.copy_precision = 1.0 / loss_scale, precision
         self._allocate_gradients(tail)
 
     def _allocate_gradients(self, tail: int) -> None:

@@ -95,16 +95,28 @@ class GraphNetworkSimulator(ParticleNetwork):
 
     def propagate(self, state: ParticleState, neighbours: NeighbourList) -> torch.Tensor:
         """The raw output [N, 3] of a state and its graph."""
-        node_NW = self.encode_particles(state)[neighbours.order_N]
-        position_N3 = state.position_N3[neighbours.order_N]
+        order_N = neighbours.order_N
+        # a gather of what has gradients would have to be summed backward
+        state = replace(
+            state,
+            position_N3=state.position_N3[order_N],
+            velocity_NM3=state.velocity_NM3[order_N],
+            material_N=state.material_N[order_N],
+            scene_N=state.scene_N[order_N],
+        )
+        decoded_N3 = self.decoded(self.encode_particles(state), state.position_N3, neighbours)
+        return torch.empty_like(decoded_N3).index_copy(0, order_N, decoded_N3)
+
+    def decoded(self, node_NW: torch.Tensor, position_N3: torch.Tensor, neighbours: NeighbourList) -> torch.Tensor:
+        """The raw output [N, 3] of encoded particles, all in the list's order."""
         if self.edges is not None:
             node_NW = self._steps_of_edges(self.edges, node_NW, position_N3, neighbours)
         elif torch.is_grad_enabled():
             node_NW = self._steps(node_NW, position_N3, neighbours)
         else:
             node_NW = self._steps_in_blocks(node_NW, position_N3, neighbours)
-        decoded_N3 = self.decode(node_NW)
-        return torch.empty_like(decoded_N3).index_copy(0, neighbours.order_N, decoded_N3)
+        result: torch.Tensor = self.decode(node_NW)
+        return result
 
     def _edges(self, position_N3: torch.Tensor, sender_E: torch.Tensor, receiver_E: torch.Tensor) -> torch.Tensor:
         """Latent edges [E, W] from sender minus receiver and their distance, in radii."""

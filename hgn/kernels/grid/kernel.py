@@ -205,71 +205,29 @@ def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
 
 
 @triton.jit
-def prepare_particles(
+def _store_features(
+    row,
+    live,
+    scene,
     position,
     velocity,
-    scene_of,
     material_of,
-    origin,
     domain,
-    particle_count,
-    low,
-    geometry,
-    mark,
-    rank,
     mean,
     std,
     obstacle_table,
     obstacle_cell_size,
     features,
-    cell_of,
-    weight_of,
-    fraction_of,
-    cell_size,
     wall_maximum,
-    capacity,
     HISTORY: tl.constexpr,
     NORMALS: tl.constexpr,
     OBSTACLES: tl.constexpr,
     SYMMETRY: tl.constexpr,
     FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
-    """Features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES]; its 8 cells,
-    their weights, and its fraction. Without OBSTACLES nothing is looked up and the normals stay zero; with SYMMETRY the
-    particles are an image of the scene that the obstacle table is of: looked up there, normals brought back."""
-    count = tl.load(particle_count)
-    if tl.program_id(0) * BLOCK >= count:
-        return
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = row < count
-    scene = tl.load(scene_of + row, mask=live, other=0)
-    bx, fx = _base(position, origin, scene, row, live, 0, cell_size)
-    by, fy = _base(position, origin, scene, row, live, 1, cell_size)
-    bz, fz = _base(position, origin, scene, row, live, 2, cell_size)
-    x, y, z = bx - tl.load(low), by - tl.load(low + 1), bz - tl.load(low + 2)
-    nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
-    inside = live & (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
-    x = tl.where(inside, x, 0.0).to(tl.int32)
-    y = tl.where(inside, y, 0.0).to(tl.int32)
-    z = tl.where(inside, z, 0.0).to(tl.int32)
-    tl.store(fraction_of + row * 3, fx, mask=live)
-    tl.store(fraction_of + row * 3 + 1, fy, mask=live)
-    tl.store(fraction_of + row * 3 + 2, fz, mask=live)
-    for corner in tl.static_range(8):
-        cx = x + (corner >> 2 & 1) * (fx > 0).to(tl.int32)
-        cy = y + (corner >> 1 & 1) * (fy > 0).to(tl.int32)
-        cz = z + (corner & 1) * (fz > 0).to(tl.int32)
-        slot = _slot(cx, cy, cz, scene, geometry, 0)
-        cell = _cell(mark, rank, slot, 0, capacity, inside)
-        weight = tl.full((BLOCK,), 1.0, tl.float32)
-        weight *= fx if (corner >> 2 & 1) == 1 else 1 - fx
-        weight *= fy if (corner >> 1 & 1) == 1 else 1 - fy
-        weight *= fz if (corner & 1) == 1 else 1 - fz
-        # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
-        tl.store(cell_of + row * 8 + corner, tl.maximum(cell, 0), mask=live)
-        tl.store(weight_of + row * 8 + corner, weight, mask=live)
-
+    """Features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES]. Without
+    OBSTACLES nothing is looked up and the normals stay zero; with SYMMETRY the particles are an image of the scene that
+    the obstacle table is of: looked up there, normals brought back."""
     column = tl.arange(0, FEATURES)
     axis = column % 3
     here = live[:, None]
@@ -327,6 +285,142 @@ def prepare_particles(
     material = tl.load(material_of + row, mask=live, other=0)
     value = tl.where((column[None, :] - (WALLS + 6)) == material[:, None], 1.0, value)
     tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
+
+
+@triton.jit
+def prepare_particles(
+    position,
+    velocity,
+    scene_of,
+    material_of,
+    origin,
+    domain,
+    particle_count,
+    low,
+    geometry,
+    mark,
+    rank,
+    mean,
+    std,
+    obstacle_table,
+    obstacle_cell_size,
+    features,
+    cell_of,
+    weight_of,
+    fraction_of,
+    cell_size,
+    wall_maximum,
+    capacity,
+    HISTORY: tl.constexpr,
+    NORMALS: tl.constexpr,
+    OBSTACLES: tl.constexpr,
+    SYMMETRY: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Features of each particle, see _store_features; its 8 cells, their weights, and its fraction."""
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    scene = tl.load(scene_of + row, mask=live, other=0)
+    bx, fx = _base(position, origin, scene, row, live, 0, cell_size)
+    by, fy = _base(position, origin, scene, row, live, 1, cell_size)
+    bz, fz = _base(position, origin, scene, row, live, 2, cell_size)
+    x, y, z = bx - tl.load(low), by - tl.load(low + 1), bz - tl.load(low + 2)
+    nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
+    inside = live & (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
+    x = tl.where(inside, x, 0.0).to(tl.int32)
+    y = tl.where(inside, y, 0.0).to(tl.int32)
+    z = tl.where(inside, z, 0.0).to(tl.int32)
+    tl.store(fraction_of + row * 3, fx, mask=live)
+    tl.store(fraction_of + row * 3 + 1, fy, mask=live)
+    tl.store(fraction_of + row * 3 + 2, fz, mask=live)
+    for corner in tl.static_range(8):
+        cx = x + (corner >> 2 & 1) * (fx > 0).to(tl.int32)
+        cy = y + (corner >> 1 & 1) * (fy > 0).to(tl.int32)
+        cz = z + (corner & 1) * (fz > 0).to(tl.int32)
+        slot = _slot(cx, cy, cz, scene, geometry, 0)
+        cell = _cell(mark, rank, slot, 0, capacity, inside)
+        weight = tl.full((BLOCK,), 1.0, tl.float32)
+        weight *= fx if (corner >> 2 & 1) == 1 else 1 - fx
+        weight *= fy if (corner >> 1 & 1) == 1 else 1 - fy
+        weight *= fz if (corner & 1) == 1 else 1 - fz
+        # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
+        tl.store(cell_of + row * 8 + corner, tl.maximum(cell, 0), mask=live)
+        tl.store(weight_of + row * 8 + corner, weight, mask=live)
+
+    _store_features(
+        row,
+        live,
+        scene,
+        position,
+        velocity,
+        material_of,
+        domain,
+        mean,
+        std,
+        obstacle_table,
+        obstacle_cell_size,
+        features,
+        wall_maximum,
+        HISTORY,
+        NORMALS,
+        OBSTACLES,
+        SYMMETRY,
+        FEATURES,
+    )
+
+
+@triton.jit
+def prepare_features(
+    position,
+    velocity,
+    scene_of,
+    material_of,
+    domain,
+    particle_count,
+    mean,
+    std,
+    obstacle_table,
+    obstacle_cell_size,
+    features,
+    wall_maximum,
+    HISTORY: tl.constexpr,
+    NORMALS: tl.constexpr,
+    OBSTACLES: tl.constexpr,
+    SYMMETRY: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """The features alone, see _store_features."""
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    scene = tl.load(scene_of + row, mask=live, other=0)
+    _store_features(
+        row,
+        live,
+        scene,
+        position,
+        velocity,
+        material_of,
+        domain,
+        mean,
+        std,
+        obstacle_table,
+        obstacle_cell_size,
+        features,
+        wall_maximum,
+        HISTORY,
+        NORMALS,
+        OBSTACLES,
+        SYMMETRY,
+        FEATURES,
+    )
 
 
 settle_keys(globals())

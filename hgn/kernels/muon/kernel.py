@@ -12,6 +12,7 @@ from hgn.kernels.keys import settle_keys
 @triton.jit
 def momentum_directions(
     starts,
+    pitch,
     gradient,
     share,
     first_moment,
@@ -22,16 +23,17 @@ def momentum_directions(
     epsilon,
     WIDTH: tl.constexpr,
 ):
-    """Momentum of square blocks (hgn.network.orthogonal), which begin at `starts`; Nesterov's, normalised, goes to
-    direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does nothing.
+    """Momentum of square blocks (hgn.network.orthogonal), which begin at `starts`, their rows `pitch` apart; Nesterov's,
+    normalised, goes to direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does nothing.
     """
     if tl.load(status) != 0:
         return
     if (tl.load(norm) < float("inf")) == 0:
         return
     block = tl.program_id(0)
-    place = tl.arange(0, WIDTH)[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :]
-    at = tl.load(starts + block) + place
+    row, column = tl.arange(0, WIDTH)[:, None], tl.arange(0, WIDTH)[None, :]
+    place = row * WIDTH + column
+    at = tl.load(starts + block) + row * tl.load(pitch + block) + column
     g = tl.load(gradient + at) * share
     m = tl.load(first_moment + at)
     m += (g - m) * (1 - momentum)
@@ -44,6 +46,7 @@ def momentum_directions(
 @triton.jit
 def step_blocks(
     starts,
+    pitch,
     direction,
     value,
     weight,
@@ -61,8 +64,9 @@ def step_blocks(
     if (tl.load(norm) < float("inf")) == 0:
         return
     block = tl.program_id(0)
-    place = tl.arange(0, WIDTH)[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :]
-    at = tl.load(starts + block) + place
+    row, column = tl.arange(0, WIDTH)[:, None], tl.arange(0, WIDTH)[None, :]
+    place = row * WIDTH + column
+    at = tl.load(starts + block) + row * tl.load(pitch + block) + column
     along = tl.load(direction + block * WIDTH * WIDTH + place).to(tl.float32)
     x = tl.load(value + at) - tl.load(rates + tl.load(update)) * step_size * along
     tl.store(value + at, x)

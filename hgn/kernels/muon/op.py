@@ -1,30 +1,32 @@
-"""Muon's steps on the packed weights. Shape legend: K blocks, W width, E elements of a block."""
+"""Muon's steps on the packed weights. Shape legend: K blocks, W width."""
 
 from __future__ import annotations
 
 import torch
 
 from hgn.kernels.muon.kernel import momentum_directions, step_blocks
-from hgn.kernels.packing import PackedNetwork
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.base import ParticleNetwork
 from hgn.network.orthogonal import EPSILON, MOMENTUM, orthogonalised, square_blocks, step_size
 
 WARPS = 8
 
 
 class SquareBlocks:
-    """The weights that Muon steps, in the packed layout, where each block is one piece."""
+    """The weights that Muon steps, in the packed layout: of each block the rows are pieces, equally far apart."""
 
-    def __init__(self, network: HierarchicalGraphNetwork, packed: PackedNetwork, device: torch.device) -> None:
+    def __init__(self, network: ParticleNetwork, index: torch.Tensor, device: torch.device) -> None:
+        """`index` maps packed elements to the concatenated parameters, -1 for padding."""
         block_KWW = square_blocks(network)
-        place = torch.empty(int(packed.index.max()) + 1, dtype=torch.int64)
-        used = packed.index >= 0
-        place[packed.index[used]] = torch.nonzero(used).flatten()
-        packed_KE = place[block_KWW].flatten(1)
-        assert (packed_KE == packed_KE[:, :1] + torch.arange(packed_KE.shape[1])).all()
-        member = torch.zeros(packed.size, dtype=torch.int8)
-        member[packed_KE] = 1
-        self.starts = packed_KE[:, 0].contiguous().to(device)
+        place = torch.empty(int(index.max()) + 1, dtype=torch.int64)
+        used = index >= 0
+        place[index[used]] = torch.nonzero(used).flatten()
+        packed_KWW, column_W = place[block_KWW], torch.arange(block_KWW.shape[-1])
+        self.starts = packed_KWW[:, 0, 0].contiguous().to(device)
+        self.pitch = (packed_KWW[:, 1, 0] - packed_KWW[:, 0, 0]).to(device)
+        row_KW = packed_KWW[:, :1, 0] + column_W * (packed_KWW[:, 1, 0] - packed_KWW[:, 0, 0])[:, None]
+        assert (packed_KWW == row_KW[:, :, None] + column_W).all()
+        member = torch.zeros(len(index), dtype=torch.int8)
+        member[packed_KWW.flatten()] = 1
         self.member = member.to(device)  # of each element of the packed buffers: whether it is stepped here
         # orthogonal to a hundredth, as the iterations are: products in bfloat16, summed in float32
         dtype = torch.float32 if device.type == "cpu" else torch.bfloat16
@@ -49,6 +51,7 @@ class SquareBlocks:
         count, width, _ = self._direction_KWW.shape
         momentum_directions[(count,)](
             self.starts,
+            self.pitch,
             gradient,
             share,
             momentum,
@@ -62,6 +65,7 @@ class SquareBlocks:
         )
         step_blocks[(count,)](
             self.starts,
+            self.pitch,
             orthogonalised(self._direction_KWW),
             values,
             weights,

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -21,11 +21,12 @@ import triton
 from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES, TrainingConfig
 from hgn.kernels.backward import TrainingEngine
 from hgn.kernels.capture import captured
-from hgn.kernels.engine import OUT, feature_columns
+from hgn.kernels.engine import feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
 from hgn.kernels.muon.op import SquareBlocks
-from hgn.kernels.packing import pack_network
+from hgn.kernels.packing import PackedNetwork, pack_network
 from hgn.kernels.update import kernel
+from hgn.network.base import ParticleNetwork
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.scene.symmetry import Symmetry, drawn_symmetry
 from hgn.schema import ConfigError
@@ -106,6 +107,50 @@ class UpdateSettings:
         )
 
 
+class Layout(Protocol):
+    """Where the parameters are in the flat buffers; `index` maps their elements to the concatenated parameters."""
+
+    @property
+    def size(self) -> int: ...
+
+    @property
+    def index(self) -> torch.Tensor: ...
+
+    def gather(self, tensors: list[torch.Tensor]) -> torch.Tensor: ...
+
+    def scatter(self, packed: torch.Tensor, tensors: list[torch.Tensor]) -> None: ...
+
+
+class Tables(Protocol):
+    """What a network needs of where particles are, in buffers of fixed capacities."""
+
+    status: torch.Tensor
+    needed_L: torch.Tensor
+
+    def build(
+        self, position: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor, count: torch.Tensor
+    ) -> None: ...
+
+
+class TrainedEngine(Protocol):
+    """A network's forward and backward pass; `totals` are gradients laid out as the values, and a tail."""
+
+    output: torch.Tensor
+    output_gradient: torch.Tensor
+    totals: torch.Tensor
+    weights: torch.Tensor  # the copy of the values that products read …
+    copy_precision: str  # … at this precision
+    unscale: float
+
+    def forward(self) -> None: ...
+
+    def backward(self) -> None: ...
+
+    def refresh(self) -> None: ...
+
+    def refresh_encoder(self) -> None: ...
+
+
 class Updates:
     """Parameters and Adam's moments in flat buffers, and the launches that update them.
 
@@ -113,12 +158,13 @@ class Updates:
     all ranks in place, the gradients of `ranks` ranks are averaged; then all make the same updates.
     """
 
-    grid: DeviceGrid
-    engine: TrainingEngine
+    growth = GROWTH  # of capacities over what was needed
+    grid: Tables
+    engine: TrainedEngine
 
     def __init__(
         self,
-        network: HierarchicalGraphNetwork,
+        network: ParticleNetwork,
         settings: UpdateSettings,
         precision: str,
         loss_sum: torch.Tensor,
@@ -131,11 +177,11 @@ class Updates:
         self.network, self.config, self.settings, self.precision = network, network.config, settings, precision
         self.loss_sum, self.counters, self.reduce, self.ranks = loss_sum, counters, reduce, ranks
         self.device = device = next(network.parameters()).device
-        self.packed = pack_network(network)
+        self.packed = self._layout()
         self.values = self.packed.gather(list(network.parameters()))
         self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self.average: torch.Tensor | None = None  # of the values over the updates; set it before the first one
-        self.blocks = SquareBlocks(network, self.packed, device) if settings.optimizer == "muon" else None
+        self.blocks = SquareBlocks(network, self.packed.index, device) if settings.optimizer == "muon" else None
         self.step = torch.zeros(1, dtype=torch.float64, device=device)
         self.update = torch.zeros(1, dtype=torch.int32, device=device)
         self.particle_count = torch.zeros(1, dtype=torch.int32, device=device)
@@ -258,7 +304,7 @@ class Updates:
     def allocate(self, particles: int, cells: Sequence[int]) -> None:
         """Buffers for about so many particles and cells of each level, without samples: for hgn.kernels.ahead."""
         self._allocate_tables(1)
-        self.particles, self.capacities = 16 * math.ceil(particles / 16), _rounded(cells)
+        self.particles, self.capacities = 16 * math.ceil(particles / 16), self._rounded(cells)
         self._build()
 
     def launches(self) -> None:
@@ -281,7 +327,7 @@ class Updates:
             self.loss,
             1.0 / engine.unscale,
             self.settings.huber,
-            OUT=OUT,
+            OUT=engine.output.shape[1],
             BLOCK=BLOCK,
         )
         engine.backward()
@@ -309,7 +355,7 @@ class Updates:
             self.norm,
             size,
             self.blocks.member if self.blocks else None,
-            PRECISION=self.precision,
+            PRECISION=engine.copy_precision,
             BLOCK=FLAT_BLOCK,
         )
         if self.blocks is not None:
@@ -323,7 +369,7 @@ class Updates:
                 self.update,
                 self.grid.status,
                 self.norm,
-                self.precision,
+                engine.copy_precision,
             )
         if self.average is not None:
             kernel.average_values[blocks](
@@ -377,7 +423,9 @@ class Updates:
         )
 
     def _grid(self) -> None:
+        """What follows from where the particles are."""
         config, grid = self.config, self.grid
+        assert isinstance(grid, DeviceGrid)
         grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
         grid.prepare(
             self.position_N3,
@@ -422,15 +470,25 @@ class Updates:
             self.grid = self._device_grid((16,) * config.levels)
             self._assemble()
             self.grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
-            self.capacities = _rounded(self.grid.needed_L.tolist())
+            self.capacities = self._rounded(self.grid.needed_L.tolist())
         self.grid = self._device_grid(self.capacities)
+        self.engine = self._engine()
+
+    # what the kind of network decides
+
+    def _layout(self) -> Layout:
+        assert isinstance(self.network, HierarchicalGraphNetwork)
+        return pack_network(self.network)
+
+    def _engine(self) -> TrainedEngine:
+        assert isinstance(self.grid, DeviceGrid) and isinstance(self.packed, PackedNetwork)
         # gradients of the mean over particles are small: float16 would lose them
-        scale = 2.0 ** round(math.log2(max(particles, 2))) if self.precision == "half" else 1.0
-        self.engine = TrainingEngine(
-            config, self.packed, self.values, self.grid, self.particle_count, self.precision, scale, tail=TAIL
+        scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "half" else 1.0
+        return TrainingEngine(
+            self.config, self.packed, self.values, self.grid, self.particle_count, self.precision, scale, tail=TAIL
         )
 
-    def _device_grid(self, capacities: tuple[int, ...]) -> DeviceGrid:
+    def _device_grid(self, capacities: tuple[int, ...]) -> Tables:
         config = self.config
         return DeviceGrid(
             self._window(),
@@ -449,7 +507,7 @@ class Updates:
                 raise ConfigError("positions of the training episodes must be finite, got some that are not")
             low, high = position.amin(0).cpu(), position.amax(0).cpu()
             self._reach = (torch.minimum(self._reach[0], low), torch.maximum(self._reach[1], high))
-        grown = _rounded(needed)
+        grown = self._rounded(needed)
         self.capacities = tuple(
             c if n <= c else max(c, g) for c, n, g in zip(self.capacities, needed, grown, strict=True)
         )
@@ -472,6 +530,5 @@ class Updates:
         self.captures += 1
         self.capture_seconds += time.monotonic() - begun
 
-
-def _rounded(needed: Sequence[int]) -> tuple[int, ...]:
-    return tuple(16 * math.ceil(max(GROWTH * count, 32) / 16) for count in needed)
+    def _rounded(self, needed: Sequence[int]) -> tuple[int, ...]:
+        return tuple(16 * math.ceil(max(self.growth * count, 32) / 16) for count in needed)

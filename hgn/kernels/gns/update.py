@@ -1,0 +1,188 @@
+"""GNS's training updates on the device: neighbours, forward, backward and optimiser in one CUDA graph for an update.
+
+Batch, loss, optimiser and bookkeeping are those of hgn.kernels.update. Between them PyTorch's autograd runs the network
+with the fused edges on lists of fixed capacity, so that all of it can be captured.
+Shape legend: N particles, W width, F columns of features.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+import triton
+from torch.nn import functional
+
+from hgn.config import NetworkConfig
+from hgn.kernels.engine import feature_columns
+from hgn.kernels.gns.op import FusedEdges
+from hgn.kernels.grid.kernel import prepare_features
+from hgn.kernels.grid.op import OUT_OF_WINDOW
+from hgn.kernels.neighbours.op import DeviceNeighbours
+from hgn.kernels.update.op import TAIL, Layout, Tables, TrainedEngine, Updates
+from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.keys import COORDINATE_LIMIT
+from hgn.schema import ConfigError
+
+OUT = 4  # the decoder's three outputs, padded
+FEATURE_BLOCK = 32
+
+
+@dataclass(frozen=True)
+class FlatLayout:
+    """The parameters one after the other, as they are."""
+
+    size: int
+
+    @cached_property
+    def index(self) -> torch.Tensor:
+        return torch.arange(self.size)
+
+    def gather(self, tensors: list[torch.Tensor]) -> torch.Tensor:
+        return torch.cat([tensor.detach().reshape(-1).float() for tensor in tensors])
+
+    def scatter(self, packed: torch.Tensor, tensors: list[torch.Tensor]) -> None:
+        with torch.no_grad():
+            for tensor, part in zip(tensors, packed.split([t.numel() for t in tensors]), strict=True):
+                tensor.copy_(part.view(tensor.shape))
+
+
+def views_of(network: GraphNetworkSimulator, values: torch.Tensor) -> GraphNetworkSimulator:
+    """A network whose parameters are pieces of `values`, laid out one after the other."""
+    result = copy.deepcopy(network)
+    parameters = list(result.parameters())
+    for parameter, part in zip(parameters, values.split([p.numel() for p in parameters]), strict=True):
+        parameter.data = part.view(parameter.shape)
+    return result
+
+
+class GnsEngine:
+    """Forward and backward passes of a network on a neighbour list of fixed capacity."""
+
+    copy_precision = "ieee"  # products read the values themselves
+    unscale = 1.0  # gradients are scaled on the way, see hgn.network.edges
+
+    def __init__(
+        self,
+        network: GraphNetworkSimulator,
+        values: torch.Tensor,
+        tables: DeviceNeighbours,
+        feature_NF: torch.Tensor,
+        particle_count: torch.Tensor,
+        precision: str,
+        tail: int = 0,
+    ) -> None:
+        """`values` are the network's parameters, and `feature_NF` rows of particles in the batch's order."""
+        self.network = views_of(network, values)
+        self.network.edges = FusedEdges.in_tf32() if precision == "tf32" else FusedEdges(precision)
+        self.parameters = list(self.network.parameters())
+        self.weights, self.tables, self.feature_NF, self.particle_count = values, tables, feature_NF, particle_count
+        self.output = torch.zeros(tables.particles, OUT, device=values.device)
+        self.output_gradient = torch.zeros_like(self.output)
+        self.totals = torch.zeros(len(values) + tail, device=values.device)
+        self._place_N = torch.arange(tables.particles, device=values.device)
+        self._decoded_N3: torch.Tensor | None = None
+
+    def forward(self) -> None:
+        """The output of every particle, [N, 3] of `output`."""
+        tables, order_N = self.tables, self.tables.neighbours.order_N
+        # rows without a particle come last in the order; what is in them is left by other updates
+        feature_NF = torch.where(self._live_N1(), self.feature_NF[order_N], 0.0)
+        position_N3 = torch.where(self._live_N1(), tables.position_N3, 0.0)
+        with torch.enable_grad():
+            node_NW = self._encoded(feature_NF)
+            self._decoded_N3 = self.network.decoded(node_NW, position_N3, tables.neighbours)
+        self.output[:, :3].index_copy_(0, order_N, self._decoded_N3.detach())
+
+    def backward(self) -> None:
+        """From `output_gradient` to `totals`."""
+        assert self._decoded_N3 is not None
+        gradient_N3 = self.output_gradient[self.tables.neighbours.order_N, :3]
+        gradient_N3 = torch.where(self._live_N1(), gradient_N3, 0.0)
+        found = torch.autograd.grad(self._decoded_N3, self.parameters, gradient_N3, allow_unused=True)
+        self._decoded_N3 = None
+        flat = [
+            (torch.zeros_like(parameter) if gradient is None else gradient).reshape(-1)
+            for parameter, gradient in zip(self.parameters, found, strict=True)
+        ]
+        torch.cat(flat, out=self.totals[: len(self.weights)])
+
+    def refresh(self) -> None:
+        """The network's parameters are the values."""
+
+    def refresh_encoder(self) -> None:
+        """There is no copy of it."""
+
+    def _live_N1(self) -> torch.Tensor:
+        """Whether there is a particle in each row of the order."""
+        return (self._place_N < self.particle_count)[:, None]
+
+    def _encoded(self, feature_NF: torch.Tensor) -> torch.Tensor:
+        """The particles' first state [N, W], from one product: what a material adds is a column of it."""
+        network, encode = self.network, self.network.encode
+        first, material = encode.first.weight.split([sum(encode.parts[:3]), encode.parts[3]], dim=1)
+        combined = torch.cat([first, material @ network.embedding.weight.T], dim=1)
+        return encode.finish(functional.linear(feature_NF[:, : combined.shape[1]], combined, encode.first.bias))
+
+
+class GnsUpdates(Updates):
+    """The updates of a GNS whose obstacles are features; `capacities` is that of edges."""
+
+    growth = 1.5  # neighbours differ more from frame to frame than cells do, and room for them costs memory alone
+    network: GraphNetworkSimulator
+
+    @staticmethod
+    def why_not(config: NetworkConfig) -> str | None:
+        """What keeps these updates from training a GNS, in words; none if nothing does."""
+        if config.obstacle_particles:
+            return "of GNS it trains those whose obstacles are features, not static particles"
+        if config.maximum_neighbours is not None:
+            return "of GNS it trains those with network.maximum_neighbours=null"
+        return None
+
+    def _layout(self) -> Layout:
+        assert self.why_not(self.config) is None
+        return FlatLayout(sum(parameter.numel() for parameter in self.network.parameters()))
+
+    def _device_grid(self, capacities: tuple[int, ...]) -> Tables:
+        (edges,) = capacities
+        return DeviceNeighbours(self.particles, edges, self.config.cell_size, self.device)
+
+    def _engine(self) -> TrainedEngine:
+        assert isinstance(self.grid, DeviceNeighbours)
+        self.feature_NF = torch.zeros(self.particles, feature_columns(self.config), device=self.device)
+        return GnsEngine(
+            self.network, self.values, self.grid, self.feature_NF, self.particle_count, self.precision, tail=TAIL
+        )
+
+    def _grid(self) -> None:
+        config, sees = self.config, self.config.obstacle_features
+        self.grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
+        prepare_features[(triton.cdiv(self.particles, FEATURE_BLOCK),)](
+            self.position_N3,
+            self.velocity_NV,
+            self.scene_N,
+            self.material_N,
+            self.domain_S3,
+            self.particle_count,
+            self.velocity_mean,
+            self.velocity_std,
+            self._obstacle_row,
+            self.settings.obstacle_cell_size,
+            self.feature_NF,
+            config.wall_distance_cells * config.cell_size,
+            HISTORY=config.velocity_history,
+            NORMALS=int(sees),
+            OBSTACLES=sees,
+            SYMMETRY=self.settings.symmetry,
+            FEATURES=self.feature_NF.shape[1],
+            BLOCK=FEATURE_BLOCK,
+        )
+
+    def _make_room(self, status: int, needed: list[int]) -> None:
+        if status & OUT_OF_WINDOW and bool(self.position_N3[: int(self.particle_count)].isfinite().all()):
+            limit = 0.5 * self.config.cell_size * (COORDINATE_LIMIT - 4)
+            raise ConfigError(f"positions of the training episodes must be within {limit:.0f} domain units")
+        super()._make_room(status, needed)

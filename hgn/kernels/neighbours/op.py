@@ -1,0 +1,97 @@
+"""A neighbour list in buffers of fixed capacity, made on the device without the host.
+
+Shape legend: N particles, E directed edges.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+
+from hgn.kernels.neighbours import kernel
+from hgn.network.neighbours import SLACK, NeighbourList
+from hgn.network.segments import Segments
+
+KEY_BLOCK = 128
+RUN_BLOCK, WALK_BLOCK = 16, 8  # particles of a program
+SIDE = 32  # runs of a particle, rounded up
+CANDIDATES = 32  # of a particle at once
+
+
+class DeviceNeighbours:
+    """The list of hgn.network.neighbours, all neighbours within the radius, with room for more edges than there are.
+
+    Rows of `neighbours` beyond the last offset are no edges: their sender is N, one more than any. Particles beyond the
+    count have none, not even themselves, and stand last in the order. needed_L int32 [1]: edges that there should be
+    room for; status int32 [1]: sticky flags, see the kernels.
+    """
+
+    def __init__(self, particles: int, edges: int, radius: float, device: torch.device) -> None:
+        self.particles, self.capacity, self.radius = particles, edges, radius
+
+        def integers(count: int) -> torch.Tensor:
+            return torch.zeros(count, dtype=torch.int64, device=device)
+
+        self._key_N, self._sorted_N, self._counts_N = (integers(particles) for _ in range(3))
+        self._run_end, self._run_shift = (
+            torch.zeros(particles, SIDE, dtype=torch.int32, device=device) for _ in range(2)
+        )
+        self.position_N3 = torch.zeros(particles, 3, device=device)  # in the list's order
+        self.neighbours = NeighbourList(
+            integers(particles), integers(edges), Segments(integers(particles + 1), integers(edges))
+        )
+        self.status = torch.zeros(1, dtype=torch.int32, device=device)
+        self.needed_L = torch.zeros(1, dtype=torch.int32, device=device)
+
+    def build(
+        self, position_N3: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor | None, count: torch.Tensor
+    ) -> None:
+        """Of the first `count` particles, int32 [1]. There is no grid for an origin to move."""
+        list_, receivers, capacity = self.neighbours, self.neighbours.receivers, self.capacity
+        kernel.cell_keys[(triton.cdiv(self.particles, KEY_BLOCK),)](
+            position_N3,
+            scene_N,
+            count,
+            self._key_N,
+            self.status,
+            0.5 * SLACK * self.radius,
+            self.particles,
+            BLOCK=KEY_BLOCK,
+        )
+        torch.sort(self._key_N, stable=True, out=(self._sorted_N, list_.order_N))
+        torch.index_select(position_N3, 0, list_.order_N, out=self.position_N3)
+        kernel.find_runs[(triton.cdiv(self.particles, RUN_BLOCK),)](
+            self._sorted_N,
+            count,
+            self._run_end,
+            self._run_shift,
+            self.particles,
+            SIDE=SIDE,
+            STEPS=self.particles.bit_length(),
+            BLOCK=RUN_BLOCK,
+        )
+        self._walk(fill=False)
+        torch.cumsum(self._counts_N, 0, out=receivers.offset_N1[1:])
+        kernel.check_room[(1,)](receivers.offset_N1, self.particles, capacity, self.needed_L, self.status)
+        receivers.offset_N1.clamp_(max=capacity)
+        list_.sender_E.fill_(self.particles)
+        self._walk(fill=True)
+
+    def _walk(self, fill: bool) -> None:
+        list_, receivers = self.neighbours, self.neighbours.receivers
+        kernel.walk_neighbours[(triton.cdiv(self.particles, WALK_BLOCK),)](
+            self.position_N3,
+            self._run_end,
+            self._run_shift,
+            self._counts_N,
+            receivers.offset_N1,
+            list_.sender_E,
+            receivers.segment_E,
+            self.particles,
+            self.capacity,
+            self.radius * self.radius,
+            FILL=fill,
+            SIDE=SIDE,
+            BLOCK=WALK_BLOCK,
+            CANDIDATES=CANDIDATES,
+        )
