@@ -29,7 +29,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.progress import bar
 from hgn.provenance import provenance
-from hgn.runtime.path import path_on, set_matmul_precision
+from hgn.runtime.path import choose_path, set_matmul_precision, why_not_trained_fast
 from hgn.schema import ConfigError, from_mapping, to_mapping
 from hgn.training.checkpoint import (
     DataInfo,
@@ -151,7 +151,10 @@ def _path(config: TrainConfig) -> tuple[str, str]:
     training = config.training
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
-    return path_on(device, config.network, training.path, training.precision, "training.path")
+    own_states = training.rollout_share > 0
+    reason = why_not_trained_fast(device, config.network, training.precision, own_states)
+    half_plainly = config.network.kind != "hgn"
+    return choose_path("training.path", training.path, training.precision, reason, half_plainly)
 
 
 def _compile_ahead(config: TrainConfig, stack: ExitStack) -> AheadCompilation | None:

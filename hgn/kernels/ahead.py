@@ -21,9 +21,12 @@ import triton
 from triton.backends.compiler import GPUTarget
 
 from hgn.config import NetworkConfig
+from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.grid.op import ObstacleTable, Window
 from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.network.build import build_network
 from hgn.network.features import ParticleState
+from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.fast import FastRollout, first_capacities
 from hgn.runtime.path import KERNEL_PRECISION
@@ -42,7 +45,7 @@ class AheadJob:
     several_ranks: bool
     averages: bool  # the weights over the updates
     particles: int  # of an update, about
-    cells: tuple[int, ...]  # of each level, about
+    cells: tuple[int, ...]  # of each level, about; of a GNS its edges
     capability: int  # of the GPU: 90 for an H100
     rollout_scenes: int = 0  # that the network simulates to train on; 0: it does not
 
@@ -88,14 +91,16 @@ def _noted() -> Iterator[Launches]:
 
 def _update_launches(job: AheadJob, device: str) -> None:
     with torch.device(device):
-        network = HierarchicalGraphNetwork(job.network)
+        network = build_network(job.network)
     nothing = torch.zeros(5, device=device)
     reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if job.several_ranks else None
-    updates = Updates(network, job.settings, job.precision, nothing[:2], nothing, reduce)
+    kind = GnsUpdates if isinstance(network, GraphNetworkSimulator) else Updates
+    updates = kind(network, job.settings, job.precision, nothing[:2], nothing, reduce)
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
     if job.rollout_scenes:
+        assert isinstance(network, HierarchicalGraphNetwork)
         _rollout_launches(job, network, device)
 
 

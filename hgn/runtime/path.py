@@ -36,6 +36,32 @@ def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "
     return None
 
 
+def why_not_trained_fast(
+    device: torch.device, config: NetworkConfig, precision: str, own_states: bool = False
+) -> str | None:
+    """What keeps training from the fast path, which updates GNS too, in words; none if nothing does.
+
+    `own_states`: it is to train on the network's own states.
+    """
+    if config.kind == "hgn":
+        return why_not_fast(device, config, precision)
+    if config.obstacle_particles:
+        return f"it trains hgn and gns networks, not {config.kind}"
+    if device.type != "cuda":
+        return f"it needs a CUDA device, not {device.type}"
+    if importlib.util.find_spec("triton") is None:
+        return "it needs the package triton"
+    if precision != "half":
+        return f"it trains gns with precision half, not {precision}"
+    if config.width not in FAST_WIDTHS:
+        return f"network.width must be one of {', '.join(map(str, FAST_WIDTHS))} for it, not {config.width}"
+    if config.maximum_neighbours is not None:
+        return f"network.maximum_neighbours must be null for it, not {config.maximum_neighbours}"
+    if own_states:
+        return "it trains gns on true states alone (training.rollout_share=0)"
+    return None
+
+
 def choose_path(
     field: str, path: str, precision: str, reason: str | None, half_plainly: bool = False
 ) -> tuple[str, str]:

@@ -7,11 +7,15 @@ from hgn.kernels.ahead import AheadJob
 from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.path import KERNEL_PRECISION
 
+NEIGHBOURS = 100  # of a particle of GNS, about
+
 
 def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ranks: bool) -> AheadJob:
     """What a training on such a GPU will compile; sizes follow from the scenes' distribution."""
     training, network = config.training, config.network
     particles, cells = _sizes(config.scene, network.levels)
+    if network.kind == "gns":
+        cells = [NEIGHBOURS * particles]
     return AheadJob(
         network,
         UpdateSettings.of(training, config.scene.cell_size),

@@ -181,7 +181,9 @@ class Monitor(Callback):
     def _rollout(
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
-        path = "plain" if module.automatic_optimization else "fast"
+        # frames of a GNS are captured on the plain path
+        fast = not module.automatic_optimization and module.network.config.kind == "hgn"
+        path = "fast" if fast else "plain"
         simulator = Simulator(module.result, episodes[0].frame_rate_hz, path, module.training_config.precision)
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
         try:

@@ -15,9 +15,12 @@ import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.chunk import Chunk, WholeEpisode
+from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.late import LateKernels
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
+from hgn.network.base import ParticleNetwork
+from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import kernel_precision
 from hgn.scene.symmetry import drawn_symmetry
@@ -33,7 +36,7 @@ class FastTraining:
 
     def __init__(
         self,
-        network: HierarchicalGraphNetwork,
+        network: ParticleNetwork,
         optimizer: torch.optim.Optimizer,
         training: TrainingConfig,
         obstacle_cell_size: float,
@@ -41,7 +44,7 @@ class FastTraining:
         counters: torch.Tensor,
         reduce: Callable[[torch.Tensor], None] | None = None,
         ranks: int = 1,
-        averaged: HierarchicalGraphNetwork | None = None,
+        averaged: ParticleNetwork | None = None,
         rank: int = 0,
     ) -> None:
         """`averaged` holds the moving average of the weights.
@@ -55,13 +58,16 @@ class FastTraining:
         settings = UpdateSettings.of(training, obstacle_cell_size)
         precision = kernel_precision(training.precision, self.device)
         self._take_over()
-        self.updates = Updates(network, settings, precision, loss_sum, counters, reduce, ranks)
+        kind = GnsUpdates if isinstance(network, GraphNetworkSimulator) else Updates
+        self.updates = kind(network, settings, precision, loss_sum, counters, reduce, ranks)
         self._read_moments()
         self._averaged = None if averaged is None else self._take_over_average(averaged)
         self._episodes: dict[int, DeviceEpisode] = {}
         self.own: FastOwnStates | None = None
         if training.rollout_share > 0:
-            self.own = FastOwnStates(averaged or network, training, obstacle_cell_size, rank)
+            simulated = averaged or network
+            assert isinstance(simulated, HierarchicalGraphNetwork)
+            self.own = FastOwnStates(simulated, training, obstacle_cell_size, rank)
         self.agreement: tuple[float, float] | None = None  # with the plain network, see hgn.training.agreement
 
     def run(self, chunk: Chunk, rates: list[float], shares: list[float] | None = None, first_update: int = 0) -> None:
@@ -150,7 +156,7 @@ class FastTraining:
             state["step"] = self._steps[i]
             state["exp_avg"], state["exp_avg_sq"] = (m[i].view(parameter.shape) for m in (first, second))
 
-    def _take_over_average(self, averaged: HierarchicalGraphNetwork) -> torch.Tensor:
+    def _take_over_average(self, averaged: ParticleNetwork) -> torch.Tensor:
         """Makes its parameters views of a flat buffer, which it returns."""
         parameters = list(averaged.parameters())
         flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])

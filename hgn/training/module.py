@@ -19,7 +19,6 @@ from hgn.data.chunk import Chunk
 from hgn.data.order import Cursor
 from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
-from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.gns_edges import require_agreement, use_edges
 from hgn.schema import to_mapping
 from hgn.training.checkpoint import (
@@ -132,8 +131,6 @@ class TrainingModule(LightningModule):
             # Triton, which the plain path does without, is loaded here.
             from hgn.training.fast import FastTraining
 
-            assert isinstance(self.network, HierarchicalGraphNetwork)
-            assert self.averaged is None or isinstance(self.averaged, HierarchicalGraphNetwork)
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Adam)
             self._fast = FastTraining(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from training.runs import metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
-from hgn.runtime.path import choose_path, path_on, why_not_fast
+from hgn.runtime.path import choose_path, path_on, why_not_fast, why_not_trained_fast
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.feed import UPDATES_AT_ONCE, chunk_length
@@ -80,6 +81,38 @@ def test_fast_training_is_the_plain_one(
     assert len(monitored[0]) == 1 and monitored[1] == pytest.approx(monitored[0], rel=1e-3)
 
 
+def test_fast_training_of_gns_is_the_plain_one(
+    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """GNS with Muon and a moving average: a training that takes the fast path from its second update on ends where a
+    plain one does, with the same counts and rates."""
+    on_cpu = device().type == "cpu"
+    if on_cpu:
+        monkeypatch.setattr("hgn.train.why_not_trained_fast", lambda *_: None)  # kernels run in the interpreter
+    same = {"noise_std": 0.0, "grid_jitter": False, "optimizer": "muon", "ema_decay": 0.7, "maximum_updates": 3}
+    same |= {"log_every": 3, "checkpoint_every": 3, "monitor_every": 3, "precision": "highest" if on_cpu else "half"}
+    ends = {}
+    for name, parts in {"plain": [("plain", 3)], "mixed": [("plain", 1), ("fast", 3)]}.items():
+        for path, updates in parts:
+            mapping = run_mapping(data, tmp_path / name, path=path, **same)
+            with monkeypatch.context() as patch:
+                if updates < 3:
+                    stop_at(patch, updates)
+                assert train.main(mapping | {"network": NETWORK | {"kind": "gns"}}) == 0
+        ends[name] = read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
+        assert ends[name]["hgn"]["updates"] == 3
+    assert "training path: fast" in (said := capsys.readouterr().err) and "gradients within" in said
+    assert ends["mixed"]["lr_schedulers"] == ends["plain"]["lr_schedulers"]
+    tolerance = {"rtol": 1e-3, "atol": 2e-5} if on_cpu else {"rtol": 5e-2, "atol": 2e-3}
+    for key, value in ends["plain"]["state_dict"].items():
+        torch.testing.assert_close(ends["mixed"]["state_dict"][key], value, **tolerance)
+    states, expected = ends["mixed"]["optimizer_states"][0], ends["plain"]["optimizer_states"][0]
+    assert all(float(states["state"][i]["step"]) == float(state["step"]) == 3 for i, state in expected["state"].items())
+    lines = [[line for line in metrics(tmp_path / name) if "one_step/validation" in line][-1] for name in ends]
+    assert lines[0]["update"] == lines[1]["update"] == 3
+    assert lines[1]["one_step/validation"] == pytest.approx(lines[0]["one_step/validation"], rel=1e-2)
+
+
 def stop_at(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
     """Lets the next training end once it has made that many updates, or just after."""
     from hgn.training.callbacks import Stopper
@@ -137,6 +170,19 @@ def test_gns_has_half_precision_on_the_plain_path() -> None:
     assert path_on(torch.device("cpu"), NetworkConfig(kind="gns", levels=1), "auto", "half")[0] == "plain"
     with pytest.raises(ConfigError, match="got half; it needs a CUDA device"):
         path_on(torch.device("cpu"), NetworkConfig(), "auto", "half")
+
+
+def test_why_gns_is_not_trained_on_the_fast_path() -> None:
+    """Another device, precision or width, static particles, a limit of neighbours and own states are each named."""
+    gpu, gns = torch.device("cuda"), NetworkConfig(kind="gns", levels=1)
+    assert why_not_trained_fast(gpu, gns, "half") is None and why_not_trained_fast(gpu, NetworkConfig(), "high") is None
+    assert "not cpu" in str(why_not_trained_fast(torch.device("cpu"), gns, "half"))
+    assert "not high" in str(why_not_trained_fast(gpu, gns, "high"))
+    assert "not 48" in str(why_not_trained_fast(gpu, replace(gns, width=48), "half"))
+    assert "not 128" in str(why_not_trained_fast(gpu, replace(gns, maximum_neighbours=128), "half"))
+    assert "true states" in str(why_not_trained_fast(gpu, gns, "half", own_states=True))
+    static = NetworkConfig(kind="gns_particles", levels=1, obstacle_features=False)
+    assert "not gns_particles" in str(why_not_trained_fast(gpu, static, "half"))
 
 
 def test_why_the_fast_path_does_not_run() -> None:

@@ -19,7 +19,7 @@ from hgn.device import choose_device
 from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
-from hgn.runtime.path import why_not_fast
+from hgn.runtime.path import why_not_fast, why_not_trained_fast
 from hgn.schema import from_mapping, to_mapping
 from tools.bench.config import CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
 from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, Train, checked_workload
@@ -162,6 +162,8 @@ def _maker(
         return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
     if case in ("frame", "train") and why_not_fast(device, config.network, PATH_PRECISION[precision]) is None:
         return functools.partial(FastFrame if frame else FastTrain, precision), "fast"
+    if case == "gns_train" and why_not_trained_fast(device, config.gns, PATH_PRECISION[precision]) is None:
+        return functools.partial(FastTrain, precision), "fast"
     made = functools.partial(Frame if frame else Train, precision=PATH_PRECISION[precision])
     return made, None if "gns" in case else "plain"
 

@@ -10,6 +10,7 @@ import copy
 import torch
 
 from hgn.config import NetworkConfig, TrainingConfig
+from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.agreement import relative_error
 from hgn.runtime.path import kernel_precision
@@ -80,16 +81,14 @@ class FastFrame:
 
 
 class FastTrain:
-    """One training update: batch, noise, jitter, grid, forward, backward, Adam."""
+    """One training update: batch, noise, jitter, grid or neighbours, forward, backward, Adam."""
 
     def __init__(self, precision: str, config: NetworkConfig, work: Workload, device: torch.device) -> None:
         from hgn.kernels.update.op import DeviceEpisode  # loads Triton
 
         self.device, self.precision = device, precision
         self.batch = batch_of(work, config, device)
-        network = bench_network(config, device)
-        assert isinstance(network, HierarchicalGraphNetwork)
-        self.network = network
+        self.network = bench_network(config, device)
         counts = list(self.batch.particles_S)
         parts = zip(
             self.batch.window_WN3.split(counts, dim=1),
@@ -107,9 +106,11 @@ class FastTrain:
         self.rates = [training.learning_rate] * UPDATES_AT_ONCE
 
     def _updates(self, noise_std: float, grid_jitter: bool):  # type: ignore[no-untyped-def]
+        from hgn.kernels.gns.update import GnsUpdates
         from hgn.kernels.update.op import Updates, UpdateSettings
 
-        return Updates(
+        kind = GnsUpdates if isinstance(self.network, GraphNetworkSimulator) else Updates
+        return kind(
             copy.deepcopy(self.network),
             UpdateSettings(len(self.samples), noise_std, grid_jitter, OBSTACLE_CELL_SIZE),
             kernel_precision(PATH_PRECISION[self.precision], self.device),

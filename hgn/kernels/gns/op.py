@@ -79,7 +79,8 @@ class FusedEdges(Edges):
     ) -> tuple[torch.Tensor, Weights]:
         width, tuning = len(weights.second), self.tuning
         activation_EW, second_EW = torch.empty_like(gradient_EW), torch.empty_like(gradient_EW)
-        programs = self._programs(tuning.backward_programs, triton.cdiv(len(gradient_EW), tuning.backward_block))
+        wanted = triton.cdiv(len(gradient_EW), tuning.backward_block)
+        programs = self._programs(tuning.backward_programs, wanted, gradient_EW.device)
         partial_P8W = weights.second.new_empty(programs, 8, width)
         encoder = self._encoder(graph, first_bias_W, weights)
         encode_norm_backward[(programs,)](
@@ -116,7 +117,7 @@ class FusedEdges(Edges):
         out_EW = None if last else edge_EW if in_place else torch.empty_like(edge_EW)
         sum_NW = torch.empty_like(ends.receive_NW)
         count, width = sum_NW.shape
-        step_forward[(self._programs(self.tuning.programs, count),)](
+        step_forward[(self._programs(self.tuning.programs, count, edge_EW.device),)](
             edge_EW,
             edge_EW if out_EW is None else out_EW,
             *self._step(graph, ends, weights),
@@ -144,7 +145,7 @@ class FusedEdges(Edges):
         count, width = ends.receive_NW.shape
         activation_EW, second_EW, hidden_EW, result_EW = (torch.empty_like(edge_EW) for _ in range(4))
         receive_NW, send_NW = torch.empty_like(ends.receive_NW), torch.empty_like(ends.receive_NW)
-        programs = self._programs(tuning.backward_programs, count)
+        programs = self._programs(tuning.backward_programs, count, edge_EW.device)
         partial_P3W = weights.second.new_empty(programs, 3, width)
         last = gradient_EW is None
         gradient_EW = edge_EW if gradient_EW is None else gradient_EW.contiguous()
@@ -237,7 +238,7 @@ class FusedEdges(Edges):
     ) -> tuple[torch.Tensor, ...]:
         """second_EW^T activation_EW, and own[0]^T own[1], without the scale, float32 [W, W]."""
         tuning, receivers, (edges, width) = self.tuning, graph.neighbours.receivers, second_EW.shape
-        programs = self._programs(tuning.product_programs, triton.cdiv(edges, tuning.product_rows))
+        programs = self._programs(tuning.product_programs, triton.cdiv(edges, tuning.product_rows), second_EW.device)
         shape = (programs, 1 if own is None else 2, width, width)
         partial_PCWW = torch.empty(shape, dtype=torch.float32, device=second_EW.device)
         weight_products[(programs,)](
@@ -256,8 +257,8 @@ class FusedEdges(Edges):
         return (partial_PCWW.sum(0) / graph.scale).unbind(0)
 
     @staticmethod
-    def _programs(each: int, wanted: int) -> int:
+    def _programs(each: int, wanted: int, device: torch.device) -> int:
         """`each` for a multiprocessor, no more than there is work for."""
-        where = torch.cuda.is_available()
-        processors = torch.cuda.get_device_properties("cuda").multi_processor_count if where else 2
+        gpu = device.type == "cuda"
+        processors = torch.cuda.get_device_properties(device).multi_processor_count if gpu else 2
         return max(1, min(wanted, each * processors))

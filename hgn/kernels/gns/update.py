@@ -15,7 +15,6 @@ import torch
 import triton
 from torch.nn import functional
 
-from hgn.config import NetworkConfig
 from hgn.kernels.engine import feature_columns
 from hgn.kernels.gns.op import FusedEdges
 from hgn.kernels.grid.kernel import prepare_features
@@ -87,10 +86,11 @@ class GnsEngine:
 
     def forward(self) -> None:
         """The output of every particle, [N, 3] of `output`."""
+        self._decoded_N3 = None
         tables, order_N = self.tables, self.tables.neighbours.order_N
         # rows without a particle come last in the order; what is in them is left by other updates
-        feature_NF = torch.where(self._live_N1(), self.feature_NF[order_N], 0.0)
-        position_N3 = torch.where(self._live_N1(), tables.position_N3, 0.0)
+        feature_NF = torch.where(self._live(), self.feature_NF[order_N], 0.0)
+        position_N3 = torch.where(self._live(), tables.position_N3, 0.0)
         with torch.enable_grad():
             node_NW = self._encoded(feature_NF)
             self._decoded_N3 = self.network.decoded(node_NW, position_N3, tables.neighbours)
@@ -100,7 +100,7 @@ class GnsEngine:
         """From `output_gradient` to `totals`."""
         assert self._decoded_N3 is not None
         gradient_N3 = self.output_gradient[self.tables.neighbours.order_N, :3]
-        gradient_N3 = torch.where(self._live_N1(), gradient_N3, 0.0)
+        gradient_N3 = torch.where(self._live(), gradient_N3, 0.0)
         found = torch.autograd.grad(self._decoded_N3, self.parameters, gradient_N3, allow_unused=True)
         self._decoded_N3 = None
         flat = [
@@ -115,7 +115,7 @@ class GnsEngine:
     def refresh_encoder(self) -> None:
         """There is no copy of it."""
 
-    def _live_N1(self) -> torch.Tensor:
+    def _live(self) -> torch.Tensor:
         """Whether there is a particle in each row of the order."""
         return (self._place_N < self.particle_count)[:, None]
 
@@ -133,17 +133,8 @@ class GnsUpdates(Updates):
     growth = 1.5  # neighbours differ more from frame to frame than cells do, and room for them costs memory alone
     network: GraphNetworkSimulator
 
-    @staticmethod
-    def why_not(config: NetworkConfig) -> str | None:
-        """What keeps these updates from training a GNS, in words; none if nothing does."""
-        if config.obstacle_particles:
-            return "of GNS it trains those whose obstacles are features, not static particles"
-        if config.maximum_neighbours is not None:
-            return "of GNS it trains those with network.maximum_neighbours=null"
-        return None
-
     def _layout(self) -> Layout:
-        assert self.why_not(self.config) is None
+        assert not self.config.obstacle_particles and self.config.maximum_neighbours is None
         return FlatLayout(sum(parameter.numel() for parameter in self.network.parameters()))
 
     def _device_grid(self, capacities: tuple[int, ...]) -> Tables:

@@ -23,8 +23,9 @@ def momentum_directions(
     epsilon,
     WIDTH: tl.constexpr,
 ):
-    """Momentum of square blocks (hgn.network.orthogonal), which begin at `starts`, their rows `pitch` apart; Nesterov's,
-    normalised, goes to direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does nothing.
+    """Momentum of square blocks (hgn.network.orthogonal), which begin at `starts`, their rows `pitch` apart;
+    Nesterov's, normalised, goes to direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does
+    nothing.
     """
     if tl.load(status) != 0:
         return

@@ -21,8 +21,8 @@ class SquareBlocks:
         used = index >= 0
         place[index[used]] = torch.nonzero(used).flatten()
         packed_KWW, column_W = place[block_KWW], torch.arange(block_KWW.shape[-1])
-        self.starts = packed_KWW[:, 0, 0].contiguous().to(device)
-        self.pitch = (packed_KWW[:, 1, 0] - packed_KWW[:, 0, 0]).to(device)
+        self.starts = packed_KWW[:, 0, 0].int().to(device)
+        self.pitch = (packed_KWW[:, 1, 0] - packed_KWW[:, 0, 0]).int().to(device)
         row_KW = packed_KWW[:, :1, 0] + column_W * (packed_KWW[:, 1, 0] - packed_KWW[:, 0, 0])[:, None]
         assert (packed_KWW == row_KW[:, :, None] + column_W).all()
         member = torch.zeros(len(index), dtype=torch.int8)

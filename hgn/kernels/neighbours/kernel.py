@@ -1,4 +1,4 @@
-"""Neighbour lists on the device (hgn.network.neighbours): keys of cells, runs of candidates, and two walks through them.
+"""Neighbour lists on the device (hgn.network.neighbours): keys of cells, runs of candidates, two walks through them.
 
 Keys are those of hgn.network.keys; a particle's candidates are 25 runs of the particles sorted by key. The first walk
 counts neighbours, the second writes them down. Nothing here waits for the host.
@@ -44,8 +44,9 @@ def cell_keys(position, scene_of, particle_count, key, status, size, particles, 
 def find_runs(
     key, particle_count, run_end, run_shift, particles, SIDE: tl.constexpr, STEPS: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Of each sorted particle's runs of candidates, int32 [N, SIDE]: where each ends when they are counted one after the
-    other, and what takes such a number to a place in the sorted particles. SIDE is RUNS, rounded up by empty ones."""
+    """Of each sorted particle's runs of candidates, int32 [N, SIDE]: where each ends when they are counted one after
+    the other, and what takes such a number to a place in the sorted particles. SIDE is RUNS, and empty ones.
+    """
     count = tl.load(particle_count)
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = (place < count)[:, None]

@@ -14,6 +14,7 @@ from hgn.network.segments import Segments
 
 KEY_BLOCK = 128
 RUN_BLOCK, WALK_BLOCK = 16, 8  # particles of a program
+LEAST_STEPS = 16  # of a search: one variant for all up to 65,535 particles
 SIDE = 32  # runs of a particle, rounded up
 CANDIDATES = 32  # of a particle at once
 
@@ -67,7 +68,7 @@ class DeviceNeighbours:
             self._run_shift,
             self.particles,
             SIDE=SIDE,
-            STEPS=self.particles.bit_length(),
+            STEPS=max(LEAST_STEPS, self.particles.bit_length()),
             BLOCK=RUN_BLOCK,
         )
         self._walk(fill=False)
