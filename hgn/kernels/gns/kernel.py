@@ -1,7 +1,7 @@
 """The edges of GNS, forward and backward: an encoder, a message-passing step, their gradients by weights and senders.
 
-Edges lie grouped by receiver. A program of a step takes one particle after the other, reads its weights once, and sums
-what belongs to a receiver in its registers: no atomic additions, a fixed order. Forward, a step reads and writes each
+Edges lie grouped by receiver. Where sums by receiver are wanted a program takes one particle after the other, reads its
+weights once, and sums in its registers: no atomic additions, a fixed order. Forward, a step reads and writes each
 edge's state once and nothing else of that size; backward, it computes the hidden layer and the norm again.
 Rows of edges beyond the last offset belong to none: they are neither read nor written.
 What of a program's results must be summed over programs stands in `partial`, a row of them each.
@@ -103,7 +103,7 @@ def encode_norm_backward(
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     second_t = transposed(second, WIDTH, WIDTH)
-    gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
+    gain_total, shift_total = tl.zeros((1, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     tile = tl.program_id(0).to(tl.int64)
     while tile * BLOCK < count:
         row = tile * BLOCK + tl.arange(0, BLOCK)
@@ -115,14 +115,15 @@ def encode_norm_backward(
         z = product(a, second_t, PRECISION) + tl.load(second_bias + column)[None, :]
         z, scale = normalise(z, WIDTH)
         dm = tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
-        gain_total += tl.sum(dm * z, 0)
-        shift_total += tl.sum(dm, 0)
+        shift_total += tl.sum(tl.reshape(dm, (BLOCK // 8, 8, WIDTH)), 0)  # see norm_backward, and why 0 z
+        dm += 0.0 * z
+        gain_total += tl.sum(dm * z, 0, keep_dims=True)
         dz = normalise_backward(dm, z, scale, inside(tl.load(gain + column), tile), WIDTH)
         tl.store(second_gradient + at, dz, mask=live[:, None])
         tile += tl.num_programs(0)
     mine = partial + tl.program_id(0) * 8 * WIDTH + column
-    tl.store(mine, gain_total)
-    tl.store(mine + WIDTH, shift_total)
+    tl.store(mine, tl.sum(gain_total, 0))
+    tl.store(mine + WIDTH, tl.sum(shift_total, 0))
 
 
 @triton.jit
@@ -145,7 +146,7 @@ def encode_layers_backward(
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     second_w = matrix(second, WIDTH, WIDTH)
-    bias_total = tl.zeros((WIDTH,), tl.float32)
+    bias_total = tl.zeros((8, WIDTH), tl.float32)
     axis = tl.arange(0, 16)[:, None]
     first_total = tl.zeros((16, WIDTH), tl.float32)
     tile = tl.program_id(0).to(tl.int64)
@@ -155,7 +156,7 @@ def encode_layers_backward(
         at = row[:, None] * WIDTH + column[None, :]
         dz = tl.load(second_gradient + at, mask=live[:, None], other=0.0)
         a = tl.load(activation + at, mask=live[:, None], other=0.0)
-        bias_total += tl.sum(dz.to(tl.float32), 0)
+        bias_total += tl.sum(tl.reshape(dz.to(tl.float32), (BLOCK // 8, 8, WIDTH)), 0)
         dh = tl.where(a > 0, product(dz, second_w, PRECISION), 0.0)
         near = tl.load(sender + row, mask=live, other=0) * 3
         here = tl.load(receiver + row, mask=live, other=0) * 3
@@ -169,7 +170,7 @@ def encode_layers_backward(
         first_total += weighted_sums(side, dh, PRECISION)
         tile += tl.num_programs(0)
     mine = partial + (tl.program_id(0) * 8 + 2) * WIDTH
-    tl.store(mine + column, bias_total)
+    tl.store(mine + column, tl.sum(bias_total, 0))
     tl.store(mine + (1 + axis) * WIDTH + column[None, :], first_total, mask=axis < 5)
 
 
@@ -236,11 +237,11 @@ def step_forward(
 def norm_backward(
     sum_gradient,
     gradient,
-    scale_ptr,
     edge,
     send,
     receive,
     sender,
+    receiver,
     offset,
     particles,
     own,
@@ -258,46 +259,47 @@ def norm_backward(
     """A step backward through its norm, from the gradients of the sums [N, W] and of edge_out (none if LAST).
 
     activation and second_gradient [E, W] are the second layer's input and the gradient of its output; in `partial`
-    [programs, 3, W] come first those of gain and shift. All gradients but sum_gradient are multiplied by the
-    scale, a power of two for float16.
+    [programs, 3, W] come first those of gain and shift. All gradients are multiplied by the graph's scale; those of the
+    sums, send and receive are stored like edges. Nothing is summed by receiver here: tiles are full of edges.
     """
+    count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     own_t = transposed(own, WIDTH, WIDTH)
     second_t = transposed(second, WIDTH, WIDTH)
     bias = tl.load(second_bias + column)
     gain_row = tl.load(gain + column)
-    factor = tl.load(scale_ptr)
-    gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
-    particle = tl.program_id(0)
-    while particle < particles:
-        block = tl.load(offset + particle)
-        end = tl.load(offset + particle + 1)
-        received = tl.load(receive + particle * WIDTH + column)
-        summed = tl.load(sum_gradient + particle * WIDTH + column) * factor
-        while block < end:
-            row = block + tl.arange(0, BLOCK)
-            live = row < end
-            at = row[:, None] * WIDTH + column[None, :]
-            near = tl.load(sender + row, mask=live, other=0)
-            state = tl.load(edge + at, mask=live[:, None], other=0.0)
-            sent = tl.load(send + near[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
-            h = product(state, own_t, PRECISION) + sent.to(tl.float32) + inside(received, block)[None, :]
-            a = tl.maximum(h, 0.0)
-            tl.store(activation + at, a, mask=live[:, None])
-            z = product(a, second_t, PRECISION) + inside(bias, block)[None, :]
-            z, scale = normalise(z, WIDTH)
-            dm = tl.where(live[:, None], inside(summed, block)[None, :], 0.0)
-            if not LAST:
-                dm += tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
-            gain_total += tl.sum(dm * z, 0)
-            shift_total += tl.sum(dm, 0)
-            dz = normalise_backward(dm, z, scale, inside(gain_row, block), WIDTH)
-            tl.store(second_gradient + at, dz, mask=live[:, None])
-            block += BLOCK
-        particle += tl.num_programs(0)
+    gain_total, shift_total = tl.zeros((1, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
+    tile = tl.program_id(0).to(tl.int64)
+    while tile * BLOCK < count:
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = row < count
+        at = row[:, None] * WIDTH + column[None, :]
+        near = tl.load(sender + row, mask=live, other=0)
+        here = tl.load(receiver + row, mask=live, other=0)
+        state = tl.load(edge + at, mask=live[:, None], other=0.0)
+        # Both ends, and both gradients, are added as they were loaded: the sums go to the matrix units' layout once.
+        ends = tl.load(send + near[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+        ends += tl.load(receive + here[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+        h = product(state, own_t, PRECISION) + ends.to(tl.float32)
+        a = tl.maximum(h, 0.0)
+        tl.store(activation + at, a, mask=live[:, None])
+        summed = tl.load(sum_gradient + here[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+        dm = summed.to(tl.float32)
+        if not LAST:
+            dm += tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
+        # of each eighth row, which are a thread's own
+        shift_total += tl.sum(tl.reshape(dm, (BLOCK // 8, 8, WIDTH)), 0)
+        z = product(a, second_t, PRECISION) + inside(bias, tile)[None, :]
+        z, scale = normalise(z, WIDTH)
+        # 0 z: else the compiler brings z, and with it float32, to where dm was loaded
+        dm = dm.to(summed.dtype).to(tl.float32) + 0.0 * z
+        gain_total += tl.sum(dm * z, 0, keep_dims=True)
+        dz = normalise_backward(dm, z, scale, inside(gain_row, tile), WIDTH)
+        tl.store(second_gradient + at, dz, mask=live[:, None])
+        tile += tl.num_programs(0)
     mine = partial + tl.program_id(0) * 3 * WIDTH + column
-    tl.store(mine, gain_total)
-    tl.store(mine + WIDTH, shift_total)
+    tl.store(mine, tl.sum(gain_total, 0))
+    tl.store(mine + WIDTH, tl.sum(shift_total, 0))
 
 
 @triton.jit
@@ -326,7 +328,7 @@ def layers_backward(
     own_w = matrix(own, WIDTH, WIDTH)
     second_w = matrix(second, WIDTH, WIDTH)
     unscale = 1.0 / tl.load(scale_ptr)
-    bias_total = tl.zeros((WIDTH,), tl.float32)
+    bias_total = tl.zeros((8, WIDTH), tl.float32)
     particle = tl.program_id(0)
     while particle < particles:
         block = tl.load(offset + particle)
@@ -337,7 +339,7 @@ def layers_backward(
             live = row < end
             at = row[:, None] * WIDTH + column[None, :]
             dz = tl.load(second_gradient + at, mask=live[:, None], other=0.0)
-            bias_total += tl.sum(dz.to(tl.float32), 0)
+            bias_total += tl.sum(tl.reshape(dz.to(tl.float32), (BLOCK // 8, 8, WIDTH)), 0)
             a = tl.load(activation + at, mask=live[:, None], other=0.0)
             if not LAST:
                 de = tl.load(gradient + at, mask=live[:, None], other=0.0)
@@ -351,7 +353,7 @@ def layers_backward(
             block += BLOCK
         tl.store(receive_gradient + particle * WIDTH + column, sums * unscale)
         particle += tl.num_programs(0)
-    tl.store(partial + (tl.program_id(0) * 3 + 2) * WIDTH + column, bias_total)
+    tl.store(partial + (tl.program_id(0) * 3 + 2) * WIDTH + column, tl.sum(bias_total, 0))
 
 
 @triton.jit

@@ -151,11 +151,14 @@ class FusedEdges(Edges):
         gradient_EW = edge_EW if gradient_EW is None else gradient_EW.contiguous()
         step = self._step(graph, ends, weights)
         norm_backward[(programs,)](
-            sum_gradient_NW.contiguous(),
+            self._stored(sum_gradient_NW * graph.scale),
             gradient_EW,
-            graph.scale,
             edge_EW,
-            *step,
+            step[0],
+            self._stored(ends.receive_NW),
+            step[2],
+            graph.neighbours.receivers.segment_E,
+            *step[3:],
             weights.gain,
             activation_EW,
             second_EW,
