@@ -1,4 +1,4 @@
-"""ahead_keys.py launch|behind: the keys in Triton's cache on disk of every kernel of a small update, one a line.
+"""ahead_keys.py launch|behind [gns]: the keys in Triton's cache on disk of every kernel of a small update, one a line.
 
 They are asked for in the order of the launches, as a training does, or from behind, as a process might that compiles a
 share of them.
@@ -7,6 +7,7 @@ share of them.
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from typing import Any
 
 import triton
@@ -36,8 +37,11 @@ def not_compiled(
 triton.runtime.driver.set_active(NoGpu())
 use_target(90)
 settings = UpdateSettings(2, 1e-3, True, 1 / 64, True, 0.5)
-network = NetworkConfig(width=16, levels=2, message_passing_steps=2)
-found = list(launches_of(AheadJob(network, settings, "half", True, True, 300, (200, 60), 90)).values())
+network, sizes = NetworkConfig(width=16, levels=2, message_passing_steps=2), (200, 60)
+if "gns" in sys.argv:
+    settings = replace(settings, optimizer="muon")
+    network, sizes = NetworkConfig(kind="gns", width=16, levels=1, message_passing_steps=2), (9000,)
+found = list(launches_of(AheadJob(network, settings, "half", True, True, 300, sizes, 90)).values())
 JITFunction._do_compile = not_compiled
 for function, data in found if sys.argv[1] == "launch" else reversed(found):
     function.preload(data)

@@ -96,6 +96,19 @@ def test_every_process_looks_under_the_same_keys(tmp_path: Path) -> None:
     assert len(keys[0]) > 30 and keys[0] == keys[1][::-1]
 
 
+def test_an_update_of_gns_never_asks_the_device(tmp_path: Path) -> None:
+    """From the samples to new weights it runs on tensors without memory, which have no value to wait for; neighbours,
+    edges, both passes and the optimiser are among its kernels, which can be compiled ahead."""
+    names = {line.split()[0] for line in run_compiled(tmp_path, "ahead_keys.py", "launch", "gns").split("\n")}
+    assert names >= {
+        "walk_neighbours",
+        "step_forward",
+        "norm_backward",
+        "encode_layers_backward",
+        "momentum_directions",
+    }
+
+
 def run_compiled(folder: Path, program: str, *arguments: str) -> str:
     """Runs a program of this folder with Triton compiling into `folder`, not interpreting; what it printed."""
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
