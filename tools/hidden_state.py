@@ -8,9 +8,9 @@ frame once more with a part of this state replaced by what could be guessed:
 - gradients: zero;
 - deformation: none (volumes, elastic deformation, hardening), as at the start;
 - everything: all three, which is the solver started anew from what is visible;
-- neighbour: gradients and deformation of the nearest particle of the same material. Half of what this changes is the
-  variance that is left where a particle's surroundings are known, but not which of two neighbours has which state: no
-  network that sees just these can be nearer on average.
+- neighbour: gradients and deformation of the nearest particle of the same material. A network that knew all about a
+  particle's surroundings, but could not tell which of two neighbours has which state, would be wrong by half of what
+  this changes; half of it is what the row says.
 
 Errors are one-step mean squared errors as everywhere: summed over axes, domain units per frame squared.
 """
