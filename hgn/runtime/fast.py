@@ -1,14 +1,17 @@
 """The simulation loop as one CUDA graph a frame (paper algorithm 1): no host synchronisation between looks.
 
-The host looks every LOOK_FRAMES frames. Where the grid needed more room than it had, the frames before are kept, the
-buffers grow, and the simulation goes on from the last good frame: nothing is lost, and nothing is done twice.
+The host looks every LOOK_FRAMES frames, while the device is at the next ones. Where the grid needed more room than it
+had, the frames before are kept, the buffers grow, and the simulation goes on from the last good frame: nothing is lost,
+and nothing is done twice.
 Shape legend: N particles of all scenes, S scenes, T frames.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -53,6 +56,21 @@ def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
     return tuple(found)
 
 
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Frames on their way: how many, where the first goes, and frame and status behind the last."""
+
+    frames: int
+    first: int
+    seen: torch.Tensor  # int32 [2], on the host once `end` has come
+    end: torch.cuda.Event | None
+
+
+@functools.cache
+def _copy_stream(device: int) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device)
+
+
 class FastRollout:
     """A simulation in progress on one device. Without CUDA the same launches run one by one (for tests)."""
 
@@ -89,7 +107,8 @@ class FastRollout:
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
             self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
-        self.path_TN3 = torch.zeros(LOOK_FRAMES, self.particles, 3, device=self.device)
+        self.path_TN3 = torch.zeros(2 * LOOK_FRAMES, self.particles, 3, device=self.device)
+        self.overlap = self.device.type == "cuda"  # frames are started before those before them are taken away
         normaliser = network.normaliser
         self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
@@ -239,15 +258,23 @@ class FastRollout:
         Raises: LeftDomainError, with the number of the frame.
         """
         kept = np.empty((frames, self.live, 3), np.float32)
-        done = 0
+        done, half = 0, 0
+        ahead: _Look | None = None
         while done < frames:
-            path_TN3, status = self.look(frames - done)
+            look = ahead or self._launch(min(LOOK_FRAMES, frames - done), half)
+            rest, half = frames - done - look.frames, 1 - half
+            # The device goes on while the host takes frames away; where something is amiss it stands still instead.
+            ahead = self._launch(min(LOOK_FRAMES, rest), half) if self.overlap and rest else None
+            path_TN3, status = self._settle(look)
             taken = len(path_TN3)
-            kept[done : done + taken] = path_TN3.cpu().numpy()
+            kept[done : done + taken] = self._taken_away(path_TN3)
             if on_frame is not None:
                 for frame in range(done, done + taken):
                     on_frame(self.frames_done - taken + frame - done + 1)
             done += taken
+            if status and ahead is not None:
+                self._settle(ahead)  # in vain, and over before its buffers go
+                ahead = None
             if status & DIVERGED.value:
                 raise LeftDomainError(self.frames_done, self._lost())
             self.make_room(status)
@@ -258,15 +285,43 @@ class FastRollout:
 
         They are a view of what the next call writes to. Where the status is not zero, it must be dealt with first.
         """
-        self.frame.zero_()
-        for _ in range(min(LOOK_FRAMES, frames)):
+        return self._settle(self._launch(min(LOOK_FRAMES, frames), 0))
+
+    def _launch(self, frames: int, half: int) -> _Look:
+        """Starts some frames, whose positions go into one half of the path."""
+        first = half * LOOK_FRAMES
+        self.frame.fill_(first)
+        for _ in range(frames):
             if self.graph is None:
                 self.frame_launches()
             else:
                 self.graph.replay()
-        taken, status = torch.cat([self.frame, self.grid.status]).tolist()
+        seen = torch.cat([self.frame, self.grid.status])
+        if self.device.type != "cuda":
+            return _Look(frames, first, seen, None)
+        seen = torch.empty(2, dtype=seen.dtype, pin_memory=True).copy_(seen, non_blocking=True)
+        end = torch.cuda.Event()
+        end.record()
+        return _Look(frames, first, seen, end)
+
+    def _settle(self, look: _Look) -> tuple[torch.Tensor, int]:
+        """Waits for frames that were started: those taken, and the status after them."""
+        if look.end is not None:
+            look.end.synchronize()
+        last, status = look.seen.tolist()
+        taken = last - look.first
         self.frames_done += taken
-        return self.path_TN3.view(-1)[: 3 * taken * self.live].view(taken, self.live, 3), status
+        start = 3 * look.first * self.live
+        return self.path_TN3.view(-1)[start : start + 3 * taken * self.live].view(taken, self.live, 3), status
+
+    def _taken_away(self, path_TN3: torch.Tensor) -> np.ndarray:
+        """Frames that are settled, on the host: copied beside whatever the device is at."""
+        if self.device.type != "cuda":
+            return path_TN3.numpy()
+        with torch.cuda.stream(_copy_stream(torch.cuda.current_device())):
+            host_TN3 = torch.empty(path_TN3.shape, pin_memory=True).copy_(path_TN3, non_blocking=True)
+            torch.cuda.current_stream().synchronize()
+        return host_TN3.numpy()
 
     def make_room(self, status: int) -> None:
         """Grows the buffers where the status says that they were too small."""

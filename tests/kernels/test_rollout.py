@@ -11,7 +11,8 @@ from kernels.engines import device
 from network.states import network_of, random_grid
 
 from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.fast import FastRollout, first_capacities
+from hgn.runtime import fast
+from hgn.runtime.fast import FastRollout, LeftDomainError, first_capacities
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.schema import ConfigError
 
@@ -62,19 +63,19 @@ def test_overflow_loses_nothing() -> None:
 def test_later_simulations_begin_anew() -> None:
     """What a simulator has captured it uses again, for a scene of fewer particles and other obstacles too; the frames
     are bitwise those of a new simulator, after one that diverged as well."""
-    first, second = scene(5), scene(4, 1)
-    again = Simulator(network(2), 60.0, "fast", "highest")
+    first, second = scene(3), scene(2, 1)
+    again = Simulator(network(), 60.0, "fast", "highest")
     again.rollout([first], 2)
     kept = again._kept[1]
     for one in (second, first):
-        (expected,) = Simulator(network(2), 60.0, "fast", "highest").rollout([one], 3)
-        (found,) = again.rollout([one], 3)
+        (expected,) = Simulator(network(), 60.0, "fast", "highest").rollout([one], 2)
+        (found,) = again.rollout([one], 2)
         assert again._kept[1] is kept
         np.testing.assert_array_equal(found, expected)
     away = replace(first, velocity_N3=np.full_like(first.velocity_N3, 60.0))
     with pytest.raises(DivergenceError):
-        again.rollout([away], 3)
-    np.testing.assert_array_equal(again.rollout([first], 3)[0], expected)
+        again.rollout([away], 2)
+    np.testing.assert_array_equal(again.rollout([first], 2)[0], expected)
     again.rollout([scene(1)], 2)  # too few for so much room
     assert again._kept[1] is not kept
     again.release()
@@ -88,6 +89,31 @@ def test_first_room() -> None:
     assert first_capacities((1_398, 214, 56, 8), 4_296)[:2] == (2_796, 429)
     assert first_capacities((128_529, 23_263, 4_373, 612), 400_000) == (257_058, 46_526, 8_746, 1_224)
     assert first_capacities((8,) * 5, 1) == (256, 128, 64, 32, 16)
+
+
+def test_frames_taken_away_beside_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames that are started before those before them are looked at are the same bitwise, where buffers grow too: what
+    was started in vain moves nothing; and the frame of a divergence is the same."""
+    monkeypatch.setattr(fast, "LOOK_FRAMES", 1)
+    spreading = network()
+    with torch.no_grad():
+        spreading.normaliser.acceleration_std.fill_(0.03)
+    state = Simulator(spreading, 60.0).start([scene(5)])
+    paths, growths, lost = [], [], []
+    for overlap in (False, True):
+        tight = FastRollout(spreading, state, "highest", (16,))
+        tight.overlap = overlap
+        seen: list[int] = []
+        paths.append(tight.run(3, seen.append))
+        growths.append(tight.growths)
+        assert seen == [1, 2, 3]
+        tight.begin(state)
+        tight.velocity_NV[0] = 1.0
+        with pytest.raises(LeftDomainError) as caught:
+            tight.run(2)
+        lost.append((caught.value.frame, caught.value.lost))
+    np.testing.assert_array_equal(paths[0], paths[1])
+    assert growths[0] == growths[1] > 0 and lost[0] == lost[1]
 
 
 def test_divergence_names_the_frame() -> None:
