@@ -213,6 +213,8 @@ class Simulator:
     def release(self) -> None:
         """Gives back the buffers that simulations keep for those that follow."""
         self._kept.clear()
+        if isinstance(self.predict, GnsGraphs):
+            self.predict = GnsGraphs(self.predict.network)
 
     @staticmethod
     def _check(state: ParticleState, frame: int) -> None:

@@ -142,7 +142,7 @@ def time_in_turns(
     watches: list[Stopwatch | None] = [None] * len(contenders)
     for i in sorted(range(len(contenders)), key=lambda i: contenders[i].importance):
         if not late():
-            watches[i] = _warm_up(contenders[i], singles[0], batch, config, device)
+            watches[i] = _warm_up(contenders[i], singles, batch, config, device)
 
     def rows() -> list[dict[str, Any] | None]:
         return [None if watch is None else watch.row(len(batch)) for watch in watches]
@@ -273,13 +273,14 @@ def _sinkhorn(
 
 def _warm_up(
     contender: Contender,
-    single: Sequence[Episode],
+    singles: Sequence[Sequence[Episode]],
     batch: Sequence[Episode],
     config: ErrorVsTimeConfig,
     device: torch.device,
 ) -> Stopwatch:
-    """Simulates one scene and the batch for some frames, which say how many take `timed_seconds`; and the most GPU
-    memory that the one scene took, of what torch knows.
+    """Simulates one scene and the batch for some frames, which say how many take `timed_seconds`; what captures its
+    launches, as the numbers of cells or neighbours need it, then simulates all that will be timed. Tells the most GPU
+    memory that the first scene took, of what torch knows.
     """
     network = contender.row["system"] in ("hgn", "gns", "gns_particles")
     contender.release()
@@ -288,13 +289,18 @@ def _warm_up(
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
-    most = min(config.timed_frames, len(single[0].position_TN3))
+    most = min(config.timed_frames, len(batch[0].position_TN3))
     if contender.row["system"] == "mpm":
         most = min(most, config.mpm_timed_frames)
     # what looks at its frames 32 at a time tells nothing of fewer
     frames = FAST_WARM_FRAMES if contender.row.get("path") == "fast" else WARM_FRAMES
-    taken = frame_milliseconds(contender, single, min(frames, most))
+    captures = contender.row.get("path") == "fast" or contender.row["system"].startswith("gns")
+    if captures:  # which would be taken for the time of a frame
+        frame_milliseconds(contender, singles[0], min(frames, most))
+    taken = frame_milliseconds(contender, singles[0], min(frames, most))
     peak = torch.cuda.max_memory_allocated(device) - before if device.type == "cuda" else 0
+    if captures:
+        frame_milliseconds(contender, batch, min(frames, most))
     together = frame_milliseconds(contender, batch, min(frames, most))
 
     def affordable(milliseconds: float | None) -> int:
@@ -303,7 +309,11 @@ def _warm_up(
         return min(most, max(frames, int(1e3 * config.timed_seconds / milliseconds)))
 
     memory = peak / 1e9 if network and device.type == "cuda" else None
-    return Stopwatch(contender, affordable(taken), affordable(together), memory)
+    watch = Stopwatch(contender, affordable(taken), affordable(together), memory)
+    if captures:
+        for episodes, count in [*((single, watch.single_frames) for single in singles), (batch, watch.batch_frames)]:
+            frame_milliseconds(contender, episodes, count)
+    return watch
 
 
 def _quartiles(values: Sequence[float] | np.ndarray) -> list[float] | None:
