@@ -292,6 +292,7 @@ class TrainingConfig:
     maximum_minutes: float | None = None  # wall time of this start; none: no limit
     batch_scenes: int = 1  # frames of random scenes in one update, on each device
     optimizer: str = "adam"  # or muon: hidden matrices step along their orthogonalised momentum
+    weight_decay: float = 0.0  # an update, times the learning rate, of what Muon steps; 0: none
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
     warmup_updates: int = 0  # first updates, over which the rate grows linearly to what it is without
@@ -344,7 +345,7 @@ class TrainingConfig:
             "rollout_scenes",
             "rollout_frames",
         )
-        require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates")
+        require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates", "weight_decay")
         require(0 <= self.rollout_share < 1, "rollout_share", "0 or more and below 1", self.rollout_share)
         require(0 <= self.rollout_pull <= 1, "rollout_pull", "0 to 1", self.rollout_pull)
         require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
@@ -352,6 +353,13 @@ class TrainingConfig:
         require(0 <= self.frame_importance < 1, "frame_importance", "0 or more and below 1", self.frame_importance)
         require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "optimizer", ("adam", "muon"))
+        require(
+            self.weight_decay == 0 or self.optimizer == "muon",
+            "weight_decay",
+            f"0 where training.optimizer is {self.optimizer}",
+            self.weight_decay,
+            "take training.optimizer=muon",
+        )
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
         require_one_of(self, "precision", PRECISIONS)
         require_one_of(self, "path", PATHS)

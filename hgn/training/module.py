@@ -203,7 +203,7 @@ class TrainingModule(LightningModule):
     def configure_optimizers(self) -> Any:
         config = self.training_config
         if config.optimizer == "muon":
-            optimizer: torch.optim.Adam = Muon(self.network, config.learning_rate)
+            optimizer: torch.optim.Adam = Muon(self.network, config.learning_rate, config.weight_decay)
         else:
             # One launch instead of several for each group of tensors; only the fused kind can skip a step by itself.
             optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=True)

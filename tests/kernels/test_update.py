@@ -98,8 +98,11 @@ def parameters_of(updates: Updates) -> torch.Tensor:
     return torch.cat([tensor.flatten() for tensor in found]).cpu().double()
 
 
-@pytest.mark.parametrize(("huber", "optimizer"), [(math.inf, "adam"), (0.5, "adam"), (math.inf, "muon")])
-def test_updates_are_those_of_torch(huber: float, optimizer: str) -> None:
+@pytest.mark.parametrize(
+    ("huber", "optimizer", "decay"),
+    [(math.inf, "adam", 0.0), (0.5, "adam", 0.0), (math.inf, "muon", 2.0)],
+)
+def test_updates_are_those_of_torch(huber: float, optimizer: str, decay: float) -> None:
     """Two updates of two scenes, with and without obstacles, at different rates, weighted, squared or Huber's loss:
     losses and parameters are those of autograd in float64 with torch's Adam or with Muon; an update that needs more
     room than there is gets it, and is repeated."""
@@ -112,11 +115,11 @@ def test_updates_are_those_of_torch(huber: float, optimizer: str) -> None:
         [(wide, 2, 3), (open_space, 0, 4, 1.7)],
     ]
     rates = [1e-3, 3e-4]
-    updates = updates_of(network, 2, capacities=(32, 16), huber=huber, optimizer=optimizer)
+    updates = updates_of(network, 2, capacities=(32, 16), huber=huber, optimizer=optimizer, weight_decay=decay)
     updates.run(chunk, rates)
     assert updates.growths >= 1
     reference = copy.deepcopy(network)
-    muon = Muon(reference, 1.0) if optimizer == "muon" else None
+    muon = Muon(reference, 1.0, decay) if optimizer == "muon" else None
     losses = plain_updates(reference, chunk, [[grid, none], [other, none]], rates, huber, muon)
     total, count = updates.loss_sum.tolist()
     assert count == 2 and total == pytest.approx(sum(losses), rel=1e-5)

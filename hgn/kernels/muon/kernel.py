@@ -56,10 +56,13 @@ def step_blocks(
     status,
     norm,
     step_size,
+    decay,
     PRECISION: tl.constexpr,
     WIDTH: tl.constexpr,
 ):
-    """Moves square blocks against their directions by rate times `step_size`; as `adam` writes values and weights."""
+    """Moves square blocks against their directions by rate times `step_size`, and shrinks them by rate times `decay`.
+    Values and weights are written as `adam` does.
+    """
     if tl.load(status) != 0:
         return
     if (tl.load(norm) < float("inf")) == 0:
@@ -69,7 +72,9 @@ def step_blocks(
     place = row * WIDTH + column
     at = tl.load(starts + block) + row * tl.load(pitch + block) + column
     along = tl.load(direction + block * WIDTH * WIDTH + place).to(tl.float32)
-    x = tl.load(value + at) - tl.load(rates + tl.load(update)) * step_size * along
+    rate = tl.load(rates + tl.load(update))
+    x = tl.load(value + at)
+    x -= rate * (decay * x + step_size * along)
     tl.store(value + at, x)
     if PRECISION == "half":
         tl.store(weight + at, x)

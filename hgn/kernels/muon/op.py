@@ -14,8 +14,11 @@ WARPS = 8
 class SquareBlocks:
     """The weights that Muon steps, in the packed layout: of each block the rows are pieces, equally far apart."""
 
-    def __init__(self, network: ParticleNetwork, index: torch.Tensor, device: torch.device) -> None:
+    def __init__(
+        self, network: ParticleNetwork, index: torch.Tensor, device: torch.device, weight_decay: float
+    ) -> None:
         """`index` maps packed elements to the concatenated parameters, -1 for padding."""
+        self._decay = weight_decay
         block_KWW = square_blocks(network)
         place = torch.empty(int(index.max()) + 1, dtype=torch.int64)
         used = index >= 0
@@ -74,6 +77,7 @@ class SquareBlocks:
             status,
             norm,
             step_size(width),
+            self._decay,
             PRECISION=precision,
             WIDTH=width,
             num_warps=WARPS,

@@ -92,6 +92,7 @@ class UpdateSettings:
     noise_smooth: float = 0.0
     huber: float = math.inf  # normalised error from which the loss grows linearly
     optimizer: str = "adam"
+    weight_decay: float = 0.0
 
     @staticmethod
     def of(training: TrainingConfig, obstacle_cell_size: float) -> UpdateSettings:
@@ -104,6 +105,7 @@ class UpdateSettings:
             training.noise_smooth,
             math.inf if training.huber is None else training.huber,
             training.optimizer,
+            training.weight_decay,
         )
 
 
@@ -181,7 +183,8 @@ class Updates:
         self.values = self.packed.gather(list(network.parameters()))
         self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self.average: torch.Tensor | None = None  # of the values over the updates; set it before the first one
-        self.blocks = SquareBlocks(network, self.packed.index, device) if settings.optimizer == "muon" else None
+        muon = settings.optimizer == "muon"
+        self.blocks = SquareBlocks(network, self.packed.index, device, settings.weight_decay) if muon else None
         self.step = torch.zeros(1, dtype=torch.float64, device=device)
         self.update = torch.zeros(1, dtype=torch.int32, device=device)
         self.particle_count = torch.zeros(1, dtype=torch.int32, device=device)
