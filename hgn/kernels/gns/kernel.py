@@ -1,8 +1,9 @@
 """The edges of GNS, forward and backward: an encoder, a message-passing step, their gradients by weights and senders.
 
-Edges lie grouped by receiver. Where sums by receiver are wanted a program takes one particle after the other, reads its
-weights once, and sums in its registers: no atomic additions, a fixed order. Forward, a step reads and writes each
-edge's state once and nothing else of that size; backward, it computes the hidden layer and the norm again.
+Edges lie grouped by receiver. A program takes one tile of edges after the other, whatever their receivers, and reads
+its weights once; many particles have few neighbours, and tiles of one receiver each would be nearly empty. What belongs
+to a particle is summed by a kernel of its own, in a fixed order and without atomic additions. Forward, a step reads and
+writes each edge's state once, and its message; backward, it computes the hidden layer and the norm again.
 Rows of edges beyond the last offset belong to none: they are neither read nor written.
 What of a program's results must be summed over programs stands in `partial`, a row of them each.
 Shape legend: N particles, E edges, W width.
@@ -178,9 +179,11 @@ def encode_layers_backward(
 def step_forward(
     edge,
     edge_out,
+    message_out,
     send,
     receive,
     sender,
+    receiver,
     offset,
     particles,
     own,
@@ -188,49 +191,42 @@ def step_forward(
     second_bias,
     gain,
     shift,
-    total,
     LAST: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """total [N, W]: each receiver's sum of messages. edge_out [E, W] is edge with the messages added, unless LAST.
+    """message_out [E, W]: the edges' messages. edge_out [E, W] is edge with the messages added, unless LAST.
 
-    send and receive [N, W] are the particles' products with the first layer, its bias in `receive`.
+    send and receive [N, W], stored like edges, are the particles' products with the first layer, its bias in `receive`.
     """
+    count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     own_t = transposed(own, WIDTH, WIDTH)
     second_t = transposed(second, WIDTH, WIDTH)
     bias = tl.load(second_bias + column)
     gain_row = tl.load(gain + column)
     shift_row = tl.load(shift + column)
-    # neighbouring receivers run at the same time: they share senders
-    particle = tl.program_id(0)
-    while particle < particles:
-        block = tl.load(offset + particle)
-        end = tl.load(offset + particle + 1)
-        received = tl.load(receive + particle * WIDTH + column)
-        sums = tl.zeros((WIDTH,), tl.float32)
-        while block < end:
-            row = block + tl.arange(0, BLOCK)
-            live = row < end
-            at = row[:, None] * WIDTH + column[None, :]
-            near = tl.load(sender + row, mask=live, other=0)
+    tile = tl.program_id(0).to(tl.int64)
+    while tile * BLOCK < count:
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = row < count
+        at = row[:, None] * WIDTH + column[None, :]
+        near = tl.load(sender + row, mask=live, other=0)
+        here = tl.load(receiver + row, mask=live, other=0)
+        state = tl.load(edge + at, mask=live[:, None], other=0.0)
+        ends = tl.load(send + near[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+        ends += tl.load(receive + here[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+        h = product(state, own_t, PRECISION) + ends.to(tl.float32)
+        z = product(tl.maximum(h, 0.0), second_t, PRECISION) + inside(bias, tile)[None, :]
+        z, _ = normalise(z, WIDTH)
+        message = z * inside(gain_row, tile)[None, :] + inside(shift_row, tile)[None, :]
+        tl.store(message_out + at, message, mask=live[:, None])
+        if not LAST:
+            # read again: registers are dearer than a cache
             state = tl.load(edge + at, mask=live[:, None], other=0.0)
-            sent = tl.load(send + near[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
-            h = product(state, own_t, PRECISION) + sent.to(tl.float32) + inside(received, block)[None, :]
-            z = product(tl.maximum(h, 0.0), second_t, PRECISION) + inside(bias, block)[None, :]
-            z, _ = normalise(z, WIDTH)
-            z = z * inside(gain_row, block)[None, :] + inside(shift_row, block)[None, :]
-            message = tl.where(live[:, None], z, 0.0)
-            if not LAST:
-                # read again: registers are dearer than a cache
-                state = tl.load(edge + at, mask=live[:, None], other=0.0)
-                tl.store(edge_out + at, state.to(tl.float32) + message, mask=live[:, None])
-            sums += tl.sum(message, 0)
-            block += BLOCK
-        tl.store(total + particle * WIDTH + column, sums)
-        particle += tl.num_programs(0)
+            tl.store(edge_out + at, state.to(tl.float32) + message, mask=live[:, None])
+        tile += tl.num_programs(0)
 
 
 @triton.jit
@@ -260,7 +256,7 @@ def norm_backward(
 
     activation and second_gradient [E, W] are the second layer's input and the gradient of its output; in `partial`
     [programs, 3, W] come first those of gain and shift. All gradients are multiplied by the graph's scale; those of the
-    sums, send and receive are stored like edges. Nothing is summed by receiver here: tiles are full of edges.
+    sums, send and receive are stored like edges.
     """
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
@@ -313,73 +309,71 @@ def layers_backward(
     second,
     hidden_gradient,
     edge_gradient,
-    receive_gradient,
     partial,
-    scale_ptr,
     LAST: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """The rest of the step backward: hidden_gradient [E, W] is that before the activation, receive_gradient [N, W] each
-    receiver's sum of it, no longer scaled, edge_gradient [E, W] that of the edges that came in; in `partial`
-    [programs, 3, W] comes last the second bias's."""
+    """The rest of the step backward: hidden_gradient [E, W] is that before the activation, edge_gradient [E, W] that of
+    the edges that came in; in `partial` [programs, 3, W] comes last the second bias's."""
+    count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     own_w = matrix(own, WIDTH, WIDTH)
     second_w = matrix(second, WIDTH, WIDTH)
-    unscale = 1.0 / tl.load(scale_ptr)
     bias_total = tl.zeros((8, WIDTH), tl.float32)
-    particle = tl.program_id(0)
-    while particle < particles:
-        block = tl.load(offset + particle)
-        end = tl.load(offset + particle + 1)
-        sums = tl.zeros((WIDTH,), tl.float32)
-        while block < end:
-            row = block + tl.arange(0, BLOCK)
-            live = row < end
-            at = row[:, None] * WIDTH + column[None, :]
-            dz = tl.load(second_gradient + at, mask=live[:, None], other=0.0)
-            bias_total += tl.sum(tl.reshape(dz.to(tl.float32), (BLOCK // 8, 8, WIDTH)), 0)
-            a = tl.load(activation + at, mask=live[:, None], other=0.0)
-            if not LAST:
-                de = tl.load(gradient + at, mask=live[:, None], other=0.0)
-            dh = tl.where(a > 0, product(dz, second_w, PRECISION), 0.0)
-            tl.store(hidden_gradient + at, dh, mask=live[:, None])
-            sums += tl.sum(dh, 0)
-            result = product(dh, own_w, PRECISION)
-            if not LAST:
-                result += de.to(tl.float32)
-            tl.store(edge_gradient + at, result, mask=live[:, None])
-            block += BLOCK
-        tl.store(receive_gradient + particle * WIDTH + column, sums * unscale)
-        particle += tl.num_programs(0)
+    tile = tl.program_id(0).to(tl.int64)
+    while tile * BLOCK < count:
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = row < count
+        at = row[:, None] * WIDTH + column[None, :]
+        dz = tl.load(second_gradient + at, mask=live[:, None], other=0.0)
+        bias_total += tl.sum(tl.reshape(dz.to(tl.float32), (BLOCK // 8, 8, WIDTH)), 0)
+        a = tl.load(activation + at, mask=live[:, None], other=0.0)
+        if not LAST:
+            de = tl.load(gradient + at, mask=live[:, None], other=0.0)
+        dh = tl.where(a > 0, product(dz, second_w, PRECISION), 0.0)
+        tl.store(hidden_gradient + at, dh, mask=live[:, None])
+        result = product(dh, own_w, PRECISION)
+        if not LAST:
+            result += de.to(tl.float32)
+        tl.store(edge_gradient + at, result, mask=live[:, None])
+        tile += tl.num_programs(0)
     tl.store(partial + (tl.program_id(0) * 3 + 2) * WIDTH + column, tl.sum(bias_total, 0))
 
 
 @triton.jit
-def sender_sums(
-    hidden_gradient,
+def edge_sums(
+    value,
     order,
-    sender_offset,
+    offset,
     total,
     scale_ptr,
+    ORDERED: tl.constexpr,
+    SCALED: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """total [N, W]: the sum of each sender's edges, no longer scaled; `order` lists the edges by sender."""
+    """total [N, W]: the sum of each particle's rows of `value` [E, W], those from its offset to the next one's, or with
+    ORDERED those that `order` [E] has there; SCALED: divided by the scale. A program a particle."""
     particle = tl.program_id(0)
     column = tl.arange(0, WIDTH)
-    block = tl.load(sender_offset + particle)
-    end = tl.load(sender_offset + particle + 1)
+    block = tl.load(offset + particle)
+    end = tl.load(offset + particle + 1)
     sums = tl.zeros((BLOCK, WIDTH), tl.float32)
     while block < end:
         row = block + tl.arange(0, BLOCK)
         live = row < end
-        edge = tl.load(order + row, mask=live, other=0).to(tl.int64)
-        part = tl.load(hidden_gradient + edge[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
+        edge = row
+        if ORDERED:
+            edge = tl.load(order + row, mask=live, other=0).to(tl.int64)
+        part = tl.load(value + edge[:, None] * WIDTH + column[None, :], mask=live[:, None], other=0.0)
         sums += part.to(tl.float32)
         block += BLOCK
-    tl.store(total + particle * WIDTH + column, tl.sum(sums, 0) / tl.load(scale_ptr))
+    result = tl.sum(sums, 0)
+    if SCALED:
+        result = result / tl.load(scale_ptr)
+    tl.store(total + particle * WIDTH + column, result)
 
 
 @triton.jit

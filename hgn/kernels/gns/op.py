@@ -11,19 +11,19 @@ import torch
 import triton
 
 from hgn.kernels.gns.kernel import (
+    edge_sums,
     encode_forward,
     encode_layers_backward,
     encode_norm_backward,
     layers_backward,
     norm_backward,
-    sender_sums,
     step_forward,
     weight_products,
 )
 from hgn.kernels.packing import rounded_to_tf32
 from hgn.network.edges import Edges, Ends, Graph, Weights
 
-SENDER_BLOCK = 16
+SUM_BLOCK, SUM_WARPS = 16, 4  # edges and warps of a sum
 
 
 @dataclass(frozen=True)
@@ -115,22 +115,23 @@ class FusedEdges(Edges):
         self, graph: Graph, ends: Ends, weights: Weights, edge_EW: torch.Tensor, last: bool, in_place: bool
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
         out_EW = None if last else edge_EW if in_place else torch.empty_like(edge_EW)
-        sum_NW = torch.empty_like(ends.receive_NW)
-        count, width = sum_NW.shape
-        step_forward[(self._programs(self.tuning.programs, count, edge_EW.device),)](
+        message_EW = torch.empty_like(edge_EW)
+        edges, width = edge_EW.shape
+        programs = self._programs(self.tuning.programs, triton.cdiv(edges, self.tuning.block), edge_EW.device)
+        step_forward[(programs,)](
             edge_EW,
             edge_EW if out_EW is None else out_EW,
+            message_EW,
             *self._step(graph, ends, weights),
             weights.gain,
             weights.shift,
-            sum_NW,
             LAST=last,
             WIDTH=width,
             BLOCK=self.tuning.block,
             PRECISION=self.precision,
             num_warps=self.tuning.warps,
         )
-        return sum_NW, out_EW
+        return self._sums(graph, message_EW, None, ends.receive_NW, scaled=False), out_EW
 
     def step_backward(
         self,
@@ -142,10 +143,10 @@ class FusedEdges(Edges):
         gradient_EW: torch.Tensor | None,
     ) -> tuple[Ends, Weights, torch.Tensor]:
         tuning = self.tuning
-        count, width = ends.receive_NW.shape
+        edges, width = edge_EW.shape
         activation_EW, second_EW, hidden_EW, result_EW = (torch.empty_like(edge_EW) for _ in range(4))
-        receive_NW, send_NW = torch.empty_like(ends.receive_NW), torch.empty_like(ends.receive_NW)
-        programs = self._programs(tuning.backward_programs, count, edge_EW.device)
+        wanted = triton.cdiv(edges, tuning.backward_block)
+        programs = self._programs(tuning.backward_programs, wanted, edge_EW.device)
         partial_P3W = weights.second.new_empty(programs, 3, width)
         last = gradient_EW is None
         gradient_EW = edge_EW if gradient_EW is None else gradient_EW.contiguous()
@@ -154,11 +155,7 @@ class FusedEdges(Edges):
             self._stored(sum_gradient_NW * graph.scale),
             gradient_EW,
             edge_EW,
-            step[0],
-            self._stored(ends.receive_NW),
-            step[2],
-            graph.neighbours.receivers.segment_E,
-            *step[3:],
+            *step,
             weights.gain,
             activation_EW,
             second_EW,
@@ -174,23 +171,19 @@ class FusedEdges(Edges):
             activation_EW,
             gradient_EW,
             graph.neighbours.receivers.offset_N1,
-            count,
-            *step[5:7],
+            graph.neighbours.receivers.count,
+            *step[6:8],
             hidden_EW,
             result_EW,
-            receive_NW,
             partial_P3W,
-            graph.scale,
             LAST=last,
             WIDTH=width,
             BLOCK=tuning.backward_block,
             PRECISION=self.precision,
             num_warps=tuning.backward_warps,
         )
-        order_E, offset_N1 = graph.by_sender
-        sender_sums[(count,)](
-            hidden_EW, order_E, offset_N1, send_NW, graph.scale, WIDTH=width, BLOCK=SENDER_BLOCK, num_warps=4
-        )
+        receive_NW = self._sums(graph, hidden_EW, None, ends.receive_NW, scaled=True)
+        send_NW = self._sums(graph, hidden_EW, graph.by_sender, ends.receive_NW, scaled=True)
         second_WW, own_WW = self._weight_products(graph, second_EW, activation_EW, (hidden_EW, edge_EW))
         gain_W, shift_W, bias_W = (partial_P3W.sum(0) / graph.scale).unbind(0)
         return Ends(send_NW, receive_NW), Weights(own_WW, second_WW, bias_W, gain_W, shift_W), result_EW
@@ -223,14 +216,41 @@ class FusedEdges(Edges):
         receivers = graph.neighbours.receivers
         return (
             self._stored(ends.send_NW),
-            ends.receive_NW.contiguous(),
+            self._stored(ends.receive_NW),
             graph.neighbours.sender_E,
+            receivers.segment_E,
             receivers.offset_N1,
             receivers.count,
             self._operand(weights.own),
             self._operand(weights.second),
             weights.bias,
         )
+
+    def _sums(
+        self,
+        graph: Graph,
+        value_EW: torch.Tensor,
+        by_sender: tuple[torch.Tensor, torch.Tensor] | None,
+        like_NW: torch.Tensor,
+        scaled: bool,
+    ) -> torch.Tensor:
+        """Sums of edges by receiver, or as `by_sender` orders them; without the graph's scale if they have it."""
+        receivers = graph.neighbours.receivers
+        order_E, offset_N1 = by_sender or (receivers.segment_E, receivers.offset_N1)
+        total_NW = torch.empty_like(like_NW, memory_format=torch.contiguous_format)
+        edge_sums[(receivers.count,)](
+            value_EW,
+            order_E,
+            offset_N1,
+            total_NW,
+            graph.scale if scaled else total_NW,
+            ORDERED=by_sender is not None,
+            SCALED=scaled,
+            WIDTH=value_EW.shape[1],
+            BLOCK=SUM_BLOCK,
+            num_warps=SUM_WARPS,
+        )
+        return total_NW
 
     def _weight_products(
         self,
