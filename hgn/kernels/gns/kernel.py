@@ -104,7 +104,7 @@ def encode_norm_backward(
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     second_t = transposed(second, WIDTH, WIDTH)
-    gain_total, shift_total = tl.zeros((1, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
+    gain_total, shift_total = tl.zeros((BLOCK // 16, 8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     tile = tl.program_id(0).to(tl.int64)
     while tile * BLOCK < count:
         row = tile * BLOCK + tl.arange(0, BLOCK)
@@ -116,14 +116,16 @@ def encode_norm_backward(
         z = product(a, second_t, PRECISION) + tl.load(second_bias + column)[None, :]
         z, scale = normalise(z, WIDTH)
         dm = tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
-        shift_total += tl.sum(tl.reshape(dm, (BLOCK // 8, 8, WIDTH)), 0)  # see norm_backward, and why 0 z
+        if count > 0:  # see norm_backward, and why 0 z
+            shift_total += tl.sum(tl.reshape(dm, (BLOCK // 8, 8, WIDTH)), 0)
         dm += 0.0 * z
-        gain_total += tl.sum(dm * z, 0, keep_dims=True)
+        if count > 0:
+            gain_total += tl.sum(tl.reshape(dm * z, (BLOCK // 16, 2, 8, WIDTH)), 1)
         dz = normalise_backward(dm, z, scale, inside(tl.load(gain + column), tile), WIDTH)
         tl.store(second_gradient + at, dz, mask=live[:, None])
         tile += tl.num_programs(0)
     mine = partial + tl.program_id(0) * 8 * WIDTH + column
-    tl.store(mine, tl.sum(gain_total, 0))
+    tl.store(mine, tl.sum(tl.sum(gain_total, 0), 0))
     tl.store(mine + WIDTH, tl.sum(shift_total, 0))
 
 
@@ -264,7 +266,7 @@ def norm_backward(
     second_t = transposed(second, WIDTH, WIDTH)
     bias = tl.load(second_bias + column)
     gain_row = tl.load(gain + column)
-    gain_total, shift_total = tl.zeros((1, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
+    gain_total, shift_total = tl.zeros((BLOCK // 16, 8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     tile = tl.program_id(0).to(tl.int64)
     while tile * BLOCK < count:
         row = tile * BLOCK + tl.arange(0, BLOCK)
@@ -283,18 +285,20 @@ def norm_backward(
         dm = summed.to(tl.float32)
         if not LAST:
             dm += tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
-        # of each eighth row, which are a thread's own
-        shift_total += tl.sum(tl.reshape(dm, (BLOCK // 8, 8, WIDTH)), 0)
+        if count > 0:  # always; else the compiler keeps the summands to the loop's end, and registers spill
+            # rows that one thread has, here as they were loaded, below in the matrix units' layout
+            shift_total += tl.sum(tl.reshape(dm, (BLOCK // 8, 8, WIDTH)), 0)
         z = product(a, second_t, PRECISION) + inside(bias, tile)[None, :]
         z, scale = normalise(z, WIDTH)
         # 0 z: else the compiler brings z, and with it float32, to where dm was loaded
         dm = dm.to(summed.dtype).to(tl.float32) + 0.0 * z
-        gain_total += tl.sum(dm * z, 0, keep_dims=True)
+        if count > 0:
+            gain_total += tl.sum(tl.reshape(dm * z, (BLOCK // 16, 2, 8, WIDTH)), 1)
         dz = normalise_backward(dm, z, scale, inside(gain_row, tile), WIDTH)
         tl.store(second_gradient + at, dz, mask=live[:, None])
         tile += tl.num_programs(0)
     mine = partial + tl.program_id(0) * 3 * WIDTH + column
-    tl.store(mine, tl.sum(gain_total, 0))
+    tl.store(mine, tl.sum(tl.sum(gain_total, 0), 0))
     tl.store(mine + WIDTH, tl.sum(shift_total, 0))
 
 
