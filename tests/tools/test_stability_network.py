@@ -59,14 +59,16 @@ def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.Captu
     singles = [f"single particle, {name}" for name in ("water", "sand", "snow")]
     alone = [f"{name} alone" for name in ("water", "sand", "snow")]
     thrown = f"thrown at up to {8 * (2 * 9.8) ** 0.5:.1f} a second"
-    held = ["5 frames", "particles x10", "domain x4", *singles, *alone, "at the end of 64000 cells"]
+    held = ["5 frames", "particles x10", "domain x4", *alone, "at the end of 64000 cells"]
     falls = [
         f"{case}, {name}" for name in ("water", "sand", "snow") for case in ("free fall", "a body's velocity error")
     ]
-    assert list(rows) == [*falls, *held[:3], thrown, *held[3:], "a weight that explodes"]
+    assert list(rows) == [*falls, *held[:3], thrown, *singles, *held[3:], "a weight that explodes"]
     # what never accelerates misses all of gravity, and answers to nothing
     assert all(rows[name]["measured"] == pytest.approx(1.0, rel=1e-3) and not rows[name]["held"] for name in falls[::2])
     assert all(abs(rows[name]["measured"]) < 1e-6 for name in falls[1::2])
+    for name in singles:  # nor does a particle fall
+        assert not rows[name]["held"] and rows[name]["share_fallen"] <= 0 and "of its way" in rows[name]["beyond"]
     keys = {"part", "case", "predicted", "measured", "held", "beyond"}
     assert all(keys <= row.keys() and row["part"] == "network" for row in rows.values())
     for name in held:
@@ -116,8 +118,9 @@ def test_failures_are_told(weights: str) -> None:
     simulator = Simulator(network, 60.0)
     push = torch.tensor([0.0, -9.8 / 60**2, 0.0])
     simulator.predict = lambda state: push.expand(len(state.position_N3), 3)
-    case = Case(case.name, case.scenes, 16)
-    assert row_of(simulator, case, 0.02).held
+    case = Case(case.name, case.scenes, 16, falls=True)
+    row = row_of(simulator, case, 0.02)
+    assert row.held and row.more["share_fallen"] == pytest.approx(1, rel=1e-3)
     push[0] = 1e-2
     row = row_of(simulator, Case(case.name, case.scenes, 40), 0.02)
     assert not row.held and row.measured < 40 and "diverged at frame" in row.beyond

@@ -43,6 +43,7 @@ PART = "network"
 PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
 LONGEST = 100.0  # domain that is drawn whole, in heights
 DRAWN_EVERY_S = 5.0  # the picture of all cases so far, which takes longer with each
+FALL_FRAMES, FALL_BOUND = 12, 0.2  # frames in which nothing is met; how far off the way may be
 FAR_DOMAINS = 100.0  # how far the guard's case throws particles
 
 
@@ -183,6 +184,12 @@ def case_row(
     outside = max(
         outside_domain(trial.position_TN3[-1], scene.domain_size) for trial, scene in zip(trials, initial, strict=True)
     )
+    fallen = (
+        min(share_fallen(trial, scene, simulator.frame_rate_hz) for trial, scene in zip(trials, initial, strict=True))
+        if case.falls
+        else None
+    )
+    hangs = fallen is not None and abs(fallen - 1) > FALL_BOUND
     causes = [trial.cause for trial in trials if trial.cause is not None]
     if causes:
         beyond = causes[0]
@@ -190,6 +197,8 @@ def case_row(
         beyond = "positions are not finite, and the runtime did not say so"
     elif growth > energy_bound:
         beyond = f"energy grows by {growth:.2g} of a fall through the domain"
+    elif hangs:
+        beyond = f"falls {100 * (fallen or 0):.2g} % of its way in the first {FALL_FRAMES} frames"
     elif outside:
         beyond = f"{100 * outside:.2g} % of the particles end outside of the domain"
     else:
@@ -198,7 +207,7 @@ def case_row(
         case.name,
         predicted=case.frames,
         measured=reached,
-        held=finite and not causes and growth <= energy_bound and not outside,
+        held=finite and not causes and growth <= energy_bound and not outside and not hangs,
         beyond=beyond,
         more={
             "particles": sum(len(scene.position_N3) for scene in initial),
@@ -206,6 +215,7 @@ def case_row(
             "domain_size": list(initial[0].domain_size),
             "energy_growth": growth if math.isfinite(growth) else None,
             "outside_domain": outside,
+            "share_fallen": fallen,
             "failed_scenes": len(causes),
             "guard": "missed" if not finite else "raised" if causes else "not needed",
             "ms": milliseconds,
@@ -222,6 +232,16 @@ def energy_growth(trial: Trial, scene: InitialState, frame_rate_hz: float) -> fl
     speed_N3 = scene.velocity_N3 / frame_rate_hz
     start = float((0.5 * (speed_N3**2).sum(-1) - trial.position_TN3[0].astype(np.float64) @ gravity_3).mean())
     return max(0.0, float(energy_T.max()) - start) / energy_scale(gravity_3, scene.domain_size)
+
+
+def share_fallen(trial: Trial, scene: InitialState, frame_rate_hz: float) -> float:
+    """How far the particles came along gravity in their first frames, of free fall's way from their own velocity."""
+    last = min(FALL_FRAMES, trial.frame_count - 1)
+    gravity_3, seconds = np.asarray(scene.gravity, np.float64), last / frame_rate_hz
+    if not last or not gravity_3.any():
+        return 1.0
+    moved_N3 = trial.position_TN3[last].astype(np.float64) - trial.position_TN3[0] - seconds * scene.velocity_N3
+    return float((moved_N3 @ gravity_3).mean() / (0.5 * seconds**2 * (gravity_3 @ gravity_3)))
 
 
 def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:

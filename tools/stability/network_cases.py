@@ -63,6 +63,7 @@ class Case:
     name: str
     scenes: tuple[Scene, ...]
     frames: int
+    falls: bool = False  # what is known to: nothing is below, or beside
 
 
 def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Case]:
@@ -97,7 +98,7 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
         speed = config.speed_factor * math.sqrt(2 * float(np.linalg.norm(base.gravity)) * side)
         yield case(f"thrown at up to {speed:.1f} a second", replace(base, maximum_initial_speed=speed))
     for material in base.materials if "single" in wanted else ():
-        yield Case(f"single particle, {material}", (_single(base, material),), config.frames)
+        yield Case(f"single particle, {material}", (_single(base, material),), config.frames, falls=True)
     for material in base.materials if "material" in wanted else ():
         yield case(f"{material} alone", replace(base, materials=(material,)))
     if "far" in wanted:
