@@ -46,6 +46,7 @@ class SceneConfig:
     particles_per_cell: float = 8.0
     clearance_cells: float = 2.0  # between obstacles, groups and walls, in solver cells
     maximum_initial_speed: float = 0.0  # domain units per second; each group draws one velocity
+    lone_particles: int = 0  # far from all others; else a network learns that what is alone lies on the floor
 
     def __post_init__(self) -> None:
         for axis, length in zip("xyz", self.domain_size, strict=True):
@@ -54,6 +55,7 @@ class SceneConfig:
             require(math.isfinite(value), f"gravity ({axis})", "finite", value)
         require_positive(self, "cell_size", "group_size", "particles_per_cell")
         require_non_negative(self, "obstacle_count", "group_count", "clearance_cells", "maximum_initial_speed")
+        require_non_negative(self, "lone_particles")
         low, high = self.obstacle_size
         require(0 < low <= high < math.inf, "obstacle_size", "0 < smallest <= largest", list(self.obstacle_size))
         for i, name in enumerate(self.materials):

@@ -29,6 +29,7 @@ SHAPES_PER_ITEM = 20  # sizes, shapes and orientations drawn for one obstacle or
 PLACES_PER_SHAPE = 50
 SURFACE_DETAIL = 0.045  # longest edge, relative to the size, of the pieces that distances are taken between
 FEW = 32
+LONE_CELLS = 6  # solver cells from a lone particle to any other: beyond what a network looks at for neighbours
 ROUNDING = 1e-6  # of a length; keeps float32 rounding on the right side of every bound
 
 
@@ -50,7 +51,7 @@ class _NoRoomError(Exception):
 
 
 def generate_scene(config: SceneConfig, seed: int) -> Scene:
-    """A random scene with particles at rest, or with one velocity per group.
+    """A random scene with particles at rest, or with one velocity per group; a lone particle is a group of size 0.
 
     Obstacles lie completely inside the domain, `clearance_cells` solver cells from each other and none inside
     another; groups keep the same distance to obstacles, to each other and to the solver's walls. Items are
@@ -61,15 +62,19 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     """
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number >= 0", seed)
     rng = np.random.Generator(np.random.PCG64(seed))
+    lone_rng = np.random.Generator(np.random.PCG64([seed, 1]))  # the rest of a scene is the same without them
     failure = ""
     for _ in range(LAYOUTS):
         try:
             obstacles = _place_obstacles(config, rng)
             groups = _place_groups(config, obstacles, rng)
+            lone = _place_lone_particles(config, obstacles, [region for _, region in groups], lone_rng)
         except _NoRoomError as error:
             failure = str(error)
             continue
-        return _assemble(config, seed, obstacles, groups, rng)
+        bodies = [_fill_group(config, shape, region, rng) for shape, region in groups]
+        bodies += [_fill_group(config, "cube", region, lone_rng) for region in lone]
+        return _assemble(config, seed, obstacles, bodies)
     raise ConfigError(f"{failure} ({LAYOUTS} layouts, seed {seed})")
 
 
@@ -162,6 +167,30 @@ def _place_group(
     )
 
 
+def _place_lone_particles(
+    config: SceneConfig, obstacles: list[_Placed], groups: list[Region], rng: np.random.Generator
+) -> list[Region]:
+    near = LONE_CELLS * config.cell_size
+    clearance = config.clearance_cells * config.cell_size + ROUNDING
+    margin = WALL_CELLS * config.cell_size + clearance
+    room = np.array(config.domain_size) - 2 * margin
+    placed: list[Region] = []
+    for index in range(config.lone_particles):
+        for _ in range(SHAPES_PER_ITEM * PLACES_PER_SHAPE if (room >= 0).all() else 0):
+            region = Region(_triple(margin + room * rng.random(3)))
+            if any(region.distance(other) < near for other in (*groups, *placed)):
+                continue
+            if not any(_blocked(region, item, clearance) for item in obstacles):
+                placed.append(region)
+                break
+        else:
+            raise _NoRoomError(
+                f"lone_particles must leave room for each, got no place for number {index + 1} of "
+                f"{config.lone_particles}; lower lone_particles, or raise domain_size"
+            )
+    return placed
+
+
 def _blocked(region: Region, item: _Placed, clearance: float) -> bool:
     bound = clearance + item.gap
     centre = np.array(region.centre)
@@ -172,38 +201,42 @@ def _blocked(region: Region, item: _Placed, clearance: float) -> bool:
     return bool(contains(centre[None], item.obstacle)[0])
 
 
-def _assemble(
-    config: SceneConfig,
-    seed: int,
-    obstacles: list[_Placed],
-    groups: list[tuple[str, Region]],
-    rng: np.random.Generator,
-) -> Scene:
-    positions, velocities, materials = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)], []
-    records: list[dict[str, Any]] = []
-    for shape, region in groups:
-        material = _choice(config.materials, rng)
-        velocity = np.zeros(3)
-        if config.maximum_initial_speed > 0:
-            velocity = config.maximum_initial_speed * points_in_ball(1, 3, rng)[0]
-        count = particle_count(region, config.particles_per_cell, config.cell_size)
-        positions.append(fill(region, count, rng))
-        velocities.append(np.tile(velocity.astype(np.float32), (count, 1)))
-        materials.append(np.full(count, material_index(material), np.uint8))
-        records.append(
-            {
-                "shape": shape,
-                "size": config.group_size,
-                "position": list(region.centre),
-                "material": material,
-                "velocity": velocity.tolist(),
-                "particle_count": count,
-            }
-        )
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """The particles of a group."""
+
+    position_N3: np.ndarray
+    velocity_3: np.ndarray
+    material: str
+    record: dict[str, Any]
+
+
+def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.Generator) -> _Body:
+    material = _choice(config.materials, rng)
+    velocity = np.zeros(3)
+    if config.maximum_initial_speed > 0:
+        velocity = config.maximum_initial_speed * points_in_ball(1, 3, rng)[0]
+    count = particle_count(region, config.particles_per_cell, config.cell_size)
+    record = {
+        "shape": shape,
+        "size": 2 * float(region.reach[0]),
+        "position": list(region.centre),
+        "material": material,
+        "velocity": velocity.tolist(),
+        "particle_count": count,
+    }
+    return _Body(fill(region, count, rng), velocity, material, record)
+
+
+def _assemble(config: SceneConfig, seed: int, obstacles: list[_Placed], bodies: list[_Body]) -> Scene:
+    none = np.zeros((0, 3), np.float32)
+    counts = [len(body.position_N3) for body in bodies]
+    materials = np.array([material_index(body.material) for body in bodies], np.uint8)
+    velocities = np.array([body.velocity_3 for body in bodies], np.float32).reshape(-1, 3)
     return Scene(
-        position_N3=np.concatenate(positions),
-        velocity_N3=np.concatenate(velocities),
-        material_N=np.concatenate([np.zeros(0, np.uint8), *materials]),
+        position_N3=np.concatenate([none, *(body.position_N3 for body in bodies)]),
+        velocity_N3=np.repeat(velocities, counts, axis=0),
+        material_N=np.repeat(materials, counts),
         obstacles=tuple(item.obstacle for item in obstacles),
         domain_size=config.domain_size,
         cell_size=config.cell_size,
@@ -213,7 +246,7 @@ def _assemble(
             "kind": "random",
             "seed": seed,
             "obstacles": [item.record for item in obstacles],
-            "groups": records,
+            "groups": [body.record for body in bodies],
         },
     )
 

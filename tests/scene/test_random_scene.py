@@ -130,6 +130,25 @@ def test_scene_agrees_with_its_specification():
         assert np.linalg.norm(record["quaternion"]) == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_lone_particles_are_far_from_all_others(seed):
+    """They come after the groups, which are those of the scene without them, and keep clear of obstacles and walls."""
+    scene, without = generate_scene(SceneConfig(lone_particles=3), seed), generate_scene(PAPER, seed)
+    count = without.particle_count
+    assert scene.particle_count == count + 3
+    assert (scene.position_N3[:count] == without.position_N3).all()
+    assert (scene.material_N[:count] == without.material_N).all()
+    assert [group["particle_count"] for group in scene.specification["groups"][-3:]] == [1, 1, 1]
+    point = scene.position_N3.astype(np.float64)
+    distance = np.linalg.norm(point[count:, None] - point[None], axis=2)
+    distance[np.arange(3), count + np.arange(3)] = np.inf
+    assert distance.min() >= 6 * CELL * (1 - 1e-6)
+    assert point.min() > (WALL_CELLS + 2) * CELL and point.max() < 1 - (WALL_CELLS + 2) * CELL
+    for obstacle in scene.obstacles:
+        assert surface_distances(point[count:], obstacle).min() > 2 * CELL
+        assert not contains(point[count:], obstacle).any()
+
+
 def test_scenes_at_rest_have_no_velocity():
     """With maximum_initial_speed 0 every velocity is exactly zero."""
     assert not generate_scene(PAPER, 3).velocity_N3.any()
@@ -170,6 +189,7 @@ def test_no_groups_and_no_obstacles_is_an_empty_scene():
         (SceneConfig(obstacle_count=1, obstacle_size=(3.0, 3.0)), "number 1 of 1; lower obstacle_count"),
         (SceneConfig(obstacle_count=0, group_size=1.0), "group_size 1; lower group_count"),
         (SceneConfig(obstacle_count=0, group_size=0.4, group_count=9), "group_count must leave room"),
+        (SceneConfig(obstacle_count=0, group_count=0, lone_particles=2000), "lone_particles must leave room"),
     ],
 )
 def test_what_does_not_fit_is_named(config, message):
