@@ -189,7 +189,10 @@ def test_no_groups_and_no_obstacles_is_an_empty_scene():
         (SceneConfig(obstacle_count=1, obstacle_size=(3.0, 3.0)), "number 1 of 1; lower obstacle_count"),
         (SceneConfig(obstacle_count=0, group_size=1.0), "group_size 1; lower group_count"),
         (SceneConfig(obstacle_count=0, group_size=0.4, group_count=9), "group_count must leave room"),
-        (SceneConfig(obstacle_count=0, group_count=0, lone_particles=2000), "lone_particles must leave room"),
+        (
+            SceneConfig((0.25, 0.25, 0.25), obstacle_count=0, group_count=0, lone_particles=40),
+            "lone_particles must leave",
+        ),
     ],
 )
 def test_what_does_not_fit_is_named(config, message):
