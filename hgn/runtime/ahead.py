@@ -21,6 +21,7 @@ from typing import Self
 import torch
 
 from hgn.config import NetworkConfig
+from hgn.cpus import available_cpus
 from hgn.kernels.ahead import AheadJob, FrameJob, job_text
 from hgn.parent import die_with_parent
 from hgn.runtime.path import why_not_fast
@@ -37,8 +38,7 @@ class AheadCompilation:
         self, job: AheadJob | FrameJob, processes: int | None = None, command: Sequence[str] = COMMAND
     ) -> None:
         """Starts them: half as many as there are cores, where `processes` does not say."""
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        processes = processes or max(1, min(MOST_PROCESSES, cores // 2))
+        processes = processes or max(1, min(MOST_PROCESSES, available_cpus() // 2))
         self._started = time.monotonic()
         self._files = contextlib.ExitStack()
         self._messages = [self._files.enter_context(tempfile.TemporaryFile()) for _ in range(processes)]  # noqa: SIM115

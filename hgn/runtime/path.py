@@ -23,12 +23,8 @@ def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "
     """What keeps the fast path from running, in words; none if nothing does."""
     if config.kind != "hgn":
         return f"it computes hgn networks, not {config.kind}"
-    if device.type != "cuda":
-        return f"it needs a CUDA device, not {device.type}"
-    if importlib.util.find_spec("triton") is None:
-        return "it needs the package triton"
-    if config.width not in FAST_WIDTHS:
-        return f"network.width must be one of {', '.join(map(str, FAST_WIDTHS))} for it, not {config.width}"
+    if reason := _why_no_kernels(device) or _why_not_wide_so(config):
+        return reason
     if precision == "highest" and config.width > HIGHEST_WIDTH:
         return f"with precision highest it computes widths up to {HIGHEST_WIDTH}, not {config.width}"
     if config.levels > FAST_LEVELS:
@@ -47,18 +43,30 @@ def why_not_trained_fast(
         return why_not_fast(device, config, precision)
     if config.obstacle_particles:
         return f"it trains hgn and gns networks, not {config.kind}"
-    if device.type != "cuda":
-        return f"it needs a CUDA device, not {device.type}"
-    if importlib.util.find_spec("triton") is None:
-        return "it needs the package triton"
+    if reason := _why_no_kernels(device):
+        return reason
     if precision != "half":
         return f"it trains gns with precision half, not {precision}"
-    if config.width not in FAST_WIDTHS:
-        return f"network.width must be one of {', '.join(map(str, FAST_WIDTHS))} for it, not {config.width}"
+    if reason := _why_not_wide_so(config):
+        return reason
     if config.maximum_neighbours is not None:
         return f"network.maximum_neighbours must be null for it, not {config.maximum_neighbours}"
     if own_states:
         return "it trains gns on true states alone (training.rollout_share=0)"
+    return None
+
+
+def _why_no_kernels(device: torch.device) -> str | None:
+    if device.type != "cuda":
+        return f"it needs a CUDA device, not {device.type}"
+    if importlib.util.find_spec("triton") is None:
+        return "it needs the package triton"
+    return None
+
+
+def _why_not_wide_so(config: NetworkConfig) -> str | None:
+    if config.width not in FAST_WIDTHS:
+        return f"network.width must be one of {', '.join(map(str, FAST_WIDTHS))} for it, not {config.width}"
     return None
 
 

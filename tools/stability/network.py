@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -23,6 +22,7 @@ import torch
 from PIL import Image
 
 from hgn.command import run_command
+from hgn.cpus import available_cpus
 from hgn.device import choose_device
 from hgn.files import write_json
 from hgn.picture import compare_picture, spread, stacked, write_picture
@@ -72,7 +72,7 @@ def main(mapping: dict[str, Any]) -> int:
             drawn = time.monotonic()
 
     made = list(cases(config, network.config))
-    with ThreadPoolExecutor(worker_threads()) as threads, ExitStack() as stack:
+    with ThreadPoolExecutor(available_cpus()) as threads, ExitStack() as stack:
         # What the runtime makes of obstacles takes seconds where there are many: the largest cases first.
         order = sorted(range(len(made)), key=lambda i: -sum(len(scene.obstacles) for scene in made[i].scenes))
         starts = {i: threads.submit(initial_states, made[i]) for i in order}
@@ -112,11 +112,6 @@ def main(mapping: dict[str, Any]) -> int:
     print(table(rows))
     keep(done=True)
     return 0
-
-
-def worker_threads() -> int:
-    """As many as this process has cores."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def late_kernels(path: str) -> Callable[[], int]:
