@@ -452,7 +452,7 @@ class RolloutConfig:
         )
         require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
         require_non_negative(self, "seed")
-        picture = self.out is not None and Path(self.out).suffix in (".png", ".gif")
+        picture = self.out is not None and Path(self.out).suffix in (".png", ".gif", ".webp")
         require(self.out != "" and not picture, "out", "the name of an HDF5 file, as in rollout.vtkhdf", self.out)
 
 

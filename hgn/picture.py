@@ -27,8 +27,8 @@ from hgn.schema import ConfigError
 
 RADIUS_IN_SPACINGS = 0.72  # spheres that overlap a little look like a body, not like a cloud
 TEXT_COLOR = (45, 50, 60)
-FAINT_COLOR = (130, 136, 146)
 PALETTE_SAMPLES = 40_000
+WEBP_QUALITY = 70  # at 50 small particles smear, and at 90 the file is as large as a GIF
 Color = tuple[int, int, int]
 NO_OTHERS: Mapping[str, np.ndarray] = MappingProxyType({})
 
@@ -117,36 +117,62 @@ def animate(
     label: str = "prediction",
     others: Mapping[str, np.ndarray] = NO_OTHERS,
 ) -> None:
-    """Writes a GIF of every `every`-th frame, the prediction beside the ground truth where there is one.
+    """Writes every `every`-th frame, the prediction beside the ground truth where there is one.
 
-    fps: pictures per second, none for real time; GIF counts in hundredths of a second. size: width of one
-    panel in pixels. progress: called with (pictures drawn, pictures in all). label, others: as in compare_picture.
+    path: ends in .gif, or in .webp, which takes half the space and keeps all colours. fps: pictures per second, none
+    for real time; GIF counts in hundredths of a second, WebP in thousandths. size: width of one panel in pixels.
+    progress: called with (pictures drawn, pictures in all). label, others: as in compare_picture.
 
-    Raises: ConfigError when fps is not in (0, 50], which viewers slow down, every is below 1, or others hold other
+    Raises: ConfigError when fps is beyond what viewers keep (50, WebP 60), every is below 1, or others hold other
     particles.
     """
+    webp = Path(path).suffix == ".webp"
+    fastest = 60 if webp else 50
     if not every >= 1:
         raise ConfigError(f"every must be at least 1, got {every}")
     rate = rollout.frame_rate_hz / every if fps is None else fps
-    if not 0 < rate <= 50:
-        remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / 50)}" if fps is None else "choose another fps"
-        raise ConfigError(f"fps must be in (0, 50], which GIF viewers keep, got {rate:g}; {remedy}")
+    if not 0 < rate <= fastest:
+        remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / fastest)}" if fps is None else "choose another fps"
+        kind = "WebP" if webp else "GIF"
+        raise ConfigError(f"fps must be in (0, {fastest}], which {kind} viewers keep, got {rate:g}; {remedy}")
     frames = range(0, rollout.frame_count, every)
     stage = _stage(rollout, size)
     versions = _versions(rollout, label, others)
-    palette = _Palette([_animation_picture(stage, rollout, versions, frames[i], size) for i in spread(len(frames), 6)])
-    pictures = _animation(stage, rollout, versions, frames, size, palette, progress)
+
+    def drawn() -> Iterator[Image.Image]:
+        for done, frame in enumerate(frames, start=1):
+            yield _animation_picture(stage, rollout, versions, frame, size)
+            if progress is not None:
+                progress(done, len(frames))
+
     buffer = io.BytesIO()
-    next(pictures).save(
-        buffer,
-        format="GIF",
-        save_all=True,
-        append_images=pictures,
-        duration=10 * round(100 / rate),
-        loop=0,
-        disposal=1,
-        optimize=False,
-    )
+    if webp:
+        first, *later = drawn()
+        duration = round(1000 / rate)
+        first.save(
+            buffer,
+            "WEBP",
+            save_all=True,
+            append_images=later,
+            duration=duration,
+            loop=0,
+            quality=WEBP_QUALITY,
+            method=3,
+        )
+    else:
+        some = [_animation_picture(stage, rollout, versions, frames[i], size) for i in spread(len(frames), 6)]
+        pictures = map(_Palette(some).apply, drawn())
+        duration = 10 * round(100 / rate)
+        next(pictures).save(
+            buffer,
+            "GIF",
+            save_all=True,
+            append_images=pictures,
+            duration=duration,
+            loop=0,
+            disposal=1,
+            optimize=False,
+        )
     write_picture(path, buffer.getvalue())
 
 
@@ -172,7 +198,7 @@ def error_curve(
             color = tuple(MATERIAL_COLORS[MATERIALS.index(name)] * (0.85 if name == "snow" else 1.0))
             axes.plot(seconds, positive, label=name, color=color, linewidth=1.8)
         else:
-            axes.plot(seconds, positive, label=name, color="0.2", linewidth=2.2)
+            axes.plot(seconds, positive, label=name, color="0.2" if name == "all" else None, linewidth=2.2)
     if shown:
         axes.set_yscale("log")
     axes.set_xlabel("time (s)")
@@ -275,7 +301,7 @@ def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, material_N: np.nd
         panel = stage.draw(np.empty((0, 3)), material_N[:0])
         note = f"ends after {len(position_TN3)} frames"
     if note:
-        _write(panel, (panel.width / 2, panel.height * 0.42), note, _text_size(panel.width), FAINT_COLOR)
+        _write(panel, (panel.width / 2, panel.height * 0.42), note, _text_size(panel.width), halo=3)
     return panel
 
 
@@ -291,34 +317,22 @@ def _versions(rollout: Rollout, label: str, others: Mapping[str, np.ndarray]) ->
     return [(label if predicted else "", rollout.position_TN3), *others.items(), *truth]
 
 
-def _animation(
-    stage: Stage,
-    rollout: Rollout,
-    versions: Sequence[tuple[str, np.ndarray]],
-    frames: range,
-    size: int,
-    palette: _Palette,
-    progress: Callable[[int, int], None] | None,
-) -> Iterator[Image.Image]:
-    for done, frame in enumerate(frames, start=1):
-        yield palette.apply(_animation_picture(stage, rollout, versions, frame, size))
-        if progress is not None:
-            progress(done, len(frames))
-
-
 def _animation_picture(
     stage: Stage, rollout: Rollout, versions: Sequence[tuple[str, np.ndarray]], frame: int, size: int
 ) -> Image.Image:
     width, height = stage.size
-    gap, header = size // 30, _header_height(size)
+    gap, header, text = size // 30, _header_height(size), _text_size(size)
     picture = Image.new("RGB", (len(versions) * (width + gap) - gap, height + 2 * header), _background())
-    seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
     for column, (label, position_TN3) in enumerate(versions):
         x = column * (width + gap)
         picture.paste(_panel(stage, position_TN3, frame, rollout.material_N), (x, header))
-        text = f"{label}   {seconds}" if label else seconds
-        _write(picture, (x + width / 2, header / 2), text, _text_size(size))
-    _legend(picture, picture.height - header / 2, rollout, _text_size(size))
+        _write(picture, (x + width / 2, header / 2), label, 6 * text // 5, bold=True)
+    seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
+    if len(versions) == 1:  # whose legend is as wide as the picture
+        _write(picture, (width - gap, header / 2), seconds, text, anchor="rm")
+    else:
+        _write(picture, (gap, picture.height - header / 2), seconds, text, anchor="lm")
+    _legend(picture, picture.height - header / 2, rollout, text)
     return picture
 
 
@@ -396,22 +410,33 @@ def _write(
     place: tuple[float, float],
     text: str,
     size: int,
-    color: Color = TEXT_COLOR,
     anchor: str = "mm",
+    bold: bool = False,
+    halo: int = 0,
 ) -> None:
-    ImageDraw.Draw(picture).text(place, text, font=_font(size), fill=color, anchor=anchor)
+    """halo: pixels of background around the letters, for text over obstacles."""
+    ImageDraw.Draw(picture).text(
+        place,
+        text,
+        font=_font(size, bold),
+        fill=TEXT_COLOR,
+        anchor=anchor,
+        stroke_width=halo,
+        stroke_fill=_background() if halo else None,
+    )
 
 
 @functools.cache
-def _font(size: int) -> ImageFont.FreeTypeFont:
+def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which comes with matplotlib."""
     import matplotlib
 
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
 
 
 def _text_size(panel_size: int) -> int:
-    return max(9, panel_size // 26)
+    return max(9, panel_size // 23)
 
 
 def _header_height(panel_size: int) -> int:

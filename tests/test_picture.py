@@ -139,19 +139,38 @@ def test_animation(tmp_path: Path, every: int, fps: float | None, pictures: int,
         assert has_hue(Image.fromarray(shown[0][1]), material)
 
 
-def test_single_frame_animation(tmp_path: Path) -> None:
-    """A rollout of one frame gives a still GIF."""
-    animate(falling_blobs(1), tmp_path / "still.gif", size=80)
-    with Image.open(tmp_path / "still.gif") as gif:
-        assert gif.n_frames == 1
+def test_webp_animation(tmp_path: Path) -> None:
+    """A WebP holds the same pictures as the GIF in real time, loops, and is the smaller file."""
+    rollout, progress = falling_blobs(24, 24), []
+    animate(rollout, tmp_path / "a.webp", every=2, size=160, progress=lambda *step: progress.append(step))
+    animate(rollout, tmp_path / "a.gif", every=2, size=160)
+    with Image.open(tmp_path / "a.webp") as webp, Image.open(tmp_path / "a.gif") as gif:
+        assert (webp.format, webp.n_frames, webp.size, webp.info["loop"]) == ("WEBP", 12, gif.size, 0)
+        for frame in (0, 5, 11):
+            webp.seek(frame)
+            gif.seek(frame)
+            one, other = (np.asarray(picture.convert("RGB")).astype(np.float64) for picture in (webp, gif))
+            assert webp.info["duration"] == 33 and np.abs(one - other).mean() < 4
+    assert progress == [(i + 1, 12) for i in range(12)]
+    assert (tmp_path / "a.webp").stat().st_size < 0.8 * (tmp_path / "a.gif").stat().st_size
+
+
+@pytest.mark.parametrize("ending", ["gif", "webp"])
+def test_single_frame_animation(tmp_path: Path, ending: str) -> None:
+    """A rollout of one frame gives a still picture."""
+    animate(falling_blobs(1), tmp_path / f"still.{ending}", size=80)
+    with Image.open(tmp_path / f"still.{ending}") as picture:
+        assert picture.n_frames == 1
 
 
 def test_animation_rates_that_viewers_change(tmp_path: Path) -> None:
-    """Rates above 50 per second, which viewers slow down, are refused with the remedy; so is every=0."""
+    """Rates above 50 per second (WebP 60), which viewers slow down, are refused with the remedy; so is every=0."""
     with pytest.raises(ConfigError, match="every >= 2"):
         animate(falling_blobs(), tmp_path / "a.gif", every=1)
     with pytest.raises(ConfigError, match="another fps"):
         animate(falling_blobs(), tmp_path / "a.gif", fps=100)
+    with pytest.raises(ConfigError, match=r"fps must be in \(0, 60\], which WebP viewers keep, got 61"):
+        animate(falling_blobs(), tmp_path / "a.webp", fps=61)
     with pytest.raises(ConfigError, match="every must be"):
         animate(falling_blobs(), tmp_path / "a.gif", every=0)
     assert not list(tmp_path.iterdir())

@@ -1,14 +1,14 @@
 """python -m tools.render rollout=FILE out=FOLDER_OR_FILE: pictures of a rollout, or of an episode of a data set.
 
 Into a folder go NAME.png (frames beside each other), NAME.gif (the animation) and, with ground truth,
-NAME_error.png (error over time); into a file that ends in .png or .gif goes that picture alone. Other rollouts of the
-same scene (`others=[FILE,...]`) are drawn beside it, under `names`.
+NAME_error.png (error over time); into a file that ends in .png, .gif or .webp (an animation in half the space) goes
+that picture alone. Other rollouts of the same scene (`others=[FILE,...]`) are drawn beside it, under `names`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.schema import ConfigError, from_mapping, require, require_positive
 
 PICTURES = 4  # in the PNG, where frames does not say
+ANIMATIONS = (".gif", ".webp")
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,6 @@ class RenderConfig:
                 self.rollout,
                 "as in rollout=rollout.vtkhdf out=pictures",
             )
-            require(not self.others, "others", "left out where there is no rollout", self.others)
         else:
             require(
                 self.data is None and self.episode is None,
@@ -78,12 +78,13 @@ class RenderConfig:
 
 @dataclass(frozen=True)
 class Versions:
-    """A rollout, and others of the same scene by name."""
+    """A rollout, or the truth, and others of the same scene by name."""
 
     name: str  # of the files
     rollout: Rollout
     label: str
     others: Mapping[str, np.ndarray]
+    truth_TN3: np.ndarray | None  # what all of them are measured against
 
 
 def main(mapping: Mapping[str, Any]) -> int:
@@ -97,17 +98,17 @@ def main(mapping: Mapping[str, Any]) -> int:
     out = Path(config.out)
     if out.suffix == ".png":
         _write_png(config, versions, out)
-    elif out.suffix == ".gif":
-        _write_gif(config, versions, out)
+    elif out.suffix in ANIMATIONS:
+        _write_animation(config, versions, out)
     elif out.suffix and not out.is_dir():
-        raise ConfigError(f"out must be a folder or end in .png or .gif, got {config.out!r}")
+        raise ConfigError(f"out must be a folder or end in .png, {' or '.join(ANIMATIONS)}, got {config.out!r}")
     else:
         _write_png(config, versions, out / f"{name}.png")
         if config.gif:
-            _write_gif(config, versions, out / f"{name}.gif")
-        if rollout.reference_TN3 is not None:
+            _write_animation(config, versions, out / f"{name}.gif")
+        if versions.truth_TN3 is not None:
             path = out / f"{name}_error.png"
-            write_picture(path, error_curve(position_error(rollout), rollout.frame_rate_hz), rollout.source)
+            write_picture(path, error_curve(_errors(versions), rollout.frame_rate_hz), rollout.source)
             print(path)
     return 0
 
@@ -120,16 +121,22 @@ def _load(config: RenderConfig) -> Versions:
     if config.rollout is None:
         assert config.data is not None and config.episode is not None  # RenderConfig saw to it
         rollout = rollout_of_episode(find_episode(config.data, config.episode))
-        return Versions(config.episode, rollout, config.names[0] if config.names else "", {})
-    rollout = read_rollout(config.rollout)
-    label, *rest = config.names or ("prediction", *(Path(other).stem for other in config.others))
+        name, first, label = config.episode, f"episode {config.episode}", "ground truth" if config.others else ""
+        truth_TN3 = rollout.position_TN3 if config.others else None
+    else:
+        rollout = read_rollout(config.rollout)
+        name, first, label = Path(config.rollout).stem, config.rollout, "prediction"
+        truth_TN3 = rollout.reference_TN3
+    names = config.names or (label, *(Path(other).stem for other in config.others))
+    require(len(set(names)) == len(names), "names", "given where others have the same file name", config.names)
+    label, *rest = names
     others = {}
-    for i, (name, file) in enumerate(zip(rest, config.others, strict=True)):
+    for i, (other_name, file) in enumerate(zip(rest, config.others, strict=True)):
         other = read_rollout(file)
         if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0]):
-            raise ConfigError(f"others[{i}] must begin with the same particles as {config.rollout}, got {file}")
-        others[name] = other.position_TN3
-    return Versions(Path(config.rollout).stem, rollout, label, others)
+            raise ConfigError(f"others[{i}] must begin with the same particles as {first}, got {file}")
+        others[other_name] = other.position_TN3
+    return Versions(name, rollout, label, others, truth_TN3)
 
 
 def _write_png(config: RenderConfig, versions: Versions, path: Path) -> None:
@@ -140,7 +147,20 @@ def _write_png(config: RenderConfig, versions: Versions, path: Path) -> None:
     print(path)
 
 
-def _write_gif(config: RenderConfig, versions: Versions, path: Path) -> None:
+def _errors(versions: Versions) -> dict[str, np.ndarray]:
+    """Position error over time: of each material, or of each of several rollouts."""
+    rollout, truth_TN3 = versions.rollout, versions.truth_TN3
+    if not versions.others:
+        return position_error(rollout)
+    predicted = {versions.label: rollout.position_TN3, **versions.others}
+    return {
+        name: position_error(replace(rollout, position_TN3=position_TN3, reference_TN3=truth_TN3))["all"]
+        for name, position_TN3 in predicted.items()
+        if position_TN3 is not truth_TN3
+    }
+
+
+def _write_animation(config: RenderConfig, versions: Versions, path: Path) -> None:
     pictures = len(range(0, versions.rollout.frame_count, config.every))
     with bar("drawing", total=pictures, unit="picture") as progress:
         animate(
