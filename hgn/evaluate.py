@@ -12,15 +12,12 @@ from hgn.command import run_command
 from hgn.config import EvaluateConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.select import first_episodes
-from hgn.device import choose_device
 from hgn.files import write_json
 from hgn.network.base import ParticleNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
-from hgn.runtime.gns_edges import use_edges
-from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
-from hgn.runtime.weights import find_weights, load_weights, require_frame_rate
+from hgn.runtime.weights import require_frame_rate
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
@@ -38,23 +35,19 @@ from hgn.training.errors import (
 def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; returns the exit code."""
     config = from_mapping(EvaluateConfig, mapping)
-    device = choose_device(config.device)
-    network, info = load_weights(find_weights(config.weights), device)
-    path, text = path_on(device, network.config, config.path, config.precision)
-    set_matmul_precision(config.precision)
-    use_edges(network, config.precision)
+    simulator = Simulator.load(config.weights, config.device, config.path, config.precision)
+    info = simulator.info
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     require_frame_rate(info, episodes[0].frame_rate_hz)
-    rows = one_step_rows(network, episodes, config)
+    rows = one_step_rows(simulator.network, episodes, config)
     if config.rollout_frames >= 2:
-        print(text, file=sys.stderr)
-        simulator = Simulator(network, info.frame_rate_hz, path, config.precision)
+        print(simulator.path_said, file=sys.stderr)
         rows.append(rollout_row(simulator, episodes, config.rollout_frames))
     print(table(rows, config, len(episodes)))
     if config.json is not None:
         report = {
-            "meta": provenance(device) | {"weights": Path(config.weights).name, "updates": info.updates},
+            "meta": provenance(simulator.device) | {"weights": Path(config.weights).name, "updates": info.updates},
             "rows": rows,
         }
         write_json(config.json, report)

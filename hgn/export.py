@@ -30,6 +30,7 @@ def export(checkpoint_path: Path, out: Path, half: bool = False) -> None:
         network=network.config,
         frame_rate_hz=data.frame_rate_hz,
         obstacle_cell_size=data.obstacle_cell_size,
+        gravity=data.gravity,
         updates=updates_of_checkpoint(checkpoint),
         provenance=provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.config_hash},
     )

@@ -17,18 +17,15 @@ from typing import Any
 from hgn.command import run_command
 from hgn.config import RolloutConfig, SceneConfig, config_directory
 from hgn.data.select import find_episode
-from hgn.device import choose_device
-from hgn.network.base import ParticleNetwork
 from hgn.picture import animate, compare_picture, spread, write_picture
 from hgn.progress import bar
-from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
-from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, require_frame_rate
+from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import load_scene
-from hgn.schema import ConfigError, from_mapping, require
+from hgn.schema import ConfigError, from_mapping
 
 PICTURES = 4  # in the PNG
 EVERY = 3  # frames of the rollout for one picture of the GIF
@@ -54,32 +51,33 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
 
     Raises: ConfigError for bad input, weights that let the simulation diverge among them; nothing is written then.
     """
-    device = choose_device(config.device)
+    simulator = Simulator.load(config.weights, config.device, config.path, config.precision)
     weights = find_weights(config.weights)
-    network, info = load_weights(weights, device)
     source = {"weights": weights.name, "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
     frames = config.frames
     reference_TN3 = None
     if config.data is None:
-        name, scene = _scene(config, network, info)
+        name, scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(scene)
-        obstacles, cell_size = scene.obstacles, scene.cell_size
+        obstacles = scene.obstacles
+        if scene.material_parameters:
+            names = ", ".join(scene.material_parameters)
+            print(
+                f"not used: {names} of groups, which are the solver's; {weights.stem} knows one of each material",
+                file=sys.stderr,
+            )
         source["scene"] = config.scene or f"random, seed {config.seed}"
     else:
         assert config.episode is not None  # RolloutConfig saw to it
         name = config.episode
         episode = find_episode(config.data, config.episode)
-        require_frame_rate(info, episode.frame_rate_hz)
+        require_frame_rate(simulator.info, episode.frame_rate_hz)
         frames = min(frames, len(episode.position_TN3))
         initial = InitialState.of_episode(episode)
-        obstacles, cell_size = obstacles_of_episode(episode), episode.obstacle_grid.cell_size
+        obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": config.episode}
-    _require_cell_size(info, cell_size)
-    chosen, text = path_on(device, network.config, config.path, config.precision)
-    print(text, file=sys.stderr)
-    set_matmul_precision(config.precision)
-    simulator = Simulator(network, info.frame_rate_hz, chosen, config.precision)
+    print(simulator.path_said, file=sys.stderr)
     with bar("simulating", total=frames - 1, unit="frame") as progress:
         try:
             (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
@@ -91,9 +89,9 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         material_N=initial.material_N,
         obstacles=obstacles,
         domain_size=initial.domain_size,
-        frame_rate_hz=info.frame_rate_hz,
+        frame_rate_hz=simulator.frame_rate_hz,
         gravity=initial.gravity,
-        cell_size=cell_size,
+        cell_size=initial.obstacle_grid.cell_size,
         source=source,
         reference_TN3=reference_TN3,
     )
@@ -101,7 +99,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     return path, made
 
 
-def _scene(config: RolloutConfig, network: ParticleNetwork, info: WeightsInfo) -> tuple[str, Scene]:
+def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
     """A scene file or an example, or a scene like those that the network was trained on; and a name for it."""
     if config.scene is not None:
         path = Path(config.scene)
@@ -109,19 +107,10 @@ def _scene(config: RolloutConfig, network: ParticleNetwork, info: WeightsInfo) -
         if re.fullmatch(r"\w+", config.scene) and not path.exists() and example.is_file():
             path = example
         return path.stem, load_scene(path)
-    drawn = SceneConfig(cell_size=info.obstacle_cell_size, materials=network.config.materials)
-    if not network.config.sees_obstacles:
+    drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)
+    if not info.network.sees_obstacles:
         drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as conf/scene/no_obstacles.yaml says
     return f"random_{config.seed}", generate_scene(drawn, config.seed)
-
-
-def _require_cell_size(info: WeightsInfo, cell_size: float) -> None:
-    require(
-        cell_size == info.obstacle_cell_size or not info.network.sees_obstacles,
-        "cell_size",
-        f"the weights' {info.obstacle_cell_size}, the size of the cells that it knows obstacles by",
-        cell_size,
-    )
 
 
 if __name__ == "__main__":

@@ -98,7 +98,9 @@ def _fit(
     from hgn.training.tensorboard import FinalMetrics
 
     training = config.training
-    data = DataInfo(store.manifest.config_hash, config.dataset.frame_rate_hz, config.scene.cell_size)
+    data = DataInfo(
+        store.manifest.config_hash, config.dataset.frame_rate_hz, config.scene.cell_size, config.scene.gravity
+    )
     _quieten_lightning()
     devices, nodes = layout(training)
     path, text = _path(config)

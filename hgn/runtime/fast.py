@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -279,6 +279,19 @@ class FastRollout:
                 raise LeftDomainError(self.frames_done, self._lost())
             self.make_room(status)
         return kept
+
+    def frames(self) -> Iterator[np.ndarray]:
+        """Positions float32 [N, 3] of frame after frame, without an end, computed LOOK_FRAMES at a time.
+
+        Raises: LeftDomainError, behind the last frame before it.
+        """
+        while True:
+            path_TN3, status = self.look(LOOK_FRAMES)
+            diverged = bool(status & DIVERGED.value)  # in the last of them
+            yield from path_TN3[: len(path_TN3) - diverged].clone().cpu().numpy()
+            if diverged:
+                raise LeftDomainError(self.frames_done, self._lost())
+            self.make_room(status)
 
     def look(self, frames: int) -> tuple[torch.Tensor, int]:
         """Simulates up to `frames` more frames: those taken, at most LOOK_FRAMES of them, and the status after them.

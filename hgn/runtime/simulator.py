@@ -6,13 +6,17 @@ Shape legend: T frames, N particles of all scenes, S scenes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from hgn.device import choose_device
 from hgn.network.base import ParticleNetwork
 from hgn.network.edges import PlainEdges
 from hgn.network.features import ParticleState, material_rows
@@ -23,11 +27,14 @@ from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.runtime.divergence import lost
 from hgn.runtime.gns_edges import require_agreement, use_edges
 from hgn.runtime.gns_graph import GnsGraphs
+from hgn.runtime.path import path_on, set_matmul_precision
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_positions
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
 from hgn.scene.rollout_file import cell_obstacles, obstacles_of_episode
 from hgn.scene.scene import Obstacle, Scene
+from hgn.schema import require
 
 if TYPE_CHECKING:
     from hgn.runtime.fast import FastRollout
@@ -100,6 +107,8 @@ class Simulator:
         of a GNS, which works on its edges accordingly from now on."""
         self.network = network
         self.frame_rate_hz = frame_rate_hz
+        self.path_said = ""  # which path it is and why, where `load` chose it
+        self._info: WeightsInfo | None = None
         self.path, self.precision = path, precision
         self.device = next(network.parameters()).device
         self.growths = 0  # of the fast path's buffers, in all rollouts
@@ -110,14 +119,42 @@ class Simulator:
             roomy = not isinstance(network.edges, PlainEdges)  # which take no room to spare
             self.predict = GnsGraphs(network) if roomy else network
 
-    def start(self, scenes: Sequence[InitialState]) -> ParticleState:
+    @staticmethod
+    def load(
+        weights: str | Path = "obstacles", device: str = "auto", path: str = "auto", precision: str = "high"
+    ) -> Simulator:
+        """A simulator of exported weights: a file, or the name of shipped ones. The options are those of hgn.rollout.
+
+        Sets the precision of PyTorch's own float32 products, too.
+        Raises: ConfigError when the weights, the device or the path do not exist or do not fit each other.
+        """
+        place = choose_device(device)
+        network, info = load_weights(find_weights(str(weights)), place)
+        chosen, said = path_on(place, network.config, path, precision)
+        set_matmul_precision(precision)
+        simulator = Simulator(network, info.frame_rate_hz, chosen, precision)
+        simulator._info, simulator.path_said = info, said
+        return simulator
+
+    @property
+    def info(self) -> WeightsInfo:
+        """What the weights file says of itself, for a simulator that `load` made."""
+        assert self._info is not None
+        return self._info
+
+    def start(self, scenes: Sequence[InitialState | Scene]) -> ParticleState:
         """The state at frame 0, with a ballistic history.
 
-        Raises: ConfigError when a scene holds a material that the network does not know.
+        Raises: ConfigError when a scene holds a material that the network does not know, or, for weights that were
+        loaded, another gravity or obstacle cells of another size.
         """
+        return self._start(_initial(scenes))
+
+    def _start(self, scenes: Sequence[InitialState]) -> ParticleState:
         config = self.network.config
         velocities = []
         for scene in scenes:
+            self._require_known(scene)
             past = ballistic_positions(
                 scene.position_N3,
                 scene.velocity_N3,
@@ -151,7 +188,7 @@ class Simulator:
 
     def rollout(
         self,
-        scenes: Sequence[InitialState],
+        scenes: Sequence[InitialState | Scene],
         frames: int,
         on_frame: Callable[[int], None] | None = None,
     ) -> list[np.ndarray]:
@@ -159,50 +196,75 @@ class Simulator:
 
         Raises: DivergenceError, which says at which frame; the network must be trained further then.
         """
-        state = self.start(scenes)
-        counts = [len(scene.position_N3) for scene in scenes]
+        scenes = _initial(scenes)
+        state = self._start(scenes)
+        positions = [state.position_N3[None].cpu().numpy()]
         if self.path == "fast":
-            return np.split(self._fast_rollout(state, frames, on_frame), np.cumsum(counts)[:-1], axis=1)
+            with self._fast(state) as rollout:
+                positions.append(rollout.run(frames - 1, on_frame))
+        else:
+            for frame, position_N3 in enumerate(itertools.islice(self._plain_frames(state), frames - 1), start=1):
+                positions.append(position_N3[None])
+                if on_frame is not None:
+                    on_frame(frame)
+        counts = [len(scene.position_N3) for scene in scenes]
+        return np.split(np.concatenate(positions), np.cumsum(counts)[:-1], axis=1)
+
+    def frames(self, scene: InitialState | Scene) -> Iterator[np.ndarray]:
+        """Positions float32 [N, 3] of frame after frame, the initial ones first, for as long as they are asked for.
+
+        The fast path is some frames ahead. Several scenes may be simulated side by side, each by a call of its own.
+        Raises: what `rollout` does, ConfigError with the first frame and DivergenceError behind the last good one.
+        """
+        state = self.start([scene])
+        yield state.position_N3.cpu().numpy()
+        if self.path == "fast":
+            with self._fast(state) as rollout:
+                yield from rollout.frames()
+        else:
+            yield from self._plain_frames(state)
+
+    def _plain_frames(self, state: ParticleState) -> Iterator[np.ndarray]:
+        """Positions [N, 3] behind the first, without an end."""
         require_agreement(self.network, state, gradients=False)
-        positions = [state.position_N3.cpu().numpy()]
-        for frame in range(1, frames):
+        for frame in itertools.count(1):
             try:
                 state = self.step(state)
             except GridRangeError as error:
                 raise DivergenceError(frame, str(error)) from None
             self._check(state, frame)
-            positions.append(state.position_N3.cpu().numpy())
-            if on_frame is not None:
-                on_frame(frame)
-        return np.split(np.stack(positions), np.cumsum(counts)[:-1], axis=1)
+            yield state.position_N3.cpu().numpy()
 
-    def _fast_rollout(self, state: ParticleState, frames: int, on_frame: Callable[[int], None] | None) -> np.ndarray:
+    @contextmanager
+    def _fast(self, state: ParticleState) -> Iterator[FastRollout]:
+        """A simulation on the fast path, which is kept for others once it is over."""
         # Triton, which the plain path does without, is loaded here.
         from hgn.runtime.fast import CHECKED_PARTICLES, FastRollout, LeftDomainError
 
         assert isinstance(self.network, HierarchicalGraphNetwork)
-        first_1N3 = state.position_N3[None].cpu().numpy()
         rollout = self._begun(state)
         if rollout is None:
-            self._kept.pop(state.scene_count, None)  # before the new one is allocated
             rollout = FastRollout(self.network, state, self.precision)
             if len(state.position_N3) <= CHECKED_PARTICLES:
                 rollout.require_agreement(self.network, state)
-            if len(self._kept) == KEPT:
-                del self._kept[next(iter(self._kept))]
-            self._kept[state.scene_count] = rollout
         before = rollout.growths
         try:
-            later_TN3 = rollout.run(frames - 1, on_frame)
+            yield rollout
         except LeftDomainError as error:
             raise DivergenceError(error.frame, _left(error.lost, len(state.position_N3))) from None
         finally:
             self.growths += rollout.growths - before
-        return np.concatenate([first_1N3, later_TN3])
+            self._kept.pop(state.scene_count, None)
+            if len(self._kept) == KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[state.scene_count] = rollout
 
     def _begun(self, state: ParticleState) -> FastRollout | None:
-        """An earlier simulation of the same network begun anew, its launches captured already; none that fits."""
-        known, count = self._kept.get(state.scene_count), len(state.position_N3)
+        """An earlier simulation of the same network begun anew, its launches captured already; none that fits.
+
+        Nobody else has it while it runs, and one that does not fit goes before another is allocated.
+        """
+        known, count = self._kept.pop(state.scene_count, None), len(state.position_N3)
         if known is None or not known.fits(state) or count < FILLED * known.particles:
             return None
         assert isinstance(self.network, HierarchicalGraphNetwork)
@@ -216,6 +278,17 @@ class Simulator:
         if isinstance(self.predict, GnsGraphs):
             self.predict = GnsGraphs(self.predict.network)
 
+    def _require_known(self, scene: InitialState) -> None:
+        info, cell_size = self._info, scene.obstacle_grid.cell_size
+        if info is None:
+            return
+        rule = f"the weights' {info.gravity}, which a network cannot take from a scene"
+        remedy = "train one on scenes with this gravity"
+        require(tuple(scene.gravity) == info.gravity, "gravity", rule, scene.gravity, remedy)
+        if info.network.sees_obstacles:
+            rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"
+            require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)
+
     @staticmethod
     def _check(state: ParticleState, frame: int) -> None:
         left = int(lost(state.position_N3, state.domain_S3[state.scene_N]).sum())
@@ -225,3 +298,7 @@ class Simulator:
 
 def _left(left: int, count: int) -> str:
     return f"{left} of {count} particles are not finite or farther from the domain than its own size"
+
+
+def _initial(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
+    return [InitialState.of_scene(scene) if isinstance(scene, Scene) else scene for scene in scenes]

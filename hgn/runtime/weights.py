@@ -32,6 +32,7 @@ class WeightsInfo:
     network: NetworkConfig
     frame_rate_hz: float  # of the data: one step of the network is one frame
     obstacle_cell_size: float
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # of the data, which a network cannot take from a scene
     format_version: int = FORMAT_VERSION
     updates: int = 0
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions

@@ -6,6 +6,7 @@ See conf/example/ for examples. Lengths are in domain units, angles in degrees, 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,15 @@ class SceneFile:
         require(self.seed >= 0, "seed", "a whole number >= 0", self.seed)
 
 
+class _Loader(yaml.SafeLoader):
+    """Reads 1e5 as a number, as YAML 1.2 and the commands do; PyYAML wants it as 1.0e+5."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
 def load_scene(path: str | Path) -> Scene:
     """Reads a scene file.
 
@@ -131,7 +141,7 @@ def load_scene(path: str | Path) -> Scene:
     if not path.is_file():
         raise ConfigError(f"scene must be an existing YAML file, got {path}")
     try:
-        mapping = yaml.safe_load(path.read_text(encoding="utf-8"))
+        mapping = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} must be a YAML file: {error}") from error
     try:

@@ -30,6 +30,7 @@ class DataInfo:
     config_hash: str
     frame_rate_hz: float
     obstacle_cell_size: float
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

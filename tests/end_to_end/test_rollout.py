@@ -88,6 +88,17 @@ def test_scenes(tmp_path: Path, weights: str, monkeypatch: pytest.MonkeyPatch) -
     assert not read_rollout("c.vtkhdf").obstacles
 
 
+def test_constants_of_materials_are_said_to_be_unused(
+    tmp_path: Path, weights: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A network knows one water; a scene file's constants are the solver's, and a line says so."""
+    group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, youngs_modulus_pa: 1e5}"
+    (tmp_path / "stiff.yaml").write_text(f"groups: [{group}]\n")
+    out = str(tmp_path / "a.vtkhdf")
+    assert rollout.main({"weights": weights, "frames": 2, "scene": str(tmp_path / "stiff.yaml"), "out": out}) == 0
+    assert "not used: youngs_modulus_pa of groups" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

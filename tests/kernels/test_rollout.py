@@ -82,6 +82,27 @@ def test_later_simulations_begin_anew() -> None:
     assert not again._kept
 
 
+def test_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames that are asked for one by one are bitwise those of a rollout, beside another simulation of the same
+    simulator; the one that ends last is kept. What diverges gives its good frames first."""
+    monkeypatch.setattr(fast, "LOOK_FRAMES", 2)
+    first, second = scene(3), scene(2, 1)
+    simulator = Simulator(network(), 60.0, "fast", "highest")
+    (expected,) = simulator.rollout([first], 4)
+    one, other = simulator.frames(first), simulator.frames(second)
+    found = [(next(one), next(other))[0] for _ in range(4)]
+    np.testing.assert_array_equal(np.stack(found), expected)
+    assert not simulator._kept
+    one.close()
+    other.close()
+    assert simulator._kept[1].live == 2
+    away, frames = replace(first, velocity_N3=np.full_like(first.velocity_N3, 12.0)), []
+    with pytest.raises(DivergenceError) as raised:
+        for position_N3 in simulator.frames(away):
+            frames.append(position_N3)
+    assert len(frames) == raised.value.frame > 1 and all(np.isfinite(frame).all() for frame in frames)
+
+
 def test_first_room() -> None:
     """Groups that fall have room to spread at once, up to what their particles can fill; where cells are many already,
     or so many that memory counts, there is twice the room."""

@@ -30,12 +30,10 @@ TRAINING_STACK = (
 PROGRAM = """
 import json, sys
 from pathlib import Path
-from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.weights import load_weights
+from hgn.runtime.simulator import Simulator
 from hgn.scene.scene_file import load_scene
 
-network, info = load_weights(Path(sys.argv[1]))
-(path,) = Simulator(network, info.frame_rate_hz).rollout([InitialState.of_scene(load_scene(sys.argv[2]))], 3)
+(path,) = Simulator.load(sys.argv[1]).rollout([load_scene(sys.argv[2])], 3)
 print(json.dumps({"shape": path.shape, "modules": sorted(sys.modules)}))
 """
 

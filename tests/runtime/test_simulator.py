@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from network.states import network_of, random_grid
 
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import load_scene
@@ -170,3 +172,38 @@ def test_scene_file_to_rollout(tmp_path: Path) -> None:
     assert np.array_equal(state.position_N3.numpy(), scene.position_N3)
     assert state.material_N.unique().tolist() == [1]
     assert state.velocity_NM3[:, 0, 1].numpy() == pytest.approx(-1 / 60 + 0.5 * 9.8 / 3600, abs=1e-6)
+
+
+def test_frame_by_frame(tmp_path: Path) -> None:
+    """Frames asked for one by one are those of a rollout, beside another scene's; a Scene is taken as it is."""
+    network = network_of(torch.float32)
+    save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
+    simulator = Simulator.load(tmp_path / "w.safetensors", device="cpu")
+    assert simulator.frame_rate_hz == 60.0 and simulator.path_said.startswith("runtime path: plain (it needs a CUDA")
+    start, other = initial(30), initial(10, 1)
+    scene = Scene(start.position_N3, start.velocity_N3, start.material_N)
+    (expected,) = simulator.rollout([scene], 4)
+    first, second = simulator.frames(scene), simulator.frames(other)
+    found = [(next(first), next(second))[0] for _ in range(4)]
+    np.testing.assert_array_equal(np.stack(found), expected)
+
+
+def test_what_loaded_weights_cannot_take(tmp_path: Path) -> None:
+    """Another gravity, or obstacle cells of another size, is refused by name; a network that sees no obstacles minds
+    gravity alone."""
+    start = initial(5)
+    floating = replace(start, gravity=(0.0, 0.0, 0.0))
+    coarse = replace(start, obstacle_grid=replace(EMPTY_GRID, cell_size=1 / 32))
+    for sees in (True, False):
+        network = network_of(torch.float32, obstacle_features=sees)
+        save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
+        simulator = Simulator.load(tmp_path / "w.safetensors", device="cpu")
+        with pytest.raises(
+            ConfigError, match=r"gravity must be the weights' \(0.0, -9.8, 0.0\), .* got \(0.0, 0.0, 0.0\)"
+        ):
+            simulator.start([floating])
+        if sees:
+            with pytest.raises(ConfigError, match=r"cell_size must be the weights' 0.015625, .* got 0.03125"):
+                next(simulator.frames(coarse))
+        else:
+            simulator.start([coarse])

@@ -192,3 +192,12 @@ def test_material_parameters_of_groups(tmp_path):
     assert load_scene(write(tmp_path, {"groups": [CUBE]})).material_parameters == {}
     with pytest.raises(ConfigError, match=r"groups\[0\].*density_kg_m3 must be"):
         load_scene(write(tmp_path, {"groups": [CUBE | {"density_kg_m3": -1.0}]}))
+
+
+@pytest.mark.parametrize(("text", "value"), [("1e5", 1e5), ("1.0e5", 1e5), ("+2E-1", 0.2), (".5e1", 5.0), ("3", 3.0)])
+def test_numbers_as_people_write_them(tmp_path, text, value):
+    """A power of ten needs neither a point nor a sign."""
+    group = f"{{shape: cube, size: 0.08, position: [0.5, 0.5, 0.5], material: water, density_kg_m3: {text}}}"
+    (tmp_path / "scene.yaml").write_text(f"groups: [{group}]\n")
+    scene = load_scene(tmp_path / "scene.yaml")
+    np.testing.assert_array_equal(np.unique(scene.material_parameters["density_kg_m3"]), np.float32(value))

@@ -23,14 +23,11 @@ from PIL import Image
 
 from hgn.command import run_command
 from hgn.cpus import available_cpus
-from hgn.device import choose_device
 from hgn.files import write_json
 from hgn.picture import compare_picture, spread, stacked, write_picture
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
-from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.weights import find_weights, load_weights
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import from_mapping, to_mapping
 from tools.measures import energies, energy_scale, outside_domain
@@ -51,12 +48,9 @@ def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; what does not hold is a finding, and the exit code is 0."""
     begun = time.monotonic()
     config = from_mapping(StabilityNetworkConfig, mapping)
-    device = choose_device(config.device)
-    network, info = load_weights(find_weights(config.weights), device)
-    path, text = path_on(device, network.config, config.path, config.precision)
-    print(text, file=sys.stderr)
-    set_matmul_precision(config.precision)
-    simulator = Simulator(network, info.frame_rate_hz, path, config.precision)
+    simulator = Simulator.load(config.weights, config.device, config.path, config.precision)
+    network, device, path, info = simulator.network, simulator.device, simulator.path, simulator.info
+    print(simulator.path_said, file=sys.stderr)
     rows: list[Row] = []
     pictures: list[Image.Image] = []
     drawn = 0.0  # when the picture was last written
