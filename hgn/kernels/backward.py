@@ -257,6 +257,7 @@ class TrainingEngine(Engine):
                 STEP=32 if self.precision != "half" else 64,
                 PRECISION=self.precision,
                 num_warps=8,
+                maxnreg=self.tuning.weight_registers,
             )
         self._encode_gradients()
 
@@ -368,6 +369,7 @@ class TrainingEngine(Engine):
             WIDTH=self.width,
             PARTICLES=self.tuning.pair_particles,
             PRECISION=self.precision,
+            PREFETCH=self.prefetches(grid.particles),
             num_warps=self.tuning.pair_warps,
         )
 
@@ -387,6 +389,9 @@ class TrainingEngine(Engine):
         rows = self.grid.capacities[level]
         size, warps = self._row_block(rows)
         other, other_at = received or (summed, at)
+        if summands > 0 and self._gathers(rows):
+            self._gather(level, x, table, summed, received is not None)
+            x, summands = summed, 0
         gather_project_backward[self._blocks(rows, size)](
             x,
             table,
@@ -413,12 +418,18 @@ class TrainingEngine(Engine):
         gradient = self._gradient_of(block)
         edge_gradient, sum_gradient = self.edge_gradient[:rows], self.sum_gradient[:rows]
         table = grid.neighbour(level)
+        tuning = self.tuning
         size, warps = self._row_block(rows)
+        if tuning.cell_backward_block > 0 and self._many(rows):
+            size, warps = tuning.cell_backward_block, tuning.cell_backward_warps
         edge_size, edge_warps = self._edge_block(rows)
         overlap = self.overlaps(rows)
         for m in reversed(range(steps)):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             later = m if last else m + 1
+            gathers = self._gathers(rows) and not last
+            if gathers:
+                self._gather(level, g[f"{name}{later}_eh"], table, g[f"{name}{later}_s"], True)
             cell_backward[self._blocks(rows, size)](
                 gradient,
                 g[f"{name}{later}_eh"],
@@ -445,6 +456,7 @@ class TrainingEngine(Engine):
                 rows,
                 self.unscale,
                 LAST=last,
+                GATHER=not gathers,
                 WIDTH=self.width,
                 BLOCK=size,
                 PRECISION=self.precision,
@@ -456,7 +468,6 @@ class TrainingEngine(Engine):
             edge_backward[self._programs(rows, self._edge_cells(edge_size))](
                 sum_gradient,
                 edge_gradient,
-                table,
                 grid.count(level),
                 self.weights,
                 self.values,
@@ -471,7 +482,6 @@ class TrainingEngine(Engine):
                 g[f"{name}{m}_eh"],
                 g[f"{name}{m}_ez"],
                 g[f"{name}{m}_r"],
-                rows,
                 self.unscale,
                 FIRST=m == 0,
                 LAST=last,
@@ -480,6 +490,7 @@ class TrainingEngine(Engine):
                 DENSE=self.tuning.dense,
                 PRECISION=self.precision,
                 OVERLAP=overlap,
+                PREFETCH=self.prefetches(rows),
                 num_warps=edge_warps,
                 launch_pdl=overlap,
             )

@@ -30,14 +30,14 @@ def nearest_tf32(x):
 
 
 @triton.jit
-def product(x, w, PRECISION: tl.constexpr):
-    """x [R, K] @ w [K, N] in float32 accumulation."""
+def product(x, w, PRECISION: tl.constexpr, total=None):
+    """x [R, K] @ w [K, N] in float32 accumulation, added to the float32 `total` if there is one."""
     if PRECISION == "half":
-        result = tl.dot(x.to(tl.float16), w.to(tl.float16))
+        result = tl.dot(x.to(tl.float16), w.to(tl.float16), total)
     elif PRECISION == "tf32":
-        result = tl.dot(nearest_tf32(x.to(tl.float32)), w, input_precision="tf32")
+        result = tl.dot(nearest_tf32(x.to(tl.float32)), w, total, input_precision="tf32")
     else:
-        result = tl.dot(x.to(tl.float32), w.to(tl.float32), input_precision=PRECISION)
+        result = tl.dot(x.to(tl.float32), w.to(tl.float32), total, input_precision=PRECISION)
     return result
 
 
@@ -154,6 +154,17 @@ def leaky(h):
 
 
 @triton.jit
+def leaky_operand(h, PRECISION: tl.constexpr):
+    """leaky(h) for a product: in half precision of float16 numbers, two in an instruction."""
+    if PRECISION == "half":
+        h = h.to(tl.float16)
+        a = leaky(h)
+    else:
+        a = leaky(h)
+    return a
+
+
+@triton.jit
 def leaky_backward(gradient, a):
     """The gradient before the activation; `a` is its output, which has the sign of its input."""
     return tl.where(a > 0, gradient, LEAKY * gradient)
@@ -168,12 +179,63 @@ def normalise(z, WIDTH: tl.constexpr):
 
 
 @triton.jit
+def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
+    """The same, at the lower precisions with both sums at once: cancellation costs less than their operands' rounding
+    as long as a row's mean is within some ten standard deviations."""
+    if PRECISION == "half":
+        mean = tl.sum(z, 1) / WIDTH
+        variance = tl.maximum(tl.sum(z * z, 1) / WIDTH - mean * mean, 0.0)
+        scale = 1.0 / tl.sqrt(variance + EPSILON)
+        z = z * scale[:, None] - (mean * scale)[:, None]
+    else:
+        z, scale = normalise(z, WIDTH)
+    return z, scale
+
+
+@triton.jit
+def chosen_rows(ROWS: tl.constexpr, EACH: tl.constexpr, CHOICES: tl.constexpr):
+    """[ROWS, CHOICES]: one where a choice is a row's, EACH rows after one another having the same, else zero.
+
+    A product with it is exact, and spares reading a row as often as it is used.
+    """
+    return tl.where(tl.arange(0, ROWS)[:, None] // EACH == tl.arange(0, CHOICES)[None, :], 1.0, 0.0)
+
+
+@triton.jit
+def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
+    """[SUMS, W]: from row FIRST on the rows of the matrix [3, W] at `pointer` as operands of a product, and after them
+    what that rounds away of them; zeros elsewhere."""
+    row = tl.arange(0, SUMS)
+    place = row - FIRST
+    inside = (place >= 0) & (place < 6)
+    rows = tl.load(
+        pointer + (place % 3)[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=inside[:, None], other=0.0
+    )
+    if PRECISION == "half":
+        high = rows.to(tl.float16).to(tl.float32)
+        rows = tl.where((place < 3)[:, None], high, rows - high)
+    else:
+        rows = tl.where((place < 3)[:, None], rows, 0.0)
+    return rows
+
+
+@triton.jit
 def normalise_backward(gradient, normalised, scale, gamma, WIDTH: tl.constexpr):
     """The gradient before the normalisation, from the gradient after its gain `gamma` [W]."""
     inner = gradient * gamma[None, :]
     mean = tl.sum(inner, 1) / WIDTH
     slope = tl.sum(inner * normalised, 1) / WIDTH
     return (inner - mean[:, None] - normalised * slope[:, None]) * scale[:, None]
+
+
+@triton.jit
+def column_sums(x, ROWS: tl.constexpr, WIDTH: tl.constexpr, APART: tl.constexpr):
+    """Sums [APART, W] over the rows of x [ROWS, W], each of every APART-th row, for whoever adds up many tiles first.
+
+    With two rows a warp (as many as 16-byte loads of 128 float16 take) a thread adds its own rows only; a whole sum
+    passes them from thread to thread, with barriers, in each tile.
+    """
+    return tl.sum(tl.reshape(x, (ROWS // APART, APART, WIDTH)), 0)
 
 
 @triton.jit
@@ -210,6 +272,17 @@ def gathered_sum(x, found, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.con
             else:
                 total = added(total, two)
     return total
+
+
+@triton.jit
+def prefetch(x, row, live, WIDTH: tl.constexpr):
+    """Has the rows of x [.., W] that are live brought to the L2 cache; no register waits for them."""
+    LINE: tl.constexpr = 1024 // x.dtype.element_ty.primitive_bitwidth  # elements that memory delivers together
+    line = tl.arange(0, (WIDTH + LINE - 1) // LINE) * LINE
+    where = x + tl.where(live, row, 0)[:, None] * WIDTH + line[None, :]
+    tl.inline_asm_elementwise(
+        "prefetch.global.L2 [$1]; mov.b32 $0, 0;", "=r,l", [where.to(tl.int64)], dtype=tl.int32, is_pure=False, pack=1
+    )
 
 
 @triton.jit

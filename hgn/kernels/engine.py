@@ -16,7 +16,7 @@ from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.message.kernel import cell_forward, edge_forward
 from hgn.kernels.packing import PackedFCN, PackedMessagePassing, PackedNetwork, rounded_to_tf32
 from hgn.kernels.pairs.kernel import pairs_forward
-from hgn.kernels.rows.kernel import gather_project, rows_forward
+from hgn.kernels.rows.kernel import gather_project, gather_sums, rows_forward
 
 PRECISIONS = ("ieee", "tf32x3", "tf32", "half")
 PROCESSORS = 132  # an H100's
@@ -45,21 +45,36 @@ class Tuning:
     dense: bool = False  # six rows a cell in the tiles of edges, not eight
     overlap: bool = False  # kernels of a message step read their weights before their turn, where there are few rows
     overlap_many: bool = False  # and where there are many: faster, and not yet compared with the plain network on a GPU
+    prefetch: bool = False  # where there are many rows, the next tile's are brought to the L2 cache
     loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
+    gather_block: int = 0  # of a kernel for the sums of many rows' neighbours; 0: whoever needs them makes them
+    cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
+    cell_backward_warps: int = 8
+    half_cells: bool = False  # in inference cells too are rounded between kernels, as edges are
     pair_programs: int = 2  # on a processor, in inference
     pair_registers: int | None = None  # of a thread, so that as many fit
+    weight_registers: int | None = None  # of a thread of the weights' products: 128 for two programs on a processor
 
     @staticmethod
     def of(precision: str) -> Tuning:
         """What was fastest on an H100 at width 128."""
         if precision == "ieee":
-            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True)
+            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
         if precision == "tf32x3":
             return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8, 528)
         if precision == "tf32":  # operands of twice the size
             return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8, 528)
         half = Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, 1056, dense=True, overlap=True, loops=True)
-        return replace(half, pair_programs=3, pair_registers=168)
+        return replace(
+            half,
+            pair_programs=3,
+            pair_registers=168,
+            gather_block=16,
+            cell_backward_block=64,
+            cell_backward_warps=4,
+            weight_registers=128,
+            prefetch=True,
+        )
 
 
 @dataclass
@@ -170,8 +185,11 @@ class Engine:
                 block.cell_deviation = [self._float(capacity) for _ in range(steps)]
             else:
                 assert shared_edge is not None
-                first, second = self._float(capacity, width), self._float(capacity, width)
+                kind = self._operand if self.tuning.half_cells else self._float
+                first, second = kind(capacity, width), kind(capacity, width)
                 block.cell = [(first, second)[m % 2] for m in range(steps + 1)]
+                if self.tuning.half_cells and block is self.down[0]:
+                    block.cell[0] = self._float(capacity, width)  # particles are added to it, by atomics
                 block.edge = [shared_edge.flatten(0, 1)[: 6 * capacity].view(capacity, 6, width)] * max(steps - 1, 0)
                 block.sum = [self._operand(capacity, width)] * steps
                 # not kept
@@ -231,6 +249,7 @@ class Engine:
             following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
             following_bias=(packed.particle_to_cell.first_bias, packed.cell_to_particle.first_bias),
             products=(self.by_particle_down, self.by_particle_up),
+            fractions=(packed.particle_to_cell.parts[-1], packed.cell_to_particle.parts[-1]),
             fine=self.fine,
         )
         self.down[0].cell[0].zero_()
@@ -324,6 +343,10 @@ class Engine:
         """Cells that a tile of edges takes where it has rows for `block` of eight each."""
         return 8 * block // 6 if self.tuning.dense else block
 
+    def prefetches(self, rows: int) -> bool:
+        """Whether the kernels on so many rows bring the next tile's to the L2 cache: an instruction of the GPU's."""
+        return self.tuning.prefetch and self._many(rows) and not triton.knobs.runtime.interpret
+
     def _programs(self, rows: int, block: int, at_once: int = 2) -> tuple[int]:
         """Programs that take one block after the other: as many as run at once, `at_once` on a processor."""
         return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS * at_once // 2),)
@@ -346,6 +369,7 @@ class Engine:
         following: tuple[int, ...] = (),
         following_bias: tuple[int, ...] = (),
         products: tuple[torch.Tensor, ...] = (),
+        fractions: tuple[int, int] = (0, 0),
         fine: bool = False,
     ) -> None:
         first = first or (self.weights, fcn.parts[0])
@@ -373,6 +397,9 @@ class Engine:
             at[1],
             bias_at[0],
             bias_at[1],
+            self.grid.fraction_N3,
+            fractions[0],
+            fractions[1],
             y,
             hidden,
             into[0],
@@ -386,6 +413,7 @@ class Engine:
             NORM=norm,
             RESIDUAL=residual,
             NEXT=len(following),
+            FRACTION=fractions != (0, 0),
             SAVE=self.training,
             FINE=fine,
             BLOCK=block,
@@ -411,7 +439,6 @@ class Engine:
             self.latent,
             grid.cell_N8,
             grid.weight_N8,
-            grid.fraction_N3,
             self.particle_count,
             self.weights,
             self.values,
@@ -431,11 +458,34 @@ class Engine:
             maxnreg=registers,
         )
 
+    def _gathers(self, rows: int) -> bool:
+        """Whether sums of so many rows' neighbours have a kernel of their own."""
+        return self.tuning.gather_block > 0 and self._many(rows)
+
+    def _gather(self, level: int, x: torch.Tensor, table: torch.Tensor, y: torch.Tensor, edges: bool = False) -> None:
+        """y = the sums of x's rows that the table lists."""
+        rows, size = self.grid.capacities[level], self.tuning.gather_block
+        gather_sums[self._blocks(rows, size)](
+            x,
+            table,
+            self.grid.count(level),
+            y,
+            rows,
+            SUM=len(table),
+            EDGES=edges,
+            WIDTH=self.width,
+            BLOCK=size,
+            num_warps=4,
+        )
+
     def _begin(self, block: Block, from_children: bool) -> None:
         """The block's input and its products for the first iteration."""
         grid, level, edge = self.grid, block.level, block.packed.edge[0]
         rows = grid.capacities[level]
         size, warps = self._row_block(rows)
+        if from_children and self._gathers(rows):
+            self._gather(level, self.message[level - 1], grid.children(level), block.cell[0])
+            from_children = False
         gather_project[self._blocks(rows, size)](
             self.message[level - 1] if from_children else block.cell[0],
             grid.children(level),
@@ -500,6 +550,7 @@ class Engine:
                 DENSE=self.tuning.dense,
                 PRECISION=self.precision,
                 OVERLAP=overlap,
+                PREFETCH=self.prefetches(rows),
                 num_warps=edge_warps,
                 launch_pdl=overlap,
             )
@@ -533,6 +584,7 @@ class Engine:
                 RESIDENT=overlap or loops,
                 LOOP=loops,
                 OVERLAP=overlap,
+                PREFETCH=self.prefetches(rows),
                 num_warps=warps,
                 launch_pdl=overlap,
             )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from hgn.kernels.backward import TrainingEngine
-from hgn.kernels.engine import Engine, feature_columns
+from hgn.kernels.engine import Engine, Tuning, feature_columns
 from hgn.kernels.grid.op import DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
 from hgn.network.features import ParticleState
@@ -46,9 +48,11 @@ def engine_of(
     return TrainingEngine(config, packed, values, grid, count, precision, loss_scale)
 
 
-def inference_of(engine: TrainingEngine, network: HierarchicalGraphNetwork) -> Engine:
+def inference_of(engine: TrainingEngine, network: HierarchicalGraphNetwork, half_cells: bool = False) -> Engine:
     """An engine that keeps nothing, on the same grid: other kernels than those of training."""
-    return Engine(network.config, engine.packed, engine.values, engine.grid, engine.particle_count, engine.precision)
+    tuning = replace(Tuning.of(engine.precision), half_cells=half_cells)
+    given = (network.config, engine.packed, engine.values, engine.grid, engine.particle_count, engine.precision)
+    return Engine(*given, tuning=tuning)
 
 
 def run_forward(

@@ -9,6 +9,7 @@ neighbours; at least one kernel without OVERLAP lies between), and waits for tha
 anything else; a program that has rows, and the first one always, waits, so that a kernel has ended only when all before
 it have. The wait is inside the loop over tiles, where it costs nothing once it is over: the compiler then lays out the
 weights for the matrix units before it.
+PREFETCH: while a program works on a tile, what it reads of the next one is brought to the L2 cache.
 Shape legend: C cells, W width.
 """
 
@@ -21,17 +22,21 @@ from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 from hgn.kernels.blocks import (
     LAST_TILE,
     added,
+    chosen_rows,
+    column_sums,
     gathered_sum,
+    high_and_low,
     inside,
-    leaky,
     leaky_backward,
+    leaky_operand,
     listed,
     matrix,
     members,
     next_tile,
-    normalise,
     normalise_backward,
+    normalise_once,
     once_both,
+    prefetch,
     product,
     transposed,
     vector,
@@ -45,6 +50,16 @@ from hgn.kernels.keys import settle_keys
 def _nothing_to_do(count, BLOCK: tl.constexpr):
     """Whether a program has no rows. The first one stays: it waits for the kernel before where all others are idle."""
     return (tl.program_id(0) * BLOCK >= count) & (tl.program_id(0) > 0)
+
+
+@triton.jit
+def _edges_of(tile, count, ROWS: tl.constexpr, SLOTS: tl.constexpr):
+    """For each row of a tile its place among the edges, and whether it has one."""
+    row = tl.arange(0, ROWS)
+    BLOCK: tl.constexpr = ROWS // SLOTS
+    holds = (tile * BLOCK + row // SLOTS < count) & (row % SLOTS < 6) & (row < SLOTS * BLOCK)
+    place = tile * (6 * BLOCK) + (row if SLOTS == 6 else row // SLOTS * 6 + row % SLOTS)
+    return place, holds
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -75,6 +90,7 @@ def edge_forward(
     DENSE: tl.constexpr,
     PRECISION: tl.constexpr,
     OVERLAP: tl.constexpr,
+    PREFETCH: tl.constexpr,
 ):
     """The edges' new features and their sums by receiver [C, W]; send and receive [C, W] are the cells' products with
     the edge network's first two parts, receive with the bias.
@@ -98,6 +114,18 @@ def edge_forward(
     # vectors once: in the loop each would be waited for again
     second_bias = tl.load(values + second_bias_at + column)
     gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
+    # Where it is exact, a cell's row comes to its edges by a product, with the sides' rows in its spare places.
+    BY_PRODUCT: tl.constexpr = PRECISION == "half" or PRECISION == "ieee"
+    if BY_PRODUCT:
+        receiver = chosen_rows(ROWS, SLOTS, SUMS)
+        member = tl.arange(0, SUMS)
+        if FIRST:
+            # receiver minus sender: the opposite of where the sender lies
+            spare = member[None, :] - BLOCK
+            side = (slot % 2 * 2 - 1).to(tl.float32)[:, None]
+            on_axis = (spare >= 0) & (spare < 6) & (spare % 3 == (slot // 2)[:, None])
+            receiver = tl.where(spare >= 0, tl.where(on_axis, side, 0.0), receiver)
+            sides = high_and_low(values + own_at, BLOCK, SUMS, WIDTH, PRECISION)
     if not FIRST:
         own = transposed(weights + own_at, WIDTH, WIDTH)
     second = transposed(weights + second_at, WIDTH, WIDTH)
@@ -120,31 +148,42 @@ def edge_forward(
             place = owner * 6 + slot
         edge_at = place[:, None] * WIDTH + column[None, :]
         # all loads before the first use: the compiler keeps their order, and waits at the first
-        received = tl.load(receive + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
+        if BY_PRODUCT:
+            mine = tile * BLOCK + member
+            mine_there = ((member < BLOCK) & (mine < count))[:, None]
+            received = tl.load(receive + mine[:, None] * WIDTH + column[None, :], mask=mine_there, other=0.0)
+        else:
+            received = tl.load(receive + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
         sent = tl.load(send + other[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
         if not FIRST:
             edge = tl.load(edge_in + edge_at, mask=there, other=0.0)
-        h = added(received, sent).to(tl.float32)
-        if FIRST:
-            for axis in tl.static_range(3):
-                # receiver minus sender: the opposite of where the sender lies
-                side = tl.where(slot // 2 == axis, 2.0 * (slot % 2) - 1.0, 0.0)
-                h += side[:, None] * tl.load(values + own_at + axis * WIDTH + column)[None, :]
+        if PREFETCH and not FIRST:
+            later_place = place + tl.num_programs(0) * (6 * BLOCK)
+            prefetch(edge_in, later_place, later >= 0, WIDTH)
+        if BY_PRODUCT:
+            if FIRST:
+                received = received.to(tl.float32) + sides
+            h = product(receiver, received, PRECISION, sent.to(tl.float32))
         else:
-            h += product(edge, own, PRECISION)
-        a = leaky(h)
+            h = added(received, sent).to(tl.float32)
+            if FIRST:
+                for axis in tl.static_range(3):
+                    side = tl.where(slot // 2 == axis, 2.0 * (slot % 2) - 1.0, 0.0)
+                    h += side[:, None] * tl.load(values + own_at + axis * WIDTH + column)[None, :]
+        if not FIRST:
+            h = product(edge, own, PRECISION, h)
+        a = leaky_operand(h, PRECISION)
         if SAVE:
             # also where there is no edge: what lies there meets zero gradients in the weights' products
             tl.store(hidden + edge_at, a, mask=holds[:, None])
         z = product(a, second, PRECISION)
-        z, scale = normalise(z + inside(second_bias, tile)[None, :], WIDTH)
+        z, scale = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
         if SAVE:
             tl.store(normalised + edge_at, z, mask=there)
-            tl.store(deviation + place, scale, mask=other >= 0)
+            tl.store(deviation + place, tl.where(other >= 0, scale, 0.0), mask=holds)
         z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
         if not FIRST:
             z += edge.to(tl.float32)
-        z = tl.where(there, z, 0.0)
         if STORE_EDGE:
             if SAVE:
                 tl.store(edge_out + edge_at, z, mask=holds[:, None])
@@ -154,11 +193,12 @@ def edge_forward(
             # as a reduction: rounding the product's operands would spill registers here
             mine = tile * BLOCK + tl.arange(0, BLOCK)
             ends = (mine < count)[:, None]
-            total = tl.sum(tl.reshape(z, (BLOCK, 8, WIDTH)), 1)
+            total = tl.sum(tl.reshape(tl.where(there, z, 0.0), (BLOCK, 8, WIDTH)), 1)
         else:
             mine = tile * BLOCK + tl.arange(0, SUMS)
             ends = ((tl.arange(0, SUMS) < BLOCK) & (mine < count))[:, None]
-            total = weighted_sums(members(SUMS, ROWS, SLOTS), z, PRECISION)
+            among = tl.where((other >= 0)[None, :], members(SUMS, ROWS, SLOTS), 0.0)
+            total = weighted_sums(among, z, PRECISION)
         tl.store(sum_out + mine[:, None] * WIDTH + column[None, :], total, mask=ends)
         owner, other = later_owner, later
         tile += tl.num_programs(0)
@@ -197,6 +237,7 @@ def cell_forward(
     RESIDENT: tl.constexpr,
     LOOP: tl.constexpr,
     OVERLAP: tl.constexpr,
+    PREFETCH: tl.constexpr,
 ):
     """The cells' new features from theirs and their edges' sums, both [C, W], and up to two products of them, of which
     the second with a bias.
@@ -235,6 +276,10 @@ def cell_forward(
         at = row[:, None] * WIDTH + column[None, :]
         feature = tl.load(cell + at, mask=here, other=0.0)
         summed = tl.load(total + at, mask=here, other=0.0)
+        if PREFETCH and LOOP:
+            later = row + tl.num_programs(0) * BLOCK
+            prefetch(cell, later, later < count, WIDTH)
+            prefetch(total, later, later < count, WIDTH)
         if not IN_PLACE:
             feature = once_both(feature, summed, count < 0)
         if not RESIDENT:
@@ -245,20 +290,20 @@ def cell_forward(
         h += product(summed, sum_first, PRECISION)
         if IN_PLACE:
             bias = tl.load(values + bias_at + column)
-        a = leaky(h + inside(bias, tile)[None, :])
+        a = leaky_operand(h + inside(bias, tile)[None, :], PRECISION)
         if not RESIDENT:
             second = transposed(weights + second_at, WIDTH, WIDTH)
         z = product(a, second, PRECISION)
         if IN_PLACE:
             second_bias = tl.load(values + second_bias_at + column)
-        z, scale = normalise(z + inside(second_bias, tile)[None, :], WIDTH)
+        z, scale = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
         if SAVE:
             tl.store(hidden + at, a, mask=here)
             tl.store(normalised + at, z, mask=here)
             tl.store(deviation + row, scale, mask=row < count)
         if IN_PLACE:
             gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
-        feature += z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
+        feature = feature.to(tl.float32) + (z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :])
         tl.store(cell_out + at, feature, mask=here)
         if NEXT > 0:
             if not RESIDENT:
@@ -303,6 +348,7 @@ def cell_backward(
     capacity,
     unscale,
     LAST: tl.constexpr,
+    GATHER: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
@@ -313,7 +359,8 @@ def cell_backward(
     `receive` of the following iteration (added here unless LAST; what comes from the edges that start in a cell is left
     in send_gradient), and leaves as that of `cell`, again less what goes through its own.
 
-    sum_gradient [C, W] is that of the edges' sums. RESIDENT as in cell_forward.
+    sum_gradient [C, W] is that of the edges' sums. Without GATHER send_gradient is there already. RESIDENT as in
+    cell_forward.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -336,7 +383,7 @@ def cell_backward(
         row = tile * BLOCK + tl.arange(0, BLOCK)
         here = (row < count)[:, None]
         at = row[:, None] * WIDTH + column[None, :]
-        if not LAST:
+        if not LAST and GATHER:
             found = listed(neighbour, row, count, capacity, 6, True)
         if OVERLAP:
             gdc_wait()
@@ -348,9 +395,12 @@ def cell_backward(
             if not LAST:
                 received = tl.load(later_receive_gradient + at, mask=here, other=0.0)
         if not LAST:
-            # the edges that start here: each in its receiver's row, seen from there in the opposite direction
-            sent = gathered_sum(later_hidden_gradient, found, 6, WIDTH, BLOCK)
-            tl.store(send_gradient + at, sent, mask=here)
+            if GATHER:
+                # the edges that start here: each in its receiver's row, seen from there in the opposite direction
+                sent = gathered_sum(later_hidden_gradient, found, 6, WIDTH, BLOCK)
+                tl.store(send_gradient + at, sent, mask=here)
+            else:
+                sent = tl.load(send_gradient + at, mask=here, other=0.0)
             if not RESIDENT:
                 later_send = matrix(weights + later_send_at, WIDTH, WIDTH)
             df += product(sent, later_send, PRECISION)
@@ -392,7 +442,6 @@ def cell_backward(
 def edge_backward(
     sum_gradient,
     edge_gradient,
-    neighbour,
     count_ptr,
     weights,
     values,
@@ -407,7 +456,6 @@ def edge_backward(
     hidden_gradient,
     second_gradient,
     receive_gradient,
-    capacity,
     unscale,
     FIRST: tl.constexpr,
     LAST: tl.constexpr,
@@ -416,9 +464,13 @@ def edge_backward(
     DENSE: tl.constexpr,
     PRECISION: tl.constexpr,
     OVERLAP: tl.constexpr,
+    PREFETCH: tl.constexpr,
 ):
     """In place: edge_gradient [C, 6, W] comes in as that of edge_out, less the sums' part (there is none if LAST), and
-    leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`."""
+    leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`.
+
+    `deviation` is zero where there is no edge. It is read a tile ahead, for it says what else is read.
+    """
     if OVERLAP:
         gdc_launch_dependents()
     SUMS: tl.constexpr = max(16, ROWS // 4)  # the least that the matrix units take
@@ -432,22 +484,19 @@ def edge_backward(
     if not FIRST:
         own = matrix(weights + own_at, WIDTH, WIDTH)
     gain = tl.load(values + gain_at + column)
-    gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
+    gain_total, shift_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     if FIRST:
         side_total = tl.zeros((16, WIDTH), tl.float32)
     tile = tl.program_id(0)
+    place, holds = _edges_of(tile, count, ROWS, SLOTS)
+    scale = tl.load(deviation + place, mask=holds, other=0.0)
     while tile * BLOCK < count:
-        owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
         slot = tl.arange(0, ROWS) % SLOTS
-        holds = (owner < count) & (slot < 6) & (tl.arange(0, ROWS) < SLOTS * BLOCK)
-        other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
+        owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
+        place, holds = _edges_of(tile, count, ROWS, SLOTS)
+        there = (scale != 0)[:, None]
         if OVERLAP:
             gdc_wait()
-        there = (other >= 0)[:, None]
-        if DENSE:
-            place = tile * (6 * BLOCK) + tl.arange(0, ROWS)
-        else:
-            place = owner * 6 + slot
         edge_at = place[:, None] * WIDTH + column[None, :]
         sum_at = owner[:, None] * WIDTH + column[None, :]
         # all loads before the first use: the compiler keeps their order, and waits at the first
@@ -455,15 +504,24 @@ def edge_backward(
         z = tl.load(normalised + edge_at, mask=there, other=0.0)
         if not LAST:
             later = tl.load(edge_gradient + edge_at, mask=there, other=0.0)
-        a = tl.load(hidden + edge_at, mask=there, other=0.0)
-        scale = tl.load(deviation + place, mask=other >= 0, other=0.0)
+        scale = tl.load(deviation + place, mask=holds, other=0.0)
+        later_place, later_holds = _edges_of(tile + tl.num_programs(0), count, ROWS, SLOTS)
+        if PREFETCH:
+            prefetch(normalised, later_place, later_holds, WIDTH)
+            prefetch(hidden, later_place, later_holds, WIDTH)
+            if not LAST:
+                prefetch(edge_gradient, later_place, later_holds, WIDTH)
         if not LAST:
-            de = added(de.to(tl.float32), later.to(tl.float32))
-        de, z = de.to(tl.float32), z.to(tl.float32)
-        gain_total += tl.sum(de * z, 0)
-        shift_total += tl.sum(de, 0)
-        dz = normalise_backward(de, z, scale, inside(gain, tile), WIDTH)
+            de = added(de, later)
+        dy, z = de.to(tl.float32), z.to(tl.float32)
+        if tile >= 0:  # always, and the compiler does not know: else it puts these sums off, and keeps what they are of
+            gain_total += column_sums(dy * z, ROWS, WIDTH, 8)
+            shift_total += column_sums(dy, ROWS, WIDTH, 8)
+        dz = normalise_backward(dy, z, scale, inside(gain, tile), WIDTH)
+        # earlier there are no registers for it; it comes while the product runs
+        a = tl.load(hidden + edge_at, mask=there, other=0.0)
         tl.store(second_gradient + edge_at, dz, mask=holds[:, None])
+        later_scale = tl.load(deviation + later_place, mask=later_holds, other=0.0)
         dh = product(dz, second, PRECISION)
         dh = leaky_backward(dh, a.to(tl.float32))
         tl.store(hidden_gradient + edge_at, dh, mask=holds[:, None])
@@ -472,21 +530,23 @@ def edge_backward(
             axis = tl.arange(0, 16)[:, None]
             side_total += weighted_sums(tl.where(slot[None, :] // 2 == axis, sign[None, :], 0.0), dh, PRECISION)
         else:
-            de = product(dh, own, PRECISION)
-            # read again: registers are dearer than a cache
-            de += tl.load(sum_gradient + sum_at, mask=there, other=0.0).to(tl.float32)
-            if not LAST:
-                de += tl.load(edge_gradient + edge_at, mask=there, other=0.0).to(tl.float32)
+            if PRECISION != "half":
+                # read again: registers are dearer than a cache
+                de = tl.load(sum_gradient + sum_at, mask=there, other=0.0)
+                if not LAST:
+                    de += tl.load(edge_gradient + edge_at, mask=there, other=0.0)
+            de = product(dh, own, PRECISION) + de.to(tl.float32)
             tl.store(edge_gradient + edge_at, de, mask=there)
         mine = tile * BLOCK + tl.arange(0, SUMS)
         ends = ((tl.arange(0, SUMS) < BLOCK) & (mine < count))[:, None]
         received = weighted_sums(members(SUMS, ROWS, SLOTS), dh, PRECISION)
         tl.store(receive_gradient + mine[:, None] * WIDTH + column[None, :], received, mask=ends)
         tile += tl.num_programs(0)
+        scale = later_scale
     if OVERLAP:
         gdc_wait()
-    tl.atomic_add(totals + gain_at + column, gain_total * unscale, sem="relaxed")
-    tl.atomic_add(totals + shift_at + column, shift_total * unscale, sem="relaxed")
+    tl.atomic_add(totals + gain_at + column, tl.sum(gain_total, 0) * unscale, sem="relaxed")
+    tl.atomic_add(totals + shift_at + column, tl.sum(shift_total, 0) * unscale, sem="relaxed")
     if FIRST:
         axis = tl.arange(0, 16)[:, None]
         at = totals + own_at + axis * WIDTH + column[None, :]

@@ -11,13 +11,17 @@ import triton.language as tl
 
 from hgn.kernels.blocks import (
     added,
+    chosen_rows,
+    column_sums,
+    high_and_low,
     inside,
-    leaky,
     leaky_backward,
+    leaky_operand,
     matrix,
     members,
-    normalise,
     normalise_backward,
+    normalise_once,
+    prefetch,
     product,
     transposed,
     weighted_sums,
@@ -39,7 +43,6 @@ def pairs_forward(
     particle,
     cell_of,
     weight_of,
-    fraction,
     count_ptr,
     weights,
     values,
@@ -59,7 +62,8 @@ def pairs_forward(
     PRECISION: tl.constexpr,
 ):
     """TO_CELL: out [C, W] += weight * FCN(by_particle_n + offset). Otherwise out [N, W] = particle + sum over the
-    corners of weight * FCN(by_cell_c + by_particle_n - offset). The by_… are products with first-layer weights.
+    corners of weight * FCN(by_cell_c + by_particle_n - offset). The by_… are products with first-layer weights,
+    by_particle with the particle's part of the offset: what is left of it are the corner's three bits.
 
     SAVE keeps what pairs_backward reads: the hidden layer and the normalised output [8 N, W], one over its deviation.
     """
@@ -72,9 +76,19 @@ def pairs_forward(
     # vectors once: in the loop each would be waited for again
     second_bias = tl.load(values + second_bias_at + column)
     gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
-    offset_0 = tl.load(values + offset_at + column)
-    offset_1 = tl.load(values + offset_at + WIDTH + column)
-    offset_2 = tl.load(values + offset_at + 2 * WIDTH + column)
+    # Where it is exact, a particle's row comes to its pairs by a product, with the bits' rows in its spare places.
+    BY_PRODUCT: tl.constexpr = PRECISION == "half" or PRECISION == "ieee"
+    SIGN: tl.constexpr = 1 if TO_CELL else -1
+    if BY_PRODUCT:
+        spare = tl.arange(0, SUMS) - PARTICLES
+        bit = ((tl.arange(0, ROWS) % 8)[:, None] >> (2 - spare % 3)[None, :]) & 1
+        sides = tl.where((spare < 6)[None, :], SIGN * bit.to(tl.float32), 0.0)
+        choice = tl.where((spare >= 0)[None, :], sides, chosen_rows(ROWS, 8, SUMS))
+        offsets = high_and_low(values + offset_at, PARTICLES, SUMS, WIDTH, PRECISION)
+    else:
+        offset_0 = tl.load(values + offset_at + column)
+        offset_1 = tl.load(values + offset_at + WIDTH + column)
+        offset_2 = tl.load(values + offset_at + 2 * WIDTH + column)
     second = transposed(weights + second_at, WIDTH, WIDTH)
     tile = tl.program_id(0)
     while tile * PARTICLES < count:
@@ -84,27 +98,37 @@ def pairs_forward(
         live = owner < count
         here = live[:, None]
         cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
-        h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
-        if not TO_CELL:
-            h = added(h, tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0))
-        sign = 1.0 if TO_CELL else -1.0
-        h = h.to(tl.float32)
-        h += (sign * _offset(fraction, owner, corner, live, 0))[:, None] * inside(offset_0, tile)[None, :]
-        h += (sign * _offset(fraction, owner, corner, live, 1))[:, None] * inside(offset_1, tile)[None, :]
-        h += (sign * _offset(fraction, owner, corner, live, 2))[:, None] * inside(offset_2, tile)[None, :]
-        a = leaky(h)
+        if BY_PRODUCT:
+            mine = tile * PARTICLES + tl.arange(0, SUMS)
+            mine_there = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
+            rows = tl.load(by_particle + mine[:, None] * WIDTH + column[None, :], mask=mine_there, other=0.0)
+            rows = rows.to(tl.float32) + offsets
+            if TO_CELL:
+                h = product(choice, rows, PRECISION)
+            else:
+                h = tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+                h = product(choice, rows, PRECISION, h.to(tl.float32))
+        else:
+            h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+            if not TO_CELL:
+                h = added(h, tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0))
+            h = h.to(tl.float32)
+            h += (SIGN * (corner >> 2)).to(tl.float32)[:, None] * inside(offset_0, tile)[None, :]
+            h += (SIGN * (corner >> 1 & 1)).to(tl.float32)[:, None] * inside(offset_1, tile)[None, :]
+            h += (SIGN * (corner & 1)).to(tl.float32)[:, None] * inside(offset_2, tile)[None, :]
+        a = leaky_operand(h, PRECISION)
         pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
         if SAVE:
             tl.store(hidden + pair_at, a, mask=here)
         z = product(a, second, PRECISION)
-        z, scale = normalise(z + inside(second_bias, tile)[None, :], WIDTH)
+        z, scale = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
         if SAVE:
             tl.store(normalised + pair_at, z, mask=here)
             tl.store(deviation + owner * 8 + corner, scale, mask=live)
         z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
         weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
-        z = z * weight[:, None]
         if TO_CELL:
+            z = z * weight[:, None]
             # a weight of zero points at a cell that may be another's: it adds nothing
             touched = (live & (weight != 0))[:, None]
             tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
@@ -113,14 +137,29 @@ def pairs_forward(
                 # as a reduction: rounding the product's operands would cost more
                 mine = tile * PARTICLES + tl.arange(0, PARTICLES)
                 ends = (mine < count)[:, None]
-                summed = tl.sum(tl.reshape(z, (PARTICLES, 8, WIDTH)), 1)
+                summed = tl.sum(tl.reshape(z * weight[:, None], (PARTICLES, 8, WIDTH)), 1)
             else:
                 mine = tile * PARTICLES + tl.arange(0, SUMS)
                 ends = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
-                summed = weighted_sums(members(SUMS, ROWS, 8), z, PRECISION)
+                summed = weighted_sums(members(SUMS, ROWS, 8) * weight[None, :], z, PRECISION)
             at = mine[:, None] * WIDTH + column[None, :]
             tl.store(out + at, summed + tl.load(particle + at, mask=ends, other=0.0), mask=ends)
         tile += tl.num_programs(0)
+
+
+@triton.jit
+def _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS: tl.constexpr):
+    """For each row of a tile its cell, its weight, and its offset's three parts."""
+    row = tl.arange(0, ROWS)
+    owner = tile * (ROWS // 8) + row // 8
+    corner = row % 8
+    live = owner < count
+    cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
+    weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
+    side_0 = _offset(fraction, owner, corner, live, 0)
+    side_1 = _offset(fraction, owner, corner, live, 1)
+    side_2 = _offset(fraction, owner, corner, live, 2)
+    return cell, weight, side_0, side_1, side_2
 
 
 @triton.jit
@@ -148,6 +187,7 @@ def pairs_backward(
     WIDTH: tl.constexpr,
     PARTICLES: tl.constexpr,
     PRECISION: tl.constexpr,
+    PREFETCH: tl.constexpr,
 ):
     """From the gradient of `out` ([C, W] if TO_CELL, else [N, W]) to those of by_particle, and of by_cell by atomics.
 
@@ -162,9 +202,11 @@ def pairs_backward(
     second = matrix(weights + second_at, WIDTH, WIDTH)
     gain = tl.load(values + gain_at + column)
     sums = tl.arange(0, SUMS)
-    gain_total, shift_total = tl.zeros((WIDTH,), tl.float32), tl.zeros((WIDTH,), tl.float32)
+    gain_total, shift_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     side_total = tl.zeros((SUMS, WIDTH), tl.float32)
     tile = tl.program_id(0)
+    # read a tile ahead: they say where other things are, and in a loop each thread keeps but one of them
+    cell, weight, side_0, side_1, side_2 = _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS)
     while tile * PARTICLES < count:
         row = tl.arange(0, ROWS)
         owner = tile * PARTICLES + row // 8
@@ -172,8 +214,6 @@ def pairs_backward(
         live = owner < count
         here = live[:, None]
         pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
-        cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
-        weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
         # all loads before the first use: the compiler keeps their order, and waits at the first
         z = tl.load(normalised + pair_at, mask=here, other=0.0)
         a = tl.load(hidden + pair_at, mask=here, other=0.0)
@@ -182,11 +222,16 @@ def pairs_backward(
             dy = tl.load(gradient + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
         else:
             dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+        if PREFETCH:
+            later_owner = owner + tl.num_programs(0) * PARTICLES
+            prefetch(normalised, later_owner * 8 + corner, later_owner < count, WIDTH)
+            prefetch(hidden, later_owner * 8 + corner, later_owner < count, WIDTH)
         dy, z = dy * weight[:, None], z.to(tl.float32)
-        gain_total += tl.sum(dy * z, 0)
-        shift_total += tl.sum(dy, 0)
+        gain_total += column_sums(dy * z, ROWS, WIDTH, 8)
+        shift_total += column_sums(dy, ROWS, WIDTH, 8)
         dz = normalise_backward(dy, z, scale, inside(gain, tile), WIDTH)
         tl.store(second_gradient + pair_at, dz, mask=here)
+        later = _pairs_of(tile + tl.num_programs(0), count, cell_of, weight_of, fraction, ROWS)
         dh = product(dz, second, PRECISION)
         dh = leaky_backward(dh, a.to(tl.float32))
         if not TO_CELL:
@@ -194,17 +239,18 @@ def pairs_backward(
             tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
         # the sums over a particle's pairs, and in the last rows those of the offsets' weights
         chosen = members(SUMS, ROWS, 8)
-        for axis in tl.static_range(3):
-            side = _offset(fraction, owner, corner, live, axis)
-            chosen = tl.where((sums == SUMS - 3 + axis)[:, None], side[None, :], chosen)
+        chosen = tl.where((sums == SUMS - 3)[:, None], side_0[None, :], chosen)
+        chosen = tl.where((sums == SUMS - 2)[:, None], side_1[None, :], chosen)
+        chosen = tl.where((sums == SUMS - 1)[:, None], side_2[None, :], chosen)
         summed = weighted_sums(chosen, dh, PRECISION)
         mine = tile * PARTICLES + sums
         ends = ((sums < PARTICLES) & (mine < count))[:, None]
         tl.store(by_particle_gradient + mine[:, None] * WIDTH + column[None, :], summed, mask=ends)
         side_total += summed
         tile += tl.num_programs(0)
-    tl.atomic_add(totals + gain_at + column, gain_total * unscale, sem="relaxed")
-    tl.atomic_add(totals + shift_at + column, shift_total * unscale, sem="relaxed")
+        cell, weight, side_0, side_1, side_2 = later
+    tl.atomic_add(totals + gain_at + column, tl.sum(gain_total, 0) * unscale, sem="relaxed")
+    tl.atomic_add(totals + shift_at + column, tl.sum(shift_total, 0) * unscale, sem="relaxed")
     axis = sums[:, None] - (SUMS - 3)
     sign = unscale if TO_CELL else -unscale
     at = totals + offset_at + axis * WIDTH + column[None, :]

@@ -42,6 +42,13 @@ def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
     return result
 
 
+@triton.jit
+def _three_rows(pointer, WIDTH: tl.constexpr):
+    """The matrix [3, W] at `pointer`, filled up to the 16 rows that a product takes."""
+    row = tl.arange(0, 16)
+    return tl.load(pointer + row[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=(row < 3)[:, None], other=0.0)
+
+
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def rows_forward(
     x,
@@ -63,6 +70,9 @@ def rows_forward(
     next_at_1,
     next_bias_at_0,
     next_bias_at_1,
+    fraction,
+    fraction_at_0,
+    fraction_at_1,
     y,
     hidden,
     next_0,
@@ -76,6 +86,7 @@ def rows_forward(
     NORM: tl.constexpr,
     RESIDUAL: tl.constexpr,
     NEXT: tl.constexpr,
+    FRACTION: tl.constexpr,
     SAVE: tl.constexpr,
     FINE: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -84,12 +95,18 @@ def rows_forward(
 ):
     """With FINE the FCN's own products are finer than PRECISION, and read the weights themselves.
 
+    FRACTION: the products that follow are a particle's part of its pairs: the first less what its fraction [R, 3] makes
+    of the offsets' weights [3, W], the second with it.
+
     LOOP: a program takes one tile after the other, and reads its weights once.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
     column, inputs, outs = tl.arange(0, WIDTH), tl.arange(0, INPUT), tl.arange(0, OUT)
+    if FRACTION:
+        offsets_0 = _three_rows(values + fraction_at_0, WIDTH)
+        offsets_1 = _three_rows(values + fraction_at_1, WIDTH)
     IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # where many vectors would not fit into registers
     if LOOP:
         lines = vectors(values, bias_at, next_bias_at_0, next_bias_at_1, bias_at, bias_at, WIDTH)
@@ -152,7 +169,15 @@ def rows_forward(
                 next_bias_0 = tl.load(
                     values + next_bias_at_0 + column, mask=(next_bias_at_0 >= 0) & (column >= 0), other=0.0
                 )
-            later = product(z, following_0, PRECISION) + inside(next_bias_0, tile)[None, :]
+            if FRACTION:
+                part = tl.arange(0, 16)
+                fractions = tl.load(
+                    fraction + row[:, None] * 3 + part[None, :], mask=live & (part < 3)[None, :], other=0.0
+                )
+                later = finer_product(-fractions, offsets_0, PRECISION)
+                later = product(z, following_0, PRECISION, later) + inside(next_bias_0, tile)[None, :]
+            else:
+                later = product(z, following_0, PRECISION) + inside(next_bias_0, tile)[None, :]
             tl.store(next_0 + at, later, mask=live)
         if NEXT > 1:
             if not LOOP:
@@ -161,7 +186,11 @@ def rows_forward(
                 next_bias_1 = tl.load(
                     values + next_bias_at_1 + column, mask=(next_bias_at_1 >= 0) & (column >= 0), other=0.0
                 )
-            later = product(z, following_1, PRECISION) + inside(next_bias_1, tile)[None, :]
+            if FRACTION:
+                later = finer_product(fractions, offsets_1, PRECISION)
+                later = product(z, following_1, PRECISION, later) + inside(next_bias_1, tile)[None, :]
+            else:
+                later = product(z, following_1, PRECISION) + inside(next_bias_1, tile)[None, :]
             tl.store(next_1 + at, later, mask=live)
         tile = next_tile(tile, not LOOP)
 
@@ -254,6 +283,33 @@ def rows_backward(
         if INTO > 1:
             dx += tl.load(x_gradient + at, mask=live, other=0.0)
         tl.store(x_gradient + at, dx, mask=live)
+
+
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
+def gather_sums(
+    x,
+    table,
+    count_ptr,
+    y,
+    capacity,
+    SUM: tl.constexpr,
+    EDGES: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """y = the sum of x's rows listed in the table [SUM, capacity] (-1: none), as gathered_sum takes them.
+
+    In a kernel of its own where there are many rows: its programs are small enough that many wait at once, while a
+    kernel with products has registers for two rows at a time.
+    """
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = tl.arange(0, WIDTH)
+    found = listed(table, row, count, capacity, SUM, EDGES)
+    tile = gathered_sum(x, found, SUM, WIDTH, BLOCK)
+    tl.store(y + row[:, None] * WIDTH + column[None, :], tile, mask=(row < count)[:, None])
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from hgn.kernels.blocks import column_sums
 from hgn.kernels.keys import settle_keys
 
 JOB_COLUMNS = 8
@@ -42,7 +43,7 @@ def weight_gradient(
     b_width = tl.multiple_of(tl.load(job + 5), 16)
     column = tl.arange(0, TILE)
     total = tl.zeros((TILE, TILE), tl.float32)
-    lines = tl.zeros((STEP, TILE), tl.float32)
+    lines = tl.zeros((16, TILE), tl.float32)
     last = tl.minimum(rows, first + CHUNK)
     for start in range(0, CHUNK, STEP):
         row = first + start + tl.arange(0, STEP)
@@ -52,7 +53,7 @@ def weight_gradient(
         b = tl.load(
             right + b_at + place * b_width + column[None, :], mask=live & (column < b_width)[None, :], other=0.0
         )
-        lines += a.to(tl.float32)
+        lines += column_sums(a.to(tl.float32), STEP, TILE, 16)
         if PRECISION == "half":
             total = tl.dot(tl.trans(a.to(tl.float16)), b.to(tl.float16), total)
         else:
