@@ -369,7 +369,6 @@ class TrainingEngine(Engine):
             WIDTH=self.width,
             PARTICLES=self.tuning.pair_particles,
             PRECISION=self.precision,
-            PREFETCH=self.prefetches(grid.particles),
             num_warps=self.tuning.pair_warps,
         )
 
@@ -423,7 +422,7 @@ class TrainingEngine(Engine):
         if tuning.cell_backward_block > 0 and self._many(rows):
             size, warps = tuning.cell_backward_block, tuning.cell_backward_warps
         edge_size, edge_warps = self._edge_block(rows)
-        overlap = self.overlaps(rows)
+        overlap = self.overlaps()
         for m in reversed(range(steps)):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             later = m if last else m + 1
@@ -490,7 +489,6 @@ class TrainingEngine(Engine):
                 DENSE=self.tuning.dense,
                 PRECISION=self.precision,
                 OVERLAP=overlap,
-                PREFETCH=self.prefetches(rows),
                 num_warps=edge_warps,
                 launch_pdl=overlap,
             )

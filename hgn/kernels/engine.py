@@ -43,9 +43,8 @@ class Tuning:
     small_block: int = 16  # where there are few rows
     small_warps: int = 8
     dense: bool = False  # six rows a cell in the tiles of edges, not eight
-    overlap: bool = False  # kernels of a message step read their weights before their turn, where there are few rows
-    overlap_many: bool = False  # and where there are many: faster, and not yet compared with the plain network on a GPU
-    prefetch: bool = False  # where there are many rows, the next tile's are brought to the L2 cache
+    overlap: bool = False  # kernels of a message step read their weights before their turn
+    prefetch: bool = False  # where there are many rows, the next tile's are brought to the L2 cache on the way forward
     loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
     gather_block: int = 0  # of a kernel for the sums of many rows' neighbours; 0: whoever needs them makes them
     cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
@@ -74,6 +73,7 @@ class Tuning:
             cell_backward_warps=4,
             weight_registers=128,
             prefetch=True,
+            half_cells=True,
         )
 
 
@@ -331,10 +331,9 @@ class Engine:
         programs = triton.cdiv(rows, block)
         return (min(programs, PROCESSORS) if loops else programs,)
 
-    def overlaps(self, rows: int) -> bool:
-        """Whether the kernels of a message step on so many cells start before the one before has ended."""
-        wanted = self.tuning.overlap_many if self._many(rows) else self.tuning.overlap
-        if not wanted or triton.knobs.runtime.interpret:
+    def overlaps(self) -> bool:
+        """Whether the kernels of a message step start before the one before has ended."""
+        if not self.tuning.overlap or triton.knobs.runtime.interpret:
             return False
         target = triton.runtime.driver.active.get_current_target()
         return target.backend == "cuda" and target.arch >= 90
@@ -512,7 +511,7 @@ class Engine:
         rows = grid.capacities[level]
         size, warps = self._row_block(rows)
         edge_size, edge_warps = self._edge_block(rows)
-        overlap, loops = self.overlaps(rows), self._loops(rows, size)
+        overlap, loops = self.overlaps(), self._loops(rows, size)
         for m in range(steps):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             if not last:

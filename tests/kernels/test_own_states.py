@@ -136,7 +136,7 @@ def test_fast_training_is_the_plain_one(
         assert train.main(run_mapping(data, tmp_path / path, path=path, **same, **own, **counts)) == 0
         ends[path] = read_checkpoint(tmp_path / path / "checkpoints" / "last.ckpt")
         lines[path] = next(line for line in metrics(tmp_path / path) if "loss" in line)
-    assert re.findall(r"the first 2 updates took .* s own states, .* capturing 0 times", capsys.readouterr().err)
+    assert re.findall(r"the first 2 updates took .* s own states, .* capturing \d+ times", capsys.readouterr().err)
     # Adam's first steps are signs of gradients: where those are next to nothing, rounding decides
     for key, value in ends["plain"]["state_dict"].items():
         assert float((ends["fast"]["state_dict"][key] - value).double().abs().mean()) < 1e-5, key

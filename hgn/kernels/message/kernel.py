@@ -464,7 +464,6 @@ def edge_backward(
     DENSE: tl.constexpr,
     PRECISION: tl.constexpr,
     OVERLAP: tl.constexpr,
-    PREFETCH: tl.constexpr,
 ):
     """In place: edge_gradient [C, 6, W] comes in as that of edge_out, less the sums' part (there is none if LAST), and
     leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`.
@@ -506,11 +505,6 @@ def edge_backward(
             later = tl.load(edge_gradient + edge_at, mask=there, other=0.0)
         scale = tl.load(deviation + place, mask=holds, other=0.0)
         later_place, later_holds = _edges_of(tile + tl.num_programs(0), count, ROWS, SLOTS)
-        if PREFETCH:
-            prefetch(normalised, later_place, later_holds, WIDTH)
-            prefetch(hidden, later_place, later_holds, WIDTH)
-            if not LAST:
-                prefetch(edge_gradient, later_place, later_holds, WIDTH)
         if not LAST:
             de = added(de, later)
         dy, z = de.to(tl.float32), z.to(tl.float32)

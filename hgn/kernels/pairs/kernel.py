@@ -21,7 +21,6 @@ from hgn.kernels.blocks import (
     members,
     normalise_backward,
     normalise_once,
-    prefetch,
     product,
     transposed,
     weighted_sums,
@@ -187,7 +186,6 @@ def pairs_backward(
     WIDTH: tl.constexpr,
     PARTICLES: tl.constexpr,
     PRECISION: tl.constexpr,
-    PREFETCH: tl.constexpr,
 ):
     """From the gradient of `out` ([C, W] if TO_CELL, else [N, W]) to those of by_particle, and of by_cell by atomics.
 
@@ -222,10 +220,6 @@ def pairs_backward(
             dy = tl.load(gradient + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
         else:
             dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
-        if PREFETCH:
-            later_owner = owner + tl.num_programs(0) * PARTICLES
-            prefetch(normalised, later_owner * 8 + corner, later_owner < count, WIDTH)
-            prefetch(hidden, later_owner * 8 + corner, later_owner < count, WIDTH)
         dy, z = dy * weight[:, None], z.to(tl.float32)
         gain_total += column_sums(dy * z, ROWS, WIDTH, 8)
         shift_total += column_sums(dy, ROWS, WIDTH, 8)
