@@ -7,16 +7,24 @@ fault, 130 Ctrl-C.
 from __future__ import annotations
 
 import errno
+import itertools
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 from hgn.config import config_directory
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, known_keys, require
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+
+_HYDRA_OPTIONS = (
+    *("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--resolve", "--package", "-p", "--run", "-r"),
+    *("--multirun", "-m", "--shell-completion", "-sc", "--config-path", "-cp", "--config-name", "-cn", "--config-dir"),
+    *("-cd", "--experimental-rerun", "--info", "-i"),
+)
 
 # Hydra makes no folder and no log file of its own; the commands say where they write
 _QUIET = (
@@ -45,9 +53,14 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
     A command without config groups has its file in `conf/command/`: beside the groups Hydra would take its keys
     (`scene=my_scene.yaml`) for choices of a group.
 
-    Hydra's own options (--help, --cfg, --config-path, --config-name, --multirun) work as ever. `main` returns an exit
-    code or None for 0. ConfigError, an unknown key and a full disk are printed as one line, `error: ...`.
+    Hydra's own options (--cfg, --config-path, --config-name, --multirun) work as ever, and --help shows such a file
+    with its comments. `main` returns an exit code or None for 0. ConfigError, an unknown key and a full disk are
+    printed as one line, `error: ...`.
     """
+    file = config_directory() / "command" / f"{config_name}.yaml"
+    if sys.argv[1:] in (["--help"], ["-h"]) and file.is_file():
+        print(_described(), "", file.read_text(encoding="utf-8"), sep="\n", end="")
+        sys.exit(0)
     try:
         code = 0
         for mapping in _compose(config_name):
@@ -76,7 +89,7 @@ def section(mapping: Mapping[str, Any], known: Mapping[str, str | None]) -> dict
     """
     for key in mapping:
         if key not in known:
-            raise ConfigError(f"{key} is not a known key; known keys: {', '.join(known)}")
+            raise ConfigError(f"{key} is not a known key; {known_keys(str(key), known)}")
     picked: dict[str, Any] = {}
     for key, name in known.items():
         if name is None or key not in mapping:
@@ -94,7 +107,7 @@ def _compose(config_name: str) -> list[dict[str, Any]]:
     import hydra
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
     folder = config_directory()
     if (folder / "command" / f"{config_name}.yaml").is_file():
@@ -102,12 +115,23 @@ def _compose(config_name: str) -> list[dict[str, Any]]:
     composed: list[Any] = []  # one config, or several with --multirun
     arguments, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     quiet = _QUIET + (_help() if "--help" in arguments else ())
-    sys.argv = _with(quiet, _with_json_as_override(arguments))
+    given = _with_json_as_override(arguments)
+    _require_options(given)
+    sys.argv = _with(quiet, given)
     # Hydra would print and exit itself otherwise
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        hydra.main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
+        run = hydra.main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)
+        while True:
+            try:
+                run()
+                break
+            except HydraException as error:
+                if not _appended(sys.argv, str(error)):
+                    raise
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=True) for config in composed]
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra raises plain ValueErrors too
         raise ConfigError(_one_line(str(error))) from error
     finally:
@@ -117,6 +141,28 @@ def _compose(config_name: str) -> list[dict[str, Any]]:
         else:
             os.environ["HYDRA_FULL_ERROR"] = full_error
     return [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
+
+
+def _appended(arguments: list[str], message: str) -> bool:
+    """Puts a + before the key that Hydra does not find, so that the command itself refuses it, with the keys that it
+    knows; and so that experiment=… is as good as +experiment=…. False where Hydra complains of something else."""
+    unknown = re.match(r"Could not override '([^']+)'", message)
+    for place, argument in enumerate(arguments):
+        if place and unknown is not None and argument.startswith(f"{unknown[1]}="):
+            arguments[place] = f"+{argument}"
+            return True
+    return False
+
+
+def _require_options(arguments: list[str]) -> None:
+    """Refuses options that Hydra would answer with pages, and words that are no key=value."""
+    for before, argument in itertools.pairwise(arguments):
+        name, _, value = argument.partition("=")
+        if name.startswith("-") and name not in _HYDRA_OPTIONS:
+            key = name.strip("-") or "KEY"
+            raise ConfigError(f"{argument} is not an option; settings are given as {key}={value or 'VALUE'}")
+        if "=" not in argument and not argument.startswith(("-", "~")) and before not in _HYDRA_OPTIONS:
+            raise ConfigError(f"settings are given as KEY=VALUE, got {argument!r}; --help shows the keys")
 
 
 def _with_json_as_override(arguments: list[str]) -> list[str]:
@@ -144,10 +190,17 @@ def _with(ours: tuple[str, ...], arguments: list[str]) -> list[str]:
 
 def _help() -> tuple[str, ...]:
     """What --help says before the keys: the command's own description, which is its module's."""
-    program = sys.modules["__main__"]
-    name = program.__spec__.name.removesuffix(".__main__") if program.__spec__ else Path(sys.argv[0]).name
-    text = (program.__doc__ or name).strip().replace("\\", "\\\\").replace("'", "\\'")
-    return f"hydra.help.app_name='python -m {name}'", f"hydra.help.header='{text}'"
+    text = _described().replace("\\", "\\\\").replace("'", "\\'")
+    return f"hydra.help.app_name='python -m {_module()}'", f"hydra.help.header='{text}'"
+
+
+def _described() -> str:
+    return (sys.modules["__main__"].__doc__ or _module()).strip()
+
+
+def _module() -> str:
+    spec = sys.modules["__main__"].__spec__
+    return spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).name
 
 
 def _one_line(text: str) -> str:

@@ -12,7 +12,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -36,9 +36,7 @@ def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}  # type: ignore[arg-type]
     for key in mapping:
         if key not in fields:
-            close = difflib.get_close_matches(str(key), fields, n=1)
-            remedy = f"did you mean {close[0]}?" if close else f"known keys: {', '.join(fields)}"
-            raise ConfigError(f"{_join(path, str(key))} is not a known key; {remedy}")
+            raise ConfigError(f"{_join(path, str(key))} is not a known key; {known_keys(str(key), fields)}")
     values: dict[str, Any] = {}
     for name, field in fields.items():
         if name in mapping:
@@ -51,6 +49,13 @@ def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
         if path:
             raise ConfigError(f"{path}.{error}") from None
         raise
+
+
+def known_keys(key: str, known: Iterable[str]) -> str:
+    """What to say beside a key that is not known: the one that may have been meant, or else all."""
+    known = list(known)
+    close = difflib.get_close_matches(key, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"known keys: {', '.join(known)}"
 
 
 def to_mapping(value: Any) -> Any:

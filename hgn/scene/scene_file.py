@@ -145,6 +145,7 @@ def load_scene(path: str | Path) -> Scene:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} must be a YAML file: {error}") from error
     try:
+        require(isinstance(mapping, dict), "the file", "a mapping of keys to values, such as groups", mapping)
         return _build(from_mapping(SceneFile, mapping), path.parent)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error

@@ -50,7 +50,7 @@ def run(*arguments: str, ballistic: bool = True, **options: object) -> tuple[int
 BAD_INPUT = [
     (["scenes=abc"], "error: dataset.training_scenes must be a whole number, got 'abc' (str)"),
     (["dataset.frames=1"], "error: dataset.frames must be at least 2, got 1"),
-    (["colour=1"], "error: Could not override 'colour'. To append to your config use +colour=1"),
+    (["colour=1"], "error: colour is not a known key; known keys: "),
     (["+colour=1"], "error: colour is not a known key; known keys: scene, mpm, dataset, scenes, out,"),
     (["+dataset.colour=1"], "error: dataset.colour is not a known key; known keys: folder,"),
     (["scene=moon"], "error: In 'datagen': Could not find 'scene/moon' Available options in 'scene':"),
@@ -139,6 +139,9 @@ def test_help_and_config_print(tmp_path: Path) -> None:
     assert code == 0 and "makes a data set, or completes one" in output
     code, output, _ = run("--cfg", "job", *SMALL, cwd=tmp_path, ballistic=False)
     assert code == 0 and "training_scenes: 800" in output and yaml.safe_load(output)["scenes"] == 3
+    code, experiment, _ = run("--cfg", "job", "experiment=demo", cwd=tmp_path, ballistic=False)
+    assert code == 0 and run("--cfg", "job", "+experiment=demo", cwd=tmp_path, ballistic=False)[1] == experiment
+    assert yaml.safe_load(experiment)["name"] == "demo"
     assert list(tmp_path.iterdir()) == []
 
 

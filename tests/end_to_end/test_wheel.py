@@ -82,6 +82,6 @@ def test_commands_compose_their_config(python: Path, tmp_path: Path, module: str
 
 @pytest.mark.parametrize(("module", "key"), [("hgn.rollout", "weights: obstacles"), ("tools.render", "rollout: null")])
 def test_commands_help(python: Path, tmp_path: Path, module: str, key: str) -> None:
-    """`--help` says what a command does and shows its keys, from an empty folder."""
+    """`--help` says what a command does and shows its keys with their comments, from an empty folder."""
     text = run(python, tmp_path, "-m", module, "--help")
-    assert key in text and text.strip("`\n").startswith(f"python -m {module}")
+    assert key in text and "# a f" in text and text.strip("`\n").startswith(f"python -m {module}")

@@ -124,7 +124,7 @@ def obstacle_with(**changes: object) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        (None, "SceneFile must be a mapping"),
+        (None, "the file must be a mapping"),
         ({}, "groups is missing"),
         ({"groups": []}, "groups must be a list with at least one group"),
         (scene_with(gruops=1), "gruops is not a known key; did you mean groups"),
