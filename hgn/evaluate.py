@@ -28,6 +28,7 @@ from hgn.training.errors import (
     network_predictor,
     one_step_errors,
     rollout_errors,
+    told_gain,
     trivial_predictors,
 )
 
@@ -129,7 +130,7 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
     ours = next(row["one_step_mse"] for row in rows if row["system"] == "network")
     best = min(row["one_step_mse"] for row in rows if "one_step_mse" in row and row["system"] != "network")
     ratio = best / ours if ours > 0 else float("inf")
-    lines.append(f"the network's one-step MSE is {ratio:.2f} times below the best trivial predictor's")
+    lines.append(f"the network's one-step MSE is {told_gain(ratio)} the best trivial predictor's")
     return "\n".join(lines)
 
 

@@ -294,7 +294,7 @@ class Stage:
         top = gaussian_filter(top, sigma).ravel()
         above_N = np.where(inside_N, top[cell_N] - position_N3[:, 1], 0.0)
         shadow_N = np.clip((above_N - self.radius) / (10 * self.radius), 0.0, 1.0)
-        return 1 - 0.24 * shadow_N
+        return 1 - 0.17 * shadow_N
 
     def _draw_particles(
         self, picture_P3: np.ndarray, position_N3: np.ndarray, material_N: np.ndarray, lit_N: np.ndarray
@@ -337,7 +337,7 @@ class Stage:
         gloss_S = np.clip(x_S * half[0] + y_S * half[1] + z_S * half[2], 0, 1) ** 24
         material_S = material_N[order][particle_S]
         lit_S = lit_N[order][particle_S]
-        shade_S = (0.72 + 0.42 * lambert_S) * lit_S * (0.80 + 0.20 * z_S)
+        shade_S = (0.76 + 0.38 * lambert_S) * lit_S * (0.80 + 0.20 * z_S)
         shine_S = np.array((0.30, 0.06, 0.12))[material_S] * gloss_S * lit_S
         color_S3 = MATERIAL_COLORS[material_S] * shade_S[:, None].astype(np.float32)
         color_S3 += shine_S[:, None].astype(np.float32)

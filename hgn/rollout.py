@@ -24,7 +24,7 @@ from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
 from hgn.scene.scene import Scene
-from hgn.scene.scene_file import load_scene
+from hgn.scene.scene_file import load_scene, sheets_of_meshes
 from hgn.schema import ConfigError, from_mapping
 
 PICTURES = 4  # in the PNG
@@ -60,6 +60,8 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         name, scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(scene)
         obstacles = scene.obstacles
+        for sheet in sheets_of_meshes(scene):
+            print(f"a sheet, not a solid, for it is not watertight: {sheet}", file=sys.stderr)
         if scene.material_parameters:
             names = ", ".join(scene.material_parameters)
             print(

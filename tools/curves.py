@@ -149,9 +149,9 @@ def draw(run: Run) -> bytes:
     for axes in (left, middle, right):
         _finish(axes, "updates")
     training, dataset = run.settings["training"], run.settings["dataset"]
+    episodes = f"{int(last['episodes'])} training episodes, " if "episodes" in last else ""
     figure.suptitle(
-        f"{dataset['folder']}, {int(last.get('episodes', 0))} training episodes, "
-        f"{training['batch_scenes']} scenes an update, {_origin(run)}",
+        f"{dataset['folder']}, {episodes}{training['batch_scenes']} scenes an update, {_origin(run)}",
         fontsize=10,
     )
     return as_png(figure)

@@ -151,6 +151,16 @@ def load_scene(path: str | Path) -> Scene:
         raise ConfigError(f"{path}: {error}") from error
 
 
+def sheets_of_meshes(scene: Scene) -> list[str]:
+    """The mesh files of a scene file that are not closed, and so count as sheets."""
+    entries = scene.specification.get("obstacles", ())
+    return [
+        entry["mesh"]
+        for entry, obstacle in zip(entries, scene.obstacles, strict=False)
+        if entry.get("mesh") is not None and not obstacle.closed
+    ]
+
+
 def _build(file: SceneFile, folder: Path) -> Scene:
     obstacles = tuple(_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles))
     regions = [region_of(entry.shape, entry.edges, entry.position) for entry in file.groups]

@@ -21,6 +21,13 @@ REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
 Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
 
 
+def told_gain(gain: float) -> str:
+    """How many times an error is below another that is `gain` times as large, for people: above, where it is."""
+    if not 0 < gain < 1:
+        return f"{gain:.2f} times below"
+    return f"{1 / gain:.2f} times above"
+
+
 @dataclass
 class SquaredError:
     """Sums of squared errors and particle counts, by material; `mse` over all of them."""

@@ -88,15 +88,18 @@ def test_scenes(tmp_path: Path, weights: str, monkeypatch: pytest.MonkeyPatch) -
     assert not read_rollout("c.vtkhdf").obstacles
 
 
-def test_constants_of_materials_are_said_to_be_unused(
-    tmp_path: Path, weights: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A network knows one water; a scene file's constants are the solver's, and a line says so."""
+def test_what_may_surprise_is_said(tmp_path: Path, weights: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A network knows one water; a scene file's constants are the solver's, and a line says so. Another says which of
+    its meshes is no solid."""
+    (tmp_path / "open.obj").write_text("v 0.2 0.2 0.2\nv 0.4 0.2 0.2\nv 0.2 0.2 0.4\nf 1 2 3\n")
+    obstacles = "{shape: square, size: 0.1, position: [0.8, 0.2, 0.5]}, {mesh: open.obj}"
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, youngs_modulus_pa: 1e5}"
-    (tmp_path / "stiff.yaml").write_text(f"groups: [{group}]\n")
+    (tmp_path / "stiff.yaml").write_text(f"groups: [{group}]\nobstacles: [{obstacles}]\n")
     out = str(tmp_path / "a.vtkhdf")
     assert rollout.main({"weights": weights, "frames": 2, "scene": str(tmp_path / "stiff.yaml"), "out": out}) == 0
-    assert "not used: youngs_modulus_pa of groups" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "not used: youngs_modulus_pa of groups" in said
+    assert "a sheet, not a solid, for it is not watertight: open.obj" in said and "square" not in said
 
 
 @pytest.mark.parametrize(
