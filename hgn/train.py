@@ -6,6 +6,7 @@ next update, after a checkpoint.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 import warnings
@@ -44,6 +45,8 @@ from hgn.training.stop import StopRequest
 
 if TYPE_CHECKING:
     from hgn.runtime.ahead import AheadCompilation
+
+BETWEEN_LOOKS_S = 10.0  # at the data set's manifest, for the progress line
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -246,14 +249,22 @@ def _wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: S
 
 def _published_text(config: TrainConfig, generator: Generator | None) -> Callable[[], str]:
     folder, total = config.dataset.folder, config.dataset.training_scenes
+    looked_at, found = -math.inf, ""
 
     def text() -> str:
+        # hundreds of scenes take a tenth of a second to read: not with every line, and never again once all are there
+        nonlocal looked_at, found
+        if time.monotonic() - looked_at < BETWEEN_LOOKS_S:
+            return found
         try:
             count = Manifest.load(folder, patience_s=0.0).published("train")
         except UnreachableError:
-            return "the service does not answer"
-        state = "" if generator is None or generator.running or count >= total else ", generator stopped"
-        return f"{count}/{total} episodes{state}"
+            count, found = 0, "the service does not answer"
+        else:
+            state = "" if generator is None or generator.running or count >= total else ", generator stopped"
+            found = f"{count}/{total} episodes{state}"
+        looked_at = math.inf if count >= total else time.monotonic()
+        return found
 
     return text
 

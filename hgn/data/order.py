@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hgn.schema import ConfigError
+from hgn.splitmix import splitmix64
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class SampleOrder:
         self._published = published
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
+        self._first_seed = 0  # of an epoch's samples, which have one after the other
         self._begin_epoch(self.cursor.epoch, self.cursor.position, self.cursor.episodes)
 
     def next_batch(self) -> list[Sample]:
@@ -90,9 +92,9 @@ class SampleOrder:
             raise ConfigError("data set must hold at least one training episode, got none; generate some first")
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_permutation(self.seed, epoch, int(self._first_sample[-1]))
+        self._first_seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0])
         self.cursor = Cursor(epoch, position, len(frame_counts))
 
     def _sample(self, index: int) -> Sample:
         episode = int(np.searchsorted(self._first_sample, index, side="right")) - 1
-        seed = np.random.SeedSequence([self.seed, self.cursor.epoch, index]).generate_state(1, np.uint64)[0]
-        return Sample(episode, index - int(self._first_sample[episode]), int(seed >> np.uint64(1)))
+        return Sample(episode, index - int(self._first_sample[episode]), splitmix64(self._first_seed + index) >> 1)

@@ -47,7 +47,7 @@ class AheadJob:
     particles: int  # of an update, about
     cells: tuple[int, ...]  # of each level, about; of a GNS its edges
     capability: int  # of the GPU: 90 for an H100
-    rollout_scenes: int = 0  # that the network simulates to train on; 0: it does not
+    rollout_scenes: tuple[int, ...] = ()  # that the network simulates at once, to train on them and to measure
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,9 @@ def _update_launches(job: AheadJob, device: str) -> None:
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
-    if job.rollout_scenes:
+    for scenes in job.rollout_scenes:
         assert isinstance(network, HierarchicalGraphNetwork)
-        _rollout_launches(job, network, device)
+        _rollout_launches(job, scenes, network, device)
 
 
 def _frame_launches(config: NetworkConfig, precision: str, sizes: tuple[tuple[int, int], ...], device: str) -> None:
@@ -133,9 +133,9 @@ def _nowhere(config: NetworkConfig, particles: int, scenes: int, device: str) ->
     )
 
 
-def _rollout_launches(job: AheadJob, network: HierarchicalGraphNetwork, device: str) -> None:
-    """Those of a frame of hgn.training.fast_states."""
-    config, scenes = job.network, job.rollout_scenes
+def _rollout_launches(job: AheadJob, scenes: int, network: HierarchicalGraphNetwork, device: str) -> None:
+    """Those of a frame of hgn.training.fast_states, or of a monitored rollout."""
+    config = job.network
     share = scenes / job.settings.scenes
     particles = round(share * job.particles)
     obstacles = None
@@ -169,7 +169,8 @@ def job_of(text: str) -> AheadJob | FrameJob:
         return FrameJob(networks, tuple((n, cells) for n, cells in mapping["sizes"]), mapping["capability"])
     network = from_mapping(NetworkConfig, mapping.pop("network"))
     settings = UpdateSettings(**mapping.pop("settings"))
-    return AheadJob(network, settings, **{**mapping, "cells": tuple(mapping["cells"])})
+    tuples = {name: tuple(mapping[name]) for name in ("cells", "rollout_scenes")}
+    return AheadJob(network, settings, **{**mapping, **tuples})
 
 
 def use_target(capability: int) -> None:

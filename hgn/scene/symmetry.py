@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import permutations, product
 
+from hgn.splitmix import splitmix64
+
 CELL_BITS = 17  # as in a cell's key
 CODE_BITS = 3 + CELL_BITS  # of an axis: where it comes from in two bits, whether mirrored, the box's cells
 
@@ -64,9 +66,4 @@ def scene_symmetries(gravity: Vector, domain_size: Vector, cell_size: float) -> 
 def drawn_symmetry(symmetries: tuple[Symmetry, ...], seed: int) -> Symmetry:
     """One of them, each as likely; a function of the sample's seed alone, in another stream than noise and jitter."""
     assert symmetries, "the scene's symmetries are not known"
-    mask = (1 << 64) - 1
-    # splitmix64 (Steele, Lea & Flood 2014): neighbouring seeds give independent draws
-    z = (seed + 0x9E3779B97F4A7C15) & mask
-    z = (z ^ z >> 30) * 0xBF58476D1CE4E5B9 & mask
-    z = (z ^ z >> 27) * 0x94D049BB133111EB & mask
-    return symmetries[((z ^ z >> 31) * len(symmetries)) >> 64]
+    return symmetries[(splitmix64(seed) * len(symmetries)) >> 64]

@@ -16,6 +16,8 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
     particles, cells = _sizes(config.scene, network.levels)
     if network.kind == "gns":
         cells = [NEIGHBOURS * particles]
+    own = [training.rollout_scenes] if training.rollout_share > 0 else []
+    monitored = network.kind == "hgn" and training.monitor_rollout_frames >= 2
     return AheadJob(
         network,
         UpdateSettings.of(training, config.scene.cell_size),
@@ -25,7 +27,7 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
         training.batch_scenes * particles,
         tuple(training.batch_scenes * count for count in cells),
         10 * capability[0] + capability[1],
-        training.rollout_scenes if training.rollout_share > 0 else 0,
+        tuple(own + ([training.monitor_scenes] if monitored else [])),
     )
 
 

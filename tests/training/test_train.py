@@ -139,6 +139,27 @@ def test_signals_end_the_run_after_a_checkpoint(data, tmp_path, monkeypatch, num
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 3
 
 
+def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path, monkeypatch):
+    """Reading a manifest of hundreds of scenes with every line cost a third of the updates: it is read once in a while,
+    and never again once all scenes are there."""
+    config = make_config(training_scenes=2)
+    make_dataset(config)
+    looks, now = [], [0.0]
+    load = train.Manifest.load
+    monkeypatch.setattr(train.Manifest, "load", lambda *a, **k: looks.append(now[0]) or load(*a, **k))
+    monkeypatch.setattr(train.time, "monotonic", lambda: now[0])
+    for wanted, expected in ((3, [0.0, 12.0, 24.0]), (2, [0.0])):
+        mapping = train_mapping(config, tmp_path)
+        mapping["dataset"]["training_scenes"] = wanted
+        del mapping["name"]
+        settings = train.from_mapping(train.TrainConfig, mapping)
+        text = train._published_text(settings, None)
+        looks.clear()
+        for now[0] in (0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 24.0, 28.0):
+            assert text() == f"2/{wanted} episodes"
+        assert looks == expected
+
+
 def test_a_finished_run_stays_finished(data, tmp_path):
     """Starting a finished run again makes no update and changes no weight; what a crash left half-written is gone."""
     run = tmp_path / "run"
@@ -153,14 +174,14 @@ def test_a_finished_run_stays_finished(data, tmp_path):
 
 
 def test_training_learns(make_config, make_dataset, tmp_path):
-    """On free fall with strong velocity noise, 120 updates learn to undo a good part of the noise."""
+    """On free fall with strong velocity noise, 240 updates learn to undo a good part of the noise."""
     config = make_config(training_scenes=6, frames=30)
     make_dataset(config)
     run = tmp_path / "run"
-    changes = {"maximum_updates": 120, "log_every": 10, "monitor_every": 120, "learning_rate": 1e-2, "noise_std": 0.02}
+    changes = {"maximum_updates": 240, "log_every": 10, "monitor_every": 240, "learning_rate": 1e-2, "noise_std": 0.02}
     train.main(train_mapping(config, run, **changes))
     losses = [record["loss"] for record in metrics(run) if "loss" in record]
-    assert sum(losses[-4:]) < 0.9 * sum(losses[:4])
+    assert sum(losses[-4:]) < 0.8 * sum(losses[:4])
 
 
 @pytest.mark.parametrize(
