@@ -6,7 +6,7 @@ Below this file nobody sees a DictConfig. Numbers that follow from others are pr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hgn.scene.material import MATERIALS, material_index
@@ -27,6 +27,12 @@ def config_directory() -> Path:
         if (candidate / "datagen.yaml").is_file():
             return candidate
     raise ConfigError(f"conf/ must lie inside or beside {package}, got neither; reinstall the package")
+
+
+def require_rollout_name(field: str, name: str | None) -> None:
+    """Refuses names of pictures, which people give where a rollout file is to be."""
+    picture = name is not None and Path(name).suffix in (".png", ".gif", ".webp")
+    require(name != "" and not picture, field, "the name of an HDF5 file, as in rollout.vtkhdf", name)
 
 
 @dataclass(frozen=True)
@@ -194,6 +200,11 @@ class DatagenConfig:
     mpm: MpmConfig = field(default_factory=MpmConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
 
+    @property
+    def awaited(self) -> DatagenConfig:
+        """The same for a generator whose first episodes somebody waits for."""
+        return replace(self, dataset=replace(self.dataset, early_episodes=True))
+
 
 @dataclass(frozen=True)
 class ServiceConfig:
@@ -206,6 +217,22 @@ class ServiceConfig:
     def __post_init__(self) -> None:
         require(0 <= self.port < 65536, "port", "0 to 65535", self.port)
         require_positive(self, "connections")
+
+
+@dataclass(frozen=True)
+class SolveConfig:
+    """`python -m datagen.solve`: a scene file, simulated by the solver."""
+
+    scene: str
+    out: str | None = None  # none: rollout/NAME_solver.vtkhdf
+    frames: int = 300
+    frame_rate_hz: float = 60.0
+    mpm: MpmConfig = field(default_factory=MpmConfig)
+
+    def __post_init__(self) -> None:
+        require(self.frames >= 2, "frames", "at least 2", self.frames)
+        require_positive(self, "frame_rate_hz")
+        require_rollout_name("out", self.out)
 
 
 @dataclass(frozen=True)
@@ -452,8 +479,7 @@ class RolloutConfig:
         )
         require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
         require_non_negative(self, "seed")
-        picture = self.out is not None and Path(self.out).suffix in (".png", ".gif", ".webp")
-        require(self.out != "" and not picture, "out", "the name of an HDF5 file, as in rollout.vtkhdf", self.out)
+        require_rollout_name("out", self.out)
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,13 @@ from __future__ import annotations
 import hgn.idle_threads  # noqa: F401  # isort: skip  # before torch is loaded
 
 import hashlib
-import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import RolloutConfig, SceneConfig, config_directory
+from hgn.config import RolloutConfig, SceneConfig
 from hgn.data.select import find_episode
 from hgn.picture import animate, compare_picture, spread, write_picture
 from hgn.progress import bar
@@ -24,7 +23,7 @@ from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
 from hgn.scene.scene import Scene
-from hgn.scene.scene_file import load_scene, sheets_of_meshes
+from hgn.scene.scene_file import find_scene, load_scene, sheets_of_meshes
 from hgn.schema import ConfigError, from_mapping
 
 PICTURES = 4  # in the PNG
@@ -104,10 +103,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
 def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
     """A scene file or an example, or a scene like those that the network was trained on; and a name for it."""
     if config.scene is not None:
-        path = Path(config.scene)
-        example = config_directory() / "example" / f"{config.scene}.yaml"
-        if re.fullmatch(r"\w+", config.scene) and not path.exists() and example.is_file():
-            path = example
+        path = find_scene(config.scene)
         return path.stem, load_scene(path)
     drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)
     if not info.network.sees_obstacles:

@@ -127,6 +127,8 @@ def _load(config: RenderConfig) -> Versions:
         rollout = read_rollout(config.rollout)
         name, first, label = Path(config.rollout).stem, config.rollout, "prediction"
         truth_TN3 = rollout.reference_TN3
+        if "solver" in rollout.source:
+            label, truth_TN3 = "ground truth", rollout.position_TN3 if config.others else None
     names = config.names or (label, *(Path(other).stem for other in config.others))
     require(len(set(names)) == len(names), "names", "given where others have the same file name", config.names)
     label, *rest = names

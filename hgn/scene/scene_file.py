@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from hgn.config import OBSTACLE_SHAPES, MpmConfig
+from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
@@ -127,6 +127,12 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
 )
+
+
+def find_scene(name: str) -> Path:
+    """The file that `name` means: a path, or an example by its name, as in `funnel`."""
+    example = config_directory() / "example" / f"{name}.yaml"
+    return example if re.fullmatch(r"\w+", name) and not Path(name).exists() and example.is_file() else Path(name)
 
 
 def load_scene(path: str | Path) -> Scene:

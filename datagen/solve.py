@@ -1,0 +1,54 @@
+"""python -m datagen.solve scene=my_scene.yaml out=truth.vtkhdf: the solver's own simulation of a scene file.
+
+What networks learn from, for a scene of one's own. Beside a network's rollout of the same scene
+`python -m tools.render rollout=truth.vtkhdf others=[rollout.vtkhdf]` draws both, and how far they are apart.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hgn.command import run_command
+from hgn.config import SolveConfig
+from hgn.progress import bar
+from hgn.scene.rollout_file import Rollout, write_rollout
+from hgn.scene.scene_file import find_scene, load_scene
+from hgn.schema import ConfigError, from_mapping, to_mapping
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Simulates and writes the file; returns the exit code.
+
+    Raises: ConfigError for bad input, a scene that the solver cannot keep together among it; nothing is written then.
+    """
+    config = from_mapping(SolveConfig, mapping)
+    file = find_scene(config.scene)
+    scene = load_scene(file)
+    # Taichi takes seconds to load, and bad input is answered before.
+    from datagen.mpm.solver import SceneFailure, simulate
+
+    with bar("simulating", total=config.frames, unit="frame") as progress:
+        (result,) = simulate(
+            [scene], config.mpm, config.frames, config.frame_rate_hz, on_frame=lambda _: progress.update()
+        )
+    if isinstance(result, SceneFailure):
+        raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
+    made = Rollout(
+        position_TN3=result.position_TN3,
+        material_N=scene.material_N,
+        obstacles=scene.obstacles,
+        domain_size=scene.domain_size,
+        frame_rate_hz=config.frame_rate_hz,
+        gravity=scene.gravity,
+        cell_size=scene.cell_size,
+        source={"scene": config.scene, "solver": to_mapping(config.mpm)},
+    )
+    out = Path(config.out if config.out is not None else f"rollout/{file.stem}_solver.vtkhdf")
+    write_rollout(out, made)
+    print(out)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main, "solve")
