@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import ipaddress
 import socket
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +42,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
         from datagen.server import make_app, make_server
 
         progress = make_progress(kind)
-        early = replace(config, dataset=replace(config.dataset, early_episodes=True))
-        with Supervisor(early, progress, backend) as supervisor:
+        with Supervisor(config.awaited, progress, backend) as supervisor:
             app = make_app(folder, token, lambda: supervisor.state)
             server = make_server(app, service.connections)
 

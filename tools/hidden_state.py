@@ -34,12 +34,11 @@ from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
 from hgn.scene.material import MATERIALS, SAND
-from hgn.scene.random_scene import generate_scene
+from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, from_mapping, require, require_one_of, require_positive, to_mapping
 
 FRAME_RATE_HZ = 60.0
-FIRST_SEED = 1_000_000  # of no data set
 HISTORY = 3  # positions that the velocity is guessed from
 
 
@@ -69,7 +68,7 @@ def main(mapping: dict[str, Any]) -> int:
     rows: list[dict[str, Any]] = []
     with bar("frames", total=config.scenes * (config.frames - 1), unit="frame") as progress:
         for index in range(config.scenes):
-            scene = generate_scene(config.scene, FIRST_SEED + index)
+            scene = generate_scene(config.scene, REPORT_SEED + index)
             stepped = SteppedScene(scene, config.mpm)
             errors += changes(stepped, config.frames, config.every, progress.update)
             stepped.release()

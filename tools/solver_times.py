@@ -27,14 +27,13 @@ from hgn.config import MpmConfig, SceneConfig
 from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
-from hgn.scene.random_scene import generate_scene
+from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, from_mapping, require, require_one_of, to_mapping
 from tools.bench.states import Workload, scene_of
 from tools.taichi_elements import WARM_FRAMES, cubes, faithful_mode, run_theirs, taichi_elements_substeps
 
 FRAME_RATE_HZ = 60.0
-FIRST_SEED = 1_000_000  # of no data set
 CUBES = [(0.3, 0.3, 0.3), (0.3, 0.3, 0.7), (0.7, 0.3, 0.3), (0.7, 0.3, 0.7)]
 CUBE_KINDS = [0, 1, 2, 0]
 SIDE_BY_SIDE = 256
@@ -187,7 +186,7 @@ def _timed(
 
 def _random_scenes(count: int, band_cells: float) -> list[tuple[Scene, Collider]]:
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
-        seeds = range(FIRST_SEED, FIRST_SEED + count)
+        seeds = range(REPORT_SEED, REPORT_SEED + count)
         return list(pool.map(_scene, seeds, [band_cells] * count, chunksize=4))
 
 

@@ -24,6 +24,7 @@ from hgn.scene.shapes import shape_obstacle, unit_shape
 from hgn.scene.surface import split_long_edges
 from hgn.schema import ConfigError, require
 
+REPORT_SEED = 1_000_000  # the first of scenes that reports draw for themselves: a data set's seeds are hashes
 LAYOUTS = 5  # whole scenes begun afresh before giving up
 SHAPES_PER_ITEM = 20  # sizes, shapes and orientations drawn for one obstacle or group
 PLACES_PER_SHAPE = 50

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,8 +26,7 @@ class Generator:
     def __init__(self, config: DatagenConfig, folder: Path) -> None:
         """Writes the resolved configuration to `folder`/dataset.yaml and starts the process."""
         folder.mkdir(parents=True, exist_ok=True)
-        config = replace(config, dataset=replace(config.dataset, early_episodes=True))
-        mapping = to_mapping(config) | {
+        mapping = to_mapping(config.awaited) | {
             "name": folder.name,
             "scenes": config.dataset.training_scenes,
             "out": config.dataset.folder,
