@@ -39,6 +39,7 @@ from hgn.training.checkpoint import (
     network_of_weights,
     read_checkpoint,
 )
+from hgn.training.errors import told_gain
 from hgn.training.generator import Generator
 from hgn.training.launch import default_run, first_on_machine, first_rank, layout
 from hgn.training.stop import StopRequest
@@ -287,7 +288,7 @@ def _report(config: TrainConfig, run: Path, updates: int, last: dict[str, float]
     if "one_step/validation" in last:
         print(
             f"one-step validation MSE {last['one_step/validation']:.3e}, "
-            f"{last['one_step_gain/validation']:.2f} times below the best trivial predictor"
+            f"{told_gain(last['one_step_gain/validation'])} the best trivial predictor's"
         )
     if stop.requested:
         print("stopped; the same command goes on from here")
