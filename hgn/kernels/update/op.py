@@ -67,6 +67,14 @@ class DeviceEpisode:
         """All of them, those before frame 0 too."""
         return len(self.position_TN3)
 
+    @cached_property
+    def row(self) -> np.ndarray:
+        """A sample of frame 0 in the kernels' table, int64 [SAMPLE_COLUMNS], without seed, weight and symmetry."""
+        obstacles = self.obstacles.row() if self.obstacles is not None else [0] * OBSTACLE_COLUMNS
+        return np.array(
+            [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, *obstacles], np.int64
+        )
+
 
 class DeviceSample(NamedTuple):
     """A frame of an episode to train on."""
@@ -254,26 +262,23 @@ class Updates:
 
     def _upload(self, chunk: Sequence[Sequence[AnySample]], rates: Sequence[float]) -> int:
         """Writes the chunk's tables; the most particles of an update."""
-        scenes, history, most = self.settings.scenes, self.config.velocity_history, 0
-        table = np.zeros((len(chunk), scenes, SAMPLE_COLUMNS), np.int64)
-        domain = np.ones((len(chunk), scenes, 3), np.float32)
-        for k, samples in enumerate(chunk):
-            assert len(samples) == scenes
-            first = 0
-            for s, sample in enumerate(samples):
-                episode, frame, seed, weight = DeviceSample(*sample)
-                count = episode.particles
-                # kernels read raw addresses: what is not there would be read all the same
-                assert 0 <= frame <= episode.frames - history - 2, "a window reaches beyond its episode"
-                at = episode.position_TN3.data_ptr() + frame * count * 12
-                row = episode.obstacles.row() if episode.obstacles is not None else [0] * OBSTACLE_COLUMNS
-                if self.settings.symmetry:
-                    row[-1] = drawn_symmetry(episode.symmetries, seed).code
-                bits = int(np.float64(weight).view(np.int64))
-                table[k, s] = [at, count, first, seed, episode.material_N.data_ptr(), bits, *row]
-                domain[k, s] = episode.domain_size
-                first += count
-            most = max(most, first)
+        scenes, history = self.settings.scenes, self.config.velocity_history
+        assert all(len(samples) == scenes for samples in chunk)
+        flat = [DeviceSample(*sample) for samples in chunk for sample in samples]
+        # kernels read raw addresses: what is not there would be read all the same
+        for episode, frame, _, _ in flat:
+            assert 0 <= frame <= episode.frames - history - 2, "a window reaches beyond its episode"
+        table = np.array([sample.episode.row for sample in flat]).reshape(len(chunk), scenes, SAMPLE_COLUMNS)
+        count = table[..., 1]
+        table[..., 0] += np.array([sample.frame for sample in flat]).reshape(count.shape) * count * 12
+        table[..., 2] = count.cumsum(1) - count  # the first particle
+        table[..., 3] = np.array([sample.seed for sample in flat]).reshape(count.shape)
+        table[..., 5] = np.array([sample.weight for sample in flat], np.float64).view(np.int64).reshape(count.shape)
+        if self.settings.symmetry:
+            drawn = [drawn_symmetry(sample.episode.symmetries, sample.seed).code for sample in flat]
+            table[..., -1] = np.array(drawn).reshape(count.shape)
+        domain = np.array([sample.episode.domain_size for sample in flat], np.float32).reshape(len(chunk), scenes, 3)
+        most = int(count.sum(1).max())
         if len(chunk) > len(self._rates):
             self._allocate_tables(max(len(chunk), TABLE_UPDATES))
         self._samples[: len(chunk)].copy_(torch.from_numpy(table))
