@@ -26,6 +26,11 @@ def pack(scene: torch.Tensor, cell_3: torch.Tensor) -> torch.Tensor:
     return key
 
 
+def of_scene(key: torch.Tensor, scene: int) -> torch.Tensor:
+    """Keys of scene 0 as those of another."""
+    return key + (scene << (3 * COORDINATE_BITS))
+
+
 def unpack(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The inverse of `pack`: scene indices int64 […] and coordinates int64 […, 3]."""
     mask = (1 << COORDINATE_BITS) - 1

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 
-from hgn.network.keys import find, pack, unpack
+from hgn.network.keys import find, of_scene, pack, unpack
 from hgn.scene.obstacle_grid import ObstacleGrid
 
 CELL_DIAGONAL = 3**0.5 + 1e-3  # points of two cells are at most this much nearer than the cells' corners
 CELLS_AT_ONCE = 1 << 12
+REMEMBERED_SCENES = 32  # whose keys are: batches of many frames of a scene need them again and again
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +37,8 @@ class ObstacleCells:
             return None
         cell_size = grids[0].cell_size
         assert all(grid.cell_size == cell_size for grid in grids), "scenes of one batch share the cell size"
-        scene_K = np.repeat(np.arange(len(grids)), [len(grid.cell_K3) for grid in grids])
-        cell_K3 = np.concatenate([grid.cell_K3 for grid in grids]).astype(np.int64)
-        normal_K3 = np.concatenate([grid.normal_K3 for grid in grids]).astype(np.float32)
-        key_K = pack(torch.from_numpy(scene_K), torch.from_numpy(cell_K3))
-        assert bool((key_K[1:] > key_K[:-1]).all()), "obstacle cells come sorted and unique"
+        key_K = torch.cat([of_scene(_keys(grid), scene) for scene, grid in enumerate(grids)])
+        normal_K3 = np.concatenate([grid.normal_K3 for grid in grids]).astype(np.float32, copy=False)
         return ObstacleCells(key_K, torch.from_numpy(normal_K3), cell_size)
 
     def to(self, device: torch.device, non_blocking: bool = False) -> ObstacleCells:
@@ -100,3 +99,12 @@ class SurfaceParticles:
                 near_Q[block_Q] = (distance_QL < reach / size + CELL_DIAGONAL).any(-1)
         kept_P = near_Q[of_P]
         return SurfaceParticles(self.position_P3[kept_P], self.scene_P[kept_P])
+
+
+@lru_cache(REMEMBERED_SCENES)
+def _keys(grid: ObstacleGrid) -> torch.Tensor:
+    """Of scene 0, int64 [K]."""
+    cell_K3 = torch.from_numpy(grid.cell_K3.astype(np.int64))
+    key_K = pack(torch.zeros(len(cell_K3), dtype=torch.int64), cell_K3)
+    assert bool((key_K[1:] > key_K[:-1]).all()), "obstacle cells come sorted and unique"
+    return key_K
