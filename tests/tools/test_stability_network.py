@@ -19,7 +19,7 @@ from hgn.network.features import ParticleState
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.schema import ConfigError, from_mapping
-from tools.stability.network import case_row, case_trials, energy_growth, initial_states, main
+from tools.stability.network import case_row, case_trials, energy_growth, initial_states, main, share_of_way
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
 from tools.stability.network_free_fall import free_fall_rows
 from tools.stability.row import Row
@@ -32,6 +32,7 @@ SCENE = {
     "group_count": 2,
     "group_size": 0.04,
 }
+GRAVITY = (0.0, -9.8, 0.0)
 SMALL = {"frames": 3, "long_frames": 5, "domain_factors": [4], "scene": SCENE, "device": "cpu"}
 
 
@@ -52,23 +53,24 @@ def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.Captu
     path, picture = tmp_path / "reports" / "stability.json", tmp_path / "reports" / "stability.png"
     assert main(SMALL | {"weights": weights, "json": str(path), "picture": str(picture), "speed_factor": 8.0}) == 0
     with Image.open(picture) as drawn:
-        assert drawn.height > 11 * 300
+        assert drawn.height > 14 * 300
     report = json.loads(path.read_text())
     assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
     rows = {row["case"]: row for row in report["rows"]}
     singles = [f"single particle, {name}" for name in ("water", "sand", "snow")]
+    slopes = [f"slides down 45 degrees, {name}" for name in ("water", "sand", "snow")]
     alone = [f"{name} alone" for name in ("water", "sand", "snow")]
     thrown = f"thrown at up to {8 * (2 * 9.8) ** 0.5:.1f} a second"
     held = ["5 frames", "particles x10", "domain x4", *alone, "at the end of 64000 cells"]
     falls = [
         f"{case}, {name}" for name in ("water", "sand", "snow") for case in ("free fall", "a body's velocity error")
     ]
-    assert list(rows) == [*falls, *held[:3], thrown, *singles, *held[3:], "a weight that explodes"]
+    assert list(rows) == [*falls, *held[:3], thrown, *singles, *slopes, *held[3:], "a weight that explodes"]
     # what never accelerates misses all of gravity, and answers to nothing
     assert all(rows[name]["measured"] == pytest.approx(1.0, rel=1e-3) and not rows[name]["held"] for name in falls[::2])
     assert all(abs(rows[name]["measured"]) < 1e-6 for name in falls[1::2])
-    for name in singles:  # nor does a particle fall
-        assert not rows[name]["held"] and rows[name]["share_fallen"] <= 0 and "of its way" in rows[name]["beyond"]
+    for name in singles + slopes:  # nor does a particle fall, or a block slide
+        assert not rows[name]["held"] and rows[name]["share_of_way"] <= 0 and "of its way" in rows[name]["beyond"]
     keys = {"part", "case", "predicted", "measured", "held", "beyond"}
     assert all(keys <= row.keys() and row["part"] == "network" for row in rows.values())
     for name in held:
@@ -116,11 +118,11 @@ def test_failures_are_told(weights: str) -> None:
     network = network_of(torch.float32)
     case = next(iter(cases(config, network.config)))
     simulator = Simulator(network, 60.0)
-    push = torch.tensor([0.0, -9.8 / 60**2, 0.0])
+    push = torch.tensor(GRAVITY) / 60**2
     simulator.predict = lambda state: push.expand(len(state.position_N3), 3)
-    case = Case(case.name, case.scenes, 16, falls=True)
+    case = Case(case.name, case.scenes, 16, GRAVITY, 12)
     row = row_of(simulator, case, 0.02)
-    assert row.held and row.more["share_fallen"] == pytest.approx(1, rel=1e-3)
+    assert row.held and row.more["share_of_way"] == pytest.approx(1, rel=1e-3)
     push[0] = 1e-2
     row = row_of(simulator, Case(case.name, case.scenes, 40), 0.02)
     assert not row.held and row.measured < 40 and "diverged at frame" in row.beyond
@@ -129,6 +131,27 @@ def test_failures_are_told(weights: str) -> None:
     assert not row.held and row.measured == 16 and row.beyond.startswith("energy grows")
     row = row_of(simulator, case, 1e9)
     assert not row.held and row.beyond == "1e+02 % of the particles end outside of the domain"
+
+
+def test_a_slope_against_a_closed_form() -> None:
+    """A block that slides without friction is where its case expects it; friction is told as a share of the way. What
+    slides meets neither the slope's end nor a wall."""
+    made = list(cases(StabilityNetworkConfig("", cases=("slope",)), network_of().config))
+    assert [case.name for case in made] == [f"slides down 45 degrees, {name}" for name in ("water", "sand", "snow")]
+    case, (scene,) = made[0], made[0].scenes
+    assert case.known_frames == 19 and case.frames == 21 and case.known_3 is not None
+    pull = np.array(case.known_3)
+    np.testing.assert_allclose(pull, 0.5 * 9.8 * np.array([0, -1, 1]), atol=1e-12)
+    (slope,) = scene.obstacles
+    above_N = (scene.position_N3 - slope.vertex_V3[0]) @ (np.array([0, 1, 1]) / 2**0.5)
+    assert 0.5 * scene.cell_size < above_N.min() < scene.cell_size
+    seconds = np.arange(case.frames)[:, None, None] / 60
+    for share in (1.0, 0.7):
+        slid = (scene.position_N3 + 0.5 * share * pull * seconds**2).astype(np.float32)
+        found = share_of_way(Trial(slid), InitialState.of_scene(scene), 60.0, case.known_3, case.known_frames)
+        assert found == pytest.approx(share, rel=1e-3)
+    low, high = slope.vertex_V3.min(0), slope.vertex_V3.max(0)
+    assert ((slid.mean(1) >= low - 0.08) & (slid.mean(1) <= high + 0.08)).all()
 
 
 def test_energy_growth_against_a_closed_form() -> None:

@@ -40,7 +40,7 @@ PART = "network"
 PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
 LONGEST = 100.0  # domain that is drawn whole, in heights
 DRAWN_EVERY_S = 5.0  # the picture of all cases so far, which takes longer with each
-FALL_FRAMES, FALL_BOUND = 12, 0.2  # frames in which nothing is met; how far off the way may be
+WAY_BOUND = 0.2  # how far off a known way may be
 FAR_DOMAINS = 100.0  # how far the guard's case throws particles
 
 
@@ -173,12 +173,14 @@ def case_row(
     outside = max(
         outside_domain(trial.position_TN3[-1], scene.domain_size) for trial, scene in zip(trials, initial, strict=True)
     )
-    fallen = (
-        min(share_fallen(trial, scene, simulator.frame_rate_hz) for trial, scene in zip(trials, initial, strict=True))
-        if case.falls
-        else None
-    )
-    hangs = fallen is not None and abs(fallen - 1) > FALL_BOUND
+    way = None
+    if case.known_3 is not None:
+        known = case.known_3, case.known_frames
+        way = min(
+            share_of_way(trial, scene, simulator.frame_rate_hz, *known)
+            for trial, scene in zip(trials, initial, strict=True)
+        )
+    astray = way is not None and abs(way - 1) > WAY_BOUND
     causes = [trial.cause for trial in trials if trial.cause is not None]
     if causes:
         beyond = causes[0]
@@ -186,8 +188,8 @@ def case_row(
         beyond = "positions are not finite, and the runtime did not say so"
     elif growth > energy_bound:
         beyond = f"energy grows by {growth:.2g} of a fall through the domain"
-    elif hangs:
-        beyond = f"falls {100 * (fallen or 0):.2g} % of its way in the first {FALL_FRAMES} frames"
+    elif astray:
+        beyond = f"comes {100 * (way or 0):.2g} % of its way in the first {case.known_frames} frames"
     elif outside:
         beyond = f"{100 * outside:.2g} % of the particles end outside of the domain"
     else:
@@ -196,7 +198,7 @@ def case_row(
         case.name,
         predicted=case.frames,
         measured=reached,
-        held=finite and not causes and growth <= energy_bound and not outside and not hangs,
+        held=finite and not causes and growth <= energy_bound and not outside and not astray,
         beyond=beyond,
         more={
             "particles": sum(len(scene.position_N3) for scene in initial),
@@ -204,7 +206,7 @@ def case_row(
             "domain_size": list(initial[0].domain_size),
             "energy_growth": growth if math.isfinite(growth) else None,
             "outside_domain": outside,
-            "share_fallen": fallen,
+            "share_of_way": way,
             "failed_scenes": len(causes),
             "guard": "missed" if not finite else "raised" if causes else "not needed",
             "ms": milliseconds,
@@ -223,14 +225,14 @@ def energy_growth(trial: Trial, scene: InitialState, frame_rate_hz: float) -> fl
     return max(0.0, float(energy_T.max()) - start) / energy_scale(gravity_3, scene.domain_size)
 
 
-def share_fallen(trial: Trial, scene: InitialState, frame_rate_hz: float) -> float:
-    """How far the particles came along gravity in their first frames, of free fall's way from their own velocity."""
-    last = min(FALL_FRAMES, trial.frame_count - 1)
-    gravity_3, seconds = np.asarray(scene.gravity, np.float64), last / frame_rate_hz
-    if not last or not gravity_3.any():
+def share_of_way(trial: Trial, scene: InitialState, frame_rate_hz: float, known: Sequence[float], frames: int) -> float:
+    """How far the particles came in so many frames along a known acceleration, of what that and their velocity make."""
+    last = min(frames, trial.frame_count - 1)
+    known_3, seconds = np.asarray(known, np.float64), last / frame_rate_hz
+    if not last or not known_3.any():
         return 1.0
     moved_N3 = trial.position_TN3[last].astype(np.float64) - trial.position_TN3[0] - seconds * scene.velocity_N3
-    return float((moved_N3 @ gravity_3).mean() / (0.5 * seconds**2 * (gravity_3 @ gravity_3)))
+    return float((moved_N3 @ known_3).mean() / (0.5 * seconds**2 * (known_3 @ known_3)))
 
 
 def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:

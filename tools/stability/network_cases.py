@@ -14,10 +14,16 @@ import numpy as np
 from hgn.config import NetworkConfig, SceneConfig
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
+from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
+from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require, require_one_of, require_positive
 
-CASES = ("free_fall", "long", "particles", "domain", "speed", "single", "material", "far", "guard")
+CASES = ("free_fall", "long", "particles", "domain", "speed", "single", "slope", "material", "far", "guard")
+SLOPE_DEG = 45.0
+SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope's, and what is slid along it
+FRAME_RATE_HZ = 60.0  # for how long cases are
+FALL_FRAMES = 12  # in which what falls meets nothing
 ATTEMPTS = 20  # at scenes that turn out to be too full
 
 
@@ -62,7 +68,8 @@ class Case:
     name: str
     scenes: tuple[Scene, ...]
     frames: int
-    falls: bool = False  # what is known to: nothing is below, or beside
+    known_3: tuple[float, float, float] | None = None  # acceleration along which the particles' way is known
+    known_frames: int = 0  # for so long
 
 
 def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Case]:
@@ -97,7 +104,9 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
         speed = config.speed_factor * math.sqrt(2 * float(np.linalg.norm(base.gravity)) * side)
         yield case(f"thrown at up to {speed:.1f} a second", replace(base, maximum_initial_speed=speed))
     for material in base.materials if "single" in wanted else ():
-        yield Case(f"single particle, {material}", (_single(base, material),), config.frames, falls=True)
+        yield Case(f"single particle, {material}", (_single(base, material),), config.frames, base.gravity, FALL_FRAMES)
+    for material in base.materials if "slope" in wanted and network.sees_obstacles else ():
+        yield _slope(base, material, config.frames)
     for material in base.materials if "material" in wanted else ():
         yield case(f"{material} alone", replace(base, materials=(material,)))
     if "far" in wanted:
@@ -128,6 +137,31 @@ def _single(config: SceneConfig, material: str) -> Scene:
         cell_size=config.cell_size,
         gravity=config.gravity,
     )
+
+
+def _slope(config: SceneConfig, material: str, frames: int) -> Case:
+    """A block just above the upper end of a square at SLOPE_DEG: without friction it slides as gravity along the slope
+    pulls, whatever the material."""
+    length = min(config.domain_size)
+    count = int(config.particles_per_cell * (config.group_size / config.cell_size) ** 3)
+    turn = euler_rotation((SLOPE_DEG, 0.0, 0.0))
+    up_3, down_3 = turn @ np.array([0.0, 1.0, 0.0]), turn @ np.array([0.0, 0.0, 1.0])
+    middle_3 = 0.5 * np.array(config.domain_size)
+    start_3 = middle_3 - 0.6 * SLOPE_WAY * length * down_3 + (0.5 * config.group_size + 0.75 * config.cell_size) * up_3
+    draw_N3 = np.random.default_rng(0).random((count + 1, 3)) - 0.5
+    scene = Scene(
+        position_N3=(start_3 + config.group_size * draw_N3 @ turn.T).astype(np.float32),
+        velocity_N3=np.zeros((count + 1, 3), np.float32),
+        material_N=np.full(count + 1, MATERIALS.index(material), np.uint8),
+        obstacles=(shape_obstacle("square", SLOPE_SIDE * length, tuple(middle_3.tolist()), turn, "slope"),),
+        domain_size=config.domain_size,
+        cell_size=config.cell_size,
+        gravity=config.gravity,
+    )
+    pull = float(np.array(config.gravity) @ down_3)
+    last = int(FRAME_RATE_HZ * math.sqrt(2 * SLOPE_WAY * length / pull)) if pull > 0 else 0
+    known_3 = tuple((pull * down_3).tolist())
+    return Case(f"slides down {SLOPE_DEG:g} degrees, {material}", (scene,), min(frames, last + 2), known_3, last)
 
 
 def _far(scene: Scene, cells: int) -> Scene:
