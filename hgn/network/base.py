@@ -48,10 +48,11 @@ class ParticleNetwork(nn.Module, ABC):
         velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
         maximum = self.config.wall_distance_cells * self.config.cell_size
         wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)
-        hidden_NH = self.encode.project(0, velocity_NV) + self.encode.project(2, wall_N6)
         material_MH = self.encode.project(3, self.embedding.weight) + self.encode.first.bias
-        hidden_NH = hidden_NH + material_MH[state.material_N]
+        hidden_NH = material_MH.index_select(0, state.material_N)
+        self.encode.add_projection(hidden_NH, 0, velocity_NV)
+        self.encode.add_projection(hidden_NH, 2, wall_N6)
         if self.config.obstacle_features and state.obstacles is not None:
             normal_N3 = state.obstacles.normals(state.position_N3, state.scene_N)
-            hidden_NH = hidden_NH + self.encode.project(1, normal_N3)
+            self.encode.add_projection(hidden_NH, 1, normal_N3)
         return self.encode.finish(hidden_NH)

@@ -43,14 +43,23 @@ class FCN(nn.Module):
 
     def project(self, part: int, value: torch.Tensor) -> torch.Tensor:
         """The first layer's product with one part, [..., parts[part]] -> [..., hidden], without the bias."""
-        start = sum(self.parts[:part])
-        return linear(value, self.first.weight[:, start : start + self.parts[part]])
+        return linear(value, self._columns(part))
+
+    def add_projection(self, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
+        """Adds that product with rows [R, parts[part]] to `hidden` [R, hidden], in place and in one pass."""
+        if len(value) >= MINIMUM_ROWS or value.device.type != "cpu":
+            return hidden.addmm_(value, self._columns(part).T)
+        return hidden.add_(self.project(part, value))
 
     def finish(self, hidden: torch.Tensor) -> torch.Tensor:
-        """From the sum of all projections, bias included, to the output [..., out]."""
-        out = linear(functional.leaky_relu(hidden, self.slope), self.second.weight, self.second.bias)
+        """From the sum of all projections, bias included, to the output [..., out]. Overwrites `hidden`."""
+        out = linear(functional.leaky_relu_(hidden, self.slope), self.second.weight, self.second.bias)
         return out if self.norm is None else self.norm(out)
 
     def forward(self, *values: torch.Tensor) -> torch.Tensor:
         """The definition: concatenate, two layers, norm."""
         return self.finish(linear(torch.cat(values, dim=-1), self.first.weight, self.first.bias))
+
+    def _columns(self, part: int) -> torch.Tensor:
+        start = sum(self.parts[:part])
+        return self.first.weight[:, start : start + self.parts[part]]

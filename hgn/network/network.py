@@ -17,7 +17,8 @@ from hgn.network.fcn import FCN
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 
-PARTICLES_AT_ONCE = 512  # of eight pairs each; at width 128 a block is 2 MB
+# Rows of a block on a CPU: at width 128 an intermediate result of 2,048 edges takes 1 MB, one of 512 * 8 pairs 2 MB.
+PARTICLES_AT_ONCE, EDGES_AT_ONCE = 512, 2048
 
 
 class MessagePassing(nn.Module):
@@ -30,21 +31,29 @@ class MessagePassing(nn.Module):
 
     def forward(self, cell_CW: torch.Tensor, level: Level) -> torch.Tensor:
         """Returns the updated cell features [C, W]."""
-        edge_EW = None
-        for edge_network, cell_network in zip(self.edge, self.cell, strict=True):
+        blocks = _blocks(len(level.sender_E), EDGES_AT_ONCE, cell_CW.device)
+        edges: list[torch.Tensor] = []  # of each block
+        # Receiver minus sender in cells: the opposite of where the sender lies.
+        offset_63 = -DIRECTION_63.to(cell_CW)
+        for m, (edge_network, cell_network) in enumerate(zip(self.edge, self.cell, strict=True)):
             assert isinstance(edge_network, FCN) and isinstance(cell_network, FCN)
-            if edge_EW is None:
-                # Receiver minus sender in cells: the opposite of where the sender lies.
-                offset_63 = -DIRECTION_63.to(cell_CW)
-                own_EH = (edge_network.project(2, offset_63) + edge_network.first.bias)[level.direction_E]
-            else:
-                own_EH = edge_network.project(2, edge_EW) + edge_network.first.bias
-            sender_CH, receiver_CH = edge_network.project(0, cell_CW), edge_network.project(1, cell_CW)
-            update_EW = edge_network.finish(sender_CH[level.sender_E] + receiver_CH[level.receiver_E] + own_EH)
-            edge_EW = update_EW if edge_EW is None else edge_EW + update_EW
-            sum_CW = torch.zeros_like(cell_CW).index_add_(0, level.receiver_E, edge_EW)
-            hidden_CH = cell_network.project(0, cell_CW) + cell_network.project(1, sum_CW) + cell_network.first.bias
-            cell_CW = cell_CW + cell_network.finish(hidden_CH)
+            sender_CH = edge_network.project(0, cell_CW)
+            receiver_CH = edge_network.project(1, cell_CW) + edge_network.first.bias
+            offset_6H = edge_network.project(2, offset_63) if m == 0 else None
+            sum_CW = torch.zeros_like(cell_CW)
+            for i, block in enumerate(blocks):
+                sender_E, receiver_E = level.sender_E[block], level.receiver_E[block]
+                hidden_EH = sender_CH.index_select(0, sender_E).add_(receiver_CH.index_select(0, receiver_E))
+                if offset_6H is not None:
+                    hidden_EH += offset_6H.index_select(0, level.direction_E[block])
+                    edges.append(edge_network.finish(hidden_EH))
+                else:
+                    edge_network.add_projection(hidden_EH, 2, edges[i])
+                    edges[i] = edge_network.finish(hidden_EH).add_(edges[i])
+                sum_CW.index_add_(0, receiver_E, edges[i])
+            hidden_CH = cell_network.project(0, cell_CW) + cell_network.first.bias
+            cell_network.add_projection(hidden_CH, 1, sum_CW)
+            cell_CW = cell_network.finish(hidden_CH).add_(cell_CW)
         return cell_CW
 
 
@@ -87,49 +96,60 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
         parent_offset_83 = 0.5 - corner_83
 
+        blocks = _blocks(len(particle_NW), PARTICLES_AT_ONCE, particle_NW.device)
+
         network = self.particle_to_cell
-        hidden_NH = network.project(0, particle_NW) - network.project(1, grid.fraction_N3) + network.first.bias
-        corner_8H = network.project(1, corner_83)
+        corner_8H = network.project(1, corner_83) + network.first.bias
         cell_CW = particle_NW.new_zeros(grid.levels[0].cell_count, particle_NW.shape[1])
-        for block in _pair_blocks(particle_NW):
-            message_N8W = network.finish(hidden_NH[block, None] + corner_8H) * grid.weight_N8[block, :, None]
+        for block in blocks:
+            hidden_NH = network.project(0, particle_NW[block])
+            network.add_projection(hidden_NH, 1, -grid.fraction_N3[block])
+            message_N8W = network.finish(hidden_NH[:, None] + corner_8H).mul_(grid.weight_N8[block, :, None])
             cell_CW.index_add_(0, grid.cell_N8[block].flatten(), message_N8W.flatten(0, 1))
 
         kept: list[torch.Tensor] = []
         for i, level in enumerate(grid.levels):
             cell_CW = self.passing_down[i](cell_CW, level)
-            if level.parent_C is None:
+            if level.parent_C is None or level.octant_C is None:
                 break
             kept.append(cell_CW)
             network = _fcn(self.fine_to_coarse[i])
             offset_8H = network.project(1, parent_offset_83) + network.first.bias
-            message_CW = network.finish(network.project(0, cell_CW) + offset_8H[level.octant_C])
+            message_CW = network.finish(network.project(0, cell_CW).add_(offset_8H.index_select(0, level.octant_C)))
             cell_CW = _scatter(message_CW, level.parent_C, grid.levels[i + 1].cell_count)
 
         for i in reversed(range(len(kept))):
             level = grid.levels[i]
+            assert level.parent_C is not None and level.octant_C is not None
             network = _fcn(self.coarse_to_fine[i])
             offset_8H = network.project(2, -parent_offset_83) + network.first.bias
-            coarse_CH = network.project(0, cell_CW)[level.parent_C]
-            hidden_CH = coarse_CH + network.project(1, kept[i]) + offset_8H[level.octant_C]
-            cell_CW = self.passing_up[i](kept[i] + network.finish(hidden_CH), level)
+            hidden_CH = network.project(0, cell_CW).index_select(0, level.parent_C)
+            network.add_projection(hidden_CH, 1, kept[i])
+            hidden_CH += offset_8H.index_select(0, level.octant_C)
+            cell_CW = self.passing_up[i](network.finish(hidden_CH).add_(kept[i]), level)
 
         network = self.cell_to_particle
-        hidden_NH = network.project(1, particle_NW) + network.project(2, grid.fraction_N3) + network.first.bias
-        cell_CH, corner_8H = network.project(0, cell_CW), network.project(2, corner_83)
-        changes = []
-        for block in _pair_blocks(particle_NW):
-            message_N8W = network.finish(cell_CH[grid.cell_N8[block]] + hidden_NH[block, None] - corner_8H)
-            changes.append((message_N8W * grid.weight_N8[block, :, None]).sum(1))
-        return self.decode(particle_NW + torch.cat(changes))
+        cell_CH = network.project(0, cell_CW)
+        corner_8H = network.project(2, corner_83) - network.first.bias
+        outputs = []
+        for block in blocks:
+            hidden_NH = network.project(1, particle_NW[block])
+            network.add_projection(hidden_NH, 2, grid.fraction_N3[block])
+            hidden_N8H = cell_CH.index_select(0, grid.cell_N8[block].flatten()).unflatten(0, (-1, 8))
+            hidden_N8H += hidden_NH[:, None]
+            hidden_N8H -= corner_8H
+            change_NW = network.finish(hidden_N8H).mul_(grid.weight_N8[block, :, None]).sum(1)
+            outputs.append(self.decode(particle_NW[block] + change_NW))
+        return torch.cat(outputs)
 
 
-def _pair_blocks(particle_NW: torch.Tensor) -> list[slice]:
-    """Runs of particles whose pairs stay in a CPU's cache; all at once on a GPU, and where gradients keep the pairs."""
-    count = len(particle_NW)
-    if particle_NW.device.type != "cpu" or torch.is_grad_enabled() or count == 0:
-        return [slice(0, count)]
-    return [slice(first, first + PARTICLES_AT_ONCE) for first in range(0, count, PARTICLES_AT_ONCE)]
+def _blocks(count: int, at_once: int, device: torch.device) -> list[slice]:
+    """Runs of at most `at_once` rows, nearly equal, whose intermediate results stay in a CPU's cache.
+
+    All rows at once on a GPU, and where gradients keep what blocks would throw away.
+    """
+    blocks = 1 if device.type != "cpu" or torch.is_grad_enabled() else max(1, -(-count // at_once))
+    return [slice(i * count // blocks, (i + 1) * count // blocks) for i in range(blocks)]
 
 
 def _scatter(value: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tensor:

@@ -25,6 +25,7 @@ from hgn.network.grid import GridRangeError
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.runtime.divergence import lost
+from hgn.runtime.freed_memory import keep_freed_memory
 from hgn.runtime.gns_edges import require_agreement, use_edges
 from hgn.runtime.gns_graph import GnsGraphs
 from hgn.runtime.path import path_on, set_matmul_precision
@@ -115,6 +116,8 @@ class Simulator:
         self._kept: dict[int, FastRollout] = {}
         self.predict: Callable[[ParticleState], torch.Tensor] = network
         use_edges(network, precision)
+        if self.device.type == "cpu":
+            keep_freed_memory()
         if isinstance(network, GraphNetworkSimulator) and self.device.type == "cuda":
             roomy = not isinstance(network.edges, PlainEdges)  # which take no room to spare
             self.predict = GnsGraphs(network) if roomy else network

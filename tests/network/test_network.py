@@ -89,6 +89,22 @@ def test_batch_equals_single_scenes(spread, changes):
         assert float((found - expected).abs().max()) / scale < 1e-6
 
 
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+@pytest.mark.parametrize(("particles", "edges"), [(7, 20), (32, 300), (512, 2048)])
+def test_blocks_change_nothing(monkeypatch, dtype, tolerance, particles, edges):
+    """Frames, which take a CPU's rows block by block, equal the float64 output with gradients, whatever the blocks."""
+    network = network_of(width=128, levels=4).train()
+    state = random_state((70, 1, 30), spread=0.15)
+    expected = network.normalised_acceleration(state).detach()
+    monkeypatch.setattr("hgn.network.network.PARTICLES_AT_ONCE", particles)
+    monkeypatch.setattr("hgn.network.network.EDGES_AT_ONCE", edges)
+    state = replace(state, position_N3=state.position_N3.to(dtype), velocity_NM3=state.velocity_NM3.to(dtype))
+    state = replace(state, domain_S3=state.domain_S3.to(dtype))
+    with torch.inference_mode():
+        found = network.to(dtype).normalised_acceleration(state)
+    assert float((found.double() - expected).norm() / expected.norm()) < tolerance
+
+
 def test_translation_by_coarsest_cells_changes_nothing():
     """Moving particles by whole coarsest cells, latent features held fixed, leaves every output bitwise as it was."""
     network = network_of(cell_size=1 / 32, levels=4)
