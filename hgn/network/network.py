@@ -135,8 +135,8 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         for block in blocks:
             hidden_NH = network.project(1, particle_NW[block])
             network.add_projection(hidden_NH, 2, grid.fraction_N3[block])
-            hidden_N8H = cell_CH.index_select(0, grid.cell_N8[block].flatten()).unflatten(0, (-1, 8))
-            hidden_N8H += hidden_NH[:, None]
+            cell_N8H = cell_CH.index_select(0, grid.cell_N8[block].flatten()).unflatten(0, (-1, 8))
+            hidden_N8H = cell_N8H + hidden_NH[:, None]
             hidden_N8H -= corner_8H
             change_NW = network.finish(hidden_N8H).mul_(grid.weight_N8[block, :, None]).sum(1)
             outputs.append(self.decode(particle_NW[block] + change_NW))
