@@ -137,6 +137,10 @@ def _load(config: RenderConfig) -> Versions:
         other = read_rollout(file)
         if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0]):
             raise ConfigError(f"others[{i}] must begin with the same particles as {first}, got {file}")
+        if other.frame_rate_hz != rollout.frame_rate_hz:
+            raise ConfigError(
+                f"others[{i}] must have {rollout.frame_rate_hz:g} frames a second, got {other.frame_rate_hz:g}"
+            )
         others[other_name] = other.position_TN3
     return Versions(name, rollout, label, others, truth_TN3)
 

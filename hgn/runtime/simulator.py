@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from hgn.config import PATHS, PRECISIONS
 from hgn.device import choose_device
 from hgn.network.base import ParticleNetwork
 from hgn.network.edges import PlainEdges
@@ -131,6 +132,8 @@ class Simulator:
         Sets the precision of PyTorch's own float32 products, too.
         Raises: ConfigError when the weights, the device or the path do not exist or do not fit each other.
         """
+        for field, value, known in (("path", path, PATHS), ("precision", precision, PRECISIONS)):
+            require(value in known, field, f"one of {', '.join(known)}", value)
         place = choose_device(device)
         network, info = load_weights(find_weights(str(weights)), place)
         chosen, said = path_on(place, network.config, path, precision)
@@ -197,8 +200,10 @@ class Simulator:
     ) -> list[np.ndarray]:
         """Simulates `frames` frames, frame 0 included; float32 [frames, N, 3] for each scene.
 
-        Raises: DivergenceError, which says at which frame; the network must be trained further then.
+        Raises: ConfigError as `start`; DivergenceError, which says at which frame; the network must be trained further
+        then.
         """
+        require(frames >= 1, "frames", "at least 1", frames)
         scenes = _initial(scenes)
         state = self._start(scenes)
         positions = [state.position_N3[None].cpu().numpy()]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +47,10 @@ class Scene:
 
     def __post_init__(self) -> None:
         count = len(self.position_N3)
+        for name in ("position_N3", "velocity_N3", "material_N"):
+            require(
+                isinstance(getattr(self, name), np.ndarray), name, "a NumPy array", type(getattr(self, name)).__name__
+            )
         for name, shape in (
             ("position_N3", (count, 3)),
             ("velocity_N3", (count, 3)),
@@ -63,8 +67,10 @@ class Scene:
                 raise ConfigError(f"material_parameters must be among {', '.join(MATERIAL_PARAMETERS)}, got {name!r}")
             if value.shape != (count,):
                 raise ConfigError(f"material_parameters[{name}] must have shape {(count,)}, got {value.shape}")
-        if count and int(self.material_N.max()) >= len(MATERIALS):
-            raise ConfigError(f"material_N must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
+        require(self.material_N.dtype.kind in "iu", "material_N", "whole numbers", str(self.material_N.dtype))
+        for material in (self.material_N.min(), self.material_N.max()) if count else ():
+            rule = f"0 to {len(MATERIALS) - 1} ({', '.join(MATERIALS)})"
+            require(0 <= material < len(MATERIALS), "material_N", rule, int(material))
 
     @property
     def particle_count(self) -> int:

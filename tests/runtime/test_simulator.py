@@ -207,3 +207,29 @@ def test_what_loaded_weights_cannot_take(tmp_path: Path) -> None:
                 next(simulator.frames(coarse))
         else:
             simulator.start([coarse])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"position_N3": [[0.5, 0.5, 0.5]]}, "position_N3 must be a NumPy array, got 'list'"),
+        ({"velocity_N3": np.zeros(3)}, r"velocity_N3 must have shape \(1, 3\), got \(3,\)"),
+        ({"material_N": np.zeros(1)}, "material_N must be whole numbers, got 'float64'"),
+        ({"material_N": np.array([-1])}, r"material_N must be 0 to 2 \(water, sand, snow\), got -1"),
+        ({"material_N": np.array([3])}, r"material_N must be 0 to 2 \(water, sand, snow\), got 3"),
+    ],
+)
+def test_scenes_of_arrays(change: dict[str, object], message: str) -> None:
+    """What people put together themselves is refused by name."""
+    arrays = {"position_N3": np.full((1, 3), 0.5), "velocity_N3": np.zeros((1, 3)), "material_N": np.zeros(1, np.int64)}
+    with pytest.raises(ConfigError, match=message):
+        Scene(**(arrays | change))  # type: ignore[arg-type]
+
+
+def test_options_of_load() -> None:
+    """As on the command line, an option that does not exist is refused with those that do."""
+    for option, value in (("path", "quick"), ("precision", "fp16"), ("weights", "obstacle"), ("device", "abacus")):
+        with pytest.raises(ConfigError, match=f"{option} must be .*, got '{value}'"):
+            Simulator.load(**{option: value})
+    with pytest.raises(ConfigError, match="frames must be at least 1, got 0"):
+        Simulator(network_of(torch.float32), 60.0).rollout([initial(3)], 0)

@@ -123,6 +123,9 @@ def test_other_rollouts_stand_beside_it(tmp_path: Path) -> None:
             sizes.append((still.height, moving.width))
     assert sizes[1][0] > sizes[0][0] + 60 and sizes[1][1] > sizes[0][1] + 60
     rollout = read_rollout(other)
+    write_rollout(other, dataclasses.replace(rollout, frame_rate_hz=30.0))
+    with pytest.raises(ConfigError, match=r"others\[0\] must have 60 frames a second, got 30"):
+        main({"rollout": str(path), "others": [str(other)], "out": str(tmp_path / "bad")})
     write_rollout(other, dataclasses.replace(rollout, position_TN3=rollout.position_TN3 + np.float32(0.1)))
     with pytest.raises(ConfigError, match=r"others\[0\] must begin with the same particles as"):
         main({"rollout": str(path), "others": [str(other)], "out": str(tmp_path / "bad")})
