@@ -13,6 +13,7 @@ from hgn.scene.material import MATERIALS, material_index
 from hgn.schema import ConfigError, require, require_non_negative, require_one_of, require_positive
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 SYMMETRIES = ("none", "gravity")
@@ -43,7 +44,7 @@ class SceneConfig:
     cell_size: float = 1 / 64
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
     obstacle_count: int = 5
-    obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES
+    obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, whose longest side is taken for 1
     obstacle_size: tuple[float, float] = (0.1, 0.5)
     group_count: int = 4
     group_shapes: tuple[str, ...] = GROUP_SHAPES
@@ -67,7 +68,9 @@ class SceneConfig:
         for i, name in enumerate(self.materials):
             material_index(name, f"materials[{i}]")
         for i, name in enumerate(self.obstacle_shapes):
-            require(name in OBSTACLE_SHAPES, f"obstacle_shapes[{i}]", f"one of {', '.join(OBSTACLE_SHAPES)}", name)
+            rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)})"
+            known = name in OBSTACLE_SHAPES or Path(name).suffix.lower() in MESH_SUFFIXES
+            require(known, f"obstacle_shapes[{i}]", rule, name)
         for i, name in enumerate(self.group_shapes):
             require(name in GROUP_SHAPES, f"group_shapes[{i}]", f"one of {', '.join(GROUP_SHAPES)}", name)
         require(len(self.materials) > 0, "materials", "a list with at least one material", list(self.materials))

@@ -9,10 +9,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from hgn.config import DatagenConfig
 from hgn.scene.episode import SCHEMA_VERSION
+from hgn.scene.shapes import is_mesh_file, mesh_sha256
 from hgn.schema import ConfigError, to_mapping
 
 # of the solver's settings: where and how many at once, which no trajectory depends on beyond rounding
@@ -20,10 +22,15 @@ _NOT_PHYSICS = ("device", "scenes_per_launch")
 
 
 def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
-    """The plain mapping that defines the episodes: scene distribution, physics, frames, rate, seed, schema."""
+    """The plain mapping that defines the episodes: scene distribution, physics, frames, rate, seed, schema.
+
+    Mesh files count by their content. Raises: ConfigError for one that cannot be read.
+    """
+    shapes = config.scene.obstacle_shapes
+    named = [f"{Path(shape).name} {mesh_sha256(shape)}" if is_mesh_file(shape) else shape for shape in shapes]
     return {
         "schema_version": SCHEMA_VERSION,
-        "scene": to_mapping(config.scene),
+        "scene": to_mapping(config.scene) | {"obstacle_shapes": named},
         "mpm": physics_settings(config),
         "frames": config.dataset.frames,
         "frame_rate_hz": config.dataset.frame_rate_hz,

@@ -13,12 +13,12 @@ import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from hgn.config import MESH_SUFFIXES
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
 from hgn.schema import ConfigError, require
 
-SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 # what trimesh raises for damaged files of these formats
 _READ_ERRORS = (ValueError, LookupError, TypeError, AttributeError, EOFError, struct.error)
 
@@ -70,10 +70,10 @@ def load_mesh(
 
 def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ConfigError(f"{field} must end in one of {', '.join(SUFFIXES)}, got {path}; convert the mesh")
+    if suffix not in MESH_SUFFIXES:
+        raise ConfigError(f"{field} must end in one of {', '.join(MESH_SUFFIXES)}, got {path}; convert the mesh")
     if not path.is_file():
-        raise ConfigError(f"{field} must be an existing file, got {path}; paths are relative to the scene file")
+        raise ConfigError(f"{field} must be an existing file, got {path}; in a scene file paths are relative to it")
     try:
         # process=False: trimesh would silently remove non-finite vertices
         mesh = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()

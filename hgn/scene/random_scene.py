@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, points_in_
 from hgn.scene.material import material_index
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
-from hgn.scene.shapes import shape_obstacle, unit_shape
+from hgn.scene.shapes import is_mesh_file, mesh_sha256, shape_obstacle, unit_shape
 from hgn.scene.surface import split_long_edges
 from hgn.schema import ConfigError, require
 
@@ -106,11 +107,14 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
         for _ in range(PLACES_PER_SHAPE):
             centre = first + room * rng.random(3)
             position = _triple(centre)
-            obstacle = shape_obstacle(shape, size, position, rotation, f"obstacle_{index}_{shape}")
+            obstacle = shape_obstacle(shape, size, position, rotation, f"obstacle_{index}_{Path(shape).stem}")
             point = surface + centre
             if any(_too_near(obstacle, point, gap, other, clearance) for other in placed):
                 continue
-            record = {"shape": shape, "size": size, "position": list(position), "quaternion": list(quaternion)}
+            record: dict[str, Any] = {"shape": shape, "size": size}
+            record |= {"position": list(position), "quaternion": list(quaternion)}
+            if is_mesh_file(shape):
+                record["sha256"] = mesh_sha256(shape)
             return _Placed(
                 obstacle, point, gap, cKDTree(point, balanced_tree=False), low + centre, high + centre, record
             )
@@ -255,7 +259,7 @@ def _assemble(config: SceneConfig, seed: int, obstacles: list[_Placed], bodies: 
 @functools.cache
 def _unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
     """Points on the shape of size 1, and how far the rest of its surface is from them at most."""
-    vertex, triangle = unit_shape(shape)
+    vertex, triangle, _ = unit_shape(shape)
     pieces, _ = split_long_edges(vertex[triangle], SURFACE_DETAIL)
     centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
     offset = pieces - centroid[:, None]  # the farthest point of a triangle from its centroid is a corner

@@ -32,7 +32,7 @@ from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
 from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
-from hgn.scene.shapes import shape_obstacle
+from hgn.scene.shapes import is_mesh_file, mesh_sha256, shape_obstacle
 from hgn.schema import ConfigError
 
 FORMAT_NAME = "hgn rollout"
@@ -101,10 +101,11 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
 def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
     """The meshes of an episode's obstacles, which shards do not hold.
 
-    A random scene's specification has the shape and place of each, so its meshes are built again. Of any other
-    scene (user meshes) only the obstacle cells are known: a square each.
+    A random scene's specification has the shape and place of each, so its meshes are built again. Where that names
+    mesh files that are not here, and of any other scene, only the obstacle cells are known: a square each.
     """
-    if episode.specification.get("kind") != "random":
+    records = episode.specification.get("obstacles", ())
+    if episode.specification.get("kind") != "random" or not all(_is_here(record) for record in records):
         return cell_obstacles(episode.obstacle_grid)
     return tuple(
         shape_obstacle(
@@ -112,10 +113,17 @@ def obstacles_of_episode(episode: Episode) -> tuple[Obstacle, ...]:
             record["size"],
             tuple(record["position"]),
             quaternion_rotation(tuple(record["quaternion"])),
-            f"obstacle_{index}_{record['shape']}",
+            f"obstacle_{index}_{Path(record['shape']).stem}",
         )
-        for index, record in enumerate(episode.specification["obstacles"])
+        for index, record in enumerate(records)
     )
+
+
+def _is_here(record: dict[str, Any]) -> bool:
+    shape = record["shape"]
+    if not is_mesh_file(shape):
+        return True
+    return Path(shape).is_file() and mesh_sha256(shape) == record.get("sha256")
 
 
 @functools.lru_cache(maxsize=1024)

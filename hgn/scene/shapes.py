@@ -1,4 +1,4 @@
-"""The five obstacles of the paper (sec. 3.3) as small triangle meshes.
+"""The five obstacles of the paper (sec. 3.3) as small triangle meshes, and mesh files that take their place.
 
 Half box and half sphere are bowls without a lid, the square is a sheet; cone and pyramid are closed and
 oriented outwards. The open sides and the tips point along +y before rotation.
@@ -7,10 +7,13 @@ oriented outwards. The open sides and the tips point along +y before rotation.
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
+from pathlib import Path
 
 import numpy as np
 
+from hgn.config import MESH_SUFFIXES
 from hgn.scene.rotation import rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 
@@ -29,26 +32,54 @@ def shape_obstacle(
     """One obstacle of a known shape, with the middle of its unrotated bounding box at `position`.
 
     `size` in domain units is the side of the square and of the half box (which is half as high), the diameter
-    of the half sphere, the base width and the height of cone and pyramid. Vertices are rounded to float32.
+    of the half sphere, the base width and the height of cone and pyramid, the longest side of a mesh file's bounding
+    box. Vertices are rounded to float32.
 
-    Raises: KeyError for a shape that is not one of hgn.config.OBSTACLE_SHAPES.
+    Raises: KeyError for a shape that is neither one of hgn.config.OBSTACLE_SHAPES nor a mesh file; ConfigError for a
+    mesh that cannot be read.
     """
-    vertex, triangle = unit_shape(shape)
+    vertex, triangle, closed = unit_shape(shape)
     scaled = size * vertex
     turned = scaled if rotation_33 is None else rotate(scaled, rotation_33)
     placed = round_to_float32(turned + np.array(position, np.float64))
-    return Obstacle(name or shape, placed, triangle, shape in CLOSED_SHAPES)
+    return Obstacle(name or shape, placed, triangle, closed)
 
 
 @functools.cache
-def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices, float64 [V, 3], of the shape of size 1 about the origin, and triangles, int32 [F, 3]."""
-    vertex, triangle = _BUILDERS[shape]()
-    vertex_V3 = round_to_float32(np.array(vertex, np.float64))
-    triangle_F3 = np.array(triangle, np.int32)
+def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Vertices, float64 [V, 3], of the shape of size 1 about the origin, triangles, int32 [F, 3], and whether it is
+    closed."""
+    closed = shape in CLOSED_SHAPES
+    if is_mesh_file(shape):
+        # trimesh takes half a second to load, and few need it here
+        from hgn.scene.mesh import load_mesh
+
+        mesh = load_mesh(shape, "obstacle_shapes")
+        low, high = mesh.vertex_V3.min(axis=0), mesh.vertex_V3.max(axis=0)
+        vertex_V3 = round_to_float32((mesh.vertex_V3 - 0.5 * (low + high)) / (high - low).max())
+        triangle_F3, closed = mesh.triangle_F3, mesh.closed
+    else:
+        vertex, triangle = _BUILDERS[shape]()
+        vertex_V3 = round_to_float32(np.array(vertex, np.float64))
+        triangle_F3 = np.array(triangle, np.int32)
     vertex_V3.setflags(write=False)
     triangle_F3.setflags(write=False)
-    return vertex_V3, triangle_F3
+    return vertex_V3, triangle_F3, closed
+
+
+def is_mesh_file(shape: str) -> bool:
+    """Whether a shape of random obstacles is a mesh file, rather than the name of a built-in one."""
+    return Path(shape).suffix.lower() in MESH_SUFFIXES
+
+
+@functools.cache
+def mesh_sha256(shape: str) -> str:
+    """The content of a mesh file: what tells data sets and their meshes apart, wherever the file lies.
+
+    Raises: ConfigError for a mesh that cannot be read.
+    """
+    unit_shape(shape)
+    return hashlib.sha256(Path(shape).read_bytes()).hexdigest()
 
 
 Mesh = tuple[list[tuple[float, float, float]], list[tuple[int, int, int]]]

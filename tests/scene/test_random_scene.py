@@ -1,15 +1,19 @@
 import hashlib
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
-from hgn.config import SceneConfig
+from hgn.config import DatagenConfig, SceneConfig
+from hgn.data.identity import dataset_identity, identity_hash
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.group import WALL_CELLS, fill, particle_count, points_in_ball, region_of
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.random_scene import generate_scene
+from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.surface import split_long_edges
 from hgn.schema import ConfigError
@@ -241,3 +245,45 @@ def test_fill_is_uniform():
     assert box.dtype == np.float32
     np.testing.assert_allclose(box.mean(axis=0), [1, 2, 3], atol=0.01)
     np.testing.assert_allclose(box.std(axis=0), np.array([0.2, 0.4, 0.6]) / np.sqrt(12), rtol=0.02)
+
+
+def test_own_meshes_among_the_obstacles(tmp_path):
+    """A mesh file is a shape like the others, as long as its size says; its scene is deterministic and rebuilt exactly
+    where the file is, and a data set is told by the file's content, not by its place."""
+    for name, scale in (("here", 1.0), ("there", 1.0), ("other", 2.0)):
+        mesh = trimesh.creation.box((2.0, 1.0, 0.5))
+        mesh.apply_transform(np.diag([1, scale, 1, 1]))
+        (tmp_path / name).mkdir()
+        mesh.export(tmp_path / name / "brick.stl")
+    config = SceneConfig(
+        obstacle_shapes=(str(tmp_path / "here/brick.stl"),), obstacle_count=2, obstacle_size=(0.3, 0.3)
+    )
+    scene, again = generate_scene(config, 5), generate_scene(config, 5)
+    assert digest(scene) == digest(again) and [item.name for item in scene.obstacles] == [
+        "obstacle_0_brick",
+        "obstacle_1_brick",
+    ]
+    for item in scene.obstacles:
+        edges = np.linalg.norm(item.vertex_V3[:, None] - item.vertex_V3[None], axis=-1)
+        assert item.closed and edges.max() == pytest.approx(0.3 * np.linalg.norm((1, 0.5, 0.25)), rel=1e-5)
+    records = scene.specification["obstacles"]
+    for changed in (False, True):
+        known = [record | {"sha256": "0" * 64} if changed else record for record in records]
+        rebuilt = obstacles_of_episode(
+            SimpleNamespace(
+                specification=scene.specification | {"obstacles": known},
+                obstacle_grid=build_obstacle_grid(scene.obstacles, CELL, 0),
+            )
+        )
+        assert [item.name for item in rebuilt] == (["cells"] if changed else ["obstacle_0_brick", "obstacle_1_brick"])
+        if not changed:
+            np.testing.assert_array_equal(rebuilt[0].vertex_V3, scene.obstacles[0].vertex_V3)
+    hashes = [
+        identity_hash(dataset_identity(DatagenConfig(scene=SceneConfig(obstacle_shapes=(str(path),)))))
+        for path in sorted(tmp_path.glob("*/brick.stl"))
+    ]
+    assert hashes[0] == hashes[2] != hashes[1]
+    with pytest.raises(ConfigError, match=r"obstacle_shapes must be an existing file, got none\.obj"):
+        dataset_identity(DatagenConfig(scene=SceneConfig(obstacle_shapes=("none.obj",))))
+    with pytest.raises(ConfigError, match=r"obstacle_shapes\[0\] must be one of half_box, .*, or a mesh file"):
+        SceneConfig(obstacle_shapes=("torus",))

@@ -31,7 +31,7 @@ def test_shape_has_its_size_and_is_centred(shape):
 @pytest.mark.parametrize("shape", OBSTACLE_SHAPES)
 def test_closed_shapes_are_watertight_and_bowls_are_open(shape):
     """Cone and pyramid are watertight, outward and of the right volume; the others have a boundary."""
-    vertex, triangle = unit_shape(shape)
+    vertex, triangle, _ = unit_shape(shape)
     mesh = trimesh.Trimesh(vertex, triangle, process=False)
     assert mesh.is_winding_consistent
     assert mesh.is_watertight == (shape in CLOSED_SHAPES)
@@ -42,7 +42,7 @@ def test_closed_shapes_are_watertight_and_bowls_are_open(shape):
 @pytest.mark.parametrize("shape", ["half_box", "half_sphere"])
 def test_bowls_open_towards_y(shape):
     """Near the axis there is surface at the bottom only: there is no lid."""
-    vertex, triangle = unit_shape(shape)
+    vertex, triangle, _ = unit_shape(shape)
     centroid = split_long_edges(vertex[triangle], 0.1)[0].mean(axis=1)
     near_axis = np.hypot(centroid[:, 0], centroid[:, 2]) < 0.2
     assert near_axis.any()
