@@ -154,7 +154,7 @@ class TrainingEngine(Engine):
         """From `output_gradient` [N, OUT] (times the loss scale) to `totals`."""
         packed, grid, g, levels = self.packed, self.grid, self.g, self.config.levels
         self.totals.zero_()
-        self.product_gradient.zero_()
+        self._clear(self.product_gradient)
         self.counts[: grid.levels].copy_(grid.counts_L)
         self.counts[grid.levels :].copy_(self.particle_count)
         self._rows_backward(

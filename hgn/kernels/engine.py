@@ -16,12 +16,14 @@ from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.message.kernel import cell_forward, edge_forward
 from hgn.kernels.packing import PackedFCN, PackedMessagePassing, PackedNetwork, rounded_to_tf32
 from hgn.kernels.pairs.kernel import pairs_forward
-from hgn.kernels.rows.kernel import gather_project, gather_sums, rows_forward
+from hgn.kernels.rows.kernel import clear_rows, gather_project, gather_sums, rows_forward
 
 PRECISIONS = ("ieee", "tf32x3", "tf32", "half")
 PROCESSORS = 132  # an H100's
 RESIDENT_PROGRAMS = 2 * PROCESSORS
 FEW_ROWS = 64 * PROCESSORS
+CLEAR_ROWS = 64
+LIGHT_BLOCK = (64, 4)  # rows and warps of a program that keeps two weights, of which two fit on a processor
 OUT = 16  # the decoder's three outputs, padded
 NONE = -1  # where a product has no bias
 
@@ -50,8 +52,9 @@ class Tuning:
     cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
     cell_backward_warps: int = 8
     half_cells: bool = False  # in inference cells too are rounded between kernels, as edges are
-    pair_programs: int = 2  # on a processor, in inference
-    pair_registers: int | None = None  # of a thread, so that as many fit
+    half_sums: bool = False  # and particles are added to them rounded, which is half the traffic of the L2 cache
+    light_programs: int = 2  # on a processor, of kernels with one weight: pairs forward, edges of a first iteration
+    light_registers: int | None = None  # of a thread, so that as many fit
     weight_registers: int | None = None  # of a thread of the weights' products: 128 for two programs on a processor
 
     @staticmethod
@@ -66,8 +69,8 @@ class Tuning:
         half = Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, 1056, dense=True, overlap=True, loops=True)
         return replace(
             half,
-            pair_programs=3,
-            pair_registers=168,
+            light_programs=3,
+            light_registers=168,
             gather_block=16,
             cell_backward_block=64,
             cell_backward_warps=4,
@@ -188,7 +191,7 @@ class Engine:
                 kind = self._operand if self.tuning.half_cells else self._float
                 first, second = kind(capacity, width), kind(capacity, width)
                 block.cell = [(first, second)[m % 2] for m in range(steps + 1)]
-                if self.tuning.half_cells and block is self.down[0]:
+                if self.tuning.half_cells and not self.tuning.half_sums and block is self.down[0]:
                     block.cell[0] = self._float(capacity, width)  # particles are added to it, by atomics
                 block.edge = [shared_edge.flatten(0, 1)[: 6 * capacity].view(capacity, 6, width)] * max(steps - 1, 0)
                 block.sum = [self._operand(capacity, width)] * steps
@@ -252,7 +255,7 @@ class Engine:
             fractions=(packed.particle_to_cell.parts[-1], packed.cell_to_particle.parts[-1]),
             fine=self.fine,
         )
-        self.down[0].cell[0].zero_()
+        self._clear(self.down[0].cell[0])
         self._pairs(
             packed.particle_to_cell,
             self.by_particle_down,
@@ -303,6 +306,12 @@ class Engine:
         )
         self._rows(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
 
+    def _clear(self, x: torch.Tensor) -> None:
+        """Zeros into the finest cells' rows of x."""
+        clear_rows[self._blocks(len(x), CLEAR_ROWS)](
+            x, self.grid.count(0), WIDTH=self.width, BLOCK=CLEAR_ROWS, num_warps=4
+        )
+
     def _blocks(self, rows: int, block: int) -> tuple[int]:
         return (triton.cdiv(rows, block),)
 
@@ -326,10 +335,10 @@ class Engine:
         """Whether a program keeps all its weights and takes one block after the other, where each has `least`."""
         return self.tuning.loops and self._many(rows) and rows >= (least - 1) * PROCESSORS * block
 
-    def _row_programs(self, rows: int, block: int, loops: bool) -> tuple[int]:
-        """Those that keep their weights fill a processor's shared memory each."""
+    def _row_programs(self, rows: int, block: int, loops: bool, at_once: int = 1) -> tuple[int]:
+        """Those that keep their weights fill a processor's shared memory each, or an `at_once`-th of it."""
         programs = triton.cdiv(rows, block)
-        return (min(programs, PROCESSORS) if loops else programs,)
+        return (min(programs, PROCESSORS * at_once) if loops else programs,)
 
     def overlaps(self) -> bool:
         """Whether the kernels of a message step start before the one before has ended."""
@@ -376,7 +385,7 @@ class Engine:
         at, bias_at = (*following, 0, 0), (*following_bias, NONE, NONE)
         into = (*products, hidden, hidden)
         loops = self._loops(len(x), block, 4)
-        rows_forward[self._row_programs(len(x), block, loops)](
+        rows_forward[self._row_programs(len(x), block, loops, 1 if norm else 2)](
             x,
             count,
             self.weights,
@@ -431,7 +440,7 @@ class Engine:
         to_cell: bool,
     ) -> None:
         grid, tuning = self.grid, self.tuning
-        at_once, registers = (2, None) if self.training else (tuning.pair_programs, tuning.pair_registers)
+        at_once, registers = tuning.light_programs, tuning.light_registers
         pairs_forward[self._programs(grid.particles, tuning.pair_particles, at_once)](
             by_particle,
             by_cell,
@@ -485,7 +494,10 @@ class Engine:
         if from_children and self._gathers(rows):
             self._gather(level, self.message[level - 1], grid.children(level), block.cell[0])
             from_children = False
-        gather_project[self._blocks(rows, size)](
+        loops = not from_children and self._loops(rows, size)
+        if loops:
+            size, warps = LIGHT_BLOCK
+        gather_project[self._row_programs(rows, size, loops, 2)](
             self.message[level - 1] if from_children else block.cell[0],
             grid.children(level),
             grid.count(level),
@@ -499,10 +511,10 @@ class Engine:
             block.receive[0],
             rows,
             SUM=8 if from_children else 0,
-            NEXT=2,
             WIDTH=self.width,
             BLOCK=size,
             PRECISION=self.precision,
+            LOOP=loops,
             num_warps=warps,
         )
 
@@ -522,7 +534,9 @@ class Engine:
                 product = block.product if block.product is not None else block.send[(m + 1) % 2]
                 next_at, into, products = (block.next_at, 0), (product, product), int(block.product is not None)
                 next_bias = 0
-            edge_forward[self._programs(rows, self._edge_cells(edge_size))](
+            light = m == 0 and self._many(rows)
+            at_once = self.tuning.light_programs if light else 2
+            edge_forward[self._programs(rows, self._edge_cells(edge_size), at_once)](
                 block.send[m % 2],
                 block.receive[m % 2],
                 block.edge[m - 1] if m > 0 else block.cell[m],
@@ -550,7 +564,9 @@ class Engine:
                 PRECISION=self.precision,
                 OVERLAP=overlap,
                 PREFETCH=self.prefetches(rows),
+                AHEAD=self.tuning.dense and self._many(rows),
                 num_warps=edge_warps,
+                maxnreg=self.tuning.light_registers if light else None,
                 launch_pdl=overlap,
             )
             cell_forward[self._row_programs(rows, size, loops)](

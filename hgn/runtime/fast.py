@@ -35,7 +35,7 @@ HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie s
 SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # so many a particle at most, on each level; coarser ones as the last
 ROOMY_CELLS = 65_536  # up to which there is such headroom: beyond, memory counts
 CHECKED_PARTICLES = 50_000  # at most; the plain network needs memory
-INTEGRATE_BLOCK = 256
+INTEGRATE_BLOCK = 64  # particles
 
 
 class LeftDomainError(RuntimeError):
@@ -233,7 +233,7 @@ class FastRollout:
         self.engine.forward()
 
     def _integrate(self) -> None:
-        integrate[(-(-3 * self.particles // INTEGRATE_BLOCK),)](
+        integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
             self.engine.output,
             self.position_N3,
             self.velocity_NV,
@@ -248,6 +248,7 @@ class FastRollout:
             self.path_TN3,
             OUT=OUT,
             HISTORY=self.config.velocity_history,
+            COLUMNS=1 << (3 * self.config.velocity_history - 1).bit_length(),
             BLOCK=INTEGRATE_BLOCK,
         )
         advance[(1,)](self.grid.status, self.lost, self.frame)

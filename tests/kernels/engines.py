@@ -48,9 +48,11 @@ def engine_of(
     return TrainingEngine(config, packed, values, grid, count, precision, loss_scale)
 
 
-def inference_of(engine: TrainingEngine, network: HierarchicalGraphNetwork, half_cells: bool = False) -> Engine:
+def inference_of(
+    engine: TrainingEngine, network: HierarchicalGraphNetwork, half_cells: bool = False, half_sums: bool = False
+) -> Engine:
     """An engine that keeps nothing, on the same grid: other kernels than those of training."""
-    tuning = replace(Tuning.of(engine.precision), half_cells=half_cells)
+    tuning = replace(Tuning.of(engine.precision), half_cells=half_cells, half_sums=half_sums)
     given = (network.config, engine.packed, engine.values, engine.grid, engine.particle_count, engine.precision)
     return Engine(*given, tuning=tuning)
 

@@ -101,14 +101,21 @@ def test_half_precision_keeps_small_gradients() -> None:
     assert relative_error(flat(gradients(engine, network)), flat(expected)) < 5e-2
 
 
-@pytest.mark.parametrize(("precision", "half_cells"), [("tf32", False), ("half", False), ("half", True)])
-def test_inference_alone(precision: str, half_cells: bool) -> None:
+@pytest.mark.parametrize(
+    ("precision", "half_cells", "half_sums", "few_rows"),
+    [("tf32", False, False, None), ("half", False, False, None), ("half", True, False, 0), ("half", True, True, 0)],
+)
+def test_inference_alone(
+    precision: str, half_cells: bool, half_sums: bool, few_rows: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where nothing is kept for gradients, operands of TF32 and float16 change the output by less than 5e-3, also with
-    the cells in float16 between kernels."""
+    the cells in float16 between kernels and so summed, and with the kernels for many rows."""
+    if few_rows is not None:
+        monkeypatch.setattr("hgn.kernels.engine.FEW_ROWS", few_rows)
     network = network_of(width=16, levels=1, message_passing_steps=2)
     state = float32_state((5, 2), spread=0.1)
     origin_S3 = torch.zeros(2, 3, dtype=torch.float64)
-    engine = inference_of(engine_of(network, state, precision, (64,)), network, half_cells)
+    engine = inference_of(engine_of(network, state, precision, (64,)), network, half_cells, half_sums)
     found = run_forward(engine, network, state, origin_S3)
     assert relative_error(found, network.normalised_acceleration(state, origin_S3).detach()) < 5e-3
 

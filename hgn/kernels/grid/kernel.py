@@ -31,11 +31,16 @@ def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
 
 
 @triton.jit
-def _slot(x, y, z, scene, geometry, level: tl.constexpr):
+def _slots_of(geometry, level: tl.constexpr):
+    """Of a level what `_slot` needs: the compiler would read it again for each slot."""
     line = geometry + level * GEOMETRY_COLUMNS
-    ny, nz = tl.load(line + 2), tl.load(line + 3)
-    inside = ((x + 1) * ny + (y + 1)) * nz + z + 1
-    return tl.load(line) + scene * tl.load(line + 4) + inside
+    return tl.load(line), tl.load(line + 2), tl.load(line + 3), tl.load(line + 4)
+
+
+@triton.jit
+def _slot(x, y, z, scene, slots):
+    start, ny, nz, stride = slots
+    return start + scene * stride + ((x + 1) * ny + (y + 1)) * nz + z + 1
 
 
 @triton.jit
@@ -73,13 +78,22 @@ def mark_cells(
     x = tl.where(inside, x, 0.0).to(tl.int32)
     y = tl.where(inside, y, 0.0).to(tl.int32)
     z = tl.where(inside, z, 0.0).to(tl.int32)
-    for corner in tl.static_range(8):
-        cx = x + (corner >> 2 & 1) * (fx > 0).to(tl.int32)
-        cy = y + (corner >> 1 & 1) * (fy > 0).to(tl.int32)
-        cz = z + (corner & 1) * (fz > 0).to(tl.int32)
-        for level in tl.static_range(LEVELS):
-            slot = _slot(cx >> level, cy >> level, cz >> level, scene, geometry, level)
-            tl.store(mark + slot, 1, mask=inside)
+    upper_x, upper_y, upper_z = x + (fx > 0).to(tl.int32), y + (fy > 0).to(tl.int32), z + (fz > 0).to(tl.int32)
+    for level in tl.static_range(LEVELS):
+        slots = _slots_of(geometry, level)
+        for corner in tl.static_range(8):
+            cx = (upper_x if corner >> 2 & 1 else x) >> level
+            cy = (upper_y if corner >> 1 & 1 else y) >> level
+            cz = (upper_z if corner & 1 else z) >> level
+            # corners that share an ancestor leave it to the lowest of them: each store is traffic of the L2 cache
+            first = inside
+            if corner >> 2 & 1:
+                first = first & (cx != x >> level)
+            if corner >> 1 & 1:
+                first = first & (cy != y >> level)
+            if corner & 1:
+                first = first & (cz != z >> level)
+            tl.store(mark + _slot(cx, cy, cz, scene, slots), 1, mask=first)
 
 
 @triton.jit
@@ -337,19 +351,21 @@ def prepare_particles(
     tl.store(fraction_of + row * 3, fx, mask=live)
     tl.store(fraction_of + row * 3 + 1, fy, mask=live)
     tl.store(fraction_of + row * 3 + 2, fz, mask=live)
-    for corner in tl.static_range(8):
-        cx = x + (corner >> 2 & 1) * (fx > 0).to(tl.int32)
-        cy = y + (corner >> 1 & 1) * (fy > 0).to(tl.int32)
-        cz = z + (corner & 1) * (fz > 0).to(tl.int32)
-        slot = _slot(cx, cy, cz, scene, geometry, 0)
-        cell = _cell(mark, rank, slot, 0, capacity, inside)
-        weight = tl.full((BLOCK,), 1.0, tl.float32)
-        weight *= fx if (corner >> 2 & 1) == 1 else 1 - fx
-        weight *= fy if (corner >> 1 & 1) == 1 else 1 - fy
-        weight *= fz if (corner & 1) == 1 else 1 - fz
-        # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
-        tl.store(cell_of + row * 8 + corner, tl.maximum(cell, 0), mask=live)
-        tl.store(weight_of + row * 8 + corner, weight, mask=live)
+    slots = _slots_of(geometry, 0)
+    # all corners at once, [BLOCK, 8]: what a thread stores lies side by side
+    corner = tl.arange(0, 8)[None, :]
+    high_x, high_y, high_z = (corner >> 2 & 1) == 1, (corner >> 1 & 1) == 1, (corner & 1) == 1
+    cx = x[:, None] + (high_x & (fx > 0)[:, None]).to(tl.int32)
+    cy = y[:, None] + (high_y & (fy > 0)[:, None]).to(tl.int32)
+    cz = z[:, None] + (high_z & (fz > 0)[:, None]).to(tl.int32)
+    here = live[:, None] & (corner >= 0)
+    cell = _cell(mark, rank, _slot(cx, cy, cz, scene[:, None], slots), 0, capacity, inside[:, None] & (corner >= 0))
+    weight = tl.where(high_x, fx[:, None], 1 - fx[:, None])
+    weight *= tl.where(high_y, fy[:, None], 1 - fy[:, None])
+    weight *= tl.where(high_z, fz[:, None], 1 - fz[:, None])
+    # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
+    tl.store(cell_of + row[:, None] * 8 + corner, tl.maximum(cell, 0), mask=here)
+    tl.store(weight_of + row[:, None] * 8 + corner, weight, mask=here)
 
     _store_features(
         row,

@@ -10,6 +10,8 @@ anything else; a program that has rows, and the first one always, waits, so that
 it have. The wait is inside the loop over tiles, where it costs nothing once it is over: the compiler then lays out the
 weights for the matrix units before it.
 PREFETCH: while a program works on a tile, what it reads of the next one is brought to the L2 cache.
+AHEAD: the next tile's rows are asked for as soon as this one's have left their registers, so that
+they are there when it begins; the kernel before is waited for, and the first tile's rows are read, ahead of the loop.
 Shape legend: C cells, W width.
 """
 
@@ -62,6 +64,48 @@ def _edges_of(tile, count, ROWS: tl.constexpr, SLOTS: tl.constexpr):
     return place, holds
 
 
+@triton.jit
+def _senders(neighbour, slot, owner, used, count, capacity):
+    """The cells that edges come from, -1: none."""
+    return tl.load(neighbour + slot * capacity + owner, mask=used & (owner < count), other=-1)
+
+
+@triton.jit
+def _edge_rows(
+    send,
+    receive,
+    edge_in,
+    tile,
+    owner,
+    slot,
+    other,
+    count,
+    FIRST: tl.constexpr,
+    BY_PRODUCT: tl.constexpr,
+    WIDTH: tl.constexpr,
+    SUMS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """A tile's rows: of `receive` (by cell if BY_PRODUCT, else by edge), of `send`, and of the edges unless FIRST."""
+    column = tl.arange(0, WIDTH)
+    there = (other >= 0)[:, None]
+    # all loads before the first use: the compiler keeps their order, and waits at the first
+    if BY_PRODUCT:
+        member = tl.arange(0, SUMS)
+        mine = tile * BLOCK + member
+        mine_there = ((member < BLOCK) & (mine < count))[:, None]
+        received = tl.load(receive + mine[:, None] * WIDTH + column[None, :], mask=mine_there, other=0.0)
+    else:
+        received = tl.load(receive + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
+    sent = tl.load(send + other[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
+    if FIRST:
+        edge = sent
+    else:
+        edge_at = (owner * 6 + slot)[:, None] * WIDTH + column[None, :]
+        edge = tl.load(edge_in + edge_at, mask=there, other=0.0)
+    return received, sent, edge
+
+
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def edge_forward(
     send,
@@ -91,6 +135,7 @@ def edge_forward(
     PRECISION: tl.constexpr,
     OVERLAP: tl.constexpr,
     PREFETCH: tl.constexpr,
+    AHEAD: tl.constexpr,
 ):
     """The edges' new features and their sums by receiver [C, W]; send and receive [C, W] are the cells' products with
     the edge network's first two parts, receive with the bias.
@@ -110,7 +155,7 @@ def edge_forward(
     slot = tl.arange(0, ROWS) % SLOTS
     used = (slot < 6) & (tl.arange(0, ROWS) < SLOTS * BLOCK)
     owner = tl.program_id(0) * BLOCK + tl.arange(0, ROWS) // SLOTS
-    other = tl.load(neighbour + slot * capacity + owner, mask=used & (owner < count), other=-1)
+    other = _senders(neighbour, slot, owner, used, count, capacity)
     # vectors once: in the loop each would be waited for again
     second_bias = tl.load(values + second_bias_at + column)
     gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
@@ -130,33 +175,33 @@ def edge_forward(
         own = transposed(weights + own_at, WIDTH, WIDTH)
     second = transposed(weights + second_at, WIDTH, WIDTH)
     tile = tl.program_id(0)
-    while tile * BLOCK < count:
+    if AHEAD:
+        later = _senders(neighbour, slot, owner + tl.num_programs(0) * BLOCK, used, count, capacity)
         if OVERLAP:
             gdc_wait()
+        received, sent, edge = _edge_rows(
+            send, receive, edge_in, tile, owner, slot, other, count, FIRST, BY_PRODUCT, WIDTH, SUMS, BLOCK
+        )
+    while tile * BLOCK < count:
+        if OVERLAP and not AHEAD:
+            gdc_wait()
         holds = used & (owner < count)
-        # the next tile's, which says where its features lie; TF32 has no registers for it
+        # a later tile's, which say where its features lie; TF32 has no registers for it
         later_owner = owner + tl.num_programs(0) * BLOCK
-        if PRECISION == "tf32":
-            other = tl.load(neighbour + slot * capacity + owner, mask=holds, other=-1)
+        if AHEAD:
+            last = _senders(neighbour, slot, later_owner + tl.num_programs(0) * BLOCK, used, count, capacity)
+        elif PRECISION == "tf32":
+            other = _senders(neighbour, slot, owner, used, count, capacity)
             later = other
         else:
-            later = tl.load(neighbour + slot * capacity + later_owner, mask=used & (later_owner < count), other=-1)
+            later = _senders(neighbour, slot, later_owner, used, count, capacity)
         there = (other >= 0)[:, None]
-        if DENSE:
-            place = tile * (6 * BLOCK) + tl.arange(0, ROWS)
-        else:
-            place = owner * 6 + slot
+        place = owner * 6 + slot
         edge_at = place[:, None] * WIDTH + column[None, :]
-        # all loads before the first use: the compiler keeps their order, and waits at the first
-        if BY_PRODUCT:
-            mine = tile * BLOCK + member
-            mine_there = ((member < BLOCK) & (mine < count))[:, None]
-            received = tl.load(receive + mine[:, None] * WIDTH + column[None, :], mask=mine_there, other=0.0)
-        else:
-            received = tl.load(receive + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
-        sent = tl.load(send + other[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
-        if not FIRST:
-            edge = tl.load(edge_in + edge_at, mask=there, other=0.0)
+        if not AHEAD:
+            received, sent, edge = _edge_rows(
+                send, receive, edge_in, tile, owner, slot, other, count, FIRST, BY_PRODUCT, WIDTH, SUMS, BLOCK
+            )
         if PREFETCH and not FIRST:
             later_place = place + tl.num_programs(0) * (6 * BLOCK)
             prefetch(edge_in, later_place, later >= 0, WIDTH)
@@ -183,7 +228,26 @@ def edge_forward(
             tl.store(deviation + place, tl.where(other >= 0, scale, 0.0), mask=holds)
         z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
         if not FIRST:
-            z += edge.to(tl.float32)
+            if AHEAD:
+                z = added(edge, z.to(edge.dtype))
+            else:
+                z += edge.to(tl.float32)
+        if AHEAD:
+            received, sent, edge = _edge_rows(
+                send,
+                receive,
+                edge_in,
+                tile + tl.num_programs(0),
+                later_owner,
+                slot,
+                later,
+                count,
+                FIRST,
+                BY_PRODUCT,
+                WIDTH,
+                SUMS,
+                BLOCK,
+            )
         if STORE_EDGE:
             if SAVE:
                 tl.store(edge_out + edge_at, z, mask=holds[:, None])
@@ -201,6 +265,8 @@ def edge_forward(
             total = weighted_sums(among, z, PRECISION)
         tl.store(sum_out + mine[:, None] * WIDTH + column[None, :], total, mask=ends)
         owner, other = later_owner, later
+        if AHEAD:
+            later = last
         tile += tl.num_programs(0)
     if OVERLAP:
         gdc_wait()
@@ -378,6 +444,8 @@ def cell_backward(
         second = matrix(weights + second_at, WIDTH, WIDTH)
         sum_first = matrix(weights + sum_first_at, WIDTH, WIDTH)
         first = matrix(weights + first_at, WIDTH, WIDTH)
+    sums = tl.arange(0, 16)[:, None]  # of which one is used: the least that the matrix units take
+    gain_total, shift_total = tl.zeros((16, WIDTH), tl.float32), tl.zeros((16, WIDTH), tl.float32)
     tile = tl.program_id(0)
     while (tile * BLOCK < count) & (tile < LAST_TILE):
         row = tile * BLOCK + tl.arange(0, BLOCK)
@@ -413,11 +481,13 @@ def cell_backward(
             z = tl.load(normalised + at, mask=here, other=0.0)
             scale = tl.load(deviation + row, mask=row < count, other=0.0)
         z = z.to(tl.float32)
-        tl.atomic_add(totals + gain_at + column, tl.sum(df * z, 0) * unscale, sem="relaxed")
-        tl.atomic_add(totals + shift_at + column, tl.sum(df, 0) * unscale, sem="relaxed")
+        whole = tl.where((sums == 0) & (row < count)[None, :], 1.0, 0.0)
+        if tile >= 0:  # as in edge_backward
+            gain_total += weighted_sums(whole, df * z, PRECISION)
+            shift_total += weighted_sums(whole, df, PRECISION)
         if not EARLY:
             gain = tl.load(values + gain_at + column)
-        dz = normalise_backward(df, z, scale, gain, WIDTH)
+        dz = normalise_backward(df, z, scale, inside(gain, tile), WIDTH)
         tl.store(second_gradient + at, dz, mask=here)
         if not RESIDENT:
             second = matrix(weights + second_at, WIDTH, WIDTH)
@@ -436,6 +506,10 @@ def cell_backward(
         tile = next_tile(tile, not EARLY)
     if OVERLAP:
         gdc_wait()
+    at_gain = totals + gain_at + sums * WIDTH + column[None, :]
+    at_shift = totals + shift_at + sums * WIDTH + column[None, :]
+    tl.atomic_add(at_gain, gain_total * unscale, mask=sums < 1, sem="relaxed")
+    tl.atomic_add(at_shift, shift_total * unscale, mask=sums < 1, sem="relaxed")
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -491,20 +565,18 @@ def edge_backward(
     scale = tl.load(deviation + place, mask=holds, other=0.0)
     while tile * BLOCK < count:
         slot = tl.arange(0, ROWS) % SLOTS
-        owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
         place, holds = _edges_of(tile, count, ROWS, SLOTS)
         there = (scale != 0)[:, None]
         if OVERLAP:
             gdc_wait()
         edge_at = place[:, None] * WIDTH + column[None, :]
-        sum_at = owner[:, None] * WIDTH + column[None, :]
         # all loads before the first use: the compiler keeps their order, and waits at the first
-        de = tl.load(sum_gradient + sum_at, mask=there, other=0.0)
         z = tl.load(normalised + edge_at, mask=there, other=0.0)
         if not LAST:
             later = tl.load(edge_gradient + edge_at, mask=there, other=0.0)
+        owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
+        de = tl.load(sum_gradient + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
         scale = tl.load(deviation + place, mask=holds, other=0.0)
-        later_place, later_holds = _edges_of(tile + tl.num_programs(0), count, ROWS, SLOTS)
         if not LAST:
             de = added(de, later)
         dy, z = de.to(tl.float32), z.to(tl.float32)
@@ -515,6 +587,7 @@ def edge_backward(
         # earlier there are no registers for it; it comes while the product runs
         a = tl.load(hidden + edge_at, mask=there, other=0.0)
         tl.store(second_gradient + edge_at, dz, mask=holds[:, None])
+        later_place, later_holds = _edges_of(tile + tl.num_programs(0), count, ROWS, SLOTS)
         later_scale = tl.load(deviation + later_place, mask=later_holds, other=0.0)
         dh = product(dz, second, PRECISION)
         dh = leaky_backward(dh, a.to(tl.float32))
@@ -524,12 +597,15 @@ def edge_backward(
             axis = tl.arange(0, 16)[:, None]
             side_total += weighted_sums(tl.where(slot[None, :] // 2 == axis, sign[None, :], 0.0), dh, PRECISION)
         else:
-            if PRECISION != "half":
+            through = product(dh, own, PRECISION)
+            if PRECISION == "half":
+                de = added(de, through.to(de.dtype))
+            else:
                 # read again: registers are dearer than a cache
-                de = tl.load(sum_gradient + sum_at, mask=there, other=0.0)
+                owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
+                de = through + tl.load(sum_gradient + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
                 if not LAST:
                     de += tl.load(edge_gradient + edge_at, mask=there, other=0.0)
-            de = product(dh, own, PRECISION) + de.to(tl.float32)
             tl.store(edge_gradient + edge_at, de, mask=there)
         mine = tile * BLOCK + tl.arange(0, SUMS)
         ends = ((tl.arange(0, SUMS) < BLOCK) & (mine < count))[:, None]

@@ -36,6 +36,22 @@ def _offset(fraction, particle, corner, live, axis: tl.constexpr):
 
 
 @triton.jit
+def _cells_of(tile, count, cell_of, weight_of, ROWS: tl.constexpr):
+    """For each row of a tile its cell and its weight."""
+    pair = tile * ROWS + tl.arange(0, ROWS)
+    live = pair < count * 8
+    return tl.load(cell_of + pair, mask=live, other=0), tl.load(weight_of + pair, mask=live, other=0.0)
+
+
+@triton.jit
+def _particles(by_particle, tile, count, PARTICLES: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr):
+    """A tile's particles' rows [SUMS, W]."""
+    mine = tile * PARTICLES + tl.arange(0, SUMS)
+    there = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
+    return tl.load(by_particle + mine[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=there, other=0.0)
+
+
+@triton.jit
 def pairs_forward(
     by_particle,
     by_cell,
@@ -90,23 +106,27 @@ def pairs_forward(
         offset_2 = tl.load(values + offset_at + 2 * WIDTH + column)
     second = transposed(weights + second_at, WIDTH, WIDTH)
     tile = tl.program_id(0)
+    # read a tile ahead: they say where other things are, or are few
+    cell, weight = _cells_of(tile, count, cell_of, weight_of, ROWS)
+    if BY_PRODUCT:
+        rows = _particles(by_particle, tile, count, PARTICLES, SUMS, WIDTH)
     while tile * PARTICLES < count:
         row = tl.arange(0, ROWS)
         owner = tile * PARTICLES + row // 8
         corner = row % 8
         live = owner < count
         here = live[:, None]
-        cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
+        later = tile + tl.num_programs(0)
+        later_cell, later_weight = _cells_of(later, count, cell_of, weight_of, ROWS)
         if BY_PRODUCT:
             mine = tile * PARTICLES + tl.arange(0, SUMS)
-            mine_there = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
-            rows = tl.load(by_particle + mine[:, None] * WIDTH + column[None, :], mask=mine_there, other=0.0)
             rows = rows.to(tl.float32) + offsets
             if TO_CELL:
                 h = product(choice, rows, PRECISION)
             else:
                 h = tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
                 h = product(choice, rows, PRECISION, h.to(tl.float32))
+            rows = _particles(by_particle, later, count, PARTICLES, SUMS, WIDTH)
         else:
             h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
             if not TO_CELL:
@@ -125,7 +145,6 @@ def pairs_forward(
             tl.store(normalised + pair_at, z, mask=here)
             tl.store(deviation + owner * 8 + corner, scale, mask=live)
         z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
-        weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
         if TO_CELL:
             z = z * weight[:, None]
             # a weight of zero points at a cell that may be another's: it adds nothing
@@ -143,7 +162,7 @@ def pairs_forward(
                 summed = weighted_sums(members(SUMS, ROWS, 8) * weight[None, :], z, PRECISION)
             at = mine[:, None] * WIDTH + column[None, :]
             tl.store(out + at, summed + tl.load(particle + at, mask=ends, other=0.0), mask=ends)
-        tile += tl.num_programs(0)
+        tile, cell, weight = later, later_cell, later_weight
 
 
 @triton.jit
@@ -153,8 +172,7 @@ def _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS: tl.constexpr):
     owner = tile * (ROWS // 8) + row // 8
     corner = row % 8
     live = owner < count
-    cell = tl.load(cell_of + owner * 8 + corner, mask=live, other=0)
-    weight = tl.load(weight_of + owner * 8 + corner, mask=live, other=0.0)
+    cell, weight = _cells_of(tile, count, cell_of, weight_of, ROWS)
     side_0 = _offset(fraction, owner, corner, live, 0)
     side_1 = _offset(fraction, owner, corner, live, 1)
     side_2 = _offset(fraction, owner, corner, live, 2)

@@ -29,6 +29,7 @@ def integrate(
     path,
     OUT: tl.constexpr,
     HISTORY: tl.constexpr,
+    COLUMNS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """v += a, x += v, and the new positions into path [T, N, 3] at `frame`.
@@ -37,28 +38,30 @@ def integrate(
     own size are counted in `lost`, once an axis; `advance` then ends the simulation.
     """
     count = tl.load(particle_count)
-    if tl.program_id(0) * BLOCK >= count * 3:
+    if tl.program_id(0) * BLOCK >= count:
         return
     if tl.load(status) != 0:
         return
-    entry = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = entry < count * 3
-    row, axis = entry // 3, entry % 3
-    a = tl.load(output + row * OUT + axis, mask=live, other=0.0)
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = tl.arange(0, COLUMNS)[None, :]  # of the velocities, newest first: a particle's lie side by side
+    axis, newest = column % 3, column < 3
+    live = (row < count)[:, None] & (column < 3 * HISTORY)
+    live_axis = live & newest
+    entry = row[:, None] * 3 + axis
+    at = velocity + row[:, None] * (3 * HISTORY) + column
+    v = tl.load(at - tl.where(newest, 0, 3), mask=live, other=0.0)
+    a = tl.load(output + row[:, None] * OUT + axis, mask=live_axis, other=0.0)
     a = a * tl.load(std + axis) + tl.load(mean + axis)
-    at = velocity + row * (3 * HISTORY) + axis
-    newest = tl.load(at, mask=live, other=0.0)
-    v = newest + a
-    x = tl.load(position + entry, mask=live, other=0.0) + v
-    for k in tl.static_range(HISTORY - 1):
-        older = tl.load(at + 3 * (HISTORY - 2 - k), mask=live, other=0.0)
-        tl.store(at + 3 * (HISTORY - 1 - k), older, mask=live)
+    v = tl.where(newest, v + a, v)
+    x = tl.load(position + entry, mask=live_axis, other=0.0) + v
+    tl.debug_barrier()  # all have read before one writes
     tl.store(at, v, mask=live)
-    tl.store(position + entry, x, mask=live)
-    tl.store(path + tl.load(frame).to(tl.int64) * count * 3 + entry, x, mask=live)
-    size = tl.load(domain + tl.load(scene_of + row, mask=live, other=0) * 3 + axis, mask=live, other=1.0)
+    tl.store(position + entry, x, mask=live_axis)
+    tl.store(path + tl.load(frame).to(tl.int64) * count * 3 + entry, x, mask=live_axis)
+    scene = tl.load(scene_of + row, mask=row < count, other=0)
+    size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
     inside = (x > -size) & (x < 2 * size)  # NaN is outside
-    outside = tl.sum((live & (inside == 0)).to(tl.int32), 0)
+    outside = tl.sum(tl.sum((live_axis & (inside == 0)).to(tl.int32), 1), 0)
     if outside > 0:
         tl.atomic_add(lost, outside)
 

@@ -26,6 +26,7 @@ from hgn.kernels.blocks import (
     transposed,
     vector,
     vectors,
+    weighted_sums,
 )
 from hgn.kernels.keys import settle_keys
 
@@ -40,6 +41,13 @@ def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
         weight = tl.load(values + offset_at + axis * WIDTH + column)
         result += (SIGN * (0.5 - bit.to(tl.float32)))[:, None] * weight[None, :]
     return result
+
+
+@triton.jit
+def _rows_of(x, tile, count, INPUT: tl.constexpr, BLOCK: tl.constexpr):
+    """A tile's rows of x [R, INPUT]."""
+    row = tile * BLOCK + tl.arange(0, BLOCK)
+    return tl.load(x + row[:, None] * INPUT + tl.arange(0, INPUT)[None, :], mask=(row < count)[:, None], other=0.0)
 
 
 @triton.jit
@@ -103,7 +111,7 @@ def rows_forward(
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
-    column, inputs, outs = tl.arange(0, WIDTH), tl.arange(0, INPUT), tl.arange(0, OUT)
+    column, outs = tl.arange(0, WIDTH), tl.arange(0, OUT)
     if FRACTION:
         offsets_0 = _three_rows(values + fraction_at_0, WIDTH)
         offsets_1 = _three_rows(values + fraction_at_1, WIDTH)
@@ -126,11 +134,18 @@ def rows_forward(
         second_bias = tl.load(values + second_bias_at + outs)
         gain, shift = tl.load(values + gain_at + outs), tl.load(values + shift_at + outs)
     tile = tl.program_id(0)
+    if LOOP:
+        x_rows = _rows_of(x, tile, count, INPUT, BLOCK)
     while (tile * BLOCK < count) & (tile < LAST_TILE):
         row = tile * BLOCK + tl.arange(0, BLOCK)
         live = (row < count)[:, None]
         at = row[:, None] * WIDTH + column[None, :]
-        x_tile = tl.load(x + row[:, None] * INPUT + inputs[None, :], mask=live, other=0.0).to(tl.float32)
+        if not LOOP:
+            x_rows = _rows_of(x, tile, count, INPUT, BLOCK)
+        x_tile = x_rows.to(tl.float32)
+        if FRACTION:
+            part = tl.arange(0, 16)
+            fractions = tl.load(fraction + row[:, None] * 3 + part[None, :], mask=live & (part < 3)[None, :], other=0.0)
         if not LOOP:
             first = transposed(first_weights + first_at, WIDTH, INPUT)
         h = finer_product(x_tile, first, PRECISION) if FINE else product(x_tile, first, PRECISION)
@@ -162,18 +177,15 @@ def rows_forward(
         if RESIDUAL:
             z += x_tile
         tl.store(y + row[:, None] * OUT + outs[None, :], z, mask=live)
+        if LOOP:
+            # the next tile's, where there are registers for them
+            x_rows = _rows_of(x, tile + tl.num_programs(0), count, INPUT, BLOCK)
         if NEXT > 0:
             if not LOOP:
                 following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
             if IN_PLACE:
-                next_bias_0 = tl.load(
-                    values + next_bias_at_0 + column, mask=(next_bias_at_0 >= 0) & (column >= 0), other=0.0
-                )
+                next_bias_0 = optional_vector(values, next_bias_at_0, WIDTH)
             if FRACTION:
-                part = tl.arange(0, 16)
-                fractions = tl.load(
-                    fraction + row[:, None] * 3 + part[None, :], mask=live & (part < 3)[None, :], other=0.0
-                )
                 later = finer_product(-fractions, offsets_0, PRECISION)
                 later = product(z, following_0, PRECISION, later) + inside(next_bias_0, tile)[None, :]
             else:
@@ -183,9 +195,7 @@ def rows_forward(
             if not LOOP:
                 following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
             if IN_PLACE:
-                next_bias_1 = tl.load(
-                    values + next_bias_at_1 + column, mask=(next_bias_at_1 >= 0) & (column >= 0), other=0.0
-                )
+                next_bias_1 = optional_vector(values, next_bias_at_1, WIDTH)
             if FRACTION:
                 later = finer_product(fractions, offsets_1, PRECISION)
                 later = product(z, following_1, PRECISION, later) + inside(next_bias_1, tile)[None, :]
@@ -262,8 +272,12 @@ def rows_backward(
         z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
         z += tl.load(values + second_bias_at + outs)[None, :]
         normalised, scale = normalise(z, OUT)
-        tl.atomic_add(totals + gain_at + outs, tl.sum(dy * normalised, 0) * unscale)
-        tl.atomic_add(totals + shift_at + outs, tl.sum(dy, 0) * unscale)
+        summand = tl.arange(0, 16)[:, None]  # the least that the matrix units take
+        whole = tl.where((summand == 0) & live.trans(), 1.0, 0.0)
+        at_gain = totals + gain_at + summand * OUT + outs[None, :]
+        at_shift = totals + shift_at + summand * OUT + outs[None, :]
+        tl.atomic_add(at_gain, weighted_sums(whole, dy * normalised, PRECISION) * unscale, mask=summand < 1)
+        tl.atomic_add(at_shift, weighted_sums(whole, dy, PRECISION) * unscale, mask=summand < 1)
         dz = normalise_backward(dy, normalised, scale, tl.load(values + gain_at + outs), OUT)
     else:
         dz = dy
@@ -272,10 +286,11 @@ def rows_backward(
     dh = leaky_backward(product(dz, matrix(weights + second_at, OUT, WIDTH), PRECISION), a)
     tl.store(hidden_gradient + at, dh, mask=live)
     if OFFSET != 0:
-        code = tl.load(octant + row, mask=row < count, other=0)
-        for axis in tl.static_range(3):
-            side = OFFSET * (0.5 - ((code >> (2 - axis)) & 1).to(tl.float32))
-            tl.atomic_add(totals + offset_at + axis * WIDTH + column, tl.sum(dh * side[:, None], 0) * unscale)
+        code = tl.load(octant + row, mask=row < count, other=0)[None, :]
+        axis = tl.arange(0, 16)[:, None]
+        side = OFFSET * (0.5 - ((code >> tl.maximum(2 - axis, 0)) & 1).to(tl.float32))
+        sides = weighted_sums(side, dh, PRECISION) * unscale
+        tl.atomic_add(totals + offset_at + axis * WIDTH + column[None, :], sides, mask=axis < 3)
     if INTO > 0:
         dx = product(dh, matrix(weights + first_at, WIDTH, WIDTH), PRECISION)
         if RESIDUAL:
@@ -283,6 +298,15 @@ def rows_backward(
         if INTO > 1:
             dx += tl.load(x_gradient + at, mask=live, other=0.0)
         tl.store(x_gradient + at, dx, mask=live)
+
+
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
+def clear_rows(x, count_ptr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+    """Zeros into the rows of x [.., W] that are in use: capacities have room for twice as many."""
+    count = tl.load(count_ptr)
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    zeros = tl.zeros((BLOCK, WIDTH), x.dtype.element_ty)
+    tl.store(x + row[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], zeros, mask=(row < count)[:, None])
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -327,30 +351,42 @@ def gather_project(
     next_1,
     capacity,
     SUM: tl.constexpr,
-    NEXT: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
+    LOOP: tl.constexpr,
 ):
-    """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and products of y, the
-    second with a bias."""
+    """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products of y, the
+    second with a bias. LOOP as in rows_forward."""
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    live = (row < count)[:, None]
     column = tl.arange(0, WIDTH)
-    at = row[:, None] * WIDTH + column[None, :]
-    if SUM > 0:
-        tile = gathered_sum(x, listed(table, row, count, capacity, SUM, False), SUM, WIDTH, BLOCK)
-        tl.store(y + at, tile, mask=live)
-    else:
-        tile = tl.load(x + at, mask=live, other=0.0).to(tl.float32)
-    if NEXT > 0:
-        tl.store(next_0 + at, product(tile, transposed(weights + at_0, WIDTH, WIDTH), PRECISION), mask=live)
-    if NEXT > 1:
-        result = product(tile, transposed(weights + at_1, WIDTH, WIDTH), PRECISION)
-        tl.store(next_1 + at, result + tl.load(values + bias_at + column)[None, :], mask=live)
+    bias = tl.load(values + bias_at + column)
+    if LOOP:
+        first = transposed(weights + at_0, WIDTH, WIDTH)
+        second = transposed(weights + at_1, WIDTH, WIDTH)
+    tile = tl.program_id(0)
+    if SUM == 0:
+        rows = _rows_of(x, tile, count, WIDTH, BLOCK)
+    while (tile * BLOCK < count) & (tile < LAST_TILE):
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = (row < count)[:, None]
+        at = row[:, None] * WIDTH + column[None, :]
+        if SUM > 0:
+            rows = gathered_sum(x, listed(table, row, count, capacity, SUM, False), SUM, WIDTH, BLOCK)
+            tl.store(y + at, rows, mask=live)
+        if not LOOP:
+            first = transposed(weights + at_0, WIDTH, WIDTH)
+        tl.store(next_0 + at, product(rows, first, PRECISION), mask=live)
+        if not LOOP:
+            second = transposed(weights + at_1, WIDTH, WIDTH)
+        result = product(rows, second, PRECISION)
+        if LOOP:
+            # the next tile's, where there are registers for them
+            rows = _rows_of(x, tile + tl.num_programs(0), count, WIDTH, BLOCK)
+        tl.store(next_1 + at, result + inside(bias, tile)[None, :], mask=live)
+        tile = next_tile(tile, not LOOP)
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
