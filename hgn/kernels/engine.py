@@ -77,6 +77,7 @@ class Tuning:
             weight_registers=128,
             prefetch=True,
             half_cells=True,
+            half_sums=True,
         )
 
 
