@@ -30,6 +30,11 @@ def config_directory() -> Path:
     raise ConfigError(f"conf/ must lie inside or beside {package}, got neither; reinstall the package")
 
 
+def is_mesh_file(name: str | Path) -> bool:
+    """Whether a name is that of a mesh file, rather than of a built-in shape."""
+    return Path(name).suffix.lower() in MESH_SUFFIXES
+
+
 def require_rollout_name(field: str, name: str | None) -> None:
     """Refuses names of pictures, which people give where a rollout file is to be."""
     picture = name is not None and Path(name).suffix in (".png", ".gif", ".webp")
@@ -69,8 +74,7 @@ class SceneConfig:
             material_index(name, f"materials[{i}]")
         for i, name in enumerate(self.obstacle_shapes):
             rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)})"
-            known = name in OBSTACLE_SHAPES or Path(name).suffix.lower() in MESH_SUFFIXES
-            require(known, f"obstacle_shapes[{i}]", rule, name)
+            require(name in OBSTACLE_SHAPES or is_mesh_file(name), f"obstacle_shapes[{i}]", rule, name)
         for i, name in enumerate(self.group_shapes):
             require(name in GROUP_SHAPES, f"group_shapes[{i}]", f"one of {', '.join(GROUP_SHAPES)}", name)
         require(len(self.materials) > 0, "materials", "a list with at least one material", list(self.materials))

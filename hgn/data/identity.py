@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hgn.config import DatagenConfig
+from hgn.config import DatagenConfig, is_mesh_file
 from hgn.scene.episode import SCHEMA_VERSION
-from hgn.scene.shapes import is_mesh_file, mesh_sha256
+from hgn.scene.shapes import mesh_sha256
 from hgn.schema import ConfigError, to_mapping
 
 # of the solver's settings: where and how many at once, which no trajectory depends on beyond rounding

@@ -289,7 +289,7 @@ class FastRollout:
         while True:
             path_TN3, status = self.look(LOOK_FRAMES)
             diverged = bool(status & DIVERGED.value)  # in the last of them
-            yield from path_TN3[: len(path_TN3) - diverged].clone().cpu().numpy()
+            yield from path_TN3[: len(path_TN3) - diverged].to("cpu", copy=True).numpy()
             if diverged:
                 raise LeftDomainError(self.frames_done, self._lost())
             self.make_room(status)

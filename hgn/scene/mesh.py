@@ -13,7 +13,7 @@ import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hgn.config import MESH_SUFFIXES
+from hgn.config import MESH_SUFFIXES, is_mesh_file
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
@@ -69,8 +69,7 @@ def load_mesh(
 
 
 def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
-    suffix = path.suffix.lower()
-    if suffix not in MESH_SUFFIXES:
+    if not is_mesh_file(path):
         raise ConfigError(f"{field} must end in one of {', '.join(MESH_SUFFIXES)}, got {path}; convert the mesh")
     if not path.is_file():
         raise ConfigError(f"{field} must be an existing file, got {path}; in a scene file paths are relative to it")
@@ -81,7 +80,7 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
         triangle = np.array(mesh.faces, np.int64).reshape(-1, 3)
     except _READ_ERRORS as error:
         raise ConfigError(
-            f"{field} must be a readable {suffix[1:].upper()} file, got {path} ({error}); export the mesh again"
+            f"{field} must be a readable {path.suffix[1:].upper()} file, got {path} ({error}); export the mesh again"
         ) from error
     if len(triangle) == 0:
         raise ConfigError(f"{field} must contain triangles, got none in {path}; export the surface, not points")

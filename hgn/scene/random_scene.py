@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hgn.config import SceneConfig
+from hgn.config import SceneConfig, is_mesh_file
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, points_in_ball, region_of
 from hgn.scene.material import material_index
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
-from hgn.scene.shapes import is_mesh_file, mesh_sha256, shape_obstacle, unit_shape
+from hgn.scene.shapes import mesh_sha256, shape_obstacle, unit_shape
 from hgn.scene.surface import split_long_edges
 from hgn.schema import ConfigError, require
 

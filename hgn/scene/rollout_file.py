@@ -26,13 +26,14 @@ from typing import Any
 import h5py
 import numpy as np
 
+from hgn.config import is_mesh_file
 from hgn.files import sync_folder, temporary_path
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
 from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
-from hgn.scene.shapes import is_mesh_file, mesh_sha256, shape_obstacle
+from hgn.scene.shapes import mesh_sha256, shape_obstacle
 from hgn.schema import ConfigError
 
 FORMAT_NAME = "hgn rollout"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hgn.config import MESH_SUFFIXES
+from hgn.config import is_mesh_file
 from hgn.scene.rotation import rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 
@@ -65,11 +65,6 @@ def unit_shape(shape: str) -> tuple[np.ndarray, np.ndarray, bool]:
     vertex_V3.setflags(write=False)
     triangle_F3.setflags(write=False)
     return vertex_V3, triangle_F3, closed
-
-
-def is_mesh_file(shape: str) -> bool:
-    """Whether a shape of random obstacles is a mesh file, rather than the name of a built-in one."""
-    return Path(shape).suffix.lower() in MESH_SUFFIXES
 
 
 @functools.cache

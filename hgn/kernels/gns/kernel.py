@@ -15,6 +15,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import (
+    column_sums,
     inside,
     matrix,
     nearest_tf32,
@@ -117,7 +118,7 @@ def encode_norm_backward(
         z, scale = normalise(z, WIDTH)
         dm = tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
         if count > 0:  # see norm_backward, and why 0 z
-            shift_total += tl.sum(tl.reshape(dm, (BLOCK // 8, 8, WIDTH)), 0)
+            shift_total += column_sums(dm, BLOCK, WIDTH, 8)
         dm += 0.0 * z
         if count > 0:
             gain_total += tl.sum(tl.reshape(dm * z, (BLOCK // 16, 2, 8, WIDTH)), 1)
@@ -287,7 +288,7 @@ def norm_backward(
             dm += tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
         if count > 0:  # always; else the compiler keeps the summands to the loop's end, and registers spill
             # rows that one thread has, here as they were loaded, below in the matrix units' layout
-            shift_total += tl.sum(tl.reshape(dm, (BLOCK // 8, 8, WIDTH)), 0)
+            shift_total += column_sums(dm, BLOCK, WIDTH, 8)
         z = product(a, second_t, PRECISION) + inside(bias, tile)[None, :]
         z, scale = normalise(z, WIDTH)
         # 0 z: else the compiler brings z, and with it float32, to where dm was loaded
