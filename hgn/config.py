@@ -270,6 +270,9 @@ class NetworkConfig:
     obstacle_features: bool = True
     materials: tuple[str, ...] = MATERIALS
     maximum_neighbours: int | None = None  # of a particle of GNS, the nearest; none: all within R
+    static_spacing_cells: float = (
+        0.25  # of gns_particles: how far apart static particles are, at least, in obstacle cells
+    )
 
     def __post_init__(self) -> None:
         require_one_of(self, "kind", NETWORK_KINDS)
@@ -282,6 +285,7 @@ class NetworkConfig:
             "velocity_history",
             "material_embedding",
             "wall_distance_cells",
+            "static_spacing_cells",
         )
         for i, name in enumerate(self.materials):
             material_index(name, f"materials[{i}]")

@@ -90,6 +90,9 @@ def make_batch(
     if windows is None:
         windows = [window(episode, frame, network.velocity_history) for episode, frame in samples]
     episodes = [episode for episode, _ in samples]
+    surface = None
+    if network.obstacle_particles:
+        surface = SurfaceParticles.of([episode_surface(e, network.static_spacing_cells) for e in episodes])
     particles = tuple(len(episode.material_N) for episode in episodes)
     gravity_S3 = np.array([np.asarray(e.gravity) / e.frame_rate_hz**2 for e in episodes], np.float32)
     return Batch(
@@ -100,7 +103,7 @@ def make_batch(
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
         gravity_S3=torch.from_numpy(gravity_S3),
         obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
-        surface=SurfaceParticles.of([episode_surface(e) for e in episodes]) if network.obstacle_particles else None,
+        surface=surface,
         seeds_S=tuple(seeds) if seeds is not None else (0,) * len(episodes),
         cursor=cursor,
         weight_S=tuple(weights),

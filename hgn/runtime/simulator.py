@@ -92,11 +92,11 @@ class InitialState:
             lambda: scene.obstacles,
         )
 
-    def surface(self) -> np.ndarray:
-        """Points on the obstacles, no closer than a quarter of a cell, float32 [P, 3]."""
+    def surface(self, spacing_cells: float) -> np.ndarray:
+        """Points on the obstacles, no closer than `spacing_cells` cells, float32 [P, 3]."""
         grid = self.obstacle_grid
         obstacles = cell_obstacles(grid) if self.obstacles is None else self.obstacles()
-        return surface_points(obstacles, grid.cell_size, 0)
+        return surface_points(obstacles, grid.cell_size, 0, spacing_cells=spacing_cells)
 
 
 class Simulator:
@@ -174,7 +174,9 @@ class Simulator:
         counts = [len(scene.position_N3) for scene in scenes]
         position_N3 = np.concatenate([scene.position_N3 for scene in scenes]).astype(np.float32)
         obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes]) if config.obstacle_features else None
-        surface = SurfaceParticles.of([scene.surface() for scene in scenes]) if config.obstacle_particles else None
+        surface = None
+        if config.obstacle_particles:
+            surface = SurfaceParticles.of([scene.surface(config.static_spacing_cells) for scene in scenes])
         return ParticleState(
             position_N3=torch.from_numpy(position_N3).to(self.device),
             velocity_NM3=torch.from_numpy(np.concatenate(velocities)).to(self.device),

@@ -17,6 +17,7 @@ from hgn.scene.surface import area_vectors, sample_surface, split_long_edges
 from hgn.schema import ConfigError, require
 
 CANCELLED = 0.25  # below this mean length the normals of a cell cancel; three faces of a corner give 0.58
+NORMAL_SPACING_CELLS = 0.25  # of the samples that normals are made from
 SPLIT_CELLS = 16.0  # longest edge, in cells, of the pieces that are cut to the domain
 
 
@@ -75,18 +76,24 @@ def surface_points(
     cell_size: float,
     seed: int,
     domain_size: tuple[float, float, float] | None = None,
+    spacing_cells: float = NORMAL_SPACING_CELLS,
 ) -> np.ndarray:
-    """The samples that the normals of `build_obstacle_grid` are made from, float32 [S, 3]: GNS's static particles.
+    """Points on obstacles no closer than `spacing_cells` cells, float32 [S, 3]: GNS's static particles.
 
+    At the default spacing these are the samples that the normals of `build_obstacle_grid` are made from.
     Raises: ConfigError for a bad cell size, or a surface too large to sample.
     """
-    return _samples(obstacles, cell_size, seed, domain_size)[1].astype(np.float32)
+    return _samples(obstacles, cell_size, seed, domain_size, spacing_cells)[1].astype(np.float32)
 
 
 def _samples(
-    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: tuple[float, float, float] | None
+    obstacles: Sequence[Obstacle],
+    cell_size: float,
+    seed: int,
+    domain_size: tuple[float, float, float] | None,
+    spacing_cells: float = NORMAL_SPACING_CELLS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangle corners, surface points no closer than a quarter of a cell, and the triangle of each."""
+    """Triangle corners, surface points no closer than `spacing_cells` cells, and the triangle of each."""
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
     corner_F33 = np.concatenate(
         [np.zeros((0, 3, 3))]
@@ -98,7 +105,7 @@ def _samples(
     vertex_V3 = corner_F33.reshape(-1, 3)
     triangle_F3 = np.arange(len(vertex_V3)).reshape(-1, 3)
     rng = np.random.Generator(np.random.PCG64(seed))
-    point_S3, owner_S = sample_surface(vertex_V3, triangle_F3, cell_size / 4, rng)
+    point_S3, owner_S = sample_surface(vertex_V3, triangle_F3, spacing_cells * cell_size, rng)
     if domain_size is not None:
         near = ((point_S3 >= box[0]) & (point_S3 < box[1])).all(axis=1)
         point_S3, owner_S = point_S3[near], owner_S[near]

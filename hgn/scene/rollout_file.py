@@ -128,13 +128,13 @@ def _is_here(record: dict[str, Any]) -> bool:
 
 
 @functools.lru_cache(maxsize=1024)
-def episode_surface(episode: Episode) -> np.ndarray:
-    """Points on the surfaces of an episode's obstacles, no closer than a quarter of a cell, float32 [P, 3].
+def episode_surface(episode: Episode, spacing_cells: float) -> np.ndarray:
+    """Points on the surfaces of an episode's obstacles, no closer than `spacing_cells` cells, float32 [P, 3].
 
     Kept for the episodes used last; sampling takes some tenths of a second.
     """
     grid = episode.obstacle_grid
-    return surface_points(obstacles_of_episode(episode), grid.cell_size, 0)
+    return surface_points(obstacles_of_episode(episode), grid.cell_size, 0, spacing_cells=spacing_cells)
 
 
 def cell_obstacles(grid: ObstacleGrid) -> tuple[Obstacle, ...]:

@@ -55,23 +55,24 @@ def test_every_command_takes_a_baseline(
     assert out.is_file() and json.loads(report.read_text())["rows"][0]["one_step_mse"] > 0
 
 
+@pytest.mark.parametrize("spacing_cells", [0.25, 0.5])
 def test_training_and_rollout_see_the_same_surface(
-    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]
+    spacing_cells: float, make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]
 ) -> None:
-    """A batch and a simulation's start hold the same surface points, a quarter of a cell apart, in the obstacles'
+    """A batch and a simulation's start hold the same surface points, as far apart as asked, in the obstacles'
     cells; without obstacles there are none."""
     config = make_config()
     make_dataset(config)
     plain = EpisodeStore(config.dataset.folder, "train").episodes[0]
     grid = random_grid(3, 40)
     episode = replace(plain, obstacle_grid=grid, position_TN3=np.array(plain.position_TN3))
-    network = NetworkConfig(kind="gns_particles", obstacle_features=False, **GNS)
+    network = NetworkConfig(kind="gns_particles", obstacle_features=False, static_spacing_cells=spacing_cells, **GNS)
     batch = make_batch([(plain, 1), (episode, 1)], network)
     surface = batch.state().surface
     assert batch.obstacles is None and surface is not None and surface.scene_P.eq(1).all()
-    np.testing.assert_array_equal(surface.position_P3, InitialState.of_episode(episode).surface())
+    np.testing.assert_array_equal(surface.position_P3, InitialState.of_episode(episode).surface(spacing_cells))
     distance = torch.cdist(surface.position_P3.double(), surface.position_P3.double()).fill_diagonal_(1.0)
-    assert distance.min() > 0.999 * grid.cell_size / 4
+    assert distance.min() > 0.999 * spacing_cells * grid.cell_size
     assert make_batch([(plain, 1)], network).surface is None
     assert make_batch([(episode, 1)], NetworkConfig()).surface is None
 
