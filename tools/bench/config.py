@@ -9,7 +9,7 @@ from hgn.schema import require, require_positive
 
 PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
 PLAIN_CASES = ("plain_frame", "plain_train")
-CASES = ("frame", "naive_frame", "train", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
+CASES = ("frame", "train", "naive_frame", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
 PRECISIONS = ("fp32", "tf32", "fp16")
 
 
