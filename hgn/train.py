@@ -95,6 +95,7 @@ def _fit(
     from lightning.pytorch.loggers import TensorBoardLogger
 
     from hgn.training.callbacks import Checkpoints, LogLines, Monitor, Stopper
+    from hgn.training.checkpoint_writer import CheckpointWriter
     from hgn.training.feed import Feed
     from hgn.training.gradients import GradientGuard
     from hgn.training.module import TrainingModule
@@ -122,7 +123,8 @@ def _fit(
         feed.cursor = checkpoint[1]
     _write_run_files(config, run)
 
-    checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every)
+    writer = CheckpointWriter()
+    checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every, writer)
     monitor = Monitor(run, store, stop, checkpoints)
     guard = GradientGuard(training.maximum_skipped_updates)
     lines = LogLines(run, monitor, guard, feed, _published_text(config, generator))
@@ -135,6 +137,7 @@ def _fit(
         max_steps=training.maximum_updates,
         max_epochs=-1,
         callbacks=[SameStart(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
+        plugins=[writer],
         logger=TensorBoardLogger(run, name="", version="tensorboard"),
         default_root_dir=run,
         enable_checkpointing=False,

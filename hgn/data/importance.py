@@ -7,7 +7,9 @@ counts them less. Shape legend: T frames, N particles, F = T - 1 frames with a s
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -42,11 +44,16 @@ class FrameImportance:
 
         Stratified: each slot has its own F-th of the distribution, in which `seed` chooses.
         """
-        count = len(self.cumulative_F)
-        place = (slot + _fraction(seed)) / count
-        frame = min(int(np.searchsorted(self.cumulative_F, place, side="right")), count - 1)
-        chance = self.cumulative_F[frame] - (self.cumulative_F[frame - 1] if frame else 0.0)
-        return frame, float(1 / (count * chance))
+        cumulative, weights = self._lists
+        place = (slot + _fraction(seed)) / len(cumulative)
+        frame = min(bisect_right(cumulative, place), len(cumulative) - 1)
+        return frame, weights[frame]
+
+    @cached_property
+    def _lists(self) -> tuple[list[float], list[float]]:
+        """The distribution, and each frame's weight: a single number is found faster in a list than in an array."""
+        chance_F = np.diff(self.cumulative_F, prepend=0.0)
+        return self.cumulative_F.tolist(), (1 / (len(chance_F) * chance_F)).tolist()
 
 
 def _fraction(seed: int) -> float:

@@ -8,7 +8,8 @@ epoch on any number of ranks, batches are all of one size, and the whole state o
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +26,7 @@ class Cursor:
     episodes: int = 0  # episodes in this epoch; 0: not decided yet
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):  # which Python makes faster than other classes: a thousand in a second are drawn
     """Frame n of an episode: the network sees frames up to n and predicts n + 1."""
 
     episode: int
@@ -69,15 +69,16 @@ class SampleOrder:
 
     def next_batch(self) -> list[Sample]:
         """This rank's `batch_scenes` samples of the next global batch; advances the cursor."""
-        total = self.batch_scenes * self.world_size
-        mine = range(self.rank * self.batch_scenes, (self.rank + 1) * self.batch_scenes)
-        samples = []
-        for slot in range(total):
+        total, mine = self.batch_scenes * self.world_size, self.batch_scenes * self.rank
+        samples: list[Sample] = []
+        taken = 0  # of the global batch, which may run over the end of an epoch
+        while taken < total:
             if self.cursor.position == len(self._order):
                 self._begin_epoch(self.cursor.epoch + 1, 0, 0)
-            if slot in mine:
-                samples.append(self._sample(int(self._order[self.cursor.position])))
-            self.cursor = Cursor(self.cursor.epoch, self.cursor.position + 1, self.cursor.episodes)
+            rest = self._order[self.cursor.position :][: total - taken]
+            samples += self._samples(rest[max(mine - taken, 0) : max(mine + self.batch_scenes - taken, 0)])
+            self.cursor = replace(self.cursor, position=self.cursor.position + len(rest))
+            taken += len(rest)
         return samples
 
     def _begin_epoch(self, epoch: int, position: int, episodes: int) -> None:
@@ -95,6 +96,8 @@ class SampleOrder:
         self._first_seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0])
         self.cursor = Cursor(epoch, position, len(frame_counts))
 
-    def _sample(self, index: int) -> Sample:
-        episode = int(np.searchsorted(self._first_sample, index, side="right")) - 1
-        return Sample(episode, index - int(self._first_sample[episode]), splitmix64(self._first_seed + index) >> 1)
+    def _samples(self, index_K: np.ndarray) -> list[Sample]:
+        episode_K = self._first_sample.searchsorted(index_K, side="right") - 1
+        frame_K = index_K - self._first_sample[episode_K]
+        seeds = [splitmix64(self._first_seed + index) >> 1 for index in index_K.tolist()]
+        return list(map(Sample, episode_K.tolist(), frame_K.tolist(), seeds))

@@ -21,11 +21,12 @@ from tqdm import tqdm
 from hgn.data.reader import EpisodeStore
 from hgn.data.select import first_indices
 from hgn.data.storage import PATIENCE_S
-from hgn.files import TEMPORARY_SUFFIX, sync_folder, temporary_path
+from hgn.files import TEMPORARY_SUFFIX
 from hgn.picture import rollout_of_episode
 from hgn.progress import bar
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.scene.episode import Episode
+from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.errors import (
     REPORTED_FRAMES,
     SquaredError,
@@ -43,10 +44,10 @@ from hgn.training.tensorboard import show_rollout
 
 
 class Checkpoints(Callback):
-    """Writes checkpoints whole or not at all."""
+    """Says when a checkpoint is due, and where it goes; the trainer's `writer` writes it beside the next updates."""
 
-    def __init__(self, folder: Path, every: int) -> None:
-        self.folder, self.every = folder, every
+    def __init__(self, folder: Path, every: int, writer: CheckpointWriter) -> None:
+        self.folder, self.every, self.writer = folder, every, writer
         self.best_error = math.inf
         self._saved_update = -1
 
@@ -66,30 +67,22 @@ class Checkpoints(Callback):
             self.save_last(trainer)
 
     def save_last(self, trainer: Trainer) -> None:
-        """All ranks call this; rank 0 writes."""
+        """All ranks call this; rank 0 writes, see CheckpointWriter."""
         if self._saved_update != trainer.global_step:
-            self._save(trainer, "last.ckpt")
+            trainer.save_checkpoint(self.folder / "last.ckpt")
             self._saved_update = trainer.global_step
 
     def offer(self, trainer: Trainer, error: float) -> None:
         """Keeps the network as the best so far if its one-step validation error is the lowest."""
         if error < self.best_error:
             self.best_error = error
-            self._save(trainer, "best.ckpt")
+            trainer.save_checkpoint(self.folder / "best.ckpt")
 
-    def _save(self, trainer: Trainer, name: str) -> None:
-        path = self.folder / name
-        temporary = temporary_path(path)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        try:
-            trainer.save_checkpoint(temporary)
-            if trainer.is_global_zero:
-                temporary.replace(path)
-                sync_folder(self.folder)
-            trainer.strategy.barrier()  # a rank that ends before this may take the others with it
-        finally:
-            if trainer.is_global_zero:
-                temporary.unlink(missing_ok=True)
+    def finish(self, trainer: Trainer) -> None:
+        """All ranks call this at the end: the last checkpoint is on disk then."""
+        self.save_last(trainer)
+        self.writer.wait()
+        trainer.strategy.barrier()  # a rank that ends before this may take the others with it
 
 
 class Monitor(Callback):
@@ -283,7 +276,7 @@ class Stopper(Callback):
             self.stop.signal = int(reduced) or None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.checkpoints.save_last(trainer)
+        self.checkpoints.finish(trainer)
 
 
 def log(trainer: Trainer, run: Path, values: dict[str, float]) -> None:

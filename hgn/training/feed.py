@@ -145,7 +145,7 @@ class Feed(LightningDataModule):
                 episode = self.store.episodes[sample.episode]
                 self._importance[sample.episode] = FrameImportance.of(episode, share)
             frame, weight = self._importance[sample.episode].draw(sample.frame, sample.seed)
-            drawn.append(replace(sample, frame=frame, weight=weight))
+            drawn.append(Sample(sample.episode, frame, sample.seed, weight))
         return tuple(drawn)
 
     def _order(self) -> SampleOrder:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from network.states import network_of, random_state
 
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds
@@ -27,6 +28,7 @@ from tools.bench import contenders
 from tools.bench.__main__ import main, workloads
 from tools.bench.config import BenchConfig
 from tools.bench.fast import FastFrame, FastTrain
+from tools.bench.naive import NaiveNetwork
 from tools.bench.states import TILE_PARTICLES, Workload, positions, scene_of
 from tools.bench.timing import Timed, alternate
 
@@ -65,9 +67,10 @@ def test_rows_of_every_case(
     assert all(keys <= row.keys() and row["check"] == "pass" and row["ms"] > 0 for row in rows)
     for scenes in (1, 2):
         cases = sorted(row["case"] for row in rows if row["scenes"] == scenes)
-        assert cases == ["frame", "gns_frame", "gns_train", "mpm_frame", "train"]
+        assert cases == ["frame", "gns_frame", "gns_train", "mpm_frame", "naive_frame", "train"]
     phases = {row["case"]: set(row["phases"]) for row in rows if "phases" in row}
-    assert phases == {"frame": {"features", "grid", "network"}, "gns_frame": {"neighbours", "network"}}
+    ours = {"features", "grid", "network"}
+    assert phases == {"frame": ours, "naive_frame": ours, "gns_frame": {"neighbours", "network"}}
     printed = capsys.readouterr().out
     assert all(case in printed for case in ("gns_train takes", "mpm_frame takes", "parts without graphs"))
 
@@ -107,6 +110,16 @@ def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:
     predict = frame.simulator.predict
     frame.simulator.predict = lambda state: 1.0001 * predict(state)
     assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
+
+
+@pytest.mark.parametrize("changes", [{}, {"levels": 1}, {"obstacle_features": False}])
+def test_the_naive_network_is_the_same_function(changes: dict[str, Any]) -> None:
+    """What our frame is timed beside computes ours, in float64: obstacles, several scenes, one level."""
+    network = network_of(**changes)
+    naive = NaiveNetwork(network.config).double()
+    naive.load_state_dict(network.state_dict())
+    state = random_state((40, 1, 9), obstacles=network.config.obstacle_features)
+    torch.testing.assert_close(naive(state), network(state), rtol=1e-10, atol=1e-10)
 
 
 def test_gns_in_half_precision(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from hgn.provenance import provenance, without_folders
 from hgn.runtime.path import why_not_fast, why_not_trained_fast
 from hgn.schema import from_mapping, to_mapping
 from tools.bench.config import CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
-from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, Train, checked_workload
+from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, NaiveFrame, Train, checked_workload
 from tools.bench.fast import PATH_PRECISION, FastFrame, FastTrain
 from tools.bench.public_gns import PublicFrame, PublicTrain
 from tools.bench.states import TILE_PARTICLES, Workload
@@ -33,7 +33,7 @@ CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
 PHASE_ROUNDS = 11
 OUT_OF_MEMORY = "out of memory"
 EXIT_RED = 1
-FRAME_CASES = ("frame", "plain_frame", "gns_frame", "public_gns_frame", "mpm_frame")
+FRAME_CASES = ("frame", "plain_frame", "naive_frame", "gns_frame", "public_gns_frame", "mpm_frame")
 TRAIN_CASES = ("train", "plain_train", "gns_train", "public_gns_train")
 Contender = Frame | Train | FastFrame | FastTrain | PublicFrame | PublicTrain
 
@@ -164,7 +164,8 @@ def _maker(
         return functools.partial(FastFrame if frame else FastTrain, precision), "fast"
     if case == "gns_train" and why_not_trained_fast(device, config.gns, PATH_PRECISION[precision]) is None:
         return functools.partial(FastTrain, precision), "fast"
-    made = functools.partial(Frame if frame else Train, precision=PATH_PRECISION[precision])
+    plain = NaiveFrame if case == "naive_frame" else Frame if frame else Train
+    made = functools.partial(plain, precision=PATH_PRECISION[precision])
     return made, None if "gns" in case else "plain"
 
 
@@ -174,7 +175,9 @@ def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tu
     wanted = config.cases or tuple(
         case
         for case in CASES
-        if (fast or case not in PLAIN_CASES) and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
+        if (fast or case not in PLAIN_CASES)
+        and (device.type == "cpu" or case != "naive_frame")
+        and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
     )
     if precision == "fp16":
         known = (("frame", "train") if fast else ()) + ("gns_frame", "gns_train")

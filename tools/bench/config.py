@@ -9,7 +9,7 @@ from hgn.schema import require, require_positive
 
 PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
 PLAIN_CASES = ("plain_frame", "plain_train")
-CASES = ("frame", "train", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
+CASES = ("frame", "train", "naive_frame", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
 PRECISIONS = ("fp32", "tf32", "fp16")
 
 
@@ -21,7 +21,9 @@ def _bench_gns() -> NetworkConfig:
 class BenchConfig:
     """`python -m tools.bench`: what is timed."""
 
-    cases: tuple[str, ...] | None = None  # none: all that differ here; of the public GNS where there is a copy of it
+    cases: tuple[str, ...] | None = (
+        None  # none: all that differ here, naive on a CPU alone, of the public GNS where it is
+    )
     particles: tuple[int, ...] | None = None  # of one scene; none: by the device
     scenes: tuple[int, ...] | None = None  # side by side, of the smallest number of particles; none: by the device
     precisions: tuple[str, ...] | None = None  # none: TF32 and half on a GPU, float32 on a CPU

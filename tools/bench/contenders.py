@@ -27,6 +27,7 @@ from hgn.runtime.gns_edges import use_edges
 from hgn.runtime.simulator import Simulator
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
+from tools.bench.naive import NaiveNetwork
 from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_of, state_of
 from tools.bench.timing import Timed, once
 
@@ -62,7 +63,7 @@ class Frame:
 
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "highest") -> None:
         self.device = device
-        self.network = bench_network(config, device)
+        self.network = self.reference = bench_network(config, device)
         self.simulator = Simulator(self.network, FRAME_RATE_HZ, precision=precision)
         self.state = state_of(work, config, device)
 
@@ -76,7 +77,7 @@ class Frame:
         """`pass`, or by how much the accelerations differ from float64."""
         found_N3 = self.run().velocity_NM3[:, 0].double() - self.state.velocity_NM3[:, 0].double()
         with torch.no_grad():
-            expected_N3 = reference_acceleration(self.network, self.state)
+            expected_N3 = reference_acceleration(self.reference, self.state)
         return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
 
     def phases(self, rounds: int) -> dict[str, float]:
@@ -107,6 +108,17 @@ class Frame:
             "grid": grid,
             "network": lambda: network.propagate(latent_NW, built),  # type: ignore[arg-type]
         }
+
+
+class NaiveFrame(Frame):
+    """The same frame by the network as one writes it first, which has to agree with ours in float64."""
+
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "highest") -> None:
+        super().__init__(config, work, device, precision)
+        self.network = NaiveNetwork(config)
+        self.network.load_state_dict(self.reference.state_dict())
+        self.network.to(device).eval()
+        self.simulator = Simulator(self.network, FRAME_RATE_HZ, precision=precision)
 
 
 class Train:

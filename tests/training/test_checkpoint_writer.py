@@ -1,0 +1,180 @@
+"""Checkpoints written beside the training: what they hold, and what becomes of them when something goes wrong."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from training.runs import train_mapping
+
+from hgn import train
+from hgn.config import DatagenConfig
+from hgn.files import write_atomically
+from hgn.training import checkpoint_writer
+from hgn.training.checkpoint import read_checkpoint
+from hgn.training.checkpoint_writer import CheckpointWriter
+from hgn.training.module import TrainingModule
+
+ROOT = Path(__file__).resolve().parents[2]
+KILLED = """
+import sys, time
+from pathlib import Path
+import torch
+from hgn import files
+from hgn.training.checkpoint_writer import CheckpointWriter
+
+def forever(descriptor):
+    print("writing", flush=True)
+    time.sleep(600)
+
+writer, path = CheckpointWriter(), Path(sys.argv[1])
+writer.save_checkpoint({"value": torch.ones(1000)}, path)
+writer.wait()
+files.os.fsync = forever
+writer.save_checkpoint({"value": torch.zeros(1000)}, path)
+writer.wait()
+"""
+
+
+@pytest.fixture
+def writer() -> Iterator[CheckpointWriter]:
+    made = CheckpointWriter()
+    yield made
+    made.teardown()
+
+
+@pytest.fixture
+def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
+    config = make_config()
+    make_dataset(config)
+    return config
+
+
+class Gate:
+    """Holds up every write until it is opened, and remembers what happened."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.opened = threading.Event()
+        self.events: list[str] = []
+        monkeypatch.setattr(checkpoint_writer, "write_atomically", self.write)
+
+    def write(self, path: Path, content: bytes) -> None:
+        self.events.append(f"begin {path.name}")
+        assert self.opened.wait(60)
+        write_atomically(path, content)
+        self.events.append(f"end {path.name}")
+
+
+def load(path: Path) -> Any:
+    return torch.load(path, weights_only=True)
+
+
+def test_the_content_is_that_of_the_moment(writer, tmp_path, monkeypatch):
+    """Weights, moments and numbers that change while the file is written are in it as they were before."""
+    gate = Gate(monkeypatch)
+    weights = torch.arange(6.0)
+    checkpoint = {"weights": weights[2:].view(2, 2), "moments": [weights[:2]], "update": {"number": 5}}
+    writer.save_checkpoint(checkpoint, tmp_path / "last.ckpt")
+    weights.zero_()
+    checkpoint["update"]["number"] = 6
+    gate.opened.set()
+    writer.wait()
+    found = load(tmp_path / "last.ckpt")
+    assert torch.equal(found["weights"], torch.tensor([[2.0, 3.0], [4.0, 5.0]]))
+    assert torch.equal(found["moments"][0], torch.tensor([0.0, 1.0])) and found["update"] == {"number": 5}
+
+
+def test_shared_memory_is_stored_once(writer, tmp_path):
+    """Tensors that are parts of one buffer, as on the fast path, take the buffer's size in the file."""
+    flat = torch.randn(100_000)
+    writer.save_checkpoint({str(n): part for n, part in enumerate(flat.split(1000))}, tmp_path / "a.ckpt")
+    writer.wait()
+    assert flat.nbytes < (tmp_path / "a.ckpt").stat().st_size < 1.1 * flat.nbytes
+    assert torch.equal(torch.cat(list(load(tmp_path / "a.ckpt").values())), flat)
+
+
+def test_one_write_at_a_time(writer, tmp_path, monkeypatch):
+    """The next write waits for the one under way; neither is lost."""
+    gate = Gate(monkeypatch)
+    writer.save_checkpoint({"value": 1}, tmp_path / "first.ckpt")
+    second = threading.Thread(target=writer.save_checkpoint, args=({"value": 2}, tmp_path / "second.ckpt"))
+    second.start()
+    second.join(0.2)
+    assert second.is_alive() and gate.events in ([], ["begin first.ckpt"])
+    gate.opened.set()
+    second.join()
+    writer.wait()
+    assert gate.events == ["begin first.ckpt", "end first.ckpt", "begin second.ckpt", "end second.ckpt"]
+    assert load(tmp_path / "first.ckpt") == {"value": 1} and load(tmp_path / "second.ckpt") == {"value": 2}
+
+
+def test_a_failed_write_is_raised(tmp_path):
+    """By the next write, by waiting for it, or at the end; once."""
+    (tmp_path / "folder.ckpt").mkdir()  # no file can take its place
+    for raising in (
+        lambda writer: writer.save_checkpoint({}, tmp_path / "good.ckpt"),
+        CheckpointWriter.wait,
+        CheckpointWriter.teardown,
+    ):
+        writer = CheckpointWriter()
+        writer.save_checkpoint({"value": 1}, tmp_path / "folder.ckpt")
+        with pytest.raises(IsADirectoryError, match=r"folder\.ckpt"):
+            raising(writer)
+        writer.wait()
+        writer.teardown()
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.ckpt"]
+
+
+def test_killed_while_writing(tmp_path):
+    """`kill -9` in the middle of a write leaves the file before it, whole."""
+    path = tmp_path / "last.ckpt"
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "writing\n"
+    process.kill()
+    process.communicate()
+    assert torch.equal(load(path)["value"], torch.ones(1000))
+    assert len(list(tmp_path.glob(".last.ckpt.*.partial"))) == 1  # which the next start of the training removes
+
+
+@pytest.mark.parametrize("failing", ["best.ckpt", "last.ckpt"])
+def test_a_training_ends_when_it_cannot_write(data, tmp_path, monkeypatch, failing):
+    """A full disk ends the training with the file's name, and leaves the last checkpoint that could be written."""
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run, maximum_updates=2)) == 0
+    kept = (run / "checkpoints" / "last.ckpt").read_bytes()
+
+    def write(path: Path, content: bytes) -> None:
+        if path.name == failing:
+            raise OSError(28, "No space left on device", str(path))
+        write_atomically(path, content)
+
+    monkeypatch.setattr(checkpoint_writer, "write_atomically", write)
+    with pytest.raises(OSError, match=rf"No space left on device.*{failing}"):
+        train.main(train_mapping(data, run))
+    assert failing == "best.ckpt" or (run / "checkpoints" / "last.ckpt").read_bytes() == kept
+
+
+def test_a_stopped_training_waits_for_its_checkpoint(data, tmp_path, monkeypatch):
+    """A signal while a checkpoint is being written: that one and the last one are whole when the command returns."""
+    gate = Gate(monkeypatch)
+    original = TrainingModule.on_before_optimizer_step
+
+    def signalled(module: TrainingModule, optimizer: torch.optim.Optimizer) -> None:
+        if module.global_step == 5:
+            assert gate.events in ([], ["begin last.ckpt"])
+            signal.raise_signal(signal.SIGTERM)
+            threading.Timer(0.5, gate.opened.set).start()
+        original(module, optimizer)
+
+    monkeypatch.setattr(TrainingModule, "on_before_optimizer_step", signalled)
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run, monitor_every=1000)) == 128 + signal.SIGTERM
+    assert gate.events == ["begin last.ckpt", "end last.ckpt"] * 2
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 6
