@@ -71,16 +71,15 @@ class PackedNetwork:
 
 class _Packer:
     def __init__(self, network: HierarchicalGraphNetwork) -> None:
-        self.start: dict[int, int] = {}
-        total = 0
-        for parameter in network.parameters():
-            self.start[id(parameter)] = total
-            total += parameter.numel()
+        parameters = list(network.parameters())
+        every = torch.arange(sum(parameter.numel() for parameter in parameters))
+        pieces = every.split([parameter.numel() for parameter in parameters])
+        self.places = {id(parameter): piece for parameter, piece in zip(parameters, pieces, strict=True)}
         self.pieces: list[torch.Tensor] = []
         self.size = 0
 
     def positions(self, parameter: torch.Tensor) -> torch.Tensor:
-        return torch.arange(parameter.numel()).view(parameter.shape) + self.start[id(parameter)]
+        return self.places[id(parameter)].view(parameter.shape)
 
     def add(self, positions: torch.Tensor) -> int:
         offset = self.size

@@ -37,8 +37,8 @@ class AheadCompilation:
     def __init__(
         self, job: AheadJob | FrameJob, processes: int | None = None, command: Sequence[str] = COMMAND
     ) -> None:
-        """Starts them: half as many as there are cores, where `processes` does not say."""
-        processes = processes or max(1, min(MOST_PROCESSES, available_cpus() // 2))
+        """Starts them: as many as there are cores but two, where `processes` does not say; they yield to all others."""
+        processes = processes or max(1, min(MOST_PROCESSES, available_cpus() - 2))
         self._started = time.monotonic()
         self._files = contextlib.ExitStack()
         self._messages = [self._files.enter_context(tempfile.TemporaryFile()) for _ in range(processes)]  # noqa: SIM115
