@@ -16,7 +16,8 @@ from hgn.files import write_json
 from hgn.network.base import ParticleNetwork
 from hgn.progress import bar
 from hgn.provenance import provenance
-from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.trial import Trial, network_trials
 from hgn.runtime.weights import require_frame_rate
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
@@ -75,32 +76,42 @@ def one_step_rows(network: ParticleNetwork, episodes: list[Episode], config: Eva
 
 
 def rollout_row(simulator: Simulator, episodes: list[Episode], frames: int) -> dict[str, Any]:
-    """{"system", "position_mse": {frame: value}, "mean_position_mse"}, or where the rollout diverged."""
+    """{"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse", "by_material",
+    "ends"}; errors are means over the scenes that came so far.
+    """
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     with bar("rollouts", total=frames - 1, unit="frame") as progress:
-        try:
-            initial = [InitialState.of_episode(episode) for episode in episodes]
-            predicted = simulator.rollout(initial, frames, lambda _: progress.update())
-        except DivergenceError as error:
-            return {"system": "network rollout", "diverged_at_frame": error.frame}
-    mse_T = rollout_errors(predicted, episodes)
+        initial = [InitialState.of_episode(episode) for episode in episodes]
+        trials = network_trials(simulator, initial, frames, lambda _: progress.update())
+    mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
     told = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
+    reached = {str(n): sum(trial.frame_count > n for trial in trials) for n in told}
     return {
         "system": "network rollout",
-        "position_mse": {str(n): float(mse_T["all"][n]) for n in told},
-        "mean_position_mse": float(mse_T["all"].mean()),
-        "by_material": {name: {str(n): float(of_T[n]) for n in told} for name, of_T in mse_T.items() if name != "all"},
-        "ends": [end_of_rollout(path, episode) for path, episode in zip(predicted, episodes, strict=True)],
+        "position_mse": _told(mse_T["all"], told),
+        "scenes_reached": reached,
+        "mean_position_mse": float(np.nanmean(mse_T["all"])),
+        "by_material": {name: _told(of_T, told) for name, of_T in mse_T.items() if name != "all"},
+        "ends": [end_of_rollout(trial, episode) for trial, episode in zip(trials, episodes, strict=True)],
     }
 
 
-def end_of_rollout(path_TN3: np.ndarray, episode: Episode) -> dict[str, Any]:
-    """Shares of the particles within closed obstacles, beside the data's, and beyond the domain, in the last frame."""
-    obstacles, last = obstacles_of_episode(episode), len(path_TN3) - 1
-    beyond_N3 = (path_TN3[last] < 0) | (path_TN3[last] > np.asarray(episode.domain_size))
+def _told(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
+    return {str(n): float(mse_T[n]) for n in frames if n < len(mse_T) and np.isfinite(mse_T[n])}
+
+
+def end_of_rollout(trial: Trial, episode: Episode) -> dict[str, Any]:
+    """Shares of the particles within closed obstacles, beside the data's, and beyond the domain, in the last frame that
+    a scene came to, and why it came no farther.
+    """
+    obstacles, last = obstacles_of_episode(episode), trial.frame_count - 1
+    position_N3 = trial.position_TN3[last]
+    beyond_N3 = (position_N3 < 0) | (position_N3 > np.asarray(episode.domain_size))
     return {
         "episode": episode.key,
-        "penetration": share_inside(path_TN3[last], obstacles),
+        "frames": trial.frame_count,
+        "cause": trial.cause,
+        "penetration": share_inside(position_N3, obstacles),
         "reference_penetration": share_inside(np.asarray(episode.position_TN3[last]), obstacles),
         "outside_domain": float(beyond_N3.any(-1).mean()),
     }
@@ -115,12 +126,16 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
         if "one_step_mse" in row:
             materials = ", ".join(f"{name} {value:.2e}" for name, value in row["by_material"].items())
             lines.append(f"{row['system']:<20} {row['one_step_mse']:>12.3e}  {materials}")
-        elif "diverged_at_frame" in row:
-            lines.append(f"{row['system']:<20} diverged at frame {row['diverged_at_frame']}")
         else:
             frames = ", ".join(f"frame {frame} {value:.2e}" for frame, value in row["position_mse"].items())
             lines.append(f"{row['system']:<20} position MSE: {frames}")
-            mean = {name: np.mean([end[name] for end in row["ends"]]) for name in row["ends"][0] if name != "episode"}
+            short = [end for end in row["ends"] if end["cause"] is not None]
+            if short:
+                first = min(short, key=lambda end: end["frames"])
+                told = f"{first['episode']} at frame {first['frames']}: {first['cause']}"
+                lines.append(f"{'diverged':<20} {len(short)} of {len(row['ends'])} scenes, first {told}")
+            shares = ("penetration", "reference_penetration", "outside_domain")
+            mean = {name: np.mean([end[name] for end in row["ends"]]) for name in shares}
             worst = max(end["penetration"] - end["reference_penetration"] for end in row["ends"])
             lines.append(
                 f"{'at the end':<20} within obstacles {mean['penetration']:.2%}, the solver's "

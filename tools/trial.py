@@ -1,36 +1,21 @@
-"""Simulating test scenes with whatever simulates, to the end or to its failure, and how long a frame takes.
-
-Shape legend: T frames, N particles of a scene.
-"""
+"""Simulating test scenes with the solver, to the end or to its failure, and how long a frame takes."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from hgn.config import MpmConfig
-from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.runtime.trial import Trial
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.scene import Scene
 
 TOGETHER_S = 20e-6  # frames that are reported less than this apart were computed together
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """One scene as far as it came, and why it came no farther."""
-
-    position_TN3: np.ndarray  # float32, domain units; frame 0 is the initial state
-    cause: str | None = None  # of its end before the last frame
-
-    @property
-    def frame_count(self) -> int:
-        return len(self.position_TN3)
 
 
 class FrameClock:
@@ -50,23 +35,6 @@ class FrameClock:
             return None
         first = int(later[0])
         return 1e3 * float(gaps[first:].sum()) / (len(self.ends) - 1 - first)
-
-
-def network_trials(
-    simulator: Simulator, scenes: Sequence[InitialState], frames: int, on_frame: Callable[[int], None] | None = None
-) -> list[Trial]:
-    """Rollouts side by side; in halves where one diverges, so that the others go on and it ends where it must."""
-    if not scenes:
-        return []
-    try:
-        return [Trial(path_TN3) for path_TN3 in simulator.rollout(scenes, frames, on_frame)]
-    except DivergenceError as error:
-        if len(scenes) > 1:
-            halves = scenes[: len(scenes) // 2], scenes[len(scenes) // 2 :]
-            return [trial for half in halves for trial in network_trials(simulator, half, frames)]
-        # The same again up to there. On a GPU sums are in no fixed order, and it may end earlier.
-        (trial,) = network_trials(simulator, scenes, error.frame)
-        return [Trial(trial.position_TN3, trial.cause or str(error))]
 
 
 def solver_scene(episode: Episode, cell_size: float | None = None) -> Scene:

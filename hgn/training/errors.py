@@ -129,16 +129,25 @@ def position_mse(predicted_TN3: np.ndarray, reference_TN3: np.ndarray) -> np.nda
 
 
 def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode]) -> dict[str, np.ndarray]:
-    """Position MSE at each frame, mean over scenes, float64 [T]: `all`, and each material over the scenes that have it.
+    """Position MSE at each frame, mean over the scenes that came so far, float64 [T]: `all`, and each material over the
+    scenes that have it, NaN behind the last of them.
 
-    predicted: positions [T, N, 3] of each episode, all of T frames.
+    predicted: positions [T, N, 3] of each episode; T is that of the longest.
     """
-    curves: dict[str, list[np.ndarray]] = {"all": []}
+    frames = max(len(path_TN3) for path_TN3 in predicted)
+    curves: dict[str, list[np.ndarray]] = {}
     for path_TN3, episode in zip(predicted, episodes, strict=True):
         reference_TN3 = episode.position_TN3[: len(path_TN3)]
-        curves["all"].append(position_mse(path_TN3, reference_TN3))
-        for index in np.unique(episode.material_N):
-            of_material_N = episode.material_N == index
-            mse_T = position_mse(path_TN3[:, of_material_N], reference_TN3[:, of_material_N])
-            curves.setdefault(MATERIALS[index], []).append(mse_T)
-    return {name: np.mean(mse, axis=0) for name, mse in curves.items()}
+        parts = {MATERIALS[index]: episode.material_N == index for index in np.unique(episode.material_N)}
+        for name, chosen in {"all": slice(None), **parts}.items():
+            mse_T = np.full(frames, np.nan)
+            mse_T[: len(path_TN3)] = position_mse(path_TN3[:, chosen], reference_TN3[:, chosen])
+            curves.setdefault(name, []).append(mse_T)
+    return {name: mean_so_far(np.stack(mse)) for name, mse in curves.items()}
+
+
+def mean_so_far(value_ST: np.ndarray) -> np.ndarray:
+    """The mean at each frame over the scenes that came so far, float64 [T]; NaN in a scene's row behind its end."""
+    there_ST = np.isfinite(value_ST)
+    count_T = there_ST.sum(0)
+    return np.where(count_T > 0, np.where(there_ST, value_ST, 0).sum(0) / np.maximum(count_T, 1), np.nan)

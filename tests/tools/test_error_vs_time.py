@@ -21,6 +21,7 @@ from hgn.config import DatagenConfig, MpmConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.trial import Trial, network_trials
 from hgn.runtime.weights import WeightsInfo, save_weights, shipped_weights
 from hgn.scene.distance import share_inside
 from hgn.scene.shapes import shape_obstacle
@@ -32,7 +33,7 @@ from tools.error_vs_time.contenders import FastPredictor, TrivialContender
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergence, sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
-from tools.trial import FrameClock, Trial, network_trials, other_grid
+from tools.trial import FrameClock, other_grid
 
 CPU = torch.device("cpu")
 FRAMES = 6

@@ -17,13 +17,13 @@ from PIL import Image
 from hgn.config import SceneConfig
 from hgn.network.features import ParticleState
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.trial import Trial
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.schema import ConfigError, from_mapping
 from tools.stability.network import case_row, case_trials, energy_growth, initial_states, main, share_of_way
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
 from tools.stability.network_free_fall import free_fall_rows
 from tools.stability.row import Row
-from tools.trial import Trial
 
 SCENE = {
     "obstacle_count": 1,

@@ -23,11 +23,12 @@ from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.trial import Trial, network_trials
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError
 from tools.error_vs_time.launches import Setting, SolverLaunches
-from tools.trial import FrameClock, Trial, network_trials
+from tools.trial import FrameClock
 
 if TYPE_CHECKING:
     from hgn.runtime.fast import FastRollout

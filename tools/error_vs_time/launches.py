@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from hgn.config import MpmConfig
+from hgn.runtime.trial import Trial
 from hgn.scene.episode import Episode
 from hgn.scene.scene import Scene
-from tools.trial import Trial, solver_scene, solver_trials
+from tools.trial import solver_scene, solver_trials
 
 
 @dataclass(frozen=True)

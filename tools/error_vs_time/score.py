@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from hgn.runtime.trial import Trial
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import obstacles_of_episode
-from hgn.training.errors import REPORTED_FRAMES, position_mse
+from hgn.training.errors import REPORTED_FRAMES, mean_so_far, position_mse
 from tools.error_vs_time.contenders import Contender, OneStep, frame_milliseconds
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
-from tools.trial import Trial
 
 WARM_FRAMES, FAST_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
 
@@ -78,7 +78,7 @@ def rollout_figures(
         motions = list(threads.map(_motion, trials, references))
         ends = list(threads.map(_end, trials, references))
     reached_T = np.isfinite(mse_ST).sum(0)
-    curve_T = np.where(reached_T > 0, np.nansum(mse_ST, axis=0) / np.maximum(reached_T, 1), np.nan)
+    curve_T = mean_so_far(mse_ST)
     reported = sorted({frame for frame in (*REPORTED_FRAMES, frames - 1) if frame < frames})
     told = [frame for frame in reported if reached_T[frame]]
     failures = [trial for trial in trials if trial.cause is not None]
@@ -98,6 +98,7 @@ def rollout_figures(
         row[name] = float(np.mean([motion[name] for motion in motions]))
     for name in ("penetration", "reference_penetration", "outside_domain"):
         row[name] = float(np.mean([end[name] for end in ends]))
+    row["most_penetration"] = max(end["penetration"] - end["reference_penetration"] for end in ends)
     return row, curve_T
 
 

@@ -28,13 +28,14 @@ from hgn.picture import compare_picture, spread, stacked, write_picture
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.trial import Trial, network_trials
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import from_mapping, to_mapping
 from tools.measures import energies, energy_scale, outside_domain
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
 from tools.stability.network_free_fall import free_fall_rows
 from tools.stability.row import Row, table
-from tools.trial import FrameClock, Trial, network_trials
+from tools.trial import FrameClock
 
 PART = "network"
 PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
