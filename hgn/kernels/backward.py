@@ -10,9 +10,10 @@ import itertools
 import torch
 
 from hgn.config import NetworkConfig
+from hgn.kernels.cells.kernel import cell_backward
+from hgn.kernels.edges.kernel import edge_backward
 from hgn.kernels.engine import OUT, Block, Engine, Tuning
 from hgn.kernels.grid.op import DeviceGrid
-from hgn.kernels.message.kernel import cell_backward, edge_backward
 from hgn.kernels.packing import PackedFCN, PackedNetwork
 from hgn.kernels.pairs.kernel import pairs_backward
 from hgn.kernels.rows.kernel import gather_project_backward, rows_backward

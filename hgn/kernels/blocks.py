@@ -131,6 +131,12 @@ def once_both(x, y, never):
 
 
 @triton.jit
+def nothing_to_do(count, BLOCK: tl.constexpr):
+    """Whether a program has no rows. The first one stays: it waits for the kernel before where all others are idle."""
+    return (tl.program_id(0) * BLOCK >= count) & (tl.program_id(0) > 0)
+
+
+@triton.jit
 def inside(vector, tile):
     """`vector`, as a value of the loop over tiles: else it is laid out for the matrix units before the loop, where each
     thread holds a quarter of it, and registers spill. Tiles are numbered from 0."""

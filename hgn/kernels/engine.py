@@ -12,8 +12,9 @@ import torch
 import triton
 
 from hgn.config import NetworkConfig
+from hgn.kernels.cells.kernel import cell_forward
+from hgn.kernels.edges.kernel import edge_forward
 from hgn.kernels.grid.op import DeviceGrid
-from hgn.kernels.message.kernel import cell_forward, edge_forward
 from hgn.kernels.packing import PackedFCN, PackedMessagePassing, PackedNetwork, rounded_to_tf32
 from hgn.kernels.pairs.kernel import pairs_forward
 from hgn.kernels.rows.kernel import clear_rows, gather_project, gather_sums, rows_forward
