@@ -97,11 +97,38 @@ def mark_cells(
 
 
 @triton.jit
-def _cell(mark, rank, slot, first, capacity, ask):
+def _marked(mark, slot, ask):
+    """Whether the cell in a slot is active."""
+    return ask & (tl.load(mark + slot, mask=ask, other=0) > 0)
+
+
+@triton.jit
+def _number(rank, slot, first, capacity, there):
     """The number of the cell in a slot, -1 where it is not active."""
-    there = tl.load(mark + slot, mask=ask, other=0) > 0
-    cell = tl.load(rank + slot, mask=ask & there, other=0) - 1 - first
-    return tl.where(ask & there & (cell < capacity), cell, -1)
+    cell = tl.load(rank + slot, mask=there, other=0) - 1 - first
+    return tl.where(there & (cell < capacity), cell, -1)
+
+
+@triton.jit
+def _cell(mark, rank, slot, first, capacity, ask):
+    """The same, of slots that may be asked for."""
+    return _number(rank, slot, first, capacity, _marked(mark, slot, ask))
+
+
+@triton.jit
+def _write_cells(table, cell, live, mark, rank, slots, first, capacity, own_capacity, COUNT: tl.constexpr):
+    """Line i of the table [COUNT, own_capacity] gets the numbers of the cells in slots i of the tuple `slots`.
+
+    All are read before the first is written: the compiler keeps that order, and would wait for each in turn.
+    """
+    there = ()
+    for i in tl.static_range(COUNT):
+        there = there + (_marked(mark, slots[i], live),)  # noqa: RUF005 - Triton knows no unpacking here
+    found = ()
+    for i in tl.static_range(COUNT):
+        found = found + (_number(rank, slots[i], first, capacity, there[i]),)  # noqa: RUF005
+    for i in tl.static_range(COUNT):
+        tl.store(table + i * own_capacity + cell, found[i], mask=live)
 
 
 @triton.jit
@@ -147,7 +174,7 @@ def fill_tables(
     if tl.sum(live.to(tl.int32), 0) == 0:
         return
     tl.store(slot_of + at + cell, local, mask=live)
-    table = neighbour + 6 * at
+    slots_of = ()
     for direction in tl.static_range(6):
         step = ny * nz
         if direction // 2 == 1:
@@ -156,8 +183,8 @@ def fill_tables(
             step = step * 0 + 1
         if direction % 2 == 1:
             step = -step
-        found = _cell(mark, rank, slot + step, first, capacity, live)
-        tl.store(table + direction * capacity + cell, found, mask=live)
+        slots_of = slots_of + (slot + step,)  # noqa: RUF005
+    _write_cells(neighbour + 6 * at, cell, live, mark, rank, slots_of, first, capacity, capacity, 6)
     scene = local // stride
     inside = local % stride
     x, y, z = inside // (ny * nz) - 1, inside // nz % ny - 1, inside % nz - 1
@@ -174,12 +201,14 @@ def fill_tables(
         below = line - GEOMETRY_COLUMNS
         below_y, below_z = tl.load(below + 2), tl.load(below + 3)
         below_first = tl.load(rank + tl.load(below) - 1, mask=level > 1, other=0)
+        below_start = tl.load(below) + scene * tl.load(below + 4)
+        slots_below = ()
         for child in tl.static_range(8):
             cx, cy, cz = 2 * x + (child >> 2 & 1), 2 * y + (child >> 1 & 1), 2 * z + (child & 1)
-            below_slot = tl.load(below) + scene * tl.load(below + 4)
-            below_slot += ((cx + 1) * below_y + cy + 1) * below_z + cz + 1
-            found = _cell(mark, rank, below_slot, below_first, tl.load(below + 5), live)
-            tl.store(children + 8 * at + child * capacity + cell, found, mask=live)
+            below_slot = below_start + ((cx + 1) * below_y + cy + 1) * below_z + cz + 1
+            slots_below = slots_below + (below_slot,)  # noqa: RUF005
+        table = children + 8 * at
+        _write_cells(table, cell, live, mark, rank, slots_below, below_first, tl.load(below + 5), capacity, 8)
 
 
 @triton.jit

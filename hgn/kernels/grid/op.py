@@ -17,7 +17,7 @@ from hgn.network.keys import SCENE_LIMIT, unpack
 from hgn.network.obstacles import ObstacleCells
 
 MARK_BLOCK = 128
-FILL_BLOCK = 1024
+FILL_BLOCK = 512
 MARGIN_CELLS = 4  # of a window, around what it must hold
 OBSTACLE_COLUMNS = 5
 OVERFLOW = 1
