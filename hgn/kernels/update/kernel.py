@@ -85,6 +85,7 @@ def assemble_batch(
     HISTORY: tl.constexpr,
     SYMMETRY: tl.constexpr,
     WAVES: tl.constexpr,
+    SCENES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
@@ -92,34 +93,35 @@ def assemble_batch(
 
     The target is v_true^{n+1} - v_noisy^n, normalised. Grid origins are uniform in [-jitter, 0]. Noise and jitter are
     Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY the window is the image of the
-    stored one; velocities come from the stored positions, for mirrored ones are rounded.
+    stored one; velocities come from the stored positions, for mirrored ones are rounded. SCENES: a power of two, at
+    least `scenes`.
     """
     table = samples + tl.load(update).to(tl.int64) * scenes * SAMPLE_COLUMNS
     domains = sample_domain + tl.load(update) * scenes * 3
     last = table + (scenes - 1) * SAMPLE_COLUMNS
     count = (tl.load(last + 1) + tl.load(last + 2)).to(tl.int32)
+    scene = tl.arange(0, SCENES)
+    there = scene < scenes
     if tl.program_id(0) == 0:
+        # all scenes side by side: one after the other, each waits for its reads
         tl.store(particle_count, count)
-        scene = 0
-        while scene < scenes:
-            seed = tl.load(table + scene * SAMPLE_COLUMNS + 3)
-            for axis in tl.static_range(3):
-                draw = tl.rand(seed, count * 0 + JITTER_OFFSET + axis)
-                tl.store(origin + scene * 3 + axis, -jitter * draw)
-                tl.store(domain + scene * 3 + axis, tl.load(domains + scene * 3 + axis))
-            for i in tl.static_range(OBSTACLE_COLUMNS):
-                value = tl.load(table + scene * SAMPLE_COLUMNS + SAMPLE_COLUMNS - OBSTACLE_COLUMNS + i)
-                tl.store(obstacle_table + scene * OBSTACLE_COLUMNS + i, value)
-            scene += 1
+        seed = tl.load(table + scene * SAMPLE_COLUMNS + 3, mask=there, other=0)
+        for axis in tl.static_range(3):
+            draw = tl.rand(seed, scene * 0 + JITTER_OFFSET + axis)
+            size = tl.load(domains + scene * 3 + axis, mask=there, other=0.0)
+            tl.store(origin + scene * 3 + axis, -jitter * draw, mask=there)
+            tl.store(domain + scene * 3 + axis, size, mask=there)
+        for i in tl.static_range(OBSTACLE_COLUMNS):
+            at = table + scene * SAMPLE_COLUMNS + SAMPLE_COLUMNS - OBSTACLE_COLUMNS + i
+            value = tl.load(at, mask=there, other=0)
+            tl.store(obstacle_table + scene * OBSTACLE_COLUMNS + i, value, mask=there)
     if tl.program_id(0) * BLOCK >= count:
         return
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
-    scene_row = tl.zeros((BLOCK,), tl.int32)
-    other = 1
-    while other < scenes:
-        scene_row += (row >= tl.load(table + other * SAMPLE_COLUMNS + 2)).to(tl.int32)
-        other += 1
+    # how many scenes begin at or before the row, less the first
+    begins = tl.load(table + scene * SAMPLE_COLUMNS + 2, mask=there & (scene > 0), other=1 << 40)
+    scene_row = tl.sum((row[:, None] >= begins[None, :]).to(tl.int32), 1)
     line = table + scene_row * SAMPLE_COLUMNS
     address = tl.load(line, mask=live, other=0)
     particles = tl.load(line + 1, mask=live, other=1)

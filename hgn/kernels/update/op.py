@@ -427,6 +427,7 @@ class Updates:
             HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry,
             WAVES=SMOOTH_WAVES if settings.noise_smooth > 0 else 0,
+            SCENES=triton.next_power_of_2(settings.scenes),
             BLOCK=BLOCK,
         )
 
