@@ -79,8 +79,12 @@ def mark_cells(
     y = tl.where(inside, y, 0.0).to(tl.int32)
     z = tl.where(inside, z, 0.0).to(tl.int32)
     upper_x, upper_y, upper_z = x + (fx > 0).to(tl.int32), y + (fy > 0).to(tl.int32), z + (fz > 0).to(tl.int32)
+    levels = ()
     for level in tl.static_range(LEVELS):
-        slots = _slots_of(geometry, level)
+        levels = levels + (_slots_of(geometry, level),)  # noqa: RUF005 - Triton knows no unpacking here
+    # all levels are read before the first mark is written: the compiler keeps that order, and would wait for each
+    for level in tl.static_range(LEVELS):
+        slots = levels[level]
         for corner in tl.static_range(8):
             cx = (upper_x if corner >> 2 & 1 else x) >> level
             cy = (upper_y if corner >> 1 & 1 else y) >> level
@@ -377,9 +381,6 @@ def prepare_particles(
     x = tl.where(inside, x, 0.0).to(tl.int32)
     y = tl.where(inside, y, 0.0).to(tl.int32)
     z = tl.where(inside, z, 0.0).to(tl.int32)
-    tl.store(fraction_of + row * 3, fx, mask=live)
-    tl.store(fraction_of + row * 3 + 1, fy, mask=live)
-    tl.store(fraction_of + row * 3 + 2, fz, mask=live)
     slots = _slots_of(geometry, 0)
     # all corners at once, [BLOCK, 8]: what a thread stores lies side by side
     corner = tl.arange(0, 8)[None, :]
@@ -392,6 +393,9 @@ def prepare_particles(
     weight = tl.where(high_x, fx[:, None], 1 - fx[:, None])
     weight *= tl.where(high_y, fy[:, None], 1 - fy[:, None])
     weight *= tl.where(high_z, fz[:, None], 1 - fz[:, None])
+    tl.store(fraction_of + row * 3, fx, mask=live)
+    tl.store(fraction_of + row * 3 + 1, fy, mask=live)
+    tl.store(fraction_of + row * 3 + 2, fz, mask=live)
     # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
     tl.store(cell_of + row[:, None] * 8 + corner, tl.maximum(cell, 0), mask=here)
     tl.store(weight_of + row[:, None] * 8 + corner, weight, mask=here)

@@ -54,12 +54,13 @@ def integrate(
     a = a * tl.load(std + axis) + tl.load(mean + axis)
     v = tl.where(newest, v + a, v)
     x = tl.load(position + entry, mask=live_axis, other=0.0) + v
+    scene = tl.load(scene_of + row, mask=row < count, other=0)
+    size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
+    now = tl.load(frame).to(tl.int64)
     tl.debug_barrier()  # all have read before one writes
     tl.store(at, v, mask=live)
     tl.store(position + entry, x, mask=live_axis)
-    tl.store(path + tl.load(frame).to(tl.int64) * count * 3 + entry, x, mask=live_axis)
-    scene = tl.load(scene_of + row, mask=row < count, other=0)
-    size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
+    tl.store(path + now * count * 3 + entry, x, mask=live_axis)
     inside = (x > -size) & (x < 2 * size)  # NaN is outside
     outside = tl.sum(tl.sum((live_axis & (inside == 0)).to(tl.int32), 1), 0)
     if outside > 0:
