@@ -352,6 +352,21 @@ def test_diverging_weights(place: Place, capsys: Capture, monkeypatch: pytest.Mo
     check(place, "rollout", ROLLOUT, message, capsys, monkeypatch)
 
 
+def test_diverging_scenes_are_told(place: Place, capsys: Capture) -> None:
+    """An evaluation keeps what each scene came to, and says which one diverged first, and why."""
+    network = network_of(torch.float32)
+    network.normaliser.set("acceleration", torch.full((3,), 0.4), torch.ones(3), 0.0)
+    save_weights(place.path("weights.safetensors"), network, WeightsInfo(network.config, 60.0, 1 / 64))
+    options = {"weights": "weights.safetensors", "data": "data", "json": "made/errors.json"}
+    assert evaluate.main(options) == 0
+    row = json.loads(place.path("made/errors.json").read_text())["rows"][-1]
+    assert row["ends"] and all("diverged" in end["cause"] and end["frames"] < 8 for end in row["ends"])
+    assert row["position_mse"] == {} and set(row["scenes_reached"].values()) == {0}
+    told = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("diverged"))
+    count = len(row["ends"])
+    assert f"{count} of {count} scenes, first {row['ends'][0]['episode']} at frame" in told
+
+
 @pytest.mark.parametrize(
     ("command", "arguments"),
     [
@@ -381,7 +396,7 @@ def test_errors_file_makes_its_folder(place: Place, monkeypatch: pytest.MonkeyPa
         run_command(evaluate.main, "evaluate")
     assert raised.value.code == 0
     last = json.loads(place.path("made/errors.json").read_text())["rows"][-1]
-    keys = {"episode", "penetration", "reference_penetration", "outside_domain"}
+    keys = {"episode", "frames", "cause", "penetration", "reference_penetration", "outside_domain"}
     assert last["by_material"].keys() <= {"water", "sand", "snow"} and last["ends"][0].keys() == keys
 
 

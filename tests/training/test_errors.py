@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from hgn.training.errors import told_gain
+from hgn.training.errors import mean_so_far, told_gain
 
 
 @pytest.mark.parametrize(
@@ -14,3 +15,10 @@ from hgn.training.errors import told_gain
 def test_gain_in_words(gain: float, text: str) -> None:
     """An error that is larger than the other is not said to be below it."""
     assert told_gain(gain) == text
+
+
+def test_mean_over_the_scenes_that_came_so_far() -> None:
+    """A scene that ended counts in no frame behind its end; behind the last one there is no mean."""
+    none = np.nan
+    value_ST = np.array([[1.0, 2.0, none, none], [3.0, 6.0, 9.0, none]])
+    np.testing.assert_array_equal(mean_so_far(value_ST), [2.0, 4.0, 9.0, none])
