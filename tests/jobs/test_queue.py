@@ -1,0 +1,352 @@
+"""The queue of one machine: its GPUs share a list, barriers hold, it stops and goes on; and the list of networks."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import processes_of_session, wait_until
+
+from datagen.generate import datagen_config
+from hgn.command import _compose
+from hgn.config import DatagenConfig, EvaluateConfig, ExportConfig, TrainConfig
+from hgn.data.identity import dataset_identity
+from hgn.runtime.weights import shipped_weights
+from hgn.schema import from_mapping
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+
+JOBS = Path(__file__).resolve().parents[2] / "jobs"
+UNSET = ("CUDA_VISIBLE_DEVICES", "SCENES", "SHARE", "REPORT_SECONDS")
+# the arguments of each call, as a line of JSON; succeeds
+PYTHON = f"""#!{sys.executable}
+import json, sys
+print(json.dumps(sys.argv[1:]))
+"""
+
+
+def start(folder: Path, text: str | Path, *arguments: str, **variables: str) -> subprocess.Popen[str]:
+    """Starts the queue in a folder, on a list or its text, where nvidia-smi is what write_program made of it."""
+    if isinstance(text, str):
+        (folder / "list.txt").write_text(text)
+        text = Path("list.txt")
+    kept = {
+        name: value for name, value in os.environ.items() if name not in ("CUDA_VISIBLE_DEVICES", "SCENES", "SHARE")
+    }
+    return subprocess.Popen(
+        [str(JOBS / "queue.sh"), str(text), *arguments],
+        cwd=folder,
+        env=kept | {"PATH": f"{folder / 'programs'}:{os.environ['PATH']}"} | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def run(folder: Path, text: str | Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    process = start(folder, text, *arguments, **variables)
+    output, errors = process.communicate(timeout=120)
+    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
+
+
+def write_program(folder: Path, name: str, text: str) -> None:
+    programs = folder / "programs"
+    programs.mkdir(exist_ok=True)
+    (programs / name).write_text(text)
+    (programs / name).chmod(0o755)
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    """A folder on a machine with two GPUs."""
+    write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\nprintf '0\\n1\\n'\n")
+    return tmp_path
+
+
+def events(output: str) -> list[tuple[str, str, str]]:
+    """(GPU, name, what) of each line about a command; what is `begin` or `end, exit code N`."""
+    told = [line.split("  ") for line in output.splitlines() if "  GPU " in line]
+    return [(gpu.removeprefix("GPU "), name, what.rpartition(", ")[0] or what) for _, gpu, name, what in told]
+
+
+def test_gpus_share_a_list(machine: Path) -> None:
+    """Each GPU runs one command at a time, which sees that GPU alone; behind a barrier all before it is done."""
+    meet = "touch {0}; until [[ -e {1} ]]; do sleep 0.02; done; echo $CUDA_VISIBLE_DEVICES"  # both at once, or never
+    lines = [
+        f"first: {meet.format('a', 'b')}",
+        "# a comment",
+        "",
+        f"  second:   {meet.format('b', 'a')} ",
+        "third: echo words >&2; sleep 0.2; touch third",
+        "wait",
+        "fourth: [[ -e third ]] && echo $CUDA_VISIBLE_DEVICES",
+        "wait",
+    ]
+    done = run(machine, "\n".join(lines))
+    assert (done.returncode, done.stderr) == (0, "")
+    said = done.stdout.splitlines()
+    assert said[0] == "4 commands, GPUs: 0 1, logs in runs/queue" and said[-1] == "all 4 commands are done"
+    begun = {name: gpu for gpu, name, what in events(done.stdout) if what == "begin"}
+    assert sorted(begun) == ["first", "fourth", "second", "third"] and {begun["first"], begun["second"]} == {"0", "1"}
+    assert sorted(events(done.stdout)) == sorted(
+        (gpu, name, what) for name, gpu in begun.items() for what in ("begin", "end, exit code 0")
+    )
+    logs = machine / "runs" / "queue"
+    assert {name: (logs / f"{name}.log").read_text().strip() for name in begun} == begun | {"third": "words"}
+    assert {path.stem for path in logs.glob("*.done")} == set(begun)
+
+
+@pytest.mark.parametrize(
+    ("visible", "gpus"), [("5", ["5"]), ("GPU-8a,MIG-1", ["GPU-8a", "MIG-1"]), ("3, 2,7", ["3", "2", "7"])]
+)
+def test_visible_gpus(tmp_path: Path, visible: str, gpus: list[str]) -> None:
+    """CUDA_VISIBLE_DEVICES says which GPUs there are; nvidia-smi is not asked."""
+    write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\ntouch asked; exit 1\n")
+    count = len(gpus)
+    text = "".join(
+        f"{i}: touch {i}; until [[ $(ls ? | wc -l) == {count} ]]; do sleep 0.02; done; echo $CUDA_VISIBLE_DEVICES\n"
+        for i in range(count)
+    )
+    done = run(tmp_path, text, "logs", CUDA_VISIBLE_DEVICES=visible)
+    assert done.returncode == 0 and not (tmp_path / "asked").exists()
+    seen = [(tmp_path / "logs" / f"{i}.log").read_text().strip() for i in range(count)]
+    assert sorted(seen) == sorted(gpus)
+
+
+def test_without_gpus(machine: Path) -> None:
+    """Without GPUs one command runs after the other, in the order of the list."""
+    done = run(machine, "b: echo b >> order\na: echo a >> order\nc: echo c >> order\n", CUDA_VISIBLE_DEVICES="")
+    assert done.returncode == 0 and (machine / "order").read_text() == "b\na\nc\n"
+    assert done.stdout.startswith("3 commands, GPUs: cpu, logs in runs/queue\n")
+
+
+def test_nvidia_smi_that_fails_is_told(tmp_path: Path) -> None:
+    """A driver at fault is no machine without GPUs."""
+    write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\necho 'no driver'\nexit 9\n")
+    done = run(tmp_path, "a: touch a\n")
+    assert done.returncode == 2 and not (tmp_path / "a").exists()
+    assert done.stderr == (
+        "error: nvidia-smi must list the GPUs, got 'no driver'; say which there are, as in CUDA_VISIBLE_DEVICES=0,1, "
+        "or that there are none, CUDA_VISIBLE_DEVICES=\n"
+    )
+
+
+def test_failing_and_going_on(machine: Path) -> None:
+    """A command that fails stops no other before the barrier, and all behind it. The same call runs what is not done,
+    and that alone; a third finds nothing to do."""
+    lines = [
+        "good: echo good >> ran",
+        "bad: echo bad >> ran; [[ -e mended ]]",
+        "other: echo other >> ran",
+        "wait",
+        "behind: echo behind >> ran",
+    ]
+    text = "\n".join(lines)
+    done = run(machine, text)
+    assert done.returncode == 1 and ("end, exit code 1") in [
+        what for _, name, what in events(done.stdout) if name == "bad"
+    ]
+    assert done.stdout.splitlines()[-1] == (
+        "failed: bad; see runs/queue/NAME.log. Not begun, behind the barrier: behind; the same call goes on"
+    )
+    assert sorted((machine / "ran").read_text().split()) == ["bad", "good", "other"]
+
+    (machine / "mended").touch()
+    (machine / "ran").unlink()
+    done = run(machine, text)
+    assert done.returncode == 0 and (machine / "ran").read_text().split() == ["bad", "behind"]
+
+    done = run(machine, text)
+    assert done.returncode == 0 and events(done.stdout) == []
+    assert (machine / "ran").read_text().split() == ["bad", "behind"]
+
+
+def test_done_with_other_variables_is_refused(machine: Path) -> None:
+    """What a trial has done is not taken for the real thing: the variables of a command belong to it, no others do."""
+    text = "a: echo $((100 * ${SHARE:-100})) >> ran\n"
+    assert run(machine, text, SHARE="1").returncode == 0
+    assert run(machine, text, SHARE="1", SCENES="3", CUDA_VISIBLE_DEVICES="7").returncode == 0
+    done = run(machine, text)
+    assert done.returncode == 2 and (machine / "ran").read_text() == "100\n"
+    assert done.stderr == (
+        "error: runs/queue/a.done must be of the command in list.txt, with the same variables, got another; "
+        "work in another folder, or remove the file to run the command\n"
+    )
+    assert run(machine, text.replace("100", "200"), SHARE="1").returncode == 2
+    (machine / "runs" / "queue" / "a.done").unlink()
+    assert run(machine, text).returncode == 0
+
+
+# ends on SIGTERM, a moment later, with a file; tells its session
+TRAINING = """#!/usr/bin/env bash
+trap 'sleep 0.3; echo state > "$1"; exit 143' TERM
+cut -d' ' -f6 /proc/$$/stat > "$1.session"
+while true; do sleep 0.02; done
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_signals_reach_the_commands(machine: Path, number: signal.Signals) -> None:
+    """Commands get SIGTERM, and what they still have to write is waited for, in pipes and in the background too; their
+    lines do not go on, no other line begins, and the same call goes on with all of them."""
+    write_program(machine, "training", TRAINING)
+    text = "\n".join(
+        [
+            "a: [[ -e quick ]] || training a; [[ -e quick ]] || touch went_on",
+            "b: [[ -e quick ]] || { (training b; true) | cat & wait; }",
+            "c: touch c",
+            "wait",
+            "d: touch d",
+        ]
+    )
+    process = start(machine, text)
+    wait_until(
+        lambda: all(path.exists() and path.read_text() for path in (machine / "a.session", machine / "b.session"))
+    )
+    (os.kill if number == signal.SIGTERM else os.killpg)(process.pid, number)  # a terminal's go to the whole group
+    output, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (128 + number, "")
+    assert (machine / "a").read_text() == (machine / "b").read_text() == "state\n"
+    assert not any((machine / name).exists() for name in ("went_on", "c", "d"))
+    assert output.splitlines()[-1] == f"stopped by {number.name}; not done: a b c d; the same call goes on"
+    for name in ("a", "b"):
+        assert processes_of_session(int((machine / f"{name}.session").read_text())) == []
+
+    (machine / "quick").touch()
+    assert run(machine, text).returncode == 0 and (machine / "d").exists()
+
+
+def test_nothing_is_left_behind(machine: Path) -> None:
+    """What a command leaves running is ended before its GPU takes the next one."""
+    write_program(machine, "training", TRAINING)
+    text = "a: training a & until [[ -s a.session ]]; do sleep 0.02; done\nb: cat a\n"
+    assert run(machine, text, CUDA_VISIBLE_DEVICES="0").returncode == 0
+    assert (machine / "runs" / "queue" / "b.log").read_text() == "state\n"
+
+
+def test_one_queue_a_folder(machine: Path) -> None:
+    """A second queue in the same folder is refused while the first works."""
+    text = "a: touch a; until [[ -e end ]]; do sleep 0.02; done\n"
+    first = start(machine, text)
+    wait_until((machine / "a").exists)
+    second = run(machine, text)
+    assert second.returncode == 2
+    assert second.stderr.startswith("error: FOLDER must be one that no other queue works in, got 'runs/queue'; ")
+    (machine / "end").touch()
+    first.communicate(timeout=120)
+    assert first.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("echo 1", "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got 'echo 1'; as in"),
+        ("a b: echo 1", "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got 'a b: echo 1'"),
+        ("../a: echo 1", "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got '../a:"),
+        (
+            "a:",
+            "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got 'a:'; as in first: echo 1",
+        ),
+        (
+            "wait for all",
+            "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got 'wait for all'",
+        ),
+        ("one: echo 2", "list.txt:3: names must differ, got 'one' as in line 2; give it another"),
+        ("a: echo 'b", "list.txt:3: the command of 'a' must be one that bash can read, got 'echo 'b'; mend it: "),
+    ],
+)
+def test_faulty_lines_are_refused(machine: Path, line: str, message: str) -> None:
+    """File, line, rule and remedy are told before anything begins."""
+    done = run(machine, f"# list\none: touch began\n{line}\n")
+    assert done.returncode == 2 and done.stderr.startswith(f"error: {message}") and done.stderr.count("\n") == 1
+    assert done.stdout == "" and not (machine / "began").exists() and not (machine / "runs").exists()
+
+
+def test_lists_are_refused(machine: Path) -> None:
+    """So are a list that is not there, one without commands, and a call without any."""
+    missing = run(machine, Path("none.txt"))
+    assert missing.returncode == 2
+    assert missing.stderr == (
+        "error: LIST must be a file that can be read, got 'none.txt'; as in jobs/queue.sh jobs/networks.txt\n"
+    )
+    empty = run(machine, "# nothing\nwait\n")
+    assert empty.returncode == 2
+    assert empty.stderr == "error: list.txt must have a line NAME: COMMAND, got none; add one, as in first: echo 1\n"
+    usage = subprocess.run([str(JOBS / "queue.sh")], capture_output=True, text=True)
+    assert usage.returncode == 2 and usage.stderr.startswith("usage: jobs/queue.sh LIST [FOLDER]")
+
+
+def calls(machine: Path, **variables: str) -> dict[str, list[list[str]]]:
+    """The modules that each line of jobs/networks.txt runs, with their arguments, in the order of the lines."""
+    write_program(machine, "python", PYTHON)
+    done = run(machine, JOBS / "networks.txt", CUDA_VISIBLE_DEVICES="", **variables)
+    assert done.returncode == 0, done.stderr
+    names = [name for _, name, what in events(done.stdout) if what == "begin"]
+    logs = {name: (machine / "runs" / "queue" / f"{name}.log").read_text().splitlines() for name in names}
+    made = {name: [json.loads(line) for line in lines] for name, lines in logs.items()}
+    assert all(call[0] == "-m" for lines in made.values() for call in lines)
+    return {name: [call[1:] for call in lines] for name, lines in made.items()}
+
+
+def test_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """jobs/networks.txt: each command's settings compose to a valid configuration; each network is trained on data that
+    an earlier line makes, exported, and scored on the same data; all shipped networks are among them; reports take
+    what was exported."""
+    data: dict[str, DatagenConfig] = {}
+    exported: dict[str, str] = {}  # weights to data
+    reported: set[str] = set()
+    for name, lines in calls(tmp_path).items():
+        mappings: dict[str, dict[str, Any]] = {}
+        for module, *arguments in lines:
+            monkeypatch.setattr("sys.argv", [module, *arguments])
+            (mappings[module],) = _compose(module.rpartition(".")[2])
+        if list(mappings) == ["datagen"]:
+            made = datagen_config(mappings["datagen"])
+            data[made.dataset.folder] = made
+        elif list(mappings) == ["tools.error_vs_time"]:
+            report = from_mapping(ErrorVsTimeConfig, mappings["tools.error_vs_time"])
+            assert report.weights is not None
+            assert set(report.weights) == {file for file, folder in exported.items() if folder == report.data}
+            reported |= set(report.weights)
+        else:
+            assert list(mappings) == ["hgn.train", "hgn.export", "hgn.evaluate"]
+            mappings["hgn.train"].pop("name")
+            config = from_mapping(TrainConfig, mappings["hgn.train"])
+            assert config.run == f"runs/{name}" and config.training.precision == "half"
+            made = data[config.dataset.folder]
+            assert config.dataset.training_scenes == made.dataset.training_scenes == 800
+            assert dataset_identity(config.datagen) == dataset_identity(made)
+            assert made.scene.obstacle_count > 0 or not config.network.sees_obstacles
+            export = from_mapping(ExportConfig, mappings["hgn.export"])
+            assert (export.checkpoint, export.half) == (f"runs/{name}/checkpoints/last.ckpt", True)
+            score = from_mapping(EvaluateConfig, mappings["hgn.evaluate"])
+            assert (score.weights, score.data) == (export.out, config.dataset.folder)
+            assert (score.split, score.scenes, score.frame_stride, score.precision) == ("test", 20, 5, "half")
+            exported[export.out] = score.data
+    assert reported == set(exported) and set(shipped_weights()) <= {Path(file).stem for file in exported}
+
+
+def test_trial_of_networks(tmp_path: Path) -> None:
+    """SCENES, SHARE and REPORT_SECONDS shorten data, trainings and reports, and change nothing else."""
+    (tmp_path / "trial").mkdir()
+    whole = calls(tmp_path)
+    trial = calls(tmp_path / "trial", SCENES="40", SHARE="1", REPORT_SECONDS="60")
+    shorter = {
+        "scenes=800": "scenes=40",
+        "dataset.training_scenes=800": "dataset.training_scenes=40",
+        "training.maximum_updates=500000": "training.maximum_updates=5000",
+        "training.maximum_updates=50000": "training.maximum_updates=500",
+        "seconds=null": "seconds=60",
+    }
+    assert trial == {
+        name: [[shorter.get(argument, argument) for argument in call] for call in lines]
+        for name, lines in whole.items()
+    }
+    used = {argument for lines in whole.values() for call in lines for argument in call}
+    assert set(shorter) <= used
