@@ -41,7 +41,7 @@ def main(mapping: dict[str, Any]) -> int:
         config.require_tiny()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: the children end, what was found is kept
     with tempfile.TemporaryDirectory(prefix="hgn_compare_") as folder:
-        room = Path(folder)
+        room = Path(folder).resolve()
         trees = find_trees(config.trees, room)
         report = Report(Path(config.out).resolve(), _meta(config, device, trees), config.cases, [t.name for t in trees])
         with Children(_settings(config, device, room), room, interpreter=device.type == "cpu") as children:

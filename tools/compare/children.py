@@ -31,6 +31,7 @@ class Children:
         """`settings`: of the programs. `room`: for logs and caches. `interpreter`: kernels run in Triton's."""
         self.settings, self.room, self.interpreter, self.programs = json.dumps(settings), room, interpreter, programs
         self._processes: list[subprocess.Popen[str]] = []
+        self._children: list[Child] = []
 
     def __enter__(self) -> Self:
         return self
@@ -38,10 +39,14 @@ class Children:
     def __exit__(self, *error: object) -> None:
         for process in self._processes:
             _end(process)
+        for child in self._children:
+            child.close()
 
     def serve(self, tree: Tree) -> Child:
         """The tree's process that answers."""
-        return Child(tree, self._start(tree, "server.py", (), subprocess.PIPE), self._log(tree))
+        child = Child(tree, self._start(tree, "server.py", (), subprocess.PIPE), self._log(tree))
+        self._children.append(child)
+        return child
 
     def compile(self, trees: Sequence[Tree], shares: int, stop: Callable[[], bool]) -> str:
         """Compiles all trees' kernels at once, `shares` processes each, until `stop` says so; what to tell of it."""
@@ -97,7 +102,8 @@ class Child:
         self.tree, self.process, self.log = tree, process, log
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._last: dict[str, Any] | None = None  # said from now on, for the process is at its end
-        threading.Thread(target=self._read, daemon=True).start()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     def tell(self, order: str, **arguments: Any) -> None:
         """Gives an order, whose answer is waited for later."""
@@ -124,10 +130,19 @@ class Child:
         self.tell(order, **arguments)
         return self.answer(patience_s)
 
+    def close(self) -> None:
+        """What is left once the process has ended."""
+        assert self.process.stdin is not None
+        self._reader.join()
+        with contextlib.suppress(BrokenPipeError):  # of an order that nobody has read
+            self.process.stdin.close()
+
     def _read(self) -> None:
         assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self._answers.put(json.loads(line))
+        with self.process.stdout:
+            for line in self.process.stdout:
+                if line.endswith("\n"):  # it may have died in the midst of one
+                    self._answers.put(json.loads(line))
         code = self.process.wait()
         self._answers.put({"error": f"the process died (exit code {code}): {end_of(self.log)}", "ended": True})
 

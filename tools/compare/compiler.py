@@ -50,7 +50,7 @@ def _jobs(settings: dict[str, Any]) -> list[ahead.AheadJob | ahead.FrameJob]:
             continue
         scenes = int(count)
         update = UpdateSettings(scenes, training.noise_std, training.grid_jitter, OBSTACLE_CELL_SIZE)
-        cells = tuple(scenes * cells for cells in _cells(network, particles))
+        cells = tuple(scenes * of_scene for of_scene in _cells(network, particles))
         kernels = KERNEL_PRECISION[precision]
         jobs.append(ahead.AheadJob(network, update, kernels, False, False, scenes * particles, cells, capability))
     sizes = tuple((count, _cells(network, count)[0]) for count in sorted(frames))
