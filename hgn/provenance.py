@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-PACKAGES = ("torch", "lightning", "taichi", "numpy")
+PACKAGES = ("torch", "triton", "lightning", "taichi", "numpy")
 # /a/b/c, but no URL's path
 _ABSOLUTE_PATH = re.compile(r"(?<![\w.:/~-])/(?:[^/\s,='\"\[\](){}]+/)*([^/\s,='\"\[\](){}]+)/?")
 

@@ -5,19 +5,23 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from hgn.schema import ConfigError, from_mapping
+from tools.bench import contenders, fast
 from tools.bench.contenders import PASS
+from tools.bench.states import Workload, batch_of
 from tools.compare import children
 from tools.compare.__main__ import main
 from tools.compare.children import Children
 from tools.compare.config import CompareConfig
 from tools.compare.report import Report
+from tools.compare.server import Server
 from tools.compare.trees import TAKEN, Tree, find_trees
 from tools.compare.turns import Comparison
 
@@ -28,52 +32,80 @@ SMALL: dict[str, Any] = {
     "rounds": 1,
     "device": "cpu",
 }
-TIME_ADDED, TIME_SUBTRACTED = "tl.where(newest, v + a, v)", "tl.where(newest, v - a, v)"
+ADDED, SUBTRACTED = "tl.where(newest, v + a, v)", "tl.where(newest, v - a, v)"
 
 
-def test_this_tree_beside_its_last_commit(
+def test_this_tree_its_last_commit_and_a_wrong_copy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An update of this tree, and of the commit below it where there is a repository: checked before and after, timed,
-    in the file and in the table; the exit code is 0."""
-    monkeypatch.chdir(ROOT)
-    trees = [".", "HEAD"] if (ROOT / ".git").exists() else ["."]
-    out = tmp_path / "reports" / "compare.json"
-    assert main(SMALL | {"trees": trees, "cases": ["update_1"], "out": str(out)}) == 0
-    report = json.loads(out.read_text())
-    assert {"device", "versions", "commit", "date", "command", "config", "trees"} <= report["meta"].keys()
-    assert [tree["tree"] for tree in report["meta"]["trees"]] == trees
-    assert [row["tree"] for row in report["rows"]] == trees
-    for row in report["rows"]:
-        assert (row["case"], row["check"], row["checked"]) == ("update_1", PASS, ["before", "after"])
-        low, high = row["ms_quartiles"]
-        assert low <= row["ms"] <= high and row["samples"] == 1
-    assert all(check["errors"].keys() == {"loss", "gradient"} for check in report["checks"])
-    assert capsys.readouterr().out.startswith(f"| ms | {' | '.join(trees)} |\n")
-
-
-def test_a_tree_with_a_wrong_kernel(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A copy that subtracts accelerations gets no time, the error instead, and exit code 1; the other tree is timed and
-    profiled all the same."""
+    """This tree, and its last commit where there is a repository, are checked before and after, and timed; a copy
+    that subtracts accelerations gets no time but the error, and the exit code is 1."""
     wrong = tmp_path / "wrong"
     for name in TAKEN[:-1]:
         shutil.copytree(ROOT / name, wrong / name, ignore=shutil.ignore_patterns("*.safetensors", "__pycache__"))
     kernel = wrong / "hgn" / "kernels" / "rollout" / "kernel.py"
     right = kernel.read_text()
-    assert right.count(TIME_ADDED) == 1
-    kernel.write_text(right.replace(TIME_ADDED, TIME_SUBTRACTED))
-    out = tmp_path / "compare.json"
-    asked = {"trees": [str(ROOT), str(wrong)], "cases": ["frame_1"], "profiles": ["frame_1"], "out": str(out)}
+    assert right.count(ADDED) == 1
+    kernel.write_text(right.replace(ADDED, SUBTRACTED))
+    monkeypatch.chdir(ROOT)
+    good = [".", "HEAD"] if (ROOT / ".git").exists() else ["."]
+    out = tmp_path / "reports" / "compare.json"
+    asked = {"trees": [*good, str(wrong)], "cases": ["frame_1"], "out": str(out)}
     assert main(SMALL | asked) == 1
     report = json.loads(out.read_text())
-    good, bad = report["rows"]
-    assert good["tree"] == ROOT.name and good["check"] == PASS and good["ms"] > 0
+    assert {"device", "versions", "commit", "date", "command", "config", "trees"} <= report["meta"].keys()
+    assert [tree["tree"] for tree in report["meta"]["trees"]] == [*good, "wrong"]
+    *rows, bad = report["rows"]
+    assert [row["tree"] for row in rows] == good
+    for row in rows:
+        assert (row["case"], row["check"], row["checked"]) == ("frame_1", PASS, ["before", "after"])
+        low, high = row["ms_quartiles"]
+        assert 0 < low <= row["ms"] <= high and row["samples"] == 1
     assert bad["tree"] == "wrong" and bad["ms"] is None and bad["samples"] == 0 and bad["checked"] == ["before"]
     assert bad["check"].startswith("relative error of acceleration 2.0e+00 exceeds")
-    assert [profile["tree"] for profile in report["profiles"]] == [ROOT.name]
+    assert all(check["errors"].keys() == {"acceleration"} for check in report["checks"])
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0].startswith("| frame_1, µs × launches |") and printed[-1] == f"frame_1 of wrong: {bad['check']}"
+    assert printed[0] == f"| ms | {' | '.join(good)} | wrong |"
     assert printed[-2].startswith("| frame_1 | ") and printed[-2].endswith(" | - |")
+    assert printed[-1] == f"frame_1 of wrong: {bad['check']}"
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    """Of this tree, in this process."""
+    for name in ("reference_acceleration", "reference_gradients", "verdict", "FRAMES_AT_ONCE", "UPDATES_AT_ONCE"):
+        monkeypatch.setattr(fast, name, getattr(fast, name))  # which the server replaces
+    before = torch.get_float32_matmul_precision()
+    yield Server(SMALL | {"precision": "half", "references": str(tmp_path)})
+    torch.set_float32_matmul_precision(before)
+
+
+def test_an_update_is_checked_and_timed(server: Server) -> None:
+    """Loss and gradients of all scenes are compared with those that were kept; a wrong answer is seen."""
+    server.reference("update_1")
+    server.prepare("update_1")
+    found = server.check("update_1")
+    assert found["check"] == PASS and found["errors"].keys() == {"loss", "gradient"}
+    assert len(server.sample("update_1")["ms"]) == 1
+
+
+def test_a_profile(server: Server) -> None:
+    """Names, times and launches of what a frame runs, the longest first, and all together."""
+    server.prepare("frame_1")
+    found = server.profile("frame_1")
+    times = [kernel["us"] for kernel in found["kernels"]]
+    assert times == sorted(times, reverse=True) and found["us"] >= sum(times) > 0 and found["launches"] > 1
+
+
+def test_references_of_many_scenes(server: Server, tmp_path: Path) -> None:
+    """Scenes that do not fit into the GPU at once give the same loss and gradients in groups."""
+    server.reference("update_11")
+    loss, gradient = torch.load(tmp_path / "update_11.pt")
+    network = contenders.bench_network(server.network, server.device)
+    batch = batch_of(Workload(1, 11), server.network, server.device)
+    expected_loss, expected = contenders.reference_gradients(network, batch)
+    torch.testing.assert_close(loss, expected_loss)
+    torch.testing.assert_close(gradient, expected)
 
 
 STAND_IN = """
@@ -117,14 +149,20 @@ assert not (folder / "does_not_compile").exists(), "no such kernel"
 
 
 @pytest.fixture
-def compare(tmp_path: Path) -> Callable[..., Report]:
-    """Compares trees with stand-ins for server and compiler; each tree is told by the files in it."""
+def stand_ins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of server and compiler: what a tree does is told by the files in it."""
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    (programs / "server.py").write_text(STAND_IN)
+    (programs / "compiler.py").write_text(COMPILER)
+    monkeypatch.setattr(children, "PROGRAMS", programs)
+
+
+@pytest.fixture
+def compare(tmp_path: Path, stand_ins: None) -> Callable[..., Report]:
+    """Compares trees, a file in each."""
 
     def run(*files: str, seconds: float = 60.0, rounds: int = 4, interrupt: bool = False) -> Report:
-        programs = tmp_path / "programs"
-        programs.mkdir()
-        (programs / "server.py").write_text(STAND_IN)
-        (programs / "compiler.py").write_text(COMPILER)
         trees = []
         for i, file in enumerate(files):
             folder = tmp_path / f"tree_{i}"
@@ -135,7 +173,7 @@ def compare(tmp_path: Path) -> Callable[..., Report]:
             tuple(files), "unused", ("frame_5",), profiles=("frame_5",), seconds=seconds, rounds=rounds
         )
         report = Report(tmp_path / "compare.json", {}, config.cases, [tree.name for tree in trees])
-        started = Children({"cases": ["frame_5"]}, tmp_path, interpreter=False, programs=programs)
+        started = Children({"cases": ["frame_5"]}, tmp_path, interpreter=False)
         try:
             with started:
                 comparison = Comparison(config, started, trees, report)
@@ -166,6 +204,17 @@ def test_rounds_and_table(compare: Callable[..., Report]) -> None:
         "| frame_5 | 2 | 2 (1.000) |",
     ]
     assert "| k | 2.0 × 1 | 2.0 × 1 |" in report.profile_tables()
+
+
+@pytest.mark.parametrize(("file", "code"), [("fine", 0), ("wrong_after", 1)])
+def test_exit_code(
+    repository: Path, tmp_path: Path, stand_ins: None, capsys: pytest.CaptureFixture[str], file: str, code: int
+) -> None:
+    """0 where every check of every tree passes, else 1; the table comes last."""
+    (repository / file).touch()
+    asked = {"trees": ["main", ".."], "cases": ["frame_1", "frame_2"], "out": str(tmp_path / "compare.json")}
+    assert main(SMALL | asked) == code
+    assert capsys.readouterr().out.startswith("| ms | main | .. |")
 
 
 def test_no_time_of_what_fails_afterwards(compare: Callable[..., Report]) -> None:

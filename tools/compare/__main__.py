@@ -8,7 +8,6 @@ check is red.
 
 from __future__ import annotations
 
-import importlib.metadata
 import signal
 import tempfile
 from pathlib import Path
@@ -52,7 +51,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 def _meta(config: CompareConfig, device: torch.device, trees: list[Tree]) -> dict[str, Any]:
     meta = provenance(device)
-    meta["versions"] |= {"triton": importlib.metadata.version("triton"), "cuda": torch.version.cuda}
+    meta["versions"]["cuda"] = torch.version.cuda
     commits = [{"tree": tree.name, "commit": tree.commit} for tree in trees]
     return meta | {"config": without_folders(to_mapping(config)), "trees": commits}
 

@@ -27,9 +27,9 @@ LEAST_PATIENCE_S = 60.0  # for an answer, however little time is left
 class Children:
     """Starts processes of trees; they end with this one, and Ctrl-C reaches only this one."""
 
-    def __init__(self, settings: dict[str, Any], room: Path, interpreter: bool, programs: Path = PROGRAMS) -> None:
+    def __init__(self, settings: dict[str, Any], room: Path, interpreter: bool) -> None:
         """`settings`: of the programs. `room`: for logs and caches. `interpreter`: kernels run in Triton's."""
-        self.settings, self.room, self.interpreter, self.programs = json.dumps(settings), room, interpreter, programs
+        self.settings, self.room, self.interpreter = json.dumps(settings), room, interpreter
         self._processes: list[subprocess.Popen[str]] = []
         self._children: list[Child] = []
 
@@ -81,7 +81,7 @@ class Children:
             own["TRITON_INTERPRET"] = "1"
         with self._log(tree).open("a") as log:
             process = subprocess.Popen(
-                [sys.executable, "-P", str(self.programs / program), self.settings, *arguments],
+                [sys.executable, "-P", str(PROGRAMS / program), self.settings, *arguments],
                 env={**os.environ, **own},
                 cwd=tree.folder,
                 stdin=channel or subprocess.DEVNULL,

@@ -7,6 +7,7 @@ had.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -172,6 +173,7 @@ class Server:
         return kind, Workload(int(count), 1) if kind == "frame" else Workload(self.particles, int(count))
 
     def _free(self) -> None:
+        gc.collect()
         if self.gpu:
             torch.cuda.empty_cache()
 
