@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-PACKAGES = ("torch", "lightning", "taichi", "numpy")
+PACKAGES = ("torch", "triton", "lightning", "taichi", "numpy")
 # /a/b/c, but no URL's path
 _ABSOLUTE_PATH = re.compile(r"(?<![\w.:/~-])/(?:[^/\s,='\"\[\](){}]+/)*([^/\s,='\"\[\](){}]+)/?")
 
@@ -24,10 +24,11 @@ def commit() -> str:
     """The checkout's commit, with `+changes` where files differ from it; HGN_COMMIT where it is set, for copies
     without their history; else `unknown`.
     """
-    given = os.environ.get("HGN_COMMIT")
-    if given:
-        return given
-    folder = Path(__file__).resolve().parent.parent
+    return os.environ.get("HGN_COMMIT") or commit_of(Path(__file__).resolve().parent.parent)
+
+
+def commit_of(folder: Path) -> str:
+    """The commit of the checkout in `folder`, with `+changes` where files differ from it; `unknown` if it is none."""
     if not (folder / ".git").exists():
         return "unknown"
     try:
