@@ -270,9 +270,7 @@ class NetworkConfig:
     obstacle_features: bool = True
     materials: tuple[str, ...] = MATERIALS
     maximum_neighbours: int | None = None  # of a particle of GNS, the nearest; none: all within R
-    static_spacing_cells: float = (
-        0.25  # of gns_particles: how far apart static particles are, at least, in obstacle cells
-    )
+    static_spacing_cells: float = 0.25  # of gns_particles: the least distance of static particles, in obstacle cells
 
     def __post_init__(self) -> None:
         require_one_of(self, "kind", NETWORK_KINDS)

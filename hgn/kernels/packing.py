@@ -74,7 +74,7 @@ class _Packer:
         parameters = list(network.parameters())
         every = torch.arange(sum(parameter.numel() for parameter in parameters))
         pieces = every.split([parameter.numel() for parameter in parameters])
-        self.places = {id(parameter): piece for parameter, piece in zip(parameters, pieces, strict=True)}
+        self.places = dict(zip(map(id, parameters), pieces, strict=True))
         self.pieces: list[torch.Tensor] = []
         self.size = 0
 

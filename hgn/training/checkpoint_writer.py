@@ -39,9 +39,8 @@ class CheckpointWriter(TorchCheckpointIO):
     def wait(self) -> None:
         """Returns once the last checkpoint is on disk. Raises: OSError where it could not be written."""
         if self._writing is not None:
-            futures.wait(
-                [self._writing]
-            )  # a second Ctrl-C leaves from here: `teardown` then waits, and tells of errors
+            # a second Ctrl-C leaves from here: `teardown` then waits, and tells of errors
+            futures.wait([self._writing])
             writing, self._writing = self._writing, None
             writing.result()
 

@@ -21,9 +21,8 @@ def _bench_gns() -> NetworkConfig:
 class BenchConfig:
     """`python -m tools.bench`: what is timed."""
 
-    cases: tuple[str, ...] | None = (
-        None  # none: all that differ here, naive on a CPU alone, of the public GNS where it is
-    )
+    # none: all that differ here, the naive network on a CPU alone, the public GNS where there is a copy of it
+    cases: tuple[str, ...] | None = None
     particles: tuple[int, ...] | None = None  # of one scene; none: by the device
     scenes: tuple[int, ...] | None = None  # side by side, of the smallest number of particles; none: by the device
     precisions: tuple[str, ...] | None = None  # none: TF32 and half on a GPU, float32 on a CPU
