@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 
 import torch
+import triton
 
 from hgn.config import NetworkConfig
 from hgn.kernels.cells.kernel import cell_backward
@@ -15,7 +16,7 @@ from hgn.kernels.edges.kernel import edge_backward
 from hgn.kernels.engine import OUT, Block, Engine, Tuning
 from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.packing import PackedFCN, PackedNetwork
-from hgn.kernels.pairs.kernel import pairs_backward
+from hgn.kernels.pairs.kernel import pairs_backward, pairs_weight_gradient
 from hgn.kernels.rows.kernel import gather_project_backward, rows_backward
 from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
 
@@ -52,7 +53,8 @@ class TrainingEngine(Engine):
         self.totals = self._float(self.packed.size + width * grid.features + tail)
         self.output_gradient = self._float(particles, OUT)
         self.latent_gradient = self._float(particles, width)
-        self.product_gradient = self._float(capacities[0], width)  # of what the pairs read of the cells
+        # of what the pairs read of the cells, which add to it
+        self.product_gradient = (self._operand if self.tuning.half_sums else self._float)(capacities[0], width)
         self.cell_gradient_up = [self._float(c, width) for c in capacities]
         self.cell_gradient_down = [self._float(c, width) for c in capacities]
         self.edge_gradient = self._operand(capacities[0], 6, width)
@@ -103,9 +105,10 @@ class TrainingEngine(Engine):
         job(g["decode_h"], self.decoder_input, packed.decode.parts[0], particles, packed.decode.first_bias)
         job(g["decode_z"], self.decode_hidden, packed.decode.second, particles, packed.decode.second_bias)
         job(g["down_p"], self.latent, pair.parts[0], particles, pair.first_bias)
-        job(g["down_z"], self.kept_down[0], pair.second, particles, pair.second_bias, 8)
         job(g["up_p"], self.latent, back.parts[1], particles, back.first_bias)
-        job(g["up_z"], self.kept_up[0], back.second, particles, back.second_bias, 8)
+        if self.keeps_pair_hidden():
+            job(g["down_z"], self.kept_down[0], pair.second, particles, pair.second_bias, 8)
+            job(g["up_z"], self.kept_up[0], back.second, particles, back.second_bias, 8)
         for block, name in self._named_blocks():
             for m in range(steps):
                 edge, cell = block.packed.edge[m], block.packed.cell[m]
@@ -173,6 +176,8 @@ class TrainingEngine(Engine):
         self._pairs_backward(
             packed.cell_to_particle,
             self.latent_gradient,
+            self.by_particle_up,
+            top.product,
             self.kept_up,
             g["up_z"],
             g["up_p"],
@@ -227,6 +232,8 @@ class TrainingEngine(Engine):
         self._pairs_backward(
             packed.particle_to_cell,
             self.cell_gradient_down[0],
+            self.by_particle_down,
+            self.by_particle_down,
             self.kept_down,
             g["down_z"],
             g["down_p"],
@@ -341,6 +348,8 @@ class TrainingEngine(Engine):
         self,
         fcn: PackedFCN,
         gradient: torch.Tensor,
+        by_particle: torch.Tensor,
+        by_cell: torch.Tensor,
         kept: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
         second_gradient: torch.Tensor,
         by_particle_gradient: torch.Tensor,
@@ -348,8 +357,11 @@ class TrainingEngine(Engine):
         to_cell: bool,
     ) -> None:
         grid = self.grid
-        pairs_backward[self._programs(grid.particles, self.tuning.pair_particles)](
+        programs = self._programs(grid.particles, self.tuning.pair_particles)
+        pairs_backward[programs](
             gradient,
+            by_particle,
+            by_cell,
             grid.cell_N8,
             grid.weight_N8,
             grid.fraction_N3,
@@ -372,6 +384,26 @@ class TrainingEngine(Engine):
             PRECISION=self.precision,
             num_warps=self.tuning.pair_warps,
         )
+        if not self.keeps_pair_hidden():
+            pairs_weight_gradient[programs](
+                second_gradient,
+                by_particle,
+                by_cell,
+                grid.cell_N8,
+                self.particle_count,
+                self.values,
+                self.totals,
+                fcn.parts[-1],
+                fcn.second,
+                fcn.second_bias,
+                self.unscale,
+                TO_CELL=to_cell,
+                WIDTH=self.width,
+                PARTICLES=self.tuning.pair_particles,
+                PRECISION=self.precision,
+                PIPELINED=not triton.knobs.runtime.interpret,
+                num_warps=self.tuning.pair_warps,
+            )
 
     def _gather_backward(
         self,

@@ -52,8 +52,9 @@ class Tuning:
     gather_block: int = 0  # of a kernel for the sums of many rows' neighbours; 0: whoever needs them makes them
     cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
     cell_backward_warps: int = 8
-    half_cells: bool = False  # in inference cells too are rounded between kernels, as edges are
-    half_sums: bool = False  # and particles are added to them rounded, which is half the traffic of the L2 cache
+    half_cells: bool = False  # cells too are rounded between kernels, as edges are
+    # And particles are added to them rounded, half the traffic of the L2 cache: in training only the pairs' gradients.
+    half_sums: bool = False
     light_programs: int = 2  # on a processor, of kernels with one weight: pairs forward, edges of a first iteration
     light_registers: int | None = None  # of a thread, so that as many fit
     weight_registers: int | None = None  # of a thread of the weights' products: 128 for two programs on a processor
@@ -167,9 +168,10 @@ class Engine:
         self.transfer_hidden_down = [self._operand(capacities[i], width) for i in range(levels - 1)]
         self.transfer_hidden_up = [self._operand(capacities[i], width) for i in range(levels - 1)]
         pairs = 8 * particles if self.training else 1
+        hidden = pairs if self.keeps_pair_hidden() else 1
         # hidden layer, normalised output, one over its deviation
         self.kept_down, self.kept_up = (
-            (self._operand(pairs, width), self._operand(pairs, width), self._float(pairs)) for _ in range(2)
+            (self._operand(hidden, width), self._operand(pairs, width), self._float(pairs)) for _ in range(2)
         )
         shared_edge = None if self.training else self._operand(capacities[0], 6, width)
         self.down = [Block(i, packed.passing_down[i]) for i in range(levels)]
@@ -178,8 +180,12 @@ class Engine:
             capacity = capacities[block.level]
             block.send = [self._operand(capacity, width) for _ in range(2)]
             block.receive = [self._operand(capacity, width) for _ in range(2)]
+            kind = self._operand if self.tuning.half_cells else self._float
+            # particles are added to the first, by atomics: rounded sums cost the gradients precision
+            rounds = block is not self.down[0] or (self.tuning.half_sums and not self.training)
+            start = kind if rounds else self._float
             if self.training:
-                block.cell = [self._float(capacity, width) for _ in range(steps + 1)]
+                block.cell = [start(capacity, width)] + [kind(capacity, width) for _ in range(steps)]
                 block.edge = [self._operand(capacity, 6, width) for _ in range(steps - 1)]
                 block.edge_hidden = [self._operand(capacity, 6, width) for _ in range(steps)]
                 block.edge_normalised = [self._operand(capacity, 6, width) for _ in range(steps)]
@@ -190,11 +196,10 @@ class Engine:
                 block.cell_deviation = [self._float(capacity) for _ in range(steps)]
             else:
                 assert shared_edge is not None
-                kind = self._operand if self.tuning.half_cells else self._float
                 first, second = kind(capacity, width), kind(capacity, width)
                 block.cell = [(first, second)[m % 2] for m in range(steps + 1)]
-                if self.tuning.half_cells and not self.tuning.half_sums and block is self.down[0]:
-                    block.cell[0] = self._float(capacity, width)  # particles are added to it, by atomics
+                if start is not kind:
+                    block.cell[0] = start(capacity, width)
                 block.edge = [shared_edge.flatten(0, 1)[: 6 * capacity].view(capacity, 6, width)] * max(steps - 1, 0)
                 block.sum = [self._operand(capacity, width)] * steps
                 # not kept
@@ -348,6 +353,10 @@ class Engine:
             return False
         target = triton.runtime.driver.active.get_current_target()
         return target.backend == "cuda" and target.arch >= 90
+
+    def keeps_pair_hidden(self) -> bool:
+        """Whether the pairs' hidden layer is kept for the backward pass, and not computed again: see pairs_forward."""
+        return self.precision in ("tf32", "tf32x3")
 
     def _edge_cells(self, block: int) -> int:
         """Cells that a tile of edges takes where it has rows for `block` of eight each."""
