@@ -23,7 +23,7 @@ STEP_MARKERS = ("^", "v", "<", ">")  # the largest step first
 FLOOR_COLOR, TRIVIAL_COLOR = "#2b8a3e", "#868e96"
 FLOOR_LINES, TRIVIAL_LINES = ("-", "--"), (":", "--", "-.")
 TEXT, SMALL, TINY = 10.5, 9.5, 7.5  # points
-PANEL_WIDTH, PANEL_HEIGHT = 5.4, 4.9  # inches
+FIGURE_WIDTH, PANEL_HEIGHT = 16.2, 4.9  # inches
 NETWORKS = ("hgn", "gns", "gns_particles")
 NEAR_FLOOR, FAR_ABOVE = (
     30,
@@ -47,7 +47,7 @@ def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = Fa
     looks = _looks(rows)
     columns = _legend(rows, looks)
     below = max(len(column) for column in columns) * LEGEND_LINE / 72  # inches
-    size = (max(2, len(shown)) * PANEL_WIDTH, PANEL_HEIGHT + below + 0.9)
+    size = (FIGURE_WIDTH, PANEL_HEIGHT + below + 0.9)
     figure, grid = new_figure(1, len(shown), size)
     scenes = max((row.get("batch_scenes") or 1 for row in rows), default=1)
     how = f"{scenes} scenes side by side" if batched else "one scene"
@@ -276,7 +276,7 @@ def _footer(figure: Any, meta: Mapping[str, Any]) -> float:
         f"{CONVENTION}; scored by {meta['reference']}. torch {versions['torch']}, taichi {versions['taichi']}, commit "
         f"{meta['commit']}, {meta['date'][:10]}: {meta['command']}"
     )
-    width = int(figure.get_figwidth() * 72 / (0.55 * TINY))  # characters
+    width = int(figure.get_figwidth() * 72 / (0.62 * TINY))  # characters
     lines = textwrap.wrap(told, width, max_lines=4, placeholder=" …")
     figure.text(0.006, 0.008, "\n".join(lines), fontsize=TINY, color="0.35", va="bottom")
     return (len(lines) * 1.4 * TINY + 8) / 72
