@@ -64,9 +64,13 @@ class AheadCompilation:
     def __exit__(self, *error: object) -> None:
         self.stop()
 
+    @property
+    def running(self) -> bool:
+        return any(process.poll() is None for process in self._processes)
+
     def wait(self, interrupted: Callable[[], bool] = lambda: False) -> str:
         """Waits until all have ended or `interrupted` says so; what to tell the user."""
-        while any(process.poll() is None for process in self._processes):
+        while self.running:
             if interrupted():
                 self.stop()
                 return "fast path: compiling was interrupted"

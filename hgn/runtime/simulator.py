@@ -34,7 +34,7 @@ from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_positions
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
-from hgn.scene.rollout_file import cell_obstacles, obstacles_of_episode
+from hgn.scene.rollout_file import cell_obstacles, episode_surface
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import require
 
@@ -63,8 +63,9 @@ class InitialState:
     obstacle_grid: ObstacleGrid
     domain_size: tuple[float, float, float]
     gravity: tuple[float, float, float]
-    # The obstacles' meshes, for networks that see them as particles; none: only the cells are known, a square each.
-    obstacles: Callable[[], Sequence[Obstacle]] | None = None
+    # Points on the obstacles so many cells apart, for networks that see them as particles; none: only the cells are
+    # known, a square each.
+    sampled: Callable[[float], np.ndarray] | None = None
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -76,7 +77,7 @@ class InitialState:
             episode.obstacle_grid,
             episode.domain_size,
             episode.gravity,
-            lambda: obstacles_of_episode(episode),
+            lambda spacing_cells: episode_surface(episode, spacing_cells),
         )
 
     @staticmethod
@@ -89,14 +90,14 @@ class InitialState:
             build_obstacle_grid(scene.obstacles, scene.cell_size, scene.seed, scene.domain_size),
             scene.domain_size,
             scene.gravity,
-            lambda: scene.obstacles,
+            lambda spacing_cells: _surface(scene.obstacles, scene.cell_size, spacing_cells),
         )
 
     def surface(self, spacing_cells: float) -> np.ndarray:
         """Points on the obstacles, no closer than `spacing_cells` cells, float32 [P, 3]."""
-        grid = self.obstacle_grid
-        obstacles = cell_obstacles(grid) if self.obstacles is None else self.obstacles()
-        return surface_points(obstacles, grid.cell_size, 0, spacing_cells=spacing_cells)
+        if self.sampled is not None:
+            return self.sampled(spacing_cells)
+        return _surface(cell_obstacles(self.obstacle_grid), self.obstacle_grid.cell_size, spacing_cells)
 
 
 class Simulator:
@@ -261,7 +262,7 @@ class Simulator:
         try:
             yield rollout
         except LeftDomainError as error:
-            raise DivergenceError(error.frame, _left(error.lost, len(state.position_N3))) from None
+            raise DivergenceError(error.frame, left_text(error.lost, len(state.position_N3))) from None
         finally:
             self.growths += rollout.growths - before
             self._kept.pop(state.scene_count, None)
@@ -303,12 +304,17 @@ class Simulator:
     def _check(state: ParticleState, frame: int) -> None:
         left = int(lost(state.position_N3, state.domain_S3[state.scene_N]).sum())
         if left:
-            raise DivergenceError(frame, _left(left, len(state.position_N3)))
+            raise DivergenceError(frame, left_text(left, len(state.position_N3)))
 
 
-def _left(left: int, count: int) -> str:
+def left_text(left: int, count: int) -> str:
+    """How a simulation came apart."""
     return f"{left} of {count} particles are not finite or farther from the domain than its own size"
 
 
 def _initial(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
     return [InitialState.of_scene(scene) if isinstance(scene, Scene) else scene for scene in scenes]
+
+
+def _surface(obstacles: Sequence[Obstacle], cell_size: float, spacing_cells: float) -> np.ndarray:
+    return surface_points(obstacles, cell_size, 0, spacing_cells=spacing_cells)

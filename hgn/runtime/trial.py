@@ -6,11 +6,15 @@ Shape legend: T frames, N particles of a scene.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
-from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.network.features import ParticleState
+from hgn.runtime.divergence import lost
+from hgn.runtime.gns_edges import require_agreement
+from hgn.runtime.simulator import DivergenceError, InitialState, Simulator, left_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +32,13 @@ class Trial:
 def network_trials(
     simulator: Simulator, scenes: Sequence[InitialState], frames: int, on_frame: Callable[[int], None] | None = None
 ) -> list[Trial]:
-    """Rollouts side by side; in halves where one diverges, so that the others go on and it ends where it must."""
+    """Rollouts side by side. One that diverges ends where it must and the others go on: off the fast path without it,
+    on the fast path again in halves.
+    """
     if not scenes:
         return []
+    if simulator.path != "fast":
+        return _plain_trials(simulator, scenes, frames, on_frame)
     try:
         return [Trial(path_TN3) for path_TN3 in simulator.rollout(scenes, frames, on_frame)]
     except DivergenceError as error:
@@ -40,3 +48,49 @@ def network_trials(
         # The same again up to there. On a GPU sums are in no fixed order, and it may end earlier.
         (trial,) = network_trials(simulator, scenes, error.frame)
         return [Trial(trial.position_TN3, trial.cause or str(error))]
+
+
+@torch.inference_mode()
+def _plain_trials(
+    simulator: Simulator, scenes: Sequence[InitialState], frames: int, on_frame: Callable[[int], None] | None
+) -> list[Trial]:
+    state = simulator.start(scenes)
+    require_agreement(simulator.network, state, gradients=False)
+    paths = [np.empty((frames, *scene.position_N3.shape), np.float32) for scene in scenes]
+    for path_TN3, scene in zip(paths, scenes, strict=True):
+        path_TN3[0] = scene.position_N3
+    ends: dict[int, DivergenceError] = {}
+    going = list(range(len(scenes)))
+    for frame in range(1, frames):
+        state = simulator.step(state)
+        lost_N = lost(state.position_N3, state.domain_S3[state.scene_N])
+        if bool(lost_N.any()):
+            lost_S = torch.bincount(state.scene_N[lost_N], minlength=len(scenes)).tolist()
+            for i in filter(lambda i: lost_S[i], going):
+                ends[i] = DivergenceError(frame, left_text(lost_S[i], len(scenes[i].position_N3)))
+            going = [i for i in going if i not in ends]
+            state = _of_scenes(state, going)
+        if not going:
+            break
+        position_N3, begin = state.position_N3.cpu().numpy(), 0
+        for i in going:
+            end = begin + len(scenes[i].position_N3)
+            paths[i][frame], begin = position_N3[begin:end], end
+        if on_frame is not None:
+            on_frame(frame)
+    return [
+        Trial(path_TN3[: ends[i].frame], str(ends[i])) if i in ends else Trial(path_TN3)
+        for i, path_TN3 in enumerate(paths)
+    ]
+
+
+def _of_scenes(state: ParticleState, scenes: Sequence[int]) -> ParticleState:
+    """The state without the particles of other scenes; scenes keep their numbers."""
+    kept_N = torch.isin(state.scene_N, torch.tensor(scenes, device=state.scene_N.device))
+    return replace(
+        state,
+        position_N3=state.position_N3[kept_N],
+        velocity_NM3=state.velocity_NM3[kept_N],
+        material_N=state.material_N[kept_N],
+        scene_N=state.scene_N[kept_N],
+    )

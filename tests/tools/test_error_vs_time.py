@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Callable
@@ -29,7 +30,9 @@ from hgn.schema import ConfigError, from_mapping
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
+from tools.error_vs_time.comparisons import comparisons
 from tools.error_vs_time.contenders import FastPredictor, TrivialContender
+from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergence, sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
@@ -104,7 +107,7 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert 1e-13 < floor["perturbed by 1e-06"] < 3e-12
     assert floor["twice the step"] == pytest.approx(mpm[64, 0.5]["position_mse"]["5"])
     assert rows[0]["training_hours"] == 1.5 and "pay_back_rollouts" in rows[0]
-    for end in ("", "_frames"):
+    for end in ("", "_batched", "_frames"):
         with Image.open(f"{out}{end}.png") as picture:
             assert picture.width > 500
     printed = capsys.readouterr().out
@@ -136,13 +139,13 @@ def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.Monkey
     }
     assert main(options) == 0
     assert [call for call in calls if call[2] == 3] == [(1 / 64, [0.5, 1.0], 3)]  # of one grid side by side
-    assert {call[2] for call in calls} == {3, 4} and all(len(call[1]) == 1 for call in calls if call[2] == 4)
+    assert {call[2] for call in calls} == {2, 3, 4} and all(len(call[1]) == 1 for call in calls if call[2] != 3)
     rows = json.loads(Path(f"{out}.json").read_text())["rows"]
     assert [row["system"] for row in rows] == ["trivial"] * 3 + ["mpm", "mpm", "chaos"]
     assert rows[4]["scenes_reached"] == {"5": 0} and rows[4]["failed_scenes"] == 0
     assert main(options | {"seconds": 1e-9}) == 0
     report = json.loads(Path(f"{out}.json").read_text())
-    assert report["rows"] == [] and len(report["meta"]["not_run"]) == 6
+    assert [row["system"] for row in report["rows"]] == ["trivial"] * 3 and len(report["meta"]["not_run"]) == 3
     assert all(left["cause"] == "the time was over" for left in report["meta"]["not_run"])
 
 
@@ -203,9 +206,9 @@ def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys:
 def test_what_counts_most_comes_first(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Networks at the precision that tells most, then the solver on the data's grid, coarse grids, then other
-    precisions, whose rollouts off the fast path are short; the report keeps its order. What fails or is late is named
-    with the cause, and the others go on."""
+    """What is simulated with the reference, networks at the precision that tells most, coarse grids, then other
+    precisions, whose rollouts off the fast path are short; the report keeps its order. What fails is named with the
+    cause, the others go on, and only a fault that nobody foresaw makes the exit code 1."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
     monkeypatch.setattr("tools.error_vs_time.__main__.GNS_ORDER", ("fp32", "fp16", "tf32"))
     files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("gns", "hgn")]
@@ -217,16 +220,16 @@ def test_what_counts_most_comes_first(
             raise ConfigError("grids of 48 are not liked")
         return score.score(contender, *more)
 
-    monkeypatch.setattr("tools.error_vs_time.__main__.score", noted)
+    monkeypatch.setattr("tools.error_vs_time.run.score", noted)
     options = {"data": data, "out": str(tmp_path / "report"), "split": "validation", "weights": files, "device": "cpu"}
     options |= {"frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1, "sinkhorn_scenes": 0}
     options |= {"mpm_grids": [48, 64], "mpm_steps": [0.5], "precisions": ["tf32", "fp32"], "repeated_frames": 3}
     assert main(options) == 0
     assert [name.split(" (")[0] for name in order] == [
-        "HGN L = 3, M = 2, plain tf32",
-        "GNS M = 3, plain fp32",
         *["constant velocity", "ballistic motion", "mean acceleration"],
         *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
+        "HGN L = 3, M = 2, plain tf32",
+        "GNS M = 3, plain fp32",
         "MPM 48³, step 0.5",
         "HGN L = 3, M = 2, plain fp32",
         "GNS M = 3, plain tf32",
@@ -374,11 +377,11 @@ def test_pay_back() -> None:
 def test_scenes_that_failed_leave_the_means(data: str) -> None:
     """Errors at a frame are means over the scenes that reached it, and say over how many."""
     episodes = list(EpisodeStore(data, "validation").episodes)
-    config = ErrorVsTimeConfig(data="", out="x", sinkhorn_points=4)
+    config = ErrorVsTimeConfig(data="d", out="x", sinkhorn_points=4)
     paths = [np.array(episode.position_TN3) for episode in episodes]
     trials = [Trial(paths[0] + np.float32(0.1)), Trial(paths[1][:3] + np.float32(0.2), "why")]
-    row, curve = score.rollout_figures(trials, episodes, config, CPU)
-    np.testing.assert_allclose(curve, [*[0.075] * 3, *[0.03] * 3], rtol=1e-4)
+    row = score.rollout_figures(trials, episodes, config, CPU)
+    np.testing.assert_allclose(row["curve"], [*[0.075] * 3, *[0.03] * 3], rtol=1e-4)
     assert row["scenes_reached"] == {"5": 1} and row["first_failure_frame"] == 3 and row["first_failure"] == "why"
 
 
@@ -397,3 +400,177 @@ def test_bad_options(change: dict[str, Any], message: str) -> None:
     """Each wrong option is named before anything is simulated."""
     with pytest.raises(ConfigError, match=message):
         from_mapping(ErrorVsTimeConfig, {"data": "d", "out": "o"} | change)
+
+
+SHORT = {"split": "validation", "device": "cpu", "frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1}
+SHORT |= {"sinkhorn_points": 8, "batch_scenes": 2, "mpm_timed_frames": 4, "perturbation": 0.0}
+
+
+def test_a_report_goes_on_where_it_was_cut_off(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows of an earlier report are neither simulated nor scored again; those without a run time are. Without data they
+    are drawn again and nothing else."""
+    simulated: list[set[float]] = []
+
+    def noted(scenes, config, *more, stability_fractions, **others):
+        simulated.append(set(stability_fractions))
+        return fake_simulate(scenes, config, *more, stability_fractions=stability_fractions, **others)
+
+    monkeypatch.setattr(datagen.mpm.solver, "simulate", noted)
+    weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
+    first, second = tmp_path / "first", tmp_path / "second"
+    options = {"data": data, "weights": weights, "mpm_grids": [64], "mpm_steps": [0.5], **SHORT}
+    assert main(options | {"out": str(first)}) == 0
+    report = json.loads(Path(f"{first}.json").read_text())
+    rows = {row["system"]: row for row in report["rows"]}
+    rows["gns"]["ms"], rows["mpm"]["ms"] = None, 9.0  # the stand-in's frames come all at once
+    Path(f"{first}.json").write_text(json.dumps(report))
+    simulated.clear()
+    scored: list[str] = []
+
+    def counted(contender, *more):
+        scored.append(contender.row["system"])
+        return score.score(contender, *more)
+
+    monkeypatch.setattr("tools.error_vs_time.run.score", counted)
+    assert main(options | {"out": str(second), "earlier": [f"{first}.json"]}) == 0
+    assert scored == ["gns"] and simulated == [{0.25}]
+    again = json.loads(Path(f"{second}.json").read_text())["rows"]
+    assert sorted(row["system"] for row in again) == sorted(row["system"] for row in report["rows"])
+    assert main({"out": str(tmp_path / "drawn"), "earlier": [f"{second}.json"]}) == 0
+    assert json.loads((tmp_path / "drawn.json").read_text())["rows"] == again
+    assert (tmp_path / "drawn.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(ConfigError, match=r"earlier\[0\] frames must be 4 as in this report, got 6; take the data"):
+        main(options | {"out": str(second), "earlier": [f"{first}.json"], "frames": 4})
+    for text, cause in (("{}", "must be JSON that python -m tools.error_vs_time wrote"), (None, "an existing file")):
+        other = tmp_path / f"{text is None}.json"
+        if text is not None:
+            other.write_text(text)
+        with pytest.raises(ConfigError, match=rf"earlier\[0\] must be .*{cause}|{cause}"):
+            main({"out": "x", "earlier": [str(other)]})
+
+
+def test_what_nobody_foresaw_stops_one_contender(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The others are scored and timed, the fault is printed whole and named in the report, the exit code is 1."""
+    weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
+
+    def failing(contender, *more):
+        if contender.row["system"] == "hgn":
+            raise RuntimeError("an illegal memory access")
+        return score.score(contender, *more)
+
+    monkeypatch.setattr("tools.error_vs_time.run.score", failing)
+    options = {"data": data, "weights": weights, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
+    assert main(options | SHORT) == 1
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [row["system"] for row in report["rows"]] == ["gns", *["trivial"] * 3]
+    (left,) = report["meta"]["not_run"]
+    assert left["cause"] == "RuntimeError: an illegal memory access" and report["rows"][0]["ms"] > 0
+    assert "Traceback" in (told := capsys.readouterr().err) and "1 of the measurements failed" in told
+
+
+def test_a_run_that_is_killed_leaves_whole_points(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After each contender the file holds its errors and its run times."""
+    weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
+
+    def killed(contender, *more):
+        if contender.row["system"] == "gns":
+            raise KeyboardInterrupt
+        return score.score(contender, *more)
+
+    monkeypatch.setattr("tools.error_vs_time.run.score", killed)
+    options = {"data": data, "weights": weights, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
+    with pytest.raises(KeyboardInterrupt):
+        main(options | SHORT)
+    rows = {row["system"]: row for row in json.loads((tmp_path / "report.json").read_text())["rows"]}
+    assert rows["hgn"]["ms"] > 0 and rows["hgn"]["one_step_mse"] > 0 and rows["hgn"]["position_mse"]["5"] > 0
+
+
+def test_weights_that_do_not_fit_are_told_at_once(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before anything is simulated: a name that is not shipped, a file that is not there, weights for other data."""
+    monkeypatch.delattr(datagen.mpm.solver, "simulate")
+    dry = network_of(torch.float32, materials=("snow",))
+    for name, change in (("dry", {}), ("slow", {"frame_rate_hz": 30.0}), ("moon", {"gravity": (0.0, -1.6, 0.0)})):
+        network = dry if name == "dry" else network_of(torch.float32)
+        values = {"frame_rate_hz": 60.0, "obstacle_cell_size": 1 / 64} | change
+        save_weights(tmp_path / f"{name}.safetensors", network, WeightsInfo(network.config, **values))
+    for name, message in (
+        ("obstacle", r"weights\[0\] must be a file or the name of shipped weights \(.*obstacles.*\), got 'obstacle'"),
+        (str(tmp_path / "none.safetensors"), r"weights\[0\] must be an existing file, got .*none"),
+        (str(tmp_path / "dry.safetensors"), r"weights\[0\] must be for data as this: with .*, not snow alone, got"),
+        (str(tmp_path / "slow.safetensors"), "frames at 60 Hz, not 30.*take other weights"),
+        (str(tmp_path / "moon.safetensors"), "with the gravity"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            main({"data": data, "out": str(tmp_path / "report"), "weights": [name]} | SHORT)
+    with pytest.raises(ConfigError, match="data must be a data set, got None; make one with python -m datagen, or"):
+        main({"out": str(tmp_path / "report")})
+
+
+@pytest.mark.parametrize("kind", ["hgn", "gns"])
+def test_scenes_beside_one_that_diverges_go_their_way(data: str, kind: str) -> None:
+    """Off the fast path they are simulated once, as if it had never been there."""
+    episodes = EpisodeStore(data, "validation").episodes
+    scenes = [InitialState.of_episode(episode) for episode in (*episodes, episodes[0])]
+    scenes[1] = replace(scenes[1], velocity_N3=scenes[1].velocity_N3 + np.float32(60.0))
+    simulator, calls = Simulator((network_of if kind == "hgn" else gns_of)(torch.float32), 60.0), []
+    predict = simulator.predict
+    simulator.predict = lambda state: calls.append(len(state.position_N3)) or predict(state)
+    first, lost, last = network_trials(simulator, scenes, 5)
+    assert lost.cause is not None and f"diverged at frame {lost.frame_count}" in lost.cause and len(calls) == 4
+    assert calls[0] > calls[-1]
+    for trial, scene in ((first, scenes[0]), (last, scenes[2])):
+        (alone,) = network_trials(simulator, [scene], 5)
+        assert trial.cause is None
+        np.testing.assert_allclose(trial.position_TN3, alone.position_TN3, atol=1e-6)
+
+
+def report_row(system: str, error: float, ms: float | None, **more: Any) -> dict[str, Any]:
+    one_step = None if system in ("mpm", "chaos") else error
+    worst = {"episode": "test-000003", "share": 0.02, "reference": 0.01, "reference_worst": 0.015}
+    row = {"system": system, "one_step_mse": one_step, "one_step_quartiles": one_step and [0.5 * error, 2 * error]}
+    row |= {"one_step_by_material": one_step and {"water": 2 * error}, "position_mse": {"50": error, "299": 2 * error}}
+    row |= {"position_quartiles": {"50": [0.5 * error, 2 * error]}, "scenes_reached": {"50": 2, "299": 1}}
+    row |= {"seeds": [1, 2], "failed_scenes": 1, "curve": [0.0, error, None], "penetration": 0.01, "sinkhorn": {}}
+    row |= {"reference_penetration": 0.005, "worst_penetration": worst, "ms": ms, "ms_batched": ms, "batch_scenes": 2}
+    return row | {"weights": f"{system}.safetensors", "levels": 3, "message_passing_steps": 4, "path": "fast"} | more
+
+
+def report_rows() -> list[dict[str, Any]]:
+    return [
+        report_row("hgn", 1e-7, 0.5, precision="fp16"),
+        report_row("hgn", 1e-7, 2.0, precision="fp32"),
+        report_row("gns", 2e-7, 5.0, precision="fp16"),
+        report_row("gns_particles", 1e3, 50.0, precision="fp16"),
+        report_row("trivial", 1e-5, None, predictor="ballistic motion"),
+        report_row("mpm", 0.5e-7, 100.0, grid=64, step=0.5, precision="fp32"),
+        report_row("mpm", 1e-3, 20.0, grid=32, step=1.0, precision="fp32"),
+        report_row("chaos", 1e-9, None, floor="twice the step"),
+    ]
+
+
+def test_comparisons_in_words() -> None:
+    """Each network beside the best trivial predictor, by material too; HGN beside GNS and the solver, each at its
+    fastest; penetration in the worst scene beside the solver's own."""
+    told = "\n".join(comparisons(report_rows()))
+    hgn = "HGN L = 3, M = 4, fast fp16 (hgn.safetensors)"
+    assert f"{hgn}: 1.00e-07, 100.00 times below (water 2.00e-07, 100.00 times below)" in told
+    assert f"beside GNS M = 4, fast fp16 (gns.safetensors)\n  {hgn}: one-step MSE 2.00 times below" in told
+    assert "after 299 frames 2.00 times below, 10.0 times as fast" in told
+    assert f"{hgn}: 40.0 times as fast as MPM 32³, step 1" in told
+    assert "for the error after 50 frames 200.0 times as fast as MPM 64³, step 0.5" in told
+    assert "2.000% in test-000003, where the solver has 1.000%; the solver 0.500%, 1.500% in its worst scene" in told
+    assert comparisons([]) == []
+
+
+def test_the_figures_show_what_diverged(tmp_path: Path) -> None:
+    """Points beyond the panel, scenes that failed and a report without a single row are drawn too."""
+    meta = {"versions": {"torch": "2", "taichi": "1"}, "commit": "c", "date": "2026-01-01", "command": "x " * 200}
+    meta |= {"scenes": 2, "split": "test", "data": "d", "device": "a GPU", "reference": "the solver"}
+    rows = report_rows()
+    rows[2] |= {"position_mse": {"50": 1e-6}, "scenes_reached": {"50": 2, "299": 0}, "failed_scenes": 2}
+    for some in (rows, rows[:1], []):
+        for picture in (draw_pareto(some, meta), draw_pareto(some, meta, batched=True), draw_frames(some, meta)):
+            with Image.open(io.BytesIO(picture)) as image:
+                assert image.width > 500

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -19,18 +19,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from hgn.command import run_command
+from hgn.command import EXIT_MACHINE, run_command
 from hgn.config import MpmConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.select import first_episodes
 from hgn.device import choose_device
-from hgn.files import write_atomically, write_json
+from hgn.files import write_json
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
-from hgn.runtime.weights import find_weights, load_weights, shipped_weights
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, shipped_weights
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from tools.error_vs_time.comparisons import comparisons
 from tools.error_vs_time.contenders import (
     COARSE_GRIDS,
     PARTICLES_AT_ONCE,
@@ -39,18 +40,20 @@ from tools.error_vs_time.contenders import (
     NetworkContender,
     SolverContender,
     TrivialContender,
+    solver_row,
 )
+from tools.error_vs_time.earlier import Earlier, is_among
 from tools.error_vs_time.launches import Setting, SolverLaunches
-from tools.error_vs_time.plot import CONVENTION, draw_frames, draw_pareto
-from tools.error_vs_time.score import label, pay_back, report, score, table, time_in_turns
+from tools.error_vs_time.plot import CONVENTION
+from tools.error_vs_time.run import Run, draw
+from tools.error_vs_time.score import pay_back, table
 from tools.error_vs_time.settings import PRECISIONS, ErrorVsTimeConfig
 from tools.trial import other_grid
 
 if TYPE_CHECKING:
     from hgn.runtime.ahead import AheadCompilation
 
-# of the seconds given: until when a contender's errors, and its run times, may be begun with
-SCORING_SHARE, TIMING_SHARE = 0.72, 0.9
+COMPILING_SHARE = 0.4  # of the seconds given, until when kernels that are compiled ahead are waited for
 HGN_ORDER, GNS_ORDER = ("tf32", "fp16", "fp32"), ("fp16", "tf32", "fp32")  # what tells most for its time first
 
 
@@ -58,12 +61,19 @@ def main(mapping: dict[str, Any]) -> int:
     """Prints a table and writes the report; returns the exit code."""
     begun = time.monotonic()
     config = from_mapping(ErrorVsTimeConfig, mapping)
+    earlier = [Earlier.read(file, f"earlier[{i}]") for i, file in enumerate(config.earlier)]
+    if config.data is None:
+        return _draw_again(config, earlier)
+    Path(config.out).parent.mkdir(parents=True, exist_ok=True)
     device = choose_device(config.device)
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     frames = min(config.frames, *(len(episode.position_TN3) for episode in episodes))
+    for report in earlier:
+        report.require_same([episode.key for episode in episodes], frames, _reference_name(config))
+    known = [row for report in earlier for row in report.rows]
     mpm = replace(from_mapping(MpmConfig, store.manifest.config["mpm"], "mpm"), device=_solver_device(device))
-    networks = network_contenders(config, device, episodes)
+    networks = [c for c in network_contenders(config, device, episodes) if not is_among(c.row, known)]
     own_cell, rate = episodes[0].obstacle_grid.cell_size, episodes[0].frame_rate_hz
     own_grid = round(1 / own_cell)
 
@@ -74,95 +84,67 @@ def main(mapping: dict[str, Any]) -> int:
         cell_size = own_cell if grid == own_grid else 1 / grid
         return SolverLaunches(other_grid(mpm, cell_size, own_cell), cell_size, rate, most)
 
-    solvers = solver_contenders(config, mpm, launches, own_grid)
+    solvers = solver_contenders(config, mpm, launches, own_grid, known)
     with ExitStack() as stack:
         ahead = _kernels_ahead(networks, episodes, device)
         if ahead is not None:
             stack.enter_context(ahead)
         if config.resimulate:
             references, left_out = resimulated(episodes, launches(own_grid), config.reference_step)
-            reference = f"the solver on the data's grid at {config.reference_step:g} of the limit of stability"
         else:
             references, left_out = [_with_positions(e, np.asarray(e.position_TN3[:frames])) for e in episodes], {}
-            reference = "the data"
         require(bool(references), "data", "scenes that the solver gets through", left_out)
+        trivial = [c for c in trivial_contenders(store, device) if not is_among(c.row, known)]
+        meta = provenance(device) | {
+            "config": without_folders(to_mapping(config)),
+            "data": Path(config.data).name,
+            "split": config.split,
+            "scenes": len(references),
+            "episodes": [episode.key for episode in episodes],
+            "left_out": left_out,
+            "frames": frames,
+            "reference": _reference_name(config),
+            "convention": CONVENTION,
+            "seconds_before_scoring": time.monotonic() - begun,
+        }
+        run = Run(config, [*networks, *trivial, *solvers], references, device, meta, begun, known)
+        run.score_beside(lambda: ahead is not None and ahead.running)
         if ahead is not None:
-            print(ahead.wait(), file=sys.stderr)
-    contenders = [*networks, *trivial_contenders(store, device), *solvers]
+            print(ahead.wait(lambda: run.late(COMPILING_SHARE)), file=sys.stderr)
+    run.meta["seconds_before_timing"] = time.monotonic() - begun
+    run.measure()
+    add_pay_back(run.rows, config, mpm, references[0], frames)
+    run.write(drawn=True)
+    print(table(run.rows), *comparisons(run.rows), f"{run.out}.png {run.file}", sep="\n")
+    if run.failed:
+        print(f"error: {run.failed} of the measurements failed; see above, and not_run in {run.file}", file=sys.stderr)
+    return EXIT_MACHINE if run.failed else 0
 
-    def late(share: float) -> bool:
-        return config.seconds is not None and time.monotonic() - begun > share * config.seconds
 
-    scored: dict[int, tuple[dict[str, Any], np.ndarray]] = {}  # by the contender's place in the report
-    not_run: list[dict[str, Any]] = []
-    meta = provenance(device) | {
-        "config": without_folders(to_mapping(config)),
-        "data": Path(config.data).name,
-        "split": config.split,
-        "scenes": len(references),
-        "episodes": [episode.key for episode in references],
-        "left_out": left_out,
-        "not_run": not_run,
-        "frames": frames,
-        "reference": reference,
-        "convention": CONVENTION,
-        "seconds_before_scoring": time.monotonic() - begun,
-    }
-    out = Path(config.out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    file = config.json or f"{out}.json"
-
-    def write() -> None:  # after each contender and round: what there is outlives a run that is cut off
-        write_json(file, report(meta, [scored[i][0] for i in sorted(scored)]), allow_nan=False)
-
-    def leave_out(contender: Contender, cause: str) -> None:
-        not_run.append(contender.row | {"cause": cause})
-        print(f"left out: {label(contender.row)}: {cause}", file=sys.stderr)
-
-    with bar("errors", total=len(contenders) * len(references), unit="scene") as progress:
-        for i in sorted(range(len(contenders)), key=lambda i: contenders[i].importance):
-            contender = contenders[i]
-            if late(SCORING_SHARE):
-                leave_out(contender, "the time was over")
-                continue
-            started = time.monotonic()
-            try:
-                row, curve_T = score(contender, references, config, device, progress.update)
-            except (ConfigError, torch.OutOfMemoryError) as error:  # the others need not wait for it
-                leave_out(contender, str(error))
-                continue
-            finally:
-                contender.release()
-            row["scoring_s"] = time.monotonic() - started
-            scored[i] = row, curve_T
-            write()
-    meta["seconds_before_timing"] = time.monotonic() - begun
-    timed = [i for i in sorted(scored) if scored[i][0]["system"] not in ("trivial", "chaos")]
-
-    def note(times_of: Sequence[dict[str, Any] | None]) -> None:
-        for i, times in zip(timed, times_of, strict=True):
-            scored[i][0].update(times or {})
-        write()
-
-    watched = [contenders[i] for i in timed]
-    note(time_in_turns(watched, references, config, device, lambda: late(TIMING_SHARE), note))
-    rows, curves = [scored[i][0] for i in sorted(scored)], [scored[i][1] for i in sorted(scored)]
-    meta["not_timed"] = [label(scored[i][0]) for i in timed if scored[i][0].get("ms") is None]
-    add_pay_back(rows, config, mpm, references[0], frames)
-    meta["seconds"] = time.monotonic() - begun
-    print(table(rows))
-    write()
-    write_atomically(Path(f"{out}.png"), draw_pareto(rows, meta))
-    write_atomically(Path(f"{out}_frames.png"), draw_frames(rows, curves, meta))
-    print(f"{out}.png {out}_frames.png {file}")
+def _draw_again(config: ErrorVsTimeConfig, earlier: Sequence[Earlier]) -> int:
+    """Draws the rows of earlier reports, and prints them; nothing is measured."""
+    first = earlier[0].meta
+    for report in earlier:
+        report.require_same(first["episodes"], first["frames"], first["reference"])
+    rows = [row for report in earlier for row in report.rows]
+    Path(config.out).parent.mkdir(parents=True, exist_ok=True)
+    files = draw(config.out, rows, first)
+    write_json(config.json or f"{config.out}.json", {"meta": first, "rows": rows}, allow_nan=False)
+    print(table(rows), *comparisons(rows), " ".join(files), sep="\n")
     return 0
+
+
+def _reference_name(config: ErrorVsTimeConfig) -> str:
+    if not config.resimulate:
+        return "the data"
+    return f"the solver on the data's grid at {config.reference_step:g} of the limit of stability"
 
 
 def network_contenders(
     config: ErrorVsTimeConfig, device: torch.device, episodes: Sequence[Episode]
 ) -> list[NetworkContender]:
     """Every weights file at every precision that its path knows; what is left out is said."""
-    files = fitting_weights(episodes) if config.weights is None else [find_weights(name) for name in config.weights]
+    files = fitting_weights(episodes) if config.weights is None else named_weights(config.weights, episodes)
     contenders: list[NetworkContender] = []
     rate = episodes[0].frame_rate_hz
     for file in files:
@@ -185,23 +167,50 @@ def network_contenders(
     return contenders
 
 
-def fitting_weights(episodes: Sequence[Episode]) -> list[Path]:
-    """All shipped weights for such data: of its frame rate and materials, and those that see obstacles where there are
-    some, in cells as large, else those that do not. What does not fit is said.
+def named_weights(names: Sequence[str], episodes: Sequence[Episode]) -> list[Path]:
+    """Their files. Raises: ConfigError, before anything is simulated, for a name or file that is not there or is not
+    for such data.
     """
-    first = episodes[0]
+    files = []
+    for i, name in enumerate(names):
+        file = find_weights(name, f"weights[{i}]")
+        rule = _why_unfit(load_weights(file, field=f"weights[{i}]")[1], episodes)
+        remedy = "take other weights, or the data set that these were trained on"
+        require(rule is None, f"weights[{i}]", f"for data as this: {rule}", name, remedy)
+        files.append(file)
+    return files
+
+
+def fitting_weights(episodes: Sequence[Episode]) -> list[Path]:
+    """All shipped weights for such data, and those that see obstacles where there are some, else those that do not.
+    What does not fit is said.
+    """
     seen = any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
-    present = {MATERIALS[i] for episode in episodes for i in np.unique(episode.material_N)}
     found = []
     for name, file in shipped_weights().items():
         info = load_weights(file)[1]
-        fits = info.network.sees_obstacles == seen and info.frame_rate_hz == first.frame_rate_hz
-        fits = fits and (not seen or info.obstacle_cell_size == first.obstacle_grid.cell_size)
-        if fits and present <= set(info.network.materials):
+        if info.network.sees_obstacles == seen and _why_unfit(info, episodes) is None:
             found.append(file)
         else:
             print(f"left out: the shipped weights {name}, which are for other data", file=sys.stderr)
     return found
+
+
+def _why_unfit(info: WeightsInfo, episodes: Sequence[Episode]) -> str | None:
+    """What the data has that the weights do not know; none where nothing is."""
+    first = episodes[0]
+    present = {MATERIALS[i] for episode in episodes for i in np.unique(episode.material_N)}
+    cell_size = first.obstacle_grid.cell_size
+    if info.frame_rate_hz != first.frame_rate_hz:
+        return f"frames at {first.frame_rate_hz:g} Hz, not {info.frame_rate_hz:g}"
+    if not present <= set(info.network.materials):
+        return f"with {', '.join(sorted(present))}, not {', '.join(info.network.materials)} alone"
+    if tuple(first.gravity) != info.gravity:
+        return f"with the gravity {first.gravity}, not {info.gravity}"
+    obstacles = info.network.sees_obstacles and any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
+    if obstacles and info.obstacle_cell_size != cell_size:
+        return f"with obstacles in cells of {cell_size:g}, not {info.obstacle_cell_size:g}"
+    return None
 
 
 def _kernels_ahead(
@@ -232,9 +241,15 @@ def trivial_contenders(store: EpisodeStore, device: torch.device) -> list[Conten
 
 
 def solver_contenders(
-    config: ErrorVsTimeConfig, mpm: MpmConfig, launches: Callable[[int], SolverLaunches], own_grid: int
+    config: ErrorVsTimeConfig,
+    mpm: MpmConfig,
+    launches: Callable[[int], SolverLaunches],
+    own_grid: int,
+    known: Sequence[Mapping[str, Any]] = (),
 ) -> list[Contender]:
-    """The solver at its settings, and how far the reference departs from itself: the chaos floor."""
+    """The solver at its settings, and how far the reference departs from itself: the chaos floor. What is among the
+    `known` rows is neither simulated nor given.
+    """
     step = config.reference_step if config.resimulate else mpm.stability_fraction
     if config.resimulate:
         launches(own_grid).add(Setting(step))
@@ -243,14 +258,18 @@ def solver_contenders(
         importance = SAME_GRID if grid == own_grid else COARSE_GRIDS
         return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, importance)
 
-    points = {(grid, step): solver(grid, step) for grid in config.mpm_grids for step in config.mpm_steps}
+    def wanted(row: Mapping[str, Any]) -> bool:
+        return not is_among(row, known)
+
+    settings = [(grid, step) for grid in config.mpm_grids for step in config.mpm_steps]
+    points = {pair: solver(*pair) for pair in settings if wanted(solver_row(*pair))}
     contenders: list[Contender] = list(points.values())
-    if config.perturbation:
-        perturbed = solver(own_grid, step, config.perturbation)
-        contenders.append(perturbed.named(system="chaos", floor=f"perturbed by {config.perturbation:g}"))
-    if config.mpm_grids and 2 * step <= 1:
-        coarser = points.get((own_grid, 2 * step)) or solver(own_grid, 2 * step)
-        contenders.append(coarser.named(system="chaos", floor="twice the step"))
+    perturbed = {"system": "chaos", "floor": f"perturbed by {config.perturbation:g}"}
+    if config.perturbation and wanted(perturbed):
+        contenders.append(solver(own_grid, step, config.perturbation).named(**perturbed))
+    coarser = {"system": "chaos", "floor": "twice the step"}
+    if config.mpm_grids and 2 * step <= 1 and wanted(coarser):
+        contenders.append((points.get((own_grid, 2 * step)) or solver(own_grid, 2 * step)).named(**coarser))
     return contenders
 
 

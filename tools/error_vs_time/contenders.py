@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 PARTICLES_PER_BATCH = 32_768
 PARTICLES_AT_ONCE = 150_000  # of the fast path's one-step errors
-# What is scored first; what is last may be left out when the time is over.
-HGN_FIRST, GNS_FIRST, SAME_GRID, HGN_NEXT, COARSE_GRIDS, HGN_LAST, GNS_LAST = range(7)
+# What is measured first, a point of each kind before the others; what is last may be left out when the time is over.
+HGN_FIRST, SAME_GRID, GNS_FIRST, HGN_NEXT, COARSE_GRIDS, STATIC_PARTICLES_FIRST, HGN_LAST, GNS_LAST = range(8)
 PRECISIONS = {"fp32": "highest", "tf32": "high", "fp16": "half"}  # names of the report, and of the paths
 
 
@@ -69,8 +69,6 @@ class Contender(Protocol):
 class NetworkContender:
     """A weights file at one precision of its matrix products, on the path that a simulation would take."""
 
-    all_at_once = False
-
     def __init__(
         self,
         file: Path,
@@ -93,9 +91,11 @@ class NetworkContender:
         self.path, _ = path_on(device, config, path, self.precision)
         fast, hgn = self.path == "fast", config.kind == "hgn"
         if rank == 0:
-            self.importance = HGN_FIRST if hgn else GNS_FIRST
+            others = STATIC_PARTICLES_FIRST if config.obstacle_particles else GNS_FIRST
+            self.importance = HGN_FIRST if hgn else others
         else:
             self.importance = HGN_NEXT if fast else HGN_LAST if hgn else GNS_LAST
+        self.all_at_once = hgn and not fast and device.type == "cuda"  # which waits for the host then
         self.frames = None if fast or rank == 0 else repeated_frames
         self._fast: FastPredictor | None = None
         with self.matmul():
@@ -139,6 +139,10 @@ class NetworkContender:
         self.simulator.release()
 
 
+def solver_row(grid: int, step: float) -> dict[str, Any]:
+    return {"system": "mpm", "grid": grid, "step": step, "precision": "fp32"}
+
+
 class SolverContender:
     """The solver that made the data, on a grid and with a step of its own."""
 
@@ -148,12 +152,12 @@ class SolverContender:
         """Rollouts end at `frames`, where nobody takes the time."""
         self.launches, self.setting = launches, launches.add(setting)
         self.frames, self.importance = frames, importance
-        self.row: dict[str, Any] = {
-            "system": "mpm",
-            "grid": round(1 / launches.cell_size),
-            "step": setting.step,
-            "precision": "fp32",
-        }
+        self.row = solver_row(round(1 / launches.cell_size), setting.step)
+
+    @property
+    def simulated(self) -> bool:
+        """Whether it is known already: simulated beside another of its grid."""
+        return self.launches.knows(self.setting)
 
     def named(self, **row: Any) -> SolverContender:
         """The same in another row."""

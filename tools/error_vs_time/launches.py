@@ -41,6 +41,10 @@ class SolverLaunches:
             self._settings.append(setting)
         return setting
 
+    def knows(self, setting: Setting) -> bool:
+        """Whether scenes were simulated with it."""
+        return any(known == setting for known, _ in self._known)
+
     def trials(
         self, setting: Setting, episodes: Sequence[Episode], on_frame: Callable[[int], None] | None = None
     ) -> list[Trial]:

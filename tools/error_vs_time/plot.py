@@ -1,7 +1,9 @@
-"""The figures: error against run time, and error over the frames with the chaos floor."""
+"""The figures: error against run time, and error over the frames with the chaos floor. All are drawn from a report's
+JSON."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,114 +13,280 @@ from tools.error_vs_time.score import label
 from tools.figure import as_png, new_figure
 
 CONVENTION = "squared errors: sum over axes, mean over particles and scenes, frame units"
-STYLES = {"hgn": ("o", "tab:blue"), "gns": ("^", "tab:orange"), "gns_particles": ("v", "tab:red"), "mpm": ("s", "0.35")}
-NETWORK_COLORS = ("tab:blue", "tab:orange", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:cyan", "tab:olive")
-FLOOR_STYLE: dict[str, Any] = {"color": "tab:green", "linewidth": 1}
-TRIVIAL_LINES = (":", "--", "-.")
+SHOWN_FRAME = 50  # in a panel of its own, beside the last one
+HGN_COLORS = ("#0b3c8c", "#2f7fd6", "#12a3a8", "#7b5cd6", "#5aa9e6", "#2b2f77")
+GNS_COLORS = ("#d9480f", "#a61e4d", "#f08c00", "#862e9c")
+GRID_COLORS = ("#111111", "#5c5c5c", "#9a9a9a", "#c0c0c0")  # the finest first
+PRECISION_MARKERS = {"fp32": "o", "tf32": "s", "fp16": "D"}
+PRECISION_NAMES = {"fp32": "fp32", "tf32": "TF32", "fp16": "fp16"}
+STEP_MARKERS = ("^", "v", "<", ">")  # the largest step first
+FLOOR_COLOR, TRIVIAL_COLOR = "#2b8a3e", "#868e96"
+FLOOR_LINES, TRIVIAL_LINES = ("-", "--"), (":", "--", "-.")
+TEXT, SMALL, TINY = 10.5, 9.5, 7.5  # points
+FIGURE_WIDTH, PANEL_HEIGHT = 16.2, 4.9  # inches
+NETWORKS = ("hgn", "gns", "gns_particles")
+NEAR_FLOOR, FAR_ABOVE = (
+    30,
+    8,
+)  # times below the least error, and above the best that learns nothing: what is still shown
+LEGEND_LINE = 1.5 * SMALL  # points
+UPPER_EDGE = 0.965  # where of a panel's height they are marked that diverged in all scenes
+
+Row = Mapping[str, Any]
 
 
-def draw_pareto(rows: Sequence[Mapping[str, Any]], meta: Mapping[str, Any]) -> bytes:
-    """Milliseconds a frame against one-step MSE and position MSE; PNG bytes.
+def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = False) -> bytes:
+    """Milliseconds a frame of one scene, or of each of several side by side, against one-step MSE and position MSE; PNG
+    bytes.
 
-    Full markers are single scenes, hollow ones scenes side by side; crossed out are means over the scenes that came so
-    far, where others failed. Lines across are what needs no time: the chaos floor and the trivial predictors.
+    A line joins the precisions of a network, and the steps of the solver on a grid. Bars are the middle half of the
+    scenes. Crossed out are means over those scenes that came so far, where others failed.
     """
     frames = sorted({int(frame) for row in rows for frame in row["position_mse"]})
-    figure, axes = _figure(1 + len(frames))
-    for panel, frame in zip(axes, [None, *frames], strict=True):
-        _pareto(panel, rows, frame)
-    return _png(figure, meta, "Error against run time")
+    shown: list[int | None] = [None, *sorted({f for f in frames if f == SHOWN_FRAME} | set(frames[-1:]))]
+    looks = _looks(rows)
+    columns = _legend(rows, looks)
+    below = max(len(column) for column in columns) * LEGEND_LINE / 72  # inches
+    size = (FIGURE_WIDTH, PANEL_HEIGHT + below + 0.9)
+    figure, grid = new_figure(1, len(shown), size)
+    scenes = max((row.get("batch_scenes") or 1 for row in rows), default=1)
+    how = f"{scenes} scenes side by side" if batched else "one scene"
+    for panel, frame in zip(grid[0], shown, strict=True):
+        _pareto(panel, rows, frame, "ms_batched" if batched else "ms", looks)
+        panel.set_xlabel(f"milliseconds a frame{' and scene' if batched else ''} ({how})", fontsize=TEXT)
+    footer = _footer(figure, meta)
+    most = max(len(column) for column in columns)
+    figure.legend(
+        handles=[handle for column in columns for handle in column + [_mark("", "", "none")] * (most - len(column))],
+        loc="lower center",
+        bbox_to_anchor=(0.5, footer / size[1]),
+        ncols=len(columns),
+        fontsize=SMALL,
+        frameon=False,
+        columnspacing=2.5,
+        borderaxespad=0,
+    )
+    return _png(figure, meta, f"Error against run time, {how}", footer + below + 0.12)
 
 
-def draw_frames(rows: Sequence[Mapping[str, Any]], curves: Sequence[np.ndarray], meta: Mapping[str, Any]) -> bytes:
-    """Position MSE over the frames; PNG bytes."""
-    figure, (panel,) = _figure(1, width=9.0)
-    trivial = iter(TRIVIAL_LINES * len(rows))
-    colors = iter(NETWORK_COLORS * len(rows))
-    grays = np.linspace(0.75, 0.2, max(1, sum(row["system"] == "mpm" for row in rows))).tolist()
-    for row, curve_T in zip(rows, curves, strict=True):
-        system = row["system"]
-        style: dict[str, Any] = {"linewidth": 1.2}
-        if system == "mpm":
-            style |= {"color": str(grays.pop(0)), "marker": "s", "markevery": 0.2, "markersize": 3}
-        elif system == "chaos":
-            style = FLOOR_STYLE | {"linestyle": "--" if "step" in row["floor"] else "-"}
-        elif system == "trivial":
-            style = {"color": "0.6", "linewidth": 0.9, "linestyle": next(trivial)}
-        else:
-            style |= {"color": next(colors)}
-        time_T = np.flatnonzero(curve_T > 0)
-        panel.plot(time_T, curve_T[time_T], label=label(row), **style)
-    panel.set_xlabel("frame")
-    panel.set_ylabel("position MSE (domain units²)")
-    panel.set_yscale("log")
-    panel.grid(alpha=0.3)
-    if rows:
-        panel.legend(fontsize=6)
-    return _png(figure, meta, "Error over the frames")
-
-
-def _pareto(panel: Any, rows: Sequence[Mapping[str, Any]], frame: int | None) -> None:
-    times = [row[key] for row in rows for key in ("ms", "ms_batched") if row.get(key) is not None] or [1.0]
-    low, high = min(times), max(times)
-    middle = (low * high) ** 0.5
-    trivial = iter(TRIVIAL_LINES * len(rows))
+def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
+    """Position MSE over the frames, of each network at the precision that came farthest; PNG bytes."""
+    figure, ((panel,),) = new_figure(1, 1, (11.0, 6.4))
+    looks = _looks(rows)
+    best: dict[str, Row] = {}
     for row in rows:
-        error = row["one_step_mse"] if frame is None else row["position_mse"].get(str(frame))
-        if error is None or not error > 0:
+        if row["system"] in NETWORKS:
+            known = best.get(row["weights"])
+            if known is None or _length(row) > _length(known):
+                best[row["weights"]] = row
+    for row in rows:
+        if row["system"] in NETWORKS and row is not best[row["weights"]]:
             continue
-        if row["system"] == "chaos":
-            panel.axhline(error, label=label(row), **FLOOR_STYLE, linestyle="--" if "step" in row["floor"] else "-")
-        elif row["system"] == "trivial":
-            panel.axhline(error, color="0.6", linewidth=0.9, linestyle=next(trivial), label=label(row))
-        else:
-            marker, color = STYLES[row["system"]]
-            whole = frame is None or row["scenes_reached"][str(frame)] == len(row["seeds"])
-            for key, fill in (("ms_batched", "none"), ("ms", color)):
-                if row.get(key) is not None:
-                    panel.plot(row[key], error, marker, color=color, markerfacecolor=fill, markersize=6)
-                    if not whole:
-                        panel.plot(row[key], error, "x", color="black", markersize=8)
-            if row.get("ms") is not None:
-                left = row["ms"] < middle
-                place = {"xytext": (4 if left else -4, 3), "ha": "left" if left else "right"}
-                panel.annotate(_short(row), (row["ms"], error), fontsize=5, textcoords="offset points", **place)
+        look, curve_T = looks[_name(row)], np.array([np.nan if v is None else v for v in row["curve"]])
+        time_T = np.flatnonzero(curve_T > 0)
+        style = {"color": look["color"], "linestyle": look.get("line", "-")}
+        if row["system"] == "mpm":
+            style |= {"marker": look["markers"][row["step"]], "markevery": 0.15, "markersize": 5}
+        width = 2.0 if row["system"] in NETWORKS else 1.2
+        name = f"{_name(row)}, {PRECISION_NAMES[row['precision']]}" if row["system"] in NETWORKS else label(row)
+        panel.plot(time_T, curve_T[time_T], label=name, linewidth=width, **style)
+    panel.set_xlabel("frame", fontsize=TEXT)
+    panel.set_ylabel("position MSE (domain lengths²)", fontsize=TEXT)
+    panel.set_yscale("log")
+    panel.grid(alpha=0.25)
+    panel.tick_params(labelsize=SMALL)
+    if rows:
+        panel.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0, fontsize=SMALL, frameon=False)
+    return _png(figure, meta, "Error over the frames", _footer(figure, meta))
+
+
+def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks: Mapping[str, Any]) -> None:
+    times = [row[key] for row in rows if row.get(key) is not None] or [1.0]
+    limits = _limits(rows, frame)
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(_name(row), []).append(row)
+    for name, some in groups.items():
+        look = looks[name]
+        if some[0]["system"] in ("chaos", "trivial"):
+            error = _error(some[0], frame)
+            if error is not None:
+                panel.axhline(error, color=look["color"], linestyle=look["line"], linewidth=1.3, zorder=1)
+            continue
+        points = sorted((row for row in some if row.get(key) is not None), key=lambda row: row[key])
+        there = [(row[key], _error(row, frame)) for row in points if _error(row, frame) is not None]
+        panel.plot([x for x, _ in there], [y for _, y in there], "-", color=look["color"], linewidth=1.2, alpha=0.6)
+        for row in points:
+            _point(panel, row, frame, key, look, limits[1])
     panel.set_xscale("log")
-    panel.set_xlim(low / 2, high * 2)
+    panel.set_xlim(min(times) / 1.8, max(times) * 1.8)
+    panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
     panel.xaxis.set_minor_formatter("")
     panel.set_yscale("log")
-    panel.set_xlabel("ms a frame and scene (full: one scene, hollow: side by side)")
-    panel.set_ylabel(
-        "one-step MSE (frame units)" if frame is None else f"position MSE at frame {frame} (domain units²)"
+    panel.set_title(
+        "one step: MSE of accelerations" if frame is None else f"rollout: MSE of positions at frame {frame}",
+        fontsize=TEXT,
     )
-    panel.grid(alpha=0.3, which="both")
-    if panel.get_legend_handles_labels()[1]:
-        panel.legend(fontsize=6)
+    panel.set_ylabel("MSE (domain lengths² / frame⁴)" if frame is None else "MSE (domain lengths²)", fontsize=SMALL)
+    panel.tick_params(labelsize=SMALL)
+    panel.grid(alpha=0.25)
+    panel.grid(alpha=0.1, which="minor", axis="x")
+    panel.set_ylim(*limits)
+    floors = [error for row in rows if row["system"] == "chaos" and (error := _error(row, frame)) is not None]
+    if floors:
+        panel.axhspan(limits[0], max(floors), color=FLOOR_COLOR, alpha=0.09, linewidth=0, zorder=0)
 
 
-def _short(row: Mapping[str, Any]) -> str:
-    if row["system"] == "mpm":
-        return f"{row['grid']}³ {row['step']:g}"
-    levels = f"L{row['levels']} " if row["system"] == "hgn" else ""
-    return f"{levels}M{row['message_passing_steps']} {row['precision']} {row['weights'].rsplit('.', 1)[0]}"
+def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
+    """Of the errors' axis: all points but those far above what learns nothing, and floors that are near."""
+    errors = [
+        error for row in rows if (error := _error(row, frame)) is not None and row["system"] not in ("chaos", "trivial")
+    ]
+    trivial = [error for row in rows if row["system"] == "trivial" and (error := _error(row, frame)) is not None]
+    floors = [error for row in rows if row["system"] == "chaos" and (error := _error(row, frame)) is not None]
+    everything = errors + trivial + floors or [1.0]
+    low, high = min(errors or everything), max([*errors, *trivial[:1]] or everything)
+    low = min([low, *(floor for floor in floors if floor > low / NEAR_FLOOR)])
+    if trivial:
+        high = min(max(high, min(trivial)), FAR_ABOVE * min(trivial))
+    return low / 2.5, high * (2.5 * high / low) ** 0.12
 
 
-def _figure(panels: int, width: float = 5.5) -> tuple[Any, Sequence[Any]]:
-    columns = min(panels, 3)
-    lines = -(-panels // columns)
-    figure, axes = new_figure(lines, columns, (width * columns, 4.5 * lines + 0.6))
-    for extra in axes.flat[panels:]:
-        extra.axis("off")
-    return figure, list(axes.flat[:panels])
+def _point(panel: Any, row: Row, frame: int | None, key: str, look: Mapping[str, Any], highest: float) -> None:
+    mpm = row["system"] == "mpm"
+    marker = look["markers"][row["step"]] if mpm else PRECISION_MARKERS[row["precision"]]
+    style = {"color": look["color"], "markeredgecolor": "white", "markeredgewidth": 0.7, "markersize": 8.5, "zorder": 4}
+    error, reached = _error(row, frame), _reached(row, frame)
+    if error is None:
+        if frame is not None and not reached and row["failed_scenes"]:
+            panel.plot(row[key], UPPER_EDGE, marker, transform=panel.get_xaxis_transform(), **style)
+            panel.plot(
+                row[key], UPPER_EDGE, "x", color="black", markersize=10, zorder=5, transform=panel.get_xaxis_transform()
+            )
+        return
+    if error > highest:
+        panel.plot(row[key], UPPER_EDGE, marker, transform=panel.get_xaxis_transform(), **style)
+        told = {"textcoords": "offset points", "xytext": (8, -4), "fontsize": SMALL, "color": look["color"]}
+        panel.annotate(f"↑ {error:.0e}", (row[key], UPPER_EDGE), xycoords=panel.get_xaxis_transform(), **told)
+        return
+    bars = row["one_step_quartiles"] if frame is None else row["position_quartiles"].get(str(frame))
+    if bars and min(bars) > 0:
+        panel.plot([row[key]] * 2, bars, "-", color=look["color"], linewidth=4, alpha=0.28, zorder=2)
+    panel.plot(row[key], error, marker, **style)
+    if frame is not None and reached < len(row["seeds"]):
+        panel.plot(row[key], error, "x", color="black", markersize=10, zorder=5)
 
 
-def _png(figure: Any, meta: Mapping[str, Any], title: str) -> bytes:
+def _mark(marker: str, name: str, color: str = "0.35") -> Any:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], marker=marker, linestyle="", color=color, markersize=7.5, label=name)
+
+
+def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
+    """What the colours, markers and lines are, in columns."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    systems = [row["system"] for row in rows]
+    networks: list[Any] = []
+    grids: list[Any] = []
+    lines: list[Any] = []
+    steps: dict[float, str] = {}
+    for name, look in looks.items():
+        if look["system"] in NETWORKS:
+            networks.append(Line2D([], [], color=look["color"], linewidth=3.5, label=name))
+        elif look["system"] == "mpm":
+            grids.append(Line2D([], [], color=look["color"], linewidth=3.5, label=name))
+            steps |= look["markers"]
+        else:
+            lines.append(Line2D([], [], color=look["color"], linestyle=look["line"], linewidth=1.5, label=name))
+    present = {row["precision"] for row in rows if row["system"] in NETWORKS}
+    precisions = [_mark(m, PRECISION_NAMES[name]) for name, m in PRECISION_MARKERS.items() if name in present]
+    marks = [_mark(m, f"solver, {step:g} of the stable step") for step, m in sorted(steps.items(), reverse=True)]
+    notes: list[Any] = []
+    if networks or grids:
+        notes.append(Patch(color="0.35", alpha=0.28, label="bar: the middle half of the scenes"))
+    if any(row["failed_scenes"] for row in rows):
+        notes.append(_mark("x", "some scenes failed (at the upper edge: all)", "black"))
+    if "chaos" in systems:
+        notes.append(Patch(color=FLOOR_COLOR, alpha=0.15, label="below the chaos floor: means nothing"))
+    columns = [networks, [*grids, *marks], [*precisions, *notes], lines]
+    return [column for column in columns if column] or [[_mark("", "nothing was measured")]]
+
+
+def _looks(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Colours and markers by name: one of each network, each grid of the solver, and each line across."""
+    hgn, gns = iter(HGN_COLORS * len(rows)), iter(GNS_COLORS * len(rows))
+    floors, trivial = iter(FLOOR_LINES * len(rows)), iter(TRIVIAL_LINES * len(rows))
+    grids = sorted({row["grid"] for row in rows if row["system"] == "mpm"}, reverse=True)
+    steps = sorted({row["step"] for row in rows if row["system"] == "mpm"}, reverse=True)
+    markers = dict(zip(steps, STEP_MARKERS * len(steps), strict=False))
+    looks: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        name, system = _name(row), row["system"]
+        if name in looks:
+            continue
+        looks[name] = {"system": system}
+        if system == "mpm":
+            color = GRID_COLORS[min(grids.index(row["grid"]), len(GRID_COLORS) - 1)]
+            looks[name] |= {"color": color, "markers": markers}
+        elif system == "chaos":
+            looks[name] |= {"color": FLOOR_COLOR, "line": next(floors)}
+        elif system == "trivial":
+            looks[name] |= {"color": TRIVIAL_COLOR, "line": next(trivial)}
+        else:
+            looks[name] |= {"color": next(hgn if system == "hgn" else gns)}
+    return looks
+
+
+def _name(row: Row) -> str:
+    match row["system"]:
+        case "mpm":
+            return f"MPM solver, {row['grid']}³ cells"
+        case "trivial":
+            return f"learns nothing: {row['predictor']}"
+        case "chaos":
+            return f"chaos floor: {row['floor']}"
+        case "hgn":
+            size = f"HGN, L = {row['levels']}, M = {row['message_passing_steps']}"
+        case system:
+            obstacles = " with static particles" if system == "gns_particles" else ""
+            size = f"GNS{obstacles}, M = {row['message_passing_steps']}"
+    return f"{size} ({row['weights'].rsplit('.', 1)[0]})"
+
+
+def _error(row: Row, frame: int | None) -> float | None:
+    error = row["one_step_mse"] if frame is None else row["position_mse"].get(str(frame))
+    return error if error is not None and error > 0 else None
+
+
+def _reached(row: Row, frame: int | None) -> int:
+    return len(row["seeds"]) if frame is None else int(row["scenes_reached"].get(str(frame), 0))
+
+
+def _length(row: Row) -> int:
+    return sum(value is not None for value in row["curve"])
+
+
+def _footer(figure: Any, meta: Mapping[str, Any]) -> float:
+    """Where the figure comes from, at its lower edge; the inches that it takes."""
     versions = meta["versions"]
+    told = (
+        f"{CONVENTION}; scored by {meta['reference']}. torch {versions['torch']}, taichi {versions['taichi']}, commit "
+        f"{meta['commit']}, {meta['date'][:10]}: {meta['command']}"
+    )
+    width = int(figure.get_figwidth() * 72 / (0.62 * TINY))  # characters
+    lines = textwrap.wrap(told, width, max_lines=4, placeholder=" …")
+    figure.text(0.006, 0.008, "\n".join(lines), fontsize=TINY, color="0.35", va="bottom")
+    return (len(lines) * 1.4 * TINY + 8) / 72
+
+
+def _png(figure: Any, meta: Mapping[str, Any], title: str, below: float) -> bytes:
+    """With a title, and so many inches kept free below."""
+    share = below / figure.get_figheight()
+    figure.get_layout_engine().set(rect=(0, share, 1, 1 - share))
     figure.suptitle(
-        f"{title}: {meta['scenes']} {meta['split']} scenes of {meta['data']}, {meta['device']}, "
-        f"torch {versions['torch']}, taichi {versions['taichi']}, commit {meta['commit']}, {meta['date'][:10]}\n"
-        f"{CONVENTION}\n{meta['command']}",
-        fontsize=7,
-        wrap=True,
+        f"{title}: {meta['scenes']} {meta['split']} scenes of {meta['data']}, {meta['device']}", fontsize=TEXT + 2
     )
     return as_png(figure, dpi=130)

@@ -7,9 +7,8 @@ scenes that reached the frame. Shape legend: T frames, N particles of a scene.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,12 +20,10 @@ from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.training.errors import REPORTED_FRAMES, mean_so_far, position_mse
-from tools.error_vs_time.contenders import Contender, OneStep, frame_milliseconds
+from tools.error_vs_time.contenders import Contender, OneStep
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
-
-WARM_FRAMES, FAST_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
 
 
 def score(
@@ -34,9 +31,8 @@ def score(
     references: Sequence[Episode],
     config: ErrorVsTimeConfig,
     device: torch.device,
-    on_scene: Callable[[int], None],
-) -> tuple[dict[str, Any], np.ndarray]:
-    """The row without run times, and the position MSE of each frame, float64 [T], NaN where no scene came so far."""
+) -> dict[str, Any]:
+    """The row without run times."""
     steps = [contender.one_step(episode, config.frame_stride, config.rest_speed) for episode in references]
     frames = len(references[0].position_TN3)
     trials: list[Trial] = []
@@ -44,10 +40,8 @@ def score(
     for first in range(0, len(references), together):
         some = references[first : first + together]
         trials += contender.trials(some, frames, None)
-        on_scene(len(some))
     row = contender.row | one_step_figures([step for step in steps if step is not None])
-    figures, curve_T = rollout_figures(trials, references, config, device)
-    return row | figures, curve_T
+    return row | rollout_figures(trials, references, config, device)
 
 
 def one_step_figures(steps: Sequence[OneStep]) -> dict[str, Any]:
@@ -59,7 +53,7 @@ def one_step_figures(steps: Sequence[OneStep]) -> dict[str, Any]:
     resting = sum(step.rest_count for step in steps)
     return {
         "one_step_mse": sum(total.values()) / sum(count.values()),
-        "one_step_quartiles": _quartiles([step.error.mse for step in steps]),
+        "one_step_quartiles": quartiles([step.error.mse for step in steps]),
         "one_step_by_material": {name: total[name] / count[name] for name in MATERIALS if count[name]},
         "ghost": sum(step.rest_sum for step in steps) / resting if resting else None,
         "ghost_samples": resting,
@@ -68,8 +62,8 @@ def one_step_figures(steps: Sequence[OneStep]) -> dict[str, Any]:
 
 def rollout_figures(
     trials: Sequence[Trial], references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
-) -> tuple[dict[str, Any], np.ndarray]:
-    """Everything that rollouts tell, and the position MSE of each frame."""
+) -> dict[str, Any]:
+    """Everything that rollouts tell; `curve` is the position MSE of each frame, none where no scene came so far."""
     frames = len(references[0].position_TN3)
     mse_ST = np.full((len(trials), frames), np.nan)
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
@@ -84,7 +78,9 @@ def rollout_figures(
     failures = [trial for trial in trials if trial.cause is not None]
     row: dict[str, Any] = {
         "position_mse": {str(frame): float(curve_T[frame]) for frame in told},
-        "position_quartiles": {str(frame): _quartiles(mse_ST[:, frame]) for frame in told},
+        "position_quartiles": {str(frame): quartiles(mse_ST[:, frame]) for frame in told},
+        "position_by_material": _by_material(trials, references, told),
+        "curve": [float(f"{value:.4g}") for value in curve_T],
         "scenes_reached": {str(frame): int(reached_T[frame]) for frame in reported},
         "sinkhorn": _sinkhorn(
             trials[: config.sinkhorn_scenes], references[: config.sinkhorn_scenes], reported, config, device
@@ -99,66 +95,14 @@ def rollout_figures(
     for name in ("penetration", "reference_penetration", "outside_domain"):
         row[name] = float(np.mean([end[name] for end in ends]))
     row["most_penetration"] = max(end["penetration"] - end["reference_penetration"] for end in ends)
-    return row, curve_T
-
-
-@dataclass(eq=False)
-class Stopwatch:
-    """The run times of a contender: how many frames it is timed over, and what was measured."""
-
-    contender: Contender
-    single_frames: int
-    batch_frames: int
-    memory_gb: float | None
-    single: list[float] = field(default_factory=list)
-    batched: list[float] = field(default_factory=list)
-
-    def row(self, batch_scenes: int) -> dict[str, Any]:
-        return {
-            "ms": float(np.median(self.single)) if self.single else None,
-            "ms_quartiles": _quartiles(self.single),
-            "ms_batched": float(np.median(self.batched)) if self.batched else None,
-            "batch_scenes": batch_scenes,
-            "timed_frames": self.single_frames,
-            "memory_gb": self.memory_gb,
-        }
-
-
-def time_in_turns(
-    contenders: Sequence[Contender],
-    references: Sequence[Episode],
-    config: ErrorVsTimeConfig,
-    device: torch.device,
-    late: Callable[[], bool] = lambda: False,
-    on_round: Callable[[list[dict[str, Any] | None]], None] = lambda _: None,
-) -> list[dict[str, Any] | None]:
-    """Run times of all contenders in this process: each simulates the same scenes once to warm up, then in turns.
-
-    When it is late no other one is begun with (its row is none then), and no further round. `ms` is a frame of one
-    scene, `ms_batched` a frame of each of `batch_scenes` scenes side by side. `on_round` gets all rows after a round.
-    """
-    # The largest first: what is captured for it has room for the others.
-    some = sorted(references[: config.timed_scenes], key=lambda episode: -len(episode.material_N))
-    singles, batch = [[episode] for episode in some], list(references[: config.batch_scenes])
-    watches: list[Stopwatch | None] = [None] * len(contenders)
-    for i in sorted(range(len(contenders)), key=lambda i: contenders[i].importance):
-        if not late():
-            watches[i] = _warm_up(contenders[i], singles, batch, config, device)
-
-    def rows() -> list[dict[str, Any] | None]:
-        return [None if watch is None else watch.row(len(batch)) for watch in watches]
-
-    for done in range(config.rounds):
-        if done and late():
-            break
-        for scenes in (*singles, batch):
-            for watch in filter(None, watches):
-                frames = watch.batch_frames if scenes is batch else watch.single_frames
-                taken = frame_milliseconds(watch.contender, scenes, frames)
-                if taken is not None:
-                    (watch.batched if scenes is batch else watch.single).append(taken / len(scenes))
-        on_round(rows())
-    return rows()
+    worst = max(range(len(ends)), key=lambda i: ends[i]["penetration"])
+    row["worst_penetration"] = {
+        "episode": references[worst].key,
+        "share": ends[worst]["penetration"],
+        "reference": ends[worst]["reference_penetration"],  # the solver's own, in this scene
+        "reference_worst": max(end["reference_penetration"] for end in ends),
+    }
+    return row
 
 
 def pay_back(
@@ -207,6 +151,22 @@ def report(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[s
 
 def _position_mse(trial: Trial, reference: Episode) -> np.ndarray:
     return position_mse(trial.position_TN3, reference.position_TN3[: trial.frame_count])
+
+
+def _by_material(
+    trials: Sequence[Trial], references: Sequence[Episode], frames: Sequence[int]
+) -> dict[str, dict[str, float]]:
+    """Position MSE of a material's particles: means over the scenes that hold it and reached the frame."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for trial, reference in zip(trials, references, strict=True):
+        reached = [frame for frame in frames if frame < trial.frame_count]
+        for index in np.unique(reference.material_N):
+            chosen_N = reference.material_N == index
+            of_frames = found.setdefault(MATERIALS[index], {})
+            for frame in reached:
+                pair = trial.position_TN3[frame, chosen_N], reference.position_TN3[frame, chosen_N]
+                of_frames.setdefault(str(frame), []).append(float(position_mse(*(part[None] for part in pair))[0]))
+    return {name: {frame: float(np.mean(v)) for frame, v in values.items()} for name, values in found.items()}
 
 
 def _motion(trial: Trial, reference: Episode) -> dict[str, float]:
@@ -272,52 +232,8 @@ def _sinkhorn(
     return {name: {frame: float(np.mean(v)) for frame, v in values.items()} for name, values in found.items()}
 
 
-def _warm_up(
-    contender: Contender,
-    singles: Sequence[Sequence[Episode]],
-    batch: Sequence[Episode],
-    config: ErrorVsTimeConfig,
-    device: torch.device,
-) -> Stopwatch:
-    """Simulates one scene and the batch for some frames, which say how many take `timed_seconds`; what captures its
-    launches, as the numbers of cells or neighbours need it, then simulates all that will be timed. Tells the most GPU
-    memory that the first scene took, of what torch knows.
-    """
-    network = contender.row["system"] in ("hgn", "gns", "gns_particles")
-    contender.release()
-    before = 0
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
-        torch.cuda.reset_peak_memory_stats(device)
-        before = torch.cuda.memory_allocated(device)
-    most = min(config.timed_frames, len(batch[0].position_TN3))
-    if contender.row["system"] == "mpm":
-        most = min(most, config.mpm_timed_frames)
-    # what looks at its frames 32 at a time tells nothing of fewer
-    frames = FAST_WARM_FRAMES if contender.row.get("path") == "fast" else WARM_FRAMES
-    captures = contender.row.get("path") == "fast" or contender.row["system"].startswith("gns")
-    if captures:  # which would be taken for the time of a frame
-        frame_milliseconds(contender, singles[0], min(frames, most))
-    taken = frame_milliseconds(contender, singles[0], min(frames, most))
-    peak = torch.cuda.max_memory_allocated(device) - before if device.type == "cuda" else 0
-    if captures:
-        frame_milliseconds(contender, batch, min(frames, most))
-    together = frame_milliseconds(contender, batch, min(frames, most))
-
-    def affordable(milliseconds: float | None) -> int:
-        if milliseconds is None:
-            return most
-        return min(most, max(frames, int(1e3 * config.timed_seconds / milliseconds)))
-
-    memory = peak / 1e9 if network and device.type == "cuda" else None
-    watch = Stopwatch(contender, affordable(taken), affordable(together), memory)
-    if captures:
-        for episodes, count in [*((single, watch.single_frames) for single in singles), (batch, watch.batch_frames)]:
-            frame_milliseconds(contender, episodes, count)
-    return watch
-
-
-def _quartiles(values: Sequence[float] | np.ndarray) -> list[float] | None:
+def quartiles(values: Sequence[float] | np.ndarray) -> list[float] | None:
+    """The first and the third of what is finite."""
     finite = np.asarray(values, np.float64)
     finite = finite[np.isfinite(finite)]
     return [float(q) for q in np.percentile(finite, (25, 75))] if len(finite) else None

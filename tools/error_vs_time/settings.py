@@ -15,8 +15,9 @@ PRECISIONS = ("fp32", "tf32", "fp16")
 class ErrorVsTimeConfig:
     """What is compared, on what, and how long. See conf/command/error_vs_time.yaml."""
 
-    data: str
     out: str
+    data: str | None = None
+    earlier: tuple[str, ...] = ()
     weights: tuple[str, ...] | None = None
     split: str = "test"
     scenes: int = 20
@@ -49,6 +50,13 @@ class ErrorVsTimeConfig:
 
     def __post_init__(self) -> None:
         require(self.out != "", "out", "a file name without its ending", self.out)
+        require(
+            bool(self.data or self.earlier),
+            "data",
+            "a data set",
+            self.data,
+            "make one with python -m datagen, or give earlier=[report.json] to draw a report again",
+        )
         require_one_of(self, "split", SPLITS)
         require_positive(
             self,

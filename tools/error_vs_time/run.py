@@ -1,0 +1,163 @@
+"""Scores and times one contender after another, the most telling first, and writes the report after each.
+
+A run that is cut off anywhere leaves a whole file with all that was measured, errors and run times together.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hgn.files import write_atomically, write_json
+from hgn.progress import bar
+from hgn.scene.episode import Episode
+from hgn.schema import ConfigError
+from tools.error_vs_time.contenders import GNS_FIRST, Contender, SolverContender, TrivialContender
+from tools.error_vs_time.plot import draw_frames, draw_pareto
+from tools.error_vs_time.score import label, report, score
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.error_vs_time.timing import Stopwatch, Timing
+
+# of the seconds given: until when a contender, and a further round of run times, may be begun
+BEGIN_SHARE, ROUND_SHARE = 0.85, 0.95
+DRAWN_EVERY_S = 60.0  # which takes some seconds each time
+UNTIMED = ("trivial", "chaos")
+
+
+class Run:
+    """The contenders of a report, in its order, and what was measured of them so far."""
+
+    def __init__(
+        self,
+        config: ErrorVsTimeConfig,
+        contenders: Sequence[Contender],
+        references: Sequence[Episode],
+        device: torch.device,
+        meta: dict[str, Any],
+        begun: float,
+        earlier: Sequence[dict[str, Any]] = (),
+    ) -> None:
+        """`begun` is by time.monotonic(); `earlier` are rows of reports before this one, which come first."""
+        self.config, self.contenders, self.references, self.device = config, contenders, references, device
+        self.begun, self.earlier = begun, list(earlier)
+        self.meta = meta | {"not_run": [], "not_timed": []}
+        self.failed = 0  # contenders, by a fault of the program or the machine
+        self.timing = Timing(references, config, device)
+        self.watches: dict[int, Stopwatch] = {}
+        self._rows: dict[int, dict[str, Any]] = {}
+        self._given_up: set[int] = set()
+        self._drawn = time.monotonic()
+        out = Path(config.out)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        self.out, self.file = str(out), config.json or f"{out}.json"
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        return [*self.earlier, *(self._rows[i] for i in sorted(self._rows))]
+
+    def late(self, share: float) -> bool:
+        """Whether that share of the time given is over."""
+        return self.config.seconds is not None and time.monotonic() - self.begun > share * self.config.seconds
+
+    def score_beside(self, compiling: Callable[[], bool]) -> None:
+        """Scores what is simulated already or needs no simulation, then, as long as kernels are being compiled, what
+        launches none of them: GNS at the precision that tells most.
+        """
+        for i, contender in enumerate(self.contenders):
+            known = isinstance(contender, SolverContender) and contender.simulated
+            if known or isinstance(contender, TrivialContender):  # late or not: it takes a second
+                self._attempt(i, self._score)
+        self.write()
+        for i, contender in enumerate(self.contenders):
+            if contender.importance == GNS_FIRST and compiling() and not self.late(BEGIN_SHARE):
+                self._attempt(i, self._score)
+                self.write()
+
+    def measure(self) -> None:
+        """Scores and times every contender, in order of importance, then times all of them further in turns."""
+        order = sorted(range(len(self.contenders)), key=lambda i: self.contenders[i].importance)
+        with bar("contenders", total=len(order), unit="contender") as progress:
+            for i in order:
+                if self.late(BEGIN_SHARE):
+                    if i not in self._rows and i not in self._given_up:
+                        self._leave_out(i, "the time was over")
+                else:
+                    self._attempt(i, self._measure)
+                self.write(drawn=time.monotonic() - self._drawn > DRAWN_EVERY_S)
+                progress.update()
+        for _ in range(1, self.config.rounds):
+            for i in sorted(self.watches):
+                if not self.late(ROUND_SHARE):
+                    self._attempt(i, self._time)
+        self.write()
+
+    def write(self, drawn: bool = False) -> None:
+        """Writes the JSON, and the figures if wanted."""
+        self.meta["not_timed"] = [
+            label(row) for row in self.rows if row["system"] not in UNTIMED and row.get("ms") is None
+        ]
+        self.meta["seconds"] = time.monotonic() - self.begun
+        written = report(self.meta, self.rows)
+        write_json(self.file, written, allow_nan=False)
+        if drawn:
+            draw(self.out, written["rows"], written["meta"])
+            self._drawn = time.monotonic()
+
+    def _measure(self, i: int) -> None:
+        if i not in self._rows:
+            self._score(i)
+            self.write()
+        if self.contenders[i].row["system"] not in UNTIMED:
+            begun = time.monotonic()
+            self.watches[i] = self.timing.begun(self.contenders[i])
+            self._time(i)
+            self._rows[i]["timing_s"] = time.monotonic() - begun
+
+    def _score(self, i: int) -> None:
+        begun = time.monotonic()
+        try:
+            self._rows[i] = score(self.contenders[i], self.references, self.config, self.device)
+        finally:
+            self.contenders[i].release()
+        self._rows[i]["scoring_s"] = time.monotonic() - begun
+
+    def _time(self, i: int) -> None:
+        self._rows[i].update(self.timing.round(self.watches[i]))
+
+    def _attempt(self, i: int, work: Callable[[int], None]) -> None:
+        """The others need not wait for what fails; that is named, and counted where nobody foresaw it."""
+        if i in self._given_up:
+            return
+        try:
+            work(i)
+        except (ConfigError, torch.OutOfMemoryError) as error:
+            self._leave_out(i, str(error))
+        except Exception as error:  # noqa: BLE001 - printed whole and counted: the others go on
+            traceback.print_exc()
+            self.failed += 1
+            self._leave_out(i, f"{type(error).__name__}: {error}")
+
+    def _leave_out(self, i: int, cause: str) -> None:
+        self._given_up.add(i)
+        self.watches.pop(i, None)
+        self.contenders[i].release()
+        self.meta["not_run"].append(self.contenders[i].row | {"cause": cause, "scored": i in self._rows})
+        print(f"left out: {label(self.contenders[i].row)}: {cause}", file=sys.stderr)
+
+
+def draw(out: str, rows: Sequence[dict[str, Any]], meta: dict[str, Any]) -> list[str]:
+    """Writes the figures of a report's JSON; their names."""
+    files = {
+        f"{out}.png": draw_pareto(rows, meta),
+        f"{out}_batched.png": draw_pareto(rows, meta, batched=True),
+        f"{out}_frames.png": draw_frames(rows, meta),
+    }
+    for file, picture in files.items():
+        write_atomically(Path(file), picture)
+    return list(files)

@@ -1,0 +1,101 @@
+"""The run times of contenders, all on the same scenes in one process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from hgn.scene.episode import Episode
+from tools.error_vs_time.contenders import Contender, frame_milliseconds
+from tools.error_vs_time.score import quartiles
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+
+WARM_FRAMES, FAST_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
+SOLVER_WARM_FRAMES = 2  # the initial state and the first, in which the solver compiles
+
+
+@dataclass(eq=False)
+class Stopwatch:
+    """The run times of a contender: how many frames it is timed over, and what was measured."""
+
+    contender: Contender
+    single_frames: int
+    batch_frames: int
+    memory_gb: float | None
+    single: list[float] = field(default_factory=list)
+    batched: list[float] = field(default_factory=list)
+
+
+class Timing:
+    """Times a contender over some scenes one by one and over some side by side, which are warmed up once."""
+
+    def __init__(self, references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device) -> None:
+        # The largest first: what is captured for it has room for the others.
+        some = sorted(references[: config.timed_scenes], key=lambda episode: -len(episode.material_N))
+        self.singles = [[episode] for episode in some]
+        self.batch = list(references[: config.batch_scenes])
+        self.config, self.device = config, device
+
+    def begun(self, contender: Contender) -> Stopwatch:
+        """Simulates one scene and the batch for some frames, which say how many take `timed_seconds`; then all that
+        will be timed, as far as something is captured or compiled for it. Tells the most GPU memory that the first
+        scene took, of what torch knows.
+        """
+        kind, fast = contender.row["system"], contender.row.get("path") == "fast"
+        contender.release()
+        before = 0
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats(self.device)
+            before = torch.cuda.memory_allocated(self.device)
+        most = min(self.config.timed_frames, len(self.batch[0].position_TN3))
+        if kind == "mpm":
+            most = min(most, self.config.mpm_timed_frames)
+            for scenes in (*self.singles, self.batch):  # kernels are compiled for the materials that a scene holds
+                frame_milliseconds(contender, scenes, min(SOLVER_WARM_FRAMES, most))
+        # what looks at its frames 32 at a time tells nothing of fewer
+        frames = FAST_WARM_FRAMES if fast else WARM_FRAMES
+        captures = fast or kind.startswith("gns")
+        if captures:  # which would be taken for the time of a frame
+            frame_milliseconds(contender, self.singles[0], min(frames, most))
+        taken = frame_milliseconds(contender, self.singles[0], min(frames, most))
+        peak = torch.cuda.max_memory_allocated(self.device) - before if self.device.type == "cuda" else 0
+        if captures:
+            frame_milliseconds(contender, self.batch, min(frames, most))
+        together = frame_milliseconds(contender, self.batch, min(frames, most))
+
+        def affordable(milliseconds: float | None) -> int:
+            if milliseconds is None:
+                return most
+            return min(most, max(frames, int(1e3 * self.config.timed_seconds / milliseconds)))
+
+        memory = peak / 1e9 if kind != "mpm" and self.device.type == "cuda" else None
+        watch = Stopwatch(contender, affordable(taken), affordable(together), memory)
+        if captures:
+            for single in self.singles:
+                frame_milliseconds(contender, single, watch.single_frames)
+            frame_milliseconds(contender, self.batch, watch.batch_frames)
+        return watch
+
+    def round(self, watch: Stopwatch) -> dict[str, Any]:
+        """Simulates each of the scenes once more; what the report tells of all times so far. `ms` is a frame of one
+        scene, `ms_batched` a frame of each of the scenes side by side.
+        """
+        for scenes in (*self.singles, self.batch):
+            together = scenes is self.batch
+            frames = watch.batch_frames if together else watch.single_frames
+            taken = frame_milliseconds(watch.contender, scenes, frames)
+            if taken is not None:
+                (watch.batched if together else watch.single).append(taken / len(scenes))
+        return {
+            "ms": float(np.median(watch.single)) if watch.single else None,
+            "ms_quartiles": quartiles(watch.single),
+            "ms_batched": float(np.median(watch.batched)) if watch.batched else None,
+            "batch_scenes": len(self.batch),
+            "timed_frames": watch.single_frames,
+            "memory_gb": watch.memory_gb,
+        }
