@@ -1,215 +1,286 @@
-"""A frame of the hierarchical graph network on a CPU: the same function in blocks of rows, one on each core.
+"""A frame of the hierarchical graph network on a CPU: the same function in blocks of rows, each on one core.
 
 What belongs to the same cells is done block by block of cells, from one exchange with other cells to the next: a step
-of message passing takes the edges that end there, their sum, the cells' network and the products with the cells that
-the next step needs. Pairs of particles and cells are taken in the order of their cells. So sums of blocks never meet,
-their order does not depend on threads, and intermediate results stay in a core's cache.
-Needs no gradients: nothing is kept for them. hgn.network.network says what is computed, step by step.
+of message passing takes the edges that end there, their sums, the cells' network and the products with the cells that
+the next step needs. Pairs of particles and cells are taken in the order of their cells on the way to cells. So blocks
+write to different places, sums have one order whatever the threads, and intermediate results stay in a core's cache.
+Norms of pairs commute with their sums as far as gain and shift go, so those are left to the sums.
+There are no gradients: nothing is kept for them. hgn.network.network says what is computed, step by step.
 Shape legend: N particles, P pairs of particles and cells, C cells, E directed edges, W width.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
+from torch import nn
 
 from hgn.network.cores import for_each, single_threaded
-from hgn.network.fcn import FCN
+from hgn.network.fcn import FCN, MINIMUM_ROWS, linear
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level
 
 if TYPE_CHECKING:
-    from hgn.network.network import HierarchicalGraphNetwork, MessagePassing
+    from hgn.network.network import HierarchicalGraphNetwork
 
-# Rows of edges or pairs of a block: at width 128 an intermediate result takes a quarter of a megabyte.
-ROWS_AT_ONCE = 512
-
-
-class Block(NamedTuple):
-    """Consecutive cells (or particles), and the rows that belong to them (edges that end there, or pairs)."""
-
-    cells: slice
-    rows: slice
-
-
-def blocks_of(offset_C1: torch.Tensor, threads: int) -> list[Block]:
-    """Cells in blocks of about ROWS_AT_ONCE rows, as many for each thread. Cell c has rows offset_C1[c] to the next."""
-    cells, rows = len(offset_C1) - 1, int(offset_C1[-1])
-    count = -(-rows // ROWS_AT_ONCE)
-    count = max(1, count if count <= 1 else -(-count // threads) * threads)
-    wanted = torch.arange(1, count) * rows // count
-    cut = torch.searchsorted(offset_C1, wanted).clamp_(max=cells)
-    places = [(0, 0), *torch.stack([cut, offset_C1[cut]], dim=-1).tolist(), (cells, rows)]
-    return [Block(slice(c, d), slice(p, q)) for (c, p), (d, q) in itertools.pairwise(places) if d > c]
-
-
-class Ends(NamedTuple):
-    """What a step of message passing needs of the cells as they are before it, each with its bias [C, W]."""
-
-    sender_CW: torch.Tensor
-    receiver_CW: torch.Tensor
-    cell_CW: torch.Tensor
-
-
-def _fcn(module: torch.nn.Module) -> FCN:
-    assert isinstance(module, FCN)
-    return module
-
-
-def _offsets(index_R: torch.Tensor, count: int) -> torch.Tensor:
-    """Where the rows of each index begin, and their number, [count + 1]; they are in ascending order."""
-    return torch.searchsorted(index_R, torch.arange(count + 1))
-
-
-class Blockwise:
-    """One frame's work."""
-
-    def __init__(self, network: HierarchicalGraphNetwork, threads: int) -> None:
-        self.network = network
-        self.threads = threads
-
-    def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-        """Latent particles and their grids to normalised accelerations [N, 3]: steps 1 to 12."""
-        network, levels = self.network, grid.levels
-        parent_offset_83 = 0.5 - CORNER_83.to(particle_NW)
-        blocks = [blocks_of(_offsets(level.receiver_E, level.cell_count), self.threads) for level in levels]
-        cell_CW = self.to_cells(particle_NW, grid)
-        kept: list[torch.Tensor] = []
-        for i, level in enumerate(levels):
-            cell_CW = self.passed(network.passing_down[i], cell_CW, level, blocks[i])
-            if level.parent_C is None or level.octant_C is None:
-                break
-            kept.append(cell_CW)
-            cell_CW = self.coarser(_fcn(network.fine_to_coarse[i]), cell_CW, parent_offset_83, level, blocks[i], levels[i + 1].cell_count)
-        for i in reversed(range(len(kept))):
-            cell_CW = self.finer(_fcn(network.coarse_to_fine[i]), cell_CW, kept[i], -parent_offset_83, levels[i], blocks[i])
-            cell_CW = self.passed(network.passing_up[i], cell_CW, levels[i], blocks[i])
-        return self.to_particles(particle_NW, cell_CW, grid)
-
-    def to_cells(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-        network, cells = self.network.particle_to_cell, grid.levels[0].cell_count
-        corner_8W = network.project(1, CORNER_83.to(particle_NW)) + network.first.bias
-        cell_P, pair_P = torch.sort(grid.cell_N8.flatten(), stable=True)
-        particle_P, corner_P = pair_P >> 3, pair_P & 7
-        weight_P1 = grid.weight_N8.flatten()[pair_P][:, None]
-        projected_NW = torch.empty_like(particle_NW)
-        sum_CW = torch.zeros(cells, particle_NW.shape[1], dtype=particle_NW.dtype)
-
-        def project(rows: slice) -> None:
-            hidden_NW = network.project(0, particle_NW[rows])
-            projected_NW[rows] = network.add_projection(hidden_NW, 1, -grid.fraction_N3[rows])
-
-        def add(block: Block) -> None:
-            rows = block.rows
-            hidden_PW = projected_NW.index_select(0, particle_P[rows]).add_(corner_8W.index_select(0, corner_P[rows]))
-            message_PW = network.finish(hidden_PW).mul_(weight_P1[rows])
-            sum_CW[block.cells].index_add_(0, cell_P[rows] - block.cells.start, message_PW)
-
-        for_each(project, _runs(len(particle_NW), self.threads), self.threads)
-        for_each(add, blocks_of(_offsets(cell_P, cells), self.threads), self.threads)
-        return sum_CW
-
-    def passed(
-        self, passing: torch.nn.Module, cell_CW: torch.Tensor, level: Level, blocks: list[Block]
-    ) -> torch.Tensor:
-        edge_networks, cell_networks = [[_fcn(n) for n in p] for p in (passing.edge, passing.cell)]
-        offset_6W = edge_networks[0].project(2, -DIRECTION_63.to(cell_CW))
-        cell_CW = cell_CW.clone()
-        edge_EW = cell_CW.new_empty(len(level.sender_E), cell_CW.shape[1])
-        ends = Ends(*(torch.empty_like(cell_CW) for _ in range(3)))
-        old = ends
-
-        def project(m: int, cells: slice, own_CW: torch.Tensor, ends: Ends) -> None:
-            edge, cell = edge_networks[m], cell_networks[m]
-            ends.sender_CW[cells] = edge.project(0, own_CW)
-            torch.add(edge.project(1, own_CW), edge.first.bias, out=ends.receiver_CW[cells])
-            torch.add(cell.project(0, own_CW), cell.first.bias, out=ends.cell_CW[cells])
-
-        for_each(lambda block: project(0, block.cells, cell_CW[block.cells], ends), blocks, self.threads)
-        for m in range(len(edge_networks)):
-            old, ends = ends, Ends(*(torch.empty_like(cell_CW) for _ in range(3)))
-
-            def step(block: Block, m=m, old=old, ends=ends) -> None:
-                cells, rows = block
-                edge, cell = edge_networks[m], cell_networks[m]
-                sum_CW = cell_CW.new_zeros(cells.stop - cells.start, cell_CW.shape[1])
-                if rows.stop > rows.start:
-                    receiver_E = level.receiver_E[rows]
-                    hidden_EW = old.sender_CW.index_select(0, level.sender_E[rows])
-                    hidden_EW += old.receiver_CW.index_select(0, receiver_E)
-                    if m == 0:
-                        hidden_EW += offset_6W.index_select(0, level.direction_E[rows])
-                        edge_EW[rows] = edge.finish(hidden_EW)
-                    else:
-                        edge.add_projection(hidden_EW, 2, edge_EW[rows])
-                        edge_EW[rows] += edge.finish(hidden_EW)
-                    sum_CW.index_add_(0, receiver_E - cells.start, edge_EW[rows])
-                hidden_CW = old.cell_CW[cells]
-                cell.add_projection(hidden_CW, 1, sum_CW)
-                own_CW = cell_CW[cells]
-                own_CW += cell.finish(hidden_CW)
-                if m + 1 < len(edge_networks):
-                    project(m + 1, cells, own_CW, ends)
-
-            for_each(step, blocks, self.threads)
-        return cell_CW
-
-    def coarser(self, network, cell_CW, offset_83, level, blocks, count):
-        offset_8W = network.project(1, offset_83) + network.first.bias
-        message_CW = torch.empty_like(cell_CW)
-
-        def message(block: Block) -> None:
-            hidden_CW = network.project(0, cell_CW[block.cells])
-            hidden_CW += offset_8W.index_select(0, level.octant_C[block.cells])
-            message_CW[block.cells] = network.finish(hidden_CW)
-
-        for_each(message, blocks, self.threads)
-        return cell_CW.new_zeros(count, cell_CW.shape[1]).index_add_(0, level.parent_C, message_CW)
-
-    def finer(self, network, coarse_CW, kept_CW, offset_83, level, blocks):
-        offset_8W = network.project(2, offset_83) + network.first.bias
-        parent_CW = network.project(0, coarse_CW)
-        cell_CW = torch.empty_like(kept_CW)
-
-        def begin(block: Block) -> None:
-            cells = block.cells
-            hidden_CW = parent_CW.index_select(0, level.parent_C[cells])
-            network.add_projection(hidden_CW, 1, kept_CW[cells])
-            hidden_CW += offset_8W.index_select(0, level.octant_C[cells])
-            torch.add(network.finish(hidden_CW), kept_CW[cells], out=cell_CW[cells])
-
-        for_each(begin, blocks, self.threads)
-        return cell_CW
-
-    def to_particles(self, particle_NW: torch.Tensor, cell_CW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-        network, decode = self.network.cell_to_particle, self.network.decode
-        cell_CW = network.project(0, cell_CW)
-        corner_8W = network.project(2, CORNER_83.to(particle_NW)) - network.first.bias
-        result_N3 = particle_NW.new_empty(len(particle_NW), 3)
-
-        def add(rows: slice) -> None:
-            hidden_NW = network.project(1, particle_NW[rows])
-            network.add_projection(hidden_NW, 2, grid.fraction_N3[rows])
-            hidden_N8W = cell_CW.index_select(0, grid.cell_N8[rows].flatten()).unflatten(0, (-1, 8))
-            hidden_N8W += hidden_NW[:, None]
-            hidden_N8W -= corner_8W
-            change_NW = network.finish(hidden_N8W).mul_(grid.weight_N8[rows, :, None]).sum(1)
-            result_N3[rows] = decode(change_NW.add_(particle_NW[rows]))
-
-        for_each(add, _runs(8 * len(particle_NW), self.threads, 8), self.threads)
-        return result_N3
-
-
-def _runs(rows: int, threads: int, each: int = 1) -> list[slice]:
-    """Nearly equal runs of rows, `each` together"""
-    total = rows // each
-    count = -(-rows // ROWS_AT_ONCE)
-    count = max(1, count if count <= 1 else -(-count // threads) * threads)
-    return [slice(i * total // count, (i + 1) * total // count) for i in range(count)]
+# Rows of edges or pairs of a block: at width 128 an intermediate result takes 3/8 of a megabyte.
+ROWS_AT_ONCE = 2048
+FEWEST_ROWS = 96  # worth a thread's waking
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-    with single_threaded() as threads:
-        return Blockwise(network, threads).propagate(particle_NW, grid)
+    """Latent particles and their grids to normalised accelerations [N, 3]: steps 1 to 12, without gradients."""
+    # Towards the parent's centre, in fine cells, as in hgn.network.network.
+    parent_offset_83 = 0.5 - CORNER_83.to(particle_NW)
+    with torch.no_grad(), single_threaded() as threads:
+        cells = [_Cells(level, threads) for level in grid.levels]
+        cell_CW = _to_cells(network.particle_to_cell, particle_NW, grid, threads)
+        kept: list[torch.Tensor] = []
+        for i, level in enumerate(cells):
+            cell_CW = _passed(network.passing_down[i], cell_CW, level, threads)
+            if i + 1 == len(cells):
+                break
+            parent_C = grid.levels[i].parent_C
+            assert parent_C is not None
+            kept.append(cell_CW)
+            message_CW = _to_parents(_fcn(network.fine_to_coarse[i]), cell_CW, level, parent_offset_83, threads)
+            cell_CW = cell_CW.new_zeros(grid.levels[i + 1].cell_count, cell_CW.shape[1])
+            cell_CW.index_add_(0, parent_C, message_CW)
+        for i in reversed(range(len(kept))):
+            cell_CW = _to_children(
+                _fcn(network.coarse_to_fine[i]), cell_CW, kept[i], cells[i], -parent_offset_83, threads
+            )
+            cell_CW = _passed(network.passing_up[i], cell_CW, cells[i], threads)
+        return _to_particles(network, particle_NW, cell_CW, grid, threads)
+
+
+class _Cells:
+    """A level in blocks of cells with the edges that end in them."""
+
+    def __init__(self, level: Level, threads: int) -> None:
+        count = level.cell_count
+        self.blocks = _Blocks(level.receiver_E, count, threads)
+        # Rows of a table of all cells as senders, all as receivers, and the directions: what an edge sums of it.
+        ends_E3 = torch.stack([level.sender_E, level.receiver_E + count, level.direction_E + 2 * count], -1)
+        self.ends = self.blocks.split_rows(ends_E3[:, :2].contiguous()), self.blocks.split_rows(ends_E3)
+        self.level = level
+
+
+def _passed(passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: int) -> torch.Tensor:
+    """Message passing on one level, as MessagePassing.forward."""
+    assert isinstance(passing.edge, nn.ModuleList) and isinstance(passing.cell, nn.ModuleList)
+    networks = [(_fcn(edge), _fcn(cell)) for edge, cell in zip(passing.edge, passing.cell, strict=True)]
+    blocks, count = cells.blocks, len(cell_CW)
+    result_CW, hidden_CW = cell_CW.clone(), torch.empty_like(cell_CW)
+    own, hidden = blocks.split(result_CW), blocks.split(hidden_CW)
+    edges: list[torch.Tensor | None] = [None] * len(blocks)
+    # A step reads what the cells of other blocks were before it, and writes what its own are after: tables in turns.
+    tables = cell_CW.new_empty(2, 2 * count + len(DIRECTION_63), cell_CW.shape[1])
+    tables[1, 2 * count :] = networks[0][0].project(2, -DIRECTION_63.to(cell_CW))
+    ends = [(blocks.split(table[:count]), blocks.split(table[count : 2 * count])) for table in tables]
+
+    def project(step: int, block: int) -> None:
+        edge, cell = networks[step]
+        senders, receivers = ends[(step + 1) % 2]
+        _project(edge, 0, own[block], None, senders[block])
+        _project(edge, 1, own[block], edge.first.bias, receivers[block])
+        _project(cell, 0, own[block], cell.first.bias, hidden[block])
+
+    def update(step: int, block: int) -> None:
+        edge, cell = networks[step]
+        rows_EW = _sums_of(tables[(step + 1) % 2], cells.ends[step == 0][block])
+        before_EW = edges[block]
+        if before_EW is None:
+            edges[block] = rows_EW = edge.finish(rows_EW)
+        else:
+            rows_EW = before_EW.add_(edge.finish(edge.add_projection(rows_EW, 2, before_EW)))
+        cell.add_projection(hidden[block], 1, blocks.sums(block, rows_EW))
+        own[block].add_(cell.finish(hidden[block]))
+        if step + 1 < len(networks):
+            project(step + 1, block)
+
+    for_each(partial(project, 0), range(len(blocks)), threads)
+    for step in range(len(networks)):
+        for_each(partial(update, step), range(len(blocks)), threads)
+    return result_CW
+
+
+def _project(network: FCN, part: int, value: torch.Tensor, bias: torch.Tensor | None, out: torch.Tensor) -> None:
+    columns = network.columns(part)
+    if len(value) < MINIMUM_ROWS:
+        out.copy_(linear(value, columns, bias))
+    elif bias is None:
+        torch.mm(value, columns.T, out=out)
+    else:
+        torch.addmm(bias, value, columns.T, out=out)
+
+
+def _to_parents(
+    network: FCN, cell_CW: torch.Tensor, cells: _Cells, offset_83: torch.Tensor, threads: int
+) -> torch.Tensor:
+    """What each cell sends to its parent [C, W]."""
+    assert cells.level.octant_C is not None
+    offset_8W = network.project(1, offset_83) + network.first.bias
+    message_CW = torch.empty_like(cell_CW)
+    octant, own, message = map(cells.blocks.split, (cells.level.octant_C, cell_CW, message_CW))
+
+    def send(block: int) -> None:
+        rows_CW = network.project(0, own[block]).add_(offset_8W.index_select(0, octant[block]))
+        message[block].copy_(network.finish(rows_CW))
+
+    for_each(send, range(len(cells.blocks)), threads)
+    return message_CW
+
+
+def _to_children(
+    network: FCN, coarse_CW: torch.Tensor, kept_CW: torch.Tensor, cells: _Cells, offset_83: torch.Tensor, threads: int
+) -> torch.Tensor:
+    """The cells on the way up, from their parents and what they were on the way down."""
+    assert cells.level.parent_C is not None and cells.level.octant_C is not None
+    parent_CW = network.project(0, coarse_CW)
+    table_CW = torch.cat([parent_CW, network.project(2, offset_83) + network.first.bias])
+    ends_C2 = torch.stack([cells.level.parent_C, cells.level.octant_C + len(coarse_CW)], -1)
+    result_CW = torch.empty_like(kept_CW)
+    ends, kept, result = map(cells.blocks.split, (ends_C2, kept_CW, result_CW))
+
+    def receive(block: int) -> None:
+        rows_CW = network.add_projection(_sums_of(table_CW, ends[block]), 1, kept[block])
+        torch.add(network.finish(rows_CW), kept[block], out=result[block])
+
+    for_each(receive, range(len(cells.blocks)), threads)
+    return result_CW
+
+
+def _to_cells(network: FCN, particle_NW: torch.Tensor, grid: GridHierarchy, threads: int) -> torch.Tensor:
+    """Step 1: the finest cells [C, W]."""
+    assert network.norm is not None
+    norm, second = network.norm, _Centred(network)
+    particles, count = len(particle_NW), grid.levels[0].cell_count
+    cell_P, pair_P = torch.sort(grid.cell_N8.flatten(), stable=True)
+    blocks = _Blocks(cell_P, count, threads)
+    weight_P = grid.weight_N8.flatten()[pair_P]
+    ends = blocks.split_rows(torch.stack([pair_P >> 3, (pair_P & 7) + particles], -1))
+    weight = blocks.split_rows(weight_P)
+    # The particles' share of the hidden layer, and the corners'.
+    table_NW = particle_NW.new_empty(particles + len(CORNER_83), particle_NW.shape[1])
+    table_NW[particles:] = network.project(1, CORNER_83.to(particle_NW)) + network.first.bias
+    runs = _runs(particles, ROWS_AT_ONCE, threads)
+    latent, offset, share = (x.split(runs) for x in (particle_NW, -grid.fraction_N3, table_NW[:particles]))
+    sum_CW = particle_NW.new_empty(count, particle_NW.shape[1])
+    weights_C1 = particle_NW.new_zeros(count).index_add_(0, cell_P, weight_P)[:, None]
+    sums, weights = blocks.split(sum_CW), blocks.split(weights_C1)
+
+    def project(run: int) -> None:
+        _project(network, 0, latent[run], None, share[run])
+        network.add_projection(share[run], 1, offset[run])
+
+    def add(block: int) -> None:
+        rows_PW, scale_P = second(_sums_of(table_NW, ends[block]))
+        sum_CW = blocks.sums(block, rows_PW, scale_P.mul_(weight[block])).mul_(norm.weight)
+        torch.addcmul(sum_CW, weights[block], norm.bias, out=sums[block])
+
+    for_each(project, range(len(runs)), threads)
+    for_each(add, range(len(blocks)), threads)
+    return sum_CW
+
+
+def _to_particles(
+    network: HierarchicalGraphNetwork,
+    particle_NW: torch.Tensor,
+    cell_CW: torch.Tensor,
+    grid: GridHierarchy,
+    threads: int,
+) -> torch.Tensor:
+    """Steps 11 and 12: normalised accelerations [N, 3]."""
+    gather, decode, width = network.cell_to_particle, network.decode, particle_NW.shape[1]
+    assert gather.norm is not None
+    norm, second = gather.norm, _Centred(gather)
+    cells, particles = len(cell_CW), len(particle_NW)
+    # The share of the hidden layer of cells, of corners, and of a run's particles.
+    shared_CW = torch.cat(
+        [gather.project(0, cell_CW), gather.first.bias - gather.project(2, CORNER_83.to(particle_NW))]
+    )
+    runs = _runs(particles, ROWS_AT_ONCE // 8, threads)
+    result_N3 = particle_NW.new_empty(particles, 3)
+    latent, offset, result = (x.split(runs) for x in (particle_NW, grid.fraction_N3, result_N3))
+    corner_N8 = (torch.arange(8) + cells).expand(particles, 8)
+    pairs = [8 * length for length in runs]
+    ends = torch.stack([grid.cell_N8, corner_N8], -1).flatten(0, 1).split(pairs)
+    weight = grid.weight_N8.flatten().split(pairs)
+
+    def add(run: int) -> None:
+        hidden_NW = gather.add_projection(gather.project(1, latent[run]), 2, offset[run])
+        rows_PW = _sums_of(shared_CW, ends[run])
+        rows_PW.view(-1, 8, width).add_(hidden_NW[:, None])
+        rows_PW, scale_P = second(rows_PW)
+        change_NW = torch.bmm(scale_P.mul_(weight[run]).view(-1, 1, 8), rows_PW.view(-1, 8, width))[:, 0]
+        # Weights sum to 1, so the norm's shift is added once.
+        result[run].copy_(decode(torch.addcmul(latent[run] + norm.bias, change_NW, norm.weight)))
+
+    for_each(add, range(len(runs)), threads)
+    return result_N3
+
+
+class _Centred:
+    """The second layer of a network with a norm, less its mean over the outputs: what the norm divides."""
+
+    def __init__(self, network: FCN) -> None:
+        assert network.norm is not None
+        self.slope, self.epsilon = network.slope, network.norm.eps
+        self.weight = network.second.weight - network.second.weight.mean(0)
+        self.bias = network.second.bias - network.second.bias.mean()
+
+    def __call__(self, hidden_RW: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows [R, W] and what the norm multiplies each by [R]. Overwrites `hidden_RW`."""
+        out_RW = linear(nn.functional.leaky_relu_(hidden_RW, self.slope), self.weight, self.bias)
+        square_R = torch.linalg.vector_norm(out_RW, dim=1).square_()
+        return out_RW, square_R.mul_(1 / out_RW.shape[1]).add_(self.epsilon).rsqrt_()
+
+
+class _Blocks:
+    """Runs of cells with about as many rows each; rows are in ascending order of their cells."""
+
+    def __init__(self, cell_R: torch.Tensor, count: int, threads: int) -> None:
+        rows = len(cell_R)
+        offset_C1 = torch.searchsorted(cell_R, torch.arange(count + 1))
+        wanted = torch.tensor(_runs(rows, ROWS_AT_ONCE, threads)[:-1], dtype=torch.int64).cumsum(0)
+        cut = torch.searchsorted(offset_C1, wanted).clamp_(max=count)
+        places = [[0, 0], *torch.stack([cut, offset_C1[cut]], -1).tolist(), [count, rows]]
+        places = [a for a, b in itertools.pairwise(places) if b[0] > a[0]] + places[-1:]
+        self.cells = [b[0] - a[0] for a, b in itertools.pairwise(places)]  # of each block
+        self.rows = [b[1] - a[1] for a, b in itertools.pairwise(places)]
+        self.offset = [offset_C1[a[0] : b[0]] - a[1] for a, b in itertools.pairwise(places)]
+        self.row = [torch.arange(length) for length in self.rows]
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def split(self, value_C: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return value_C.split(self.cells)
+
+    def split_rows(self, value_R: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return value_R.split(self.rows)
+
+    def sums(self, block: int, row_RW: torch.Tensor, weight_R: torch.Tensor | None = None) -> torch.Tensor:
+        """The sum of each cell's rows, times their weights, in a block [cells, W]."""
+        return torch.embedding_bag(row_RW, self.row[block], self.offset[block], per_sample_weights=weight_R)[0]
+
+
+def _sums_of(table_KW: torch.Tensor, index_RK: torch.Tensor) -> torch.Tensor:
+    """For each row of `index_RK` the sum of those rows of the table [R, W], in one pass."""
+    rows, each = index_RK.shape
+    return torch.embedding_bag(table_KW, index_RK.flatten(), torch.arange(0, rows * each, each))[0]
+
+
+def _runs(rows: int, at_once: int, threads: int) -> list[int]:
+    """Lengths of nearly equal runs: of about `at_once` rows, as many for each thread, but none of a few rows only."""
+    count = -(-rows // (at_once * threads)) * threads
+    count = max(1, min(count, rows // min(at_once, FEWEST_ROWS)))
+    return [(i + 1) * rows // count - i * rows // count for i in range(count)]
+
+
+def _fcn(module: nn.Module) -> FCN:
+    assert isinstance(module, FCN)
+    return module
