@@ -45,12 +45,12 @@ def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid
             parent_C = grid.levels[i].parent_C
             assert parent_C is not None
             kept.append(cell_CW)
-            message_CW = _to_parents(_fcn(network.fine_to_coarse[i]), cell_CW, level, parent_offset_83, threads)
+            message_CW = _to_parents(_Weights(network.fine_to_coarse[i]), cell_CW, level, parent_offset_83, threads)
             cell_CW = cell_CW.new_zeros(grid.levels[i + 1].cell_count, cell_CW.shape[1])
             cell_CW.index_add_(0, parent_C, message_CW)
         for i in reversed(range(len(kept))):
             cell_CW = _to_children(
-                _fcn(network.coarse_to_fine[i]), cell_CW, kept[i], cells[i], -parent_offset_83, threads
+                _Weights(network.coarse_to_fine[i]), cell_CW, kept[i], cells[i], -parent_offset_83, threads
             )
             cell_CW = _passed(network.passing_up[i], cell_CW, cells[i], threads)
         return _to_particles(network, particle_NW, cell_CW, grid, threads)
@@ -71,7 +71,7 @@ class _Cells:
 def _passed(passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: int) -> torch.Tensor:
     """Message passing on one level, as MessagePassing.forward."""
     assert isinstance(passing.edge, nn.ModuleList) and isinstance(passing.cell, nn.ModuleList)
-    networks = [(_fcn(edge), _fcn(cell)) for edge, cell in zip(passing.edge, passing.cell, strict=True)]
+    networks = [(_Weights(edge), _Weights(cell)) for edge, cell in zip(passing.edge, passing.cell, strict=True)]
     blocks, count = cells.blocks, len(cell_CW)
     result_CW, hidden_CW = cell_CW.clone(), torch.empty_like(cell_CW)
     own, hidden = blocks.split(result_CW), blocks.split(hidden_CW)
@@ -84,9 +84,9 @@ def _passed(passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: i
     def project(step: int, block: int) -> None:
         edge, cell = networks[step]
         senders, receivers = ends[(step + 1) % 2]
-        _project(edge, 0, own[block], None, senders[block])
-        _project(edge, 1, own[block], edge.first.bias, receivers[block])
-        _project(cell, 0, own[block], cell.first.bias, hidden[block])
+        edge.project_into(senders[block], 0, own[block])
+        edge.project_into(receivers[block], 1, own[block], edge.first_bias)
+        cell.project_into(hidden[block], 0, own[block], cell.first_bias)
 
     def update(step: int, block: int) -> None:
         edge, cell = networks[step]
@@ -107,22 +107,54 @@ def _passed(passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: i
     return result_CW
 
 
-def _project(network: FCN, part: int, value: torch.Tensor, bias: torch.Tensor | None, out: torch.Tensor) -> None:
-    columns = network.columns(part)
+class _Weights:
+    """An FCN's matrices, taken once a frame: attributes of modules cost as much as a small product."""
+
+    def __init__(self, network: nn.Module) -> None:
+        assert isinstance(network, FCN)
+        self.parts = [network.columns(part).T for part in range(len(network.parts))]
+        self.first_bias, self.slope = network.first.bias, network.slope
+        self.second, self.second_bias = network.second.weight.T, network.second.bias
+        self.norm = None if network.norm is None else (network.norm.weight, network.norm.bias, network.norm.eps)
+
+    def project(self, part: int, value: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
+        return _product(value, self.parts[part], bias)
+
+    def project_into(self, out: torch.Tensor, part: int, value: torch.Tensor, bias: torch.Tensor | None = None) -> None:
+        if len(value) < MINIMUM_ROWS:
+            out.copy_(_product(value, self.parts[part], bias))
+        elif bias is None:
+            torch.mm(value, self.parts[part], out=out)
+        else:
+            torch.addmm(bias, value, self.parts[part], out=out)
+
+    def add_projection(self, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
+        if len(value) < MINIMUM_ROWS:
+            return hidden.add_(_product(value, self.parts[part]))
+        return hidden.addmm_(value, self.parts[part])
+
+    def finish(self, hidden: torch.Tensor) -> torch.Tensor:
+        """Overwrites `hidden`."""
+        out = _product(nn.functional.leaky_relu_(hidden, self.slope), self.second, self.second_bias)
+        if self.norm is None:
+            return out
+        gain, shift, epsilon = self.norm
+        return torch.layer_norm(out, gain.shape, gain, shift, epsilon)
+
+
+def _product(value: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
+    """Rows times a matrix plus bias, each row computed alike however few there are, as hgn.network.fcn.linear."""
     if len(value) < MINIMUM_ROWS:
-        out.copy_(linear(value, columns, bias))
-    elif bias is None:
-        torch.mm(value, columns.T, out=out)
-    else:
-        torch.addmm(bias, value, columns.T, out=out)
+        return linear(value, matrix.T, bias)
+    return torch.mm(value, matrix) if bias is None else torch.addmm(bias, value, matrix)
 
 
 def _to_parents(
-    network: FCN, cell_CW: torch.Tensor, cells: _Cells, offset_83: torch.Tensor, threads: int
+    network: _Weights, cell_CW: torch.Tensor, cells: _Cells, offset_83: torch.Tensor, threads: int
 ) -> torch.Tensor:
     """What each cell sends to its parent [C, W]."""
     assert cells.level.octant_C is not None
-    offset_8W = network.project(1, offset_83) + network.first.bias
+    offset_8W = network.project(1, offset_83, network.first_bias)
     message_CW = torch.empty_like(cell_CW)
     octant, own, message = map(cells.blocks.split, (cells.level.octant_C, cell_CW, message_CW))
 
@@ -135,12 +167,17 @@ def _to_parents(
 
 
 def _to_children(
-    network: FCN, coarse_CW: torch.Tensor, kept_CW: torch.Tensor, cells: _Cells, offset_83: torch.Tensor, threads: int
+    network: _Weights,
+    coarse_CW: torch.Tensor,
+    kept_CW: torch.Tensor,
+    cells: _Cells,
+    offset_83: torch.Tensor,
+    threads: int,
 ) -> torch.Tensor:
     """The cells on the way up, from their parents and what they were on the way down."""
     assert cells.level.parent_C is not None and cells.level.octant_C is not None
     parent_CW = network.project(0, coarse_CW)
-    table_CW = torch.cat([parent_CW, network.project(2, offset_83) + network.first.bias])
+    table_CW = torch.cat([parent_CW, network.project(2, offset_83, network.first_bias)])
     ends_C2 = torch.stack([cells.level.parent_C, cells.level.octant_C + len(coarse_CW)], -1)
     result_CW = torch.empty_like(kept_CW)
     ends, kept, result = map(cells.blocks.split, (ends_C2, kept_CW, result_CW))
@@ -153,10 +190,9 @@ def _to_children(
     return result_CW
 
 
-def _to_cells(network: FCN, particle_NW: torch.Tensor, grid: GridHierarchy, threads: int) -> torch.Tensor:
+def _to_cells(module: FCN, particle_NW: torch.Tensor, grid: GridHierarchy, threads: int) -> torch.Tensor:
     """Step 1: the finest cells [C, W]."""
-    assert network.norm is not None
-    norm, second = network.norm, _Centred(network)
+    second, network = _Centred(module), _Weights(module)
     particles, count = len(particle_NW), grid.levels[0].cell_count
     cell_P, pair_P = torch.sort(grid.cell_N8.flatten(), stable=True)
     blocks = _Blocks(cell_P, count, threads)
@@ -165,7 +201,7 @@ def _to_cells(network: FCN, particle_NW: torch.Tensor, grid: GridHierarchy, thre
     weight = blocks.split_rows(weight_P)
     # The particles' share of the hidden layer, and the corners'.
     table_NW = particle_NW.new_empty(particles + len(CORNER_83), particle_NW.shape[1])
-    table_NW[particles:] = network.project(1, CORNER_83.to(particle_NW)) + network.first.bias
+    table_NW[particles:] = network.project(1, CORNER_83.to(particle_NW), network.first_bias)
     runs = _runs(particles, ROWS_AT_ONCE, threads)
     latent, offset, share = (x.split(runs) for x in (particle_NW, -grid.fraction_N3, table_NW[:particles]))
     sum_CW = particle_NW.new_empty(count, particle_NW.shape[1])
@@ -173,13 +209,13 @@ def _to_cells(network: FCN, particle_NW: torch.Tensor, grid: GridHierarchy, thre
     sums, weights = blocks.split(sum_CW), blocks.split(weights_C1)
 
     def project(run: int) -> None:
-        _project(network, 0, latent[run], None, share[run])
+        network.project_into(share[run], 0, latent[run])
         network.add_projection(share[run], 1, offset[run])
 
     def add(block: int) -> None:
         rows_PW, scale_P = second(_sums_of(table_NW, ends[block]))
-        sum_CW = blocks.sums(block, rows_PW, scale_P.mul_(weight[block])).mul_(norm.weight)
-        torch.addcmul(sum_CW, weights[block], norm.bias, out=sums[block])
+        sum_CW = blocks.sums(block, rows_PW, scale_P.mul_(weight[block])).mul_(second.gain)
+        torch.addcmul(sum_CW, weights[block], second.shift, out=sums[block])
 
     for_each(project, range(len(runs)), threads)
     for_each(add, range(len(blocks)), threads)
@@ -194,14 +230,12 @@ def _to_particles(
     threads: int,
 ) -> torch.Tensor:
     """Steps 11 and 12: normalised accelerations [N, 3]."""
-    gather, decode, width = network.cell_to_particle, network.decode, particle_NW.shape[1]
-    assert gather.norm is not None
-    norm, second = gather.norm, _Centred(gather)
+    second, gather = _Centred(network.cell_to_particle), _Weights(network.cell_to_particle)
+    decode, width = _Weights(network.decode), particle_NW.shape[1]
     cells, particles = len(cell_CW), len(particle_NW)
     # The share of the hidden layer of cells, of corners, and of a run's particles.
-    shared_CW = torch.cat(
-        [gather.project(0, cell_CW), gather.first.bias - gather.project(2, CORNER_83.to(particle_NW))]
-    )
+    corner_8W = gather.first_bias - gather.project(2, CORNER_83.to(particle_NW))
+    shared_CW = torch.cat([gather.project(0, cell_CW), corner_8W])
     runs = _runs(particles, ROWS_AT_ONCE // 8, threads)
     result_N3 = particle_NW.new_empty(particles, 3)
     latent, offset, result = (x.split(runs) for x in (particle_NW, grid.fraction_N3, result_N3))
@@ -217,7 +251,8 @@ def _to_particles(
         rows_PW, scale_P = second(rows_PW)
         change_NW = torch.bmm(scale_P.mul_(weight[run]).view(-1, 1, 8), rows_PW.view(-1, 8, width))[:, 0]
         # Weights sum to 1, so the norm's shift is added once.
-        result[run].copy_(decode(torch.addcmul(latent[run] + norm.bias, change_NW, norm.weight)))
+        after_NW = torch.addcmul(latent[run] + second.shift, change_NW, second.gain)
+        result[run].copy_(decode.finish(decode.project(0, after_NW, decode.first_bias)))
 
     for_each(add, range(len(runs)), threads)
     return result_N3
@@ -229,12 +264,13 @@ class _Centred:
     def __init__(self, network: FCN) -> None:
         assert network.norm is not None
         self.slope, self.epsilon = network.slope, network.norm.eps
-        self.weight = network.second.weight - network.second.weight.mean(0)
+        self.gain, self.shift = network.norm.weight, network.norm.bias
+        self.matrix = (network.second.weight - network.second.weight.mean(0)).T
         self.bias = network.second.bias - network.second.bias.mean()
 
     def __call__(self, hidden_RW: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Rows [R, W] and what the norm multiplies each by [R]. Overwrites `hidden_RW`."""
-        out_RW = linear(nn.functional.leaky_relu_(hidden_RW, self.slope), self.weight, self.bias)
+        out_RW = _product(nn.functional.leaky_relu_(hidden_RW, self.slope), self.matrix, self.bias)
         square_R = torch.linalg.vector_norm(out_RW, dim=1).square_()
         return out_RW, square_R.mul_(1 / out_RW.shape[1]).add_(self.epsilon).rsqrt_()
 
@@ -279,8 +315,3 @@ def _runs(rows: int, at_once: int, threads: int) -> list[int]:
     count = -(-rows // (at_once * threads)) * threads
     count = max(1, min(count, rows // min(at_once, FEWEST_ROWS)))
     return [(i + 1) * rows // count - i * rows // count for i in range(count)]
-
-
-def _fcn(module: nn.Module) -> FCN:
-    assert isinstance(module, FCN)
-    return module
