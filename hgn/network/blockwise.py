@@ -64,7 +64,7 @@ class _Cells:
         self.blocks = _Blocks(level.receiver_E, count, threads)
         # Rows of a table of all cells as senders, all as receivers, and the directions: what an edge sums of it.
         ends_E3 = torch.stack([level.sender_E, level.receiver_E + count, level.direction_E + 2 * count], -1)
-        self.ends = self.blocks.split_rows(ends_E3[:, :2].contiguous()), self.blocks.split_rows(ends_E3)
+        self.ends = _ends(ends_E3[:, :2], self.blocks.rows), _ends(ends_E3, self.blocks.rows)
         self.level = level
 
 
@@ -112,9 +112,10 @@ class _Weights:
 
     def __init__(self, network: nn.Module) -> None:
         assert isinstance(network, FCN)
-        self.parts = [network.columns(part).T for part in range(len(network.parts))]
-        self.first_bias, self.slope = network.first.bias, network.slope
-        self.second, self.second_bias = network.second.weight.T, network.second.bias
+        first, second = network.first, network.second
+        self.parts = first.weight.T.split(network.parts)
+        self.first_bias, self.slope = first.bias, network.slope
+        self.second, self.second_bias = second.weight.T, second.bias
         self.norm = None if network.norm is None else (network.norm.weight, network.norm.bias, network.norm.eps)
 
     def project(self, part: int, value: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
@@ -180,7 +181,8 @@ def _to_children(
     table_CW = torch.cat([parent_CW, network.project(2, offset_83, network.first_bias)])
     ends_C2 = torch.stack([cells.level.parent_C, cells.level.octant_C + len(coarse_CW)], -1)
     result_CW = torch.empty_like(kept_CW)
-    ends, kept, result = map(cells.blocks.split, (ends_C2, kept_CW, result_CW))
+    ends = _ends(ends_C2, cells.blocks.cells)
+    kept, result = map(cells.blocks.split, (kept_CW, result_CW))
 
     def receive(block: int) -> None:
         rows_CW = network.add_projection(_sums_of(table_CW, ends[block]), 1, kept[block])
@@ -197,8 +199,8 @@ def _to_cells(module: FCN, particle_NW: torch.Tensor, grid: GridHierarchy, threa
     cell_P, pair_P = torch.sort(grid.cell_N8.flatten(), stable=True)
     blocks = _Blocks(cell_P, count, threads)
     weight_P = grid.weight_N8.flatten()[pair_P]
-    ends = blocks.split_rows(torch.stack([pair_P >> 3, (pair_P & 7) + particles], -1))
-    weight = blocks.split_rows(weight_P)
+    ends = _ends(torch.stack([pair_P >> 3, (pair_P & 7) + particles], -1), blocks.rows)
+    weight = weight_P.split(blocks.rows)
     # The particles' share of the hidden layer, and the corners'.
     table_NW = particle_NW.new_empty(particles + len(CORNER_83), particle_NW.shape[1])
     table_NW[particles:] = network.project(1, CORNER_83.to(particle_NW), network.first_bias)
@@ -241,7 +243,7 @@ def _to_particles(
     latent, offset, result = (x.split(runs) for x in (particle_NW, grid.fraction_N3, result_N3))
     corner_N8 = (torch.arange(8) + cells).expand(particles, 8)
     pairs = [8 * length for length in runs]
-    ends = torch.stack([grid.cell_N8, corner_N8], -1).flatten(0, 1).split(pairs)
+    ends = _ends(torch.stack([grid.cell_N8, corner_N8], -1).flatten(0, 1), pairs)
     weight = grid.weight_N8.flatten().split(pairs)
 
     def add(run: int) -> None:
@@ -296,18 +298,21 @@ class _Blocks:
     def split(self, value_C: torch.Tensor) -> tuple[torch.Tensor, ...]:
         return value_C.split(self.cells)
 
-    def split_rows(self, value_R: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return value_R.split(self.rows)
-
     def sums(self, block: int, row_RW: torch.Tensor, weight_R: torch.Tensor | None = None) -> torch.Tensor:
         """The sum of each cell's rows, times their weights, in a block [cells, W]."""
         return torch.embedding_bag(row_RW, self.row[block], self.offset[block], per_sample_weights=weight_R)[0]
 
 
-def _sums_of(table_KW: torch.Tensor, index_RK: torch.Tensor) -> torch.Tensor:
-    """For each row of `index_RK` the sum of those rows of the table [R, W], in one pass."""
-    rows, each = index_RK.shape
-    return torch.embedding_bag(table_KW, index_RK.flatten(), torch.arange(0, rows * each, each))[0]
+def _ends(index_RK: torch.Tensor, rows: list[int]) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """What _sums_of takes of each block of rows."""
+    each = index_RK.shape[1]
+    first_R = torch.arange(0, max(rows) * each, each)
+    return [(index.flatten(), first_R[: len(index)]) for index in index_RK.split(rows)]
+
+
+def _sums_of(table_KW: torch.Tensor, ends: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+    """For each row of indices the sum of those rows of the table [R, W], in one pass."""
+    return torch.embedding_bag(table_KW, *ends)[0]
 
 
 def _runs(rows: int, at_once: int, threads: int) -> list[int]:
