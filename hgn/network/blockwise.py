@@ -3,7 +3,7 @@
 What belongs to the same cells is done block by block of cells, from one exchange with other cells to the next: a step
 of message passing takes the edges that end there, their sums, the cells' network and the products with the cells that
 the next step needs. Pairs of particles and cells are taken in the order of their cells on the way to cells. So blocks
-write to different places, sums have one order whatever the threads, and intermediate results stay in a core's cache.
+write to different places, and sums have one order whatever the threads.
 Norms of pairs commute with their sums as far as gain and shift go, so those are left to the sums.
 There are no gradients: nothing is kept for them. hgn.network.network says what is computed, step by step.
 Shape legend: N particles, P pairs of particles and cells, C cells, E directed edges, W width.
@@ -25,7 +25,8 @@ from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level
 if TYPE_CHECKING:
     from hgn.network.network import HierarchicalGraphNetwork
 
-# Rows of edges or pairs of a block: at width 128 an intermediate result takes 3/8 of a megabyte.
+# Rows of edges or pairs of a block: at width 128 an intermediate result takes a megabyte. Smaller blocks stay in faster
+# caches, but each operation costs some microseconds of Python, in which all other threads wait.
 ROWS_AT_ONCE = 2048
 FEWEST_ROWS = 96  # worth a thread's waking
 

@@ -1,7 +1,7 @@
 """Work in blocks on the cores of a CPU: each thread computes whole blocks by itself.
 
-PyTorch shares every single operation among its threads instead. Those of a frame are short: waking a thread for each
-costs more than they do, and a block that one core works on stays in that core's cache from one operation to the next.
+PyTorch shares every single operation among its threads instead. Many of a frame are so short that waking a thread for
+each costs more than they do, for idle threads sleep (hgn.idle_threads).
 """
 
 from __future__ import annotations
