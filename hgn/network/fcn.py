@@ -43,12 +43,12 @@ class FCN(nn.Module):
 
     def project(self, part: int, value: torch.Tensor) -> torch.Tensor:
         """The first layer's product with one part, [..., parts[part]] -> [..., hidden], without the bias."""
-        return linear(value, self._columns(part))
+        return linear(value, self.columns(part))
 
     def add_projection(self, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
         """Adds that product with rows [R, parts[part]] to `hidden` [R, hidden], in place and in one pass."""
         if len(value) >= MINIMUM_ROWS or value.device.type != "cpu":
-            return hidden.addmm_(value, self._columns(part).T)
+            return hidden.addmm_(value, self.columns(part).T)
         return hidden.add_(self.project(part, value))
 
     def finish(self, hidden: torch.Tensor) -> torch.Tensor:
@@ -60,6 +60,6 @@ class FCN(nn.Module):
         """The definition: concatenate, two layers, norm."""
         return self.finish(linear(torch.cat(values, dim=-1), self.first.weight, self.first.bias))
 
-    def _columns(self, part: int) -> torch.Tensor:
+    def columns(self, part: int) -> torch.Tensor:
         start = sum(self.parts[:part])
         return self.first.weight[:, start : start + self.parts[part]]

@@ -1,5 +1,7 @@
 """The hierarchical graph network (paper sec. 3.2, fig. 2): plain torch, the reference for every faster path.
 
+On a CPU, where no gradients are wanted, hgn.network.blockwise computes the same function.
+
 Steps: encode particles (0), particles to cells (1), message passing on each level down (2, 4, …) with fine to
 coarse (3, 5, …) between, message passing on each level up (8, 10, …) after coarse to fine (7, 9, …), cells to
 particles (11), decode to the acceleration (12). With L levels there are 2 L - 1 message-passing blocks.
@@ -12,13 +14,11 @@ import torch
 from torch import nn
 
 from hgn.config import NetworkConfig
+from hgn.network import blockwise
 from hgn.network.base import ParticleNetwork
 from hgn.network.fcn import FCN
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
-
-# Rows of a block on a CPU: at width 128 an intermediate result of 2,048 edges takes 1 MB, one of 512 * 8 pairs 2 MB.
-PARTICLES_AT_ONCE, EDGES_AT_ONCE = 512, 2048
 
 
 class MessagePassing(nn.Module):
@@ -31,26 +31,21 @@ class MessagePassing(nn.Module):
 
     def forward(self, cell_CW: torch.Tensor, level: Level) -> torch.Tensor:
         """Returns the updated cell features [C, W]."""
-        blocks = _blocks(len(level.sender_E), EDGES_AT_ONCE, cell_CW.device)
-        edges: list[torch.Tensor] = []  # of each block
+        edge_EW: torch.Tensor | None = None
         # Receiver minus sender in cells: the opposite of where the sender lies.
         offset_63 = -DIRECTION_63.to(cell_CW)
-        for m, (edge_network, cell_network) in enumerate(zip(self.edge, self.cell, strict=True)):
+        for edge_network, cell_network in zip(self.edge, self.cell, strict=True):
             assert isinstance(edge_network, FCN) and isinstance(cell_network, FCN)
             sender_CH = edge_network.project(0, cell_CW)
             receiver_CH = edge_network.project(1, cell_CW) + edge_network.first.bias
-            offset_6H = edge_network.project(2, offset_63) if m == 0 else None
-            sum_CW = torch.zeros_like(cell_CW)
-            for i, block in enumerate(blocks):
-                sender_E, receiver_E = level.sender_E[block], level.receiver_E[block]
-                hidden_EH = sender_CH.index_select(0, sender_E).add_(receiver_CH.index_select(0, receiver_E))
-                if offset_6H is not None:
-                    hidden_EH += offset_6H.index_select(0, level.direction_E[block])
-                    edges.append(edge_network.finish(hidden_EH))
-                else:
-                    edge_network.add_projection(hidden_EH, 2, edges[i])
-                    edges[i] = edge_network.finish(hidden_EH).add_(edges[i])
-                sum_CW.index_add_(0, receiver_E, edges[i])
+            hidden_EH = sender_CH.index_select(0, level.sender_E).add_(receiver_CH.index_select(0, level.receiver_E))
+            if edge_EW is None:
+                hidden_EH += edge_network.project(2, offset_63).index_select(0, level.direction_E)
+                edge_EW = edge_network.finish(hidden_EH)
+            else:
+                edge_network.add_projection(hidden_EH, 2, edge_EW)
+                edge_EW = edge_network.finish(hidden_EH).add_(edge_EW)
+            sum_CW = _scatter(edge_EW, level.receiver_E, level.cell_count)
             hidden_CH = cell_network.project(0, cell_CW) + cell_network.first.bias
             cell_network.add_projection(hidden_CH, 1, sum_CW)
             cell_CW = cell_network.finish(hidden_CH).add_(cell_CW)
@@ -92,20 +87,18 @@ class HierarchicalGraphNetwork(ParticleNetwork):
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
         """Steps 1 to 12: latent particles and their grids to normalised accelerations [N, 3]."""
+        if particle_NW.device.type == "cpu" and not torch.is_grad_enabled():
+            return blockwise.propagate(self, particle_NW, grid)
         corner_83 = CORNER_83.to(particle_NW)
         # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
         parent_offset_83 = 0.5 - corner_83
 
-        blocks = _blocks(len(particle_NW), PARTICLES_AT_ONCE, particle_NW.device)
-
         network = self.particle_to_cell
         corner_8H = network.project(1, corner_83) + network.first.bias
-        cell_CW = particle_NW.new_zeros(grid.levels[0].cell_count, particle_NW.shape[1])
-        for block in blocks:
-            hidden_NH = network.project(0, particle_NW[block])
-            network.add_projection(hidden_NH, 1, -grid.fraction_N3[block])
-            message_N8W = network.finish(hidden_NH[:, None] + corner_8H).mul_(grid.weight_N8[block, :, None])
-            cell_CW.index_add_(0, grid.cell_N8[block].flatten(), message_N8W.flatten(0, 1))
+        hidden_NH = network.project(0, particle_NW)
+        network.add_projection(hidden_NH, 1, -grid.fraction_N3)
+        message_N8W = network.finish(hidden_NH[:, None] + corner_8H).mul_(grid.weight_N8[..., None])
+        cell_CW = _scatter(message_N8W, grid.cell_N8, grid.levels[0].cell_count)
 
         kept: list[torch.Tensor] = []
         for i, level in enumerate(grid.levels):
@@ -131,25 +124,14 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         network = self.cell_to_particle
         cell_CH = network.project(0, cell_CW)
         corner_8H = network.project(2, corner_83) - network.first.bias
-        outputs = []
-        for block in blocks:
-            hidden_NH = network.project(1, particle_NW[block])
-            network.add_projection(hidden_NH, 2, grid.fraction_N3[block])
-            cell_N8H = cell_CH.index_select(0, grid.cell_N8[block].flatten()).unflatten(0, (-1, 8))
-            hidden_N8H = cell_N8H + hidden_NH[:, None]
-            hidden_N8H -= corner_8H
-            change_NW = network.finish(hidden_N8H).mul_(grid.weight_N8[block, :, None]).sum(1)
-            outputs.append(self.decode(particle_NW[block] + change_NW))
-        return torch.cat(outputs)
-
-
-def _blocks(count: int, at_once: int, device: torch.device) -> list[slice]:
-    """Runs of at most `at_once` rows, nearly equal, whose intermediate results stay in a CPU's cache.
-
-    All rows at once on a GPU, and where gradients keep what blocks would throw away.
-    """
-    blocks = 1 if device.type != "cpu" or torch.is_grad_enabled() else max(1, -(-count // at_once))
-    return [slice(i * count // blocks, (i + 1) * count // blocks) for i in range(blocks)]
+        hidden_NH = network.project(1, particle_NW)
+        network.add_projection(hidden_NH, 2, grid.fraction_N3)
+        cell_N8H = cell_CH.index_select(0, grid.cell_N8.flatten()).unflatten(0, (-1, 8))
+        hidden_N8H = cell_N8H + hidden_NH[:, None]
+        hidden_N8H -= corner_8H
+        change_NW = network.finish(hidden_N8H).mul_(grid.weight_N8[..., None]).sum(1)
+        output_N3: torch.Tensor = self.decode(particle_NW + change_NW)
+        return output_N3
 
 
 def _scatter(value: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tensor:

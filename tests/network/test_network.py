@@ -90,19 +90,40 @@ def test_batch_equals_single_scenes(spread, changes):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
-@pytest.mark.parametrize(("particles", "edges"), [(7, 20), (32, 300), (512, 2048)])
-def test_blocks_change_nothing(monkeypatch, dtype, tolerance, particles, edges):
-    """Frames, which take a CPU's rows block by block, equal the float64 output with gradients, whatever the blocks."""
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("rows", [20, 300, 2048])
+@pytest.mark.parametrize("counts", [(70, 1, 30), (1,), (400,)])
+def test_blocks_change_nothing(monkeypatch, dtype, tolerance, threads, rows, counts):
+    """Frames on a CPU, in blocks on several threads, equal the float64 output with gradients, the same every time."""
     network = network_of(width=128, levels=4).train()
-    state = random_state((70, 1, 30), spread=0.15)
+    state = random_state(counts, spread=0.15)
     expected = network.normalised_acceleration(state).detach()
-    monkeypatch.setattr("hgn.network.network.PARTICLES_AT_ONCE", particles)
-    monkeypatch.setattr("hgn.network.network.EDGES_AT_ONCE", edges)
+    monkeypatch.setattr("hgn.network.blockwise.ROWS_AT_ONCE", rows)
     state = replace(state, position_N3=state.position_N3.to(dtype), velocity_NM3=state.velocity_NM3.to(dtype))
     state = replace(state, domain_S3=state.domain_S3.to(dtype))
-    with torch.inference_mode():
-        found = network.to(dtype).normalised_acceleration(state)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with torch.inference_mode():
+            found = network.to(dtype).normalised_acceleration(state)
+            again = network.normalised_acceleration(state)
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
     assert float((found.double() - expected).norm() / expected.norm()) < tolerance
+    assert torch.equal(found, again)
+
+
+def test_frames_of_batches_equal_single_scenes():
+    """What shares a batch with a scene, and with it the blocks, changes no bit of a frame's output on a CPU."""
+    counts = (40, 7, 1, 325)
+    network = network_of(dtype=torch.float32, width=128, levels=4)
+    state = random_state(counts, dtype=torch.float32, spread=0.2)
+    with torch.inference_mode():
+        together = network.normalised_acceleration(state)
+        for scene in range(len(counts)):
+            alone = scene_of(state, scene, ObstacleCells.of([random_grid(scene, 4_000)]))
+            assert torch.equal(network.normalised_acceleration(alone), together[state.scene_N == scene]), scene
 
 
 def test_translation_by_coarsest_cells_changes_nothing():
