@@ -93,6 +93,9 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
     panel.set_xlabel("frame", fontsize=TEXT)
     panel.set_ylabel("position MSE (domain lengths²)", fontsize=TEXT)
     panel.set_yscale("log")
+    scored = sorted({int(frame) for row in rows for frame in row["position_mse"]})
+    if scored:  # earlier errors of the solver, and those of ballistic motion, would leave the networks' a few pixels
+        panel.set_ylim(_limits(rows, scored[0])[0], _limits(rows, scored[-1])[1])
     panel.grid(alpha=0.25)
     panel.tick_params(labelsize=SMALL)
     if rows:
