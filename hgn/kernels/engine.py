@@ -160,13 +160,19 @@ class Engine:
         capacities = grid.capacities
         self.latent = self._operand(particles, width)
         self.by_particle_down, self.by_particle_up = self._operand(particles, width), self._operand(particles, width)
-        self.decoder_input = self._operand(particles, width)
         self.output = self._float(particles, OUT)
-        self.encode_hidden = self._operand(particles, width)
-        self.decode_hidden = self._operand(particles, width)
         self.message = [self._operand(capacities[i], width) for i in range(levels - 1)]  # to the parents
-        self.transfer_hidden_down = [self._operand(capacities[i], width) for i in range(levels - 1)]
-        self.transfer_hidden_up = [self._operand(capacities[i], width) for i in range(levels - 1)]
+        if self.training:
+            self.decoder_input = self._operand(particles, width)
+            self.encode_hidden, self.decode_hidden = (self._operand(particles, width) for _ in range(2))
+            self.transfer_hidden_down, self.transfer_hidden_up = (
+                [self._operand(capacities[i], width) for i in range(levels - 1)] for _ in range(2)
+            )
+        else:
+            # Hidden rows are not kept, and what was read for the last time makes room for what is written later.
+            self.decoder_input = self.by_particle_down
+            self.encode_hidden = self.decode_hidden = self.latent
+            self.transfer_hidden_down = self.transfer_hidden_up = self.message
         pairs = 8 * particles if self.training else 1
         hidden = pairs if self.keeps_pair_hidden() else 1
         # hidden layer, normalised output, one over its deviation
@@ -178,8 +184,12 @@ class Engine:
         self.up = [Block(i, packed.passing_up[i]) for i in range(levels - 1)]
         for block in (*self.down, *self.up):
             capacity = capacities[block.level]
-            block.send = [self._operand(capacity, width) for _ in range(2)]
-            block.receive = [self._operand(capacity, width) for _ in range(2)]
+            down = self.down[block.level]
+            before = None if self.training or block is down else down  # whose buffers this block takes over
+            if before is None:
+                block.send, block.receive = ([self._operand(capacity, width) for _ in range(2)] for _ in range(2))
+            else:
+                block.send, block.receive = before.send, before.receive
             kind = self._operand if self.tuning.half_cells else self._float
             # particles are added to the first, by atomics: rounded sums cost the gradients precision
             rounds = block is not self.down[0] or (self.tuning.half_sums and not self.training)
@@ -201,14 +211,16 @@ class Engine:
                 if start is not kind:
                     block.cell[0] = start(capacity, width)
                 block.edge = [shared_edge.flatten(0, 1)[: 6 * capacity].view(capacity, 6, width)] * max(steps - 1, 0)
-                block.sum = [self._operand(capacity, width)] * steps
+                block.sum = [self._operand(capacity, width)] * steps if before is None else before.sum
                 # not kept
                 block.edge_hidden = block.edge_normalised = [block.send[0]] * steps
                 block.cell_hidden = block.cell_normalised = [block.send[0]] * steps
                 block.edge_deviation = block.cell_deviation = [block.cell[0]] * steps
         for i in range(levels):
             block = self.down[i] if i == levels - 1 else self.up[i]
-            block.product = self._operand(capacities[i], width)
+            # Where nothing is kept, parents have read what was sent to them by then.
+            sent = None if self.training or i == levels - 1 else self.message[i]
+            block.product = self._operand(capacities[i], width) if sent is None else sent
             block.next_at = packed.cell_to_particle.parts[0] if i == 0 else packed.coarse_to_fine[i - 1].parts[0]
 
     # parameters

@@ -1,6 +1,6 @@
 """The simulation loop as one CUDA graph a frame (paper algorithm 1): no host synchronisation between looks.
 
-The host looks every LOOK_FRAMES frames, while the device is at the next ones. Where the grid needed more room than it
+The host looks every `look_frames` frames, while the device is at the next ones. Where the grid needed more room than it
 had, the frames before are kept, the buffers grow, and the simulation goes on from the last good frame: nothing is lost,
 and nothing is done twice.
 Shape legend: N particles of all scenes, S scenes, T frames.
@@ -29,7 +29,8 @@ from hgn.runtime.divergence import lost
 from hgn.runtime.path import kernel_precision
 from hgn.schema import ConfigError
 
-LOOK_FRAMES = 32
+LOOK_FRAMES, FEWEST_FRAMES = 32, 8
+PATH_BYTES = 1 << 27  # of positions on their way to the host: fewer frames where there are many particles
 GROWTH = 2.0
 HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie spread need up to six times as many,
 SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # so many a particle at most, on each level; coarser ones as the last
@@ -107,7 +108,9 @@ class FastRollout:
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
             self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
-        self.path_TN3 = torch.zeros(2 * LOOK_FRAMES, self.particles, 3, device=self.device)
+        affordable = PATH_BYTES // (2 * 3 * 4 * max(1, self.particles))
+        self.look_frames = max(FEWEST_FRAMES, min(LOOK_FRAMES, affordable))
+        self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
         self.overlap = self.device.type == "cuda"  # frames are started before those before them are taken away
         normaliser = network.normaliser
         self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
@@ -262,10 +265,10 @@ class FastRollout:
         done, half = 0, 0
         ahead: _Look | None = None
         while done < frames:
-            look = ahead or self._launch(min(LOOK_FRAMES, frames - done), half)
+            look = ahead or self._launch(min(self.look_frames, frames - done), half)
             rest, half = frames - done - look.frames, 1 - half
             # The device goes on while the host takes frames away; where something is amiss it stands still instead.
-            ahead = self._launch(min(LOOK_FRAMES, rest), half) if self.overlap and rest else None
+            ahead = self._launch(min(self.look_frames, rest), half) if self.overlap and rest else None
             path_TN3, status = self._settle(look)
             taken = len(path_TN3)
             kept[done : done + taken] = self._taken_away(path_TN3)
@@ -282,12 +285,12 @@ class FastRollout:
         return kept
 
     def frames(self) -> Iterator[np.ndarray]:
-        """Positions float32 [N, 3] of frame after frame, without an end, computed LOOK_FRAMES at a time.
+        """Positions float32 [N, 3] of frame after frame, without an end, computed `look_frames` at a time.
 
         Raises: LeftDomainError, behind the last frame before it.
         """
         while True:
-            path_TN3, status = self.look(LOOK_FRAMES)
+            path_TN3, status = self.look(self.look_frames)
             diverged = bool(status & DIVERGED.value)  # in the last of them
             yield from path_TN3[: len(path_TN3) - diverged].to("cpu", copy=True).numpy()
             if diverged:
@@ -295,15 +298,15 @@ class FastRollout:
             self.make_room(status)
 
     def look(self, frames: int) -> tuple[torch.Tensor, int]:
-        """Simulates up to `frames` more frames: those taken, at most LOOK_FRAMES of them, and the status after them.
+        """Simulates up to `frames` more frames: those taken, at most `look_frames` of them, and the status after them.
 
         They are a view of what the next call writes to. Where the status is not zero, it must be dealt with first.
         """
-        return self._settle(self._launch(min(LOOK_FRAMES, frames), 0))
+        return self._settle(self._launch(min(self.look_frames, frames), 0))
 
     def _launch(self, frames: int, half: int) -> _Look:
         """Starts some frames, whose positions go into one half of the path."""
-        first = half * LOOK_FRAMES
+        first = half * self.look_frames
         self.frame.fill_(first)
         for _ in range(frames):
             if self.graph is None:
