@@ -1,8 +1,8 @@
 """python -m tools.error_vs_time data=… weights=[…] out=results/error_vs_time: error against run time.
 
 Networks (shipped ones where none are named), the solver at coarser grids and larger steps, and predictors that learn
-nothing, all on the same test scenes, scored by one converged simulation. Writes a table, OUT.json, OUT.png and
-OUT_frames.png.
+nothing, all on the same test scenes, scored by one converged simulation. Writes a table, OUT.json, OUT.png,
+OUT_batched.png and OUT_frames.png.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hgn.config import NETWORK_KINDS
 from hgn.training.errors import told_gain
 from tools.error_vs_time.score import label
 
@@ -13,7 +14,7 @@ Row = Mapping[str, Any]
 
 def comparisons(rows: Sequence[Row]) -> list[str]:
     """Lines for people, from the rows of a report."""
-    networks = [row for row in rows if row["system"] in ("hgn", "gns", "gns_particles")]
+    networks = [row for row in rows if row["system"] in NETWORK_KINDS]
     trivial = [row for row in rows if row["system"] == "trivial" and row["one_step_mse"]]
     return [
         *_one_step(networks, trivial),

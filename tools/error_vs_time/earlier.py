@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hgn.schema import ConfigError, require
+from tools.error_vs_time.settings import UNTIMED
 
-UNTIMED = ("trivial", "chaos")
 IDENTITY = ("system", "weights", "path", "precision", "updates", "grid", "step", "predictor", "floor")
 
 

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from hgn.config import NETWORK_KINDS
 from tools.error_vs_time.score import label
+from tools.error_vs_time.settings import UNTIMED
 from tools.figure import as_png, new_figure
 
 CONVENTION = "squared errors: sum over axes, mean over particles and scenes, frame units"
@@ -24,11 +26,7 @@ FLOOR_COLOR, TRIVIAL_COLOR = "#2b8a3e", "#868e96"
 FLOOR_LINES, TRIVIAL_LINES = ("-", "--"), (":", "--", "-.")
 TEXT, SMALL, TINY = 10.5, 9.5, 7.5  # points
 FIGURE_WIDTH, PANEL_HEIGHT = 16.2, 4.9  # inches
-NETWORKS = ("hgn", "gns", "gns_particles")
-NEAR_FLOOR, FAR_ABOVE = (
-    30,
-    8,
-)  # times below the least error, and above the best that learns nothing: what is still shown
+NEAR_FLOOR, FAR_ABOVE = 30, 8  # what is still shown: times below the least error, above the best that learns nothing
 LEGEND_LINE = 1.5 * SMALL  # points
 UPPER_EDGE = 0.965  # where of a panel's height they are marked that diverged in all scenes
 
@@ -75,20 +73,20 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
     looks = _looks(rows)
     best: dict[str, Row] = {}
     for row in rows:
-        if row["system"] in NETWORKS:
+        if row["system"] in NETWORK_KINDS:
             known = best.get(row["weights"])
             if known is None or _length(row) > _length(known):
                 best[row["weights"]] = row
     for row in rows:
-        if row["system"] in NETWORKS and row is not best[row["weights"]]:
+        if row["system"] in NETWORK_KINDS and row is not best[row["weights"]]:
             continue
         look, curve_T = looks[_name(row)], np.array([np.nan if v is None else v for v in row["curve"]])
         time_T = np.flatnonzero(curve_T > 0)
         style = {"color": look["color"], "linestyle": look.get("line", "-")}
         if row["system"] == "mpm":
             style |= {"marker": look["markers"][row["step"]], "markevery": 0.15, "markersize": 5}
-        width = 2.0 if row["system"] in NETWORKS else 1.2
-        name = f"{_name(row)}, {PRECISION_NAMES[row['precision']]}" if row["system"] in NETWORKS else label(row)
+        width = 2.0 if row["system"] in NETWORK_KINDS else 1.2
+        name = f"{_name(row)}, {PRECISION_NAMES[row['precision']]}" if row["system"] in NETWORK_KINDS else label(row)
         panel.plot(time_T, curve_T[time_T], label=name, linewidth=width, **style)
     panel.set_xlabel("frame", fontsize=TEXT)
     panel.set_ylabel("position MSE (domain lengths²)", fontsize=TEXT)
@@ -111,7 +109,7 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks:
         groups.setdefault(_name(row), []).append(row)
     for name, some in groups.items():
         look = looks[name]
-        if some[0]["system"] in ("chaos", "trivial"):
+        if some[0]["system"] in UNTIMED:
             error = _error(some[0], frame)
             if error is not None:
                 panel.axhline(error, color=look["color"], linestyle=look["line"], linewidth=1.3, zorder=1)
@@ -142,9 +140,7 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks:
 
 def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
     """Of the errors' axis: all points but those far above what learns nothing, and floors that are near."""
-    errors = [
-        error for row in rows if (error := _error(row, frame)) is not None and row["system"] not in ("chaos", "trivial")
-    ]
+    errors = [error for row in rows if (error := _error(row, frame)) is not None and row["system"] not in UNTIMED]
     trivial = [error for row in rows if row["system"] == "trivial" and (error := _error(row, frame)) is not None]
     floors = [error for row in rows if row["system"] == "chaos" and (error := _error(row, frame)) is not None]
     everything = errors + trivial + floors or [1.0]
@@ -197,14 +193,14 @@ def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
     lines: list[Any] = []
     steps: dict[float, str] = {}
     for name, look in looks.items():
-        if look["system"] in NETWORKS:
+        if look["system"] in NETWORK_KINDS:
             networks.append(Line2D([], [], color=look["color"], linewidth=3.5, label=name))
         elif look["system"] == "mpm":
             grids.append(Line2D([], [], color=look["color"], linewidth=3.5, label=name))
             steps |= look["markers"]
         else:
             lines.append(Line2D([], [], color=look["color"], linestyle=look["line"], linewidth=1.5, label=name))
-    present = {row["precision"] for row in rows if row["system"] in NETWORKS}
+    present = {row["precision"] for row in rows if row["system"] in NETWORK_KINDS}
     precisions = [_mark(m, PRECISION_NAMES[name]) for name, m in PRECISION_MARKERS.items() if name in present]
     marks = [_mark(m, f"solver, {step:g} of the stable step") for step, m in sorted(steps.items(), reverse=True)]
     notes: list[Any] = []

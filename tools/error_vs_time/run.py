@@ -21,13 +21,12 @@ from hgn.schema import ConfigError
 from tools.error_vs_time.contenders import GNS_FIRST, Contender, SolverContender, TrivialContender
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, report, score
-from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
 from tools.error_vs_time.timing import Stopwatch, Timing
 
 # of the seconds given: until when a contender, and a further round of run times, may be begun
 BEGIN_SHARE, ROUND_SHARE = 0.85, 0.95
 DRAWN_EVERY_S = 60.0  # which takes some seconds each time
-UNTIMED = ("trivial", "chaos")
 
 
 class Run:
@@ -53,9 +52,7 @@ class Run:
         self._rows: dict[int, dict[str, Any]] = {}
         self._given_up: set[int] = set()
         self._drawn = time.monotonic()
-        out = Path(config.out)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        self.out, self.file = str(out), config.json or f"{out}.json"
+        self.out, self.file = config.out, config.json or f"{config.out}.json"
 
     @property
     def rows(self) -> list[dict[str, Any]]:

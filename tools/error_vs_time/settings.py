@@ -9,6 +9,7 @@ from hgn.data.manifest import SPLITS
 from hgn.schema import require, require_non_negative, require_one_of, require_positive
 
 PRECISIONS = ("fp32", "tf32", "fp16")
+UNTIMED = ("trivial", "chaos")  # rows without run times
 
 
 @dataclass(frozen=True)
