@@ -11,9 +11,10 @@ import torch
 import triton
 
 from hgn.config import NetworkConfig
+from hgn.kernels.buffers import OUT, Block
 from hgn.kernels.cells.kernel import cell_backward
 from hgn.kernels.edges.kernel import edge_backward
-from hgn.kernels.engine import OUT, Block, Engine, Tuning
+from hgn.kernels.engine import Engine, Tuning
 from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.packing import PackedFCN, PackedNetwork
 from hgn.kernels.pairs.kernel import pairs_backward, pairs_weight_gradient

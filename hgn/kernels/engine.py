@@ -6,16 +6,17 @@ paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 import triton
 
 from hgn.config import NetworkConfig
+from hgn.kernels.buffers import Block, Buffers
 from hgn.kernels.cells.kernel import cell_forward
 from hgn.kernels.edges.kernel import edge_forward
 from hgn.kernels.grid.op import DeviceGrid
-from hgn.kernels.packing import PackedFCN, PackedMessagePassing, PackedNetwork, rounded_to_tf32
+from hgn.kernels.packing import PackedFCN, PackedNetwork, rounded_to_tf32
 from hgn.kernels.pairs.kernel import pairs_forward
 from hgn.kernels.rows.kernel import clear_rows, gather_project, gather_sums, rows_forward
 
@@ -25,7 +26,6 @@ RESIDENT_PROGRAMS = 2 * PROCESSORS
 FEW_ROWS = 64 * PROCESSORS
 CLEAR_ROWS = 64
 LIGHT_BLOCK = (64, 4)  # rows and warps of a program that keeps two weights, of which two fit on a processor
-OUT = 16  # the decoder's three outputs, padded
 NONE = -1  # where a product has no bias
 
 
@@ -83,34 +83,13 @@ class Tuning:
         )
 
 
-@dataclass
-class Block:
-    """One message-passing block: its level, weights, and buffers (lists over iterations)."""
-
-    level: int
-    packed: PackedMessagePassing
-    cell: list[torch.Tensor] = field(default_factory=list)  # M + 1 of [C, W]
-    edge: list[torch.Tensor] = field(default_factory=list)  # M - 1 of [C, 6, W]
-    edge_hidden: list[torch.Tensor] = field(default_factory=list)
-    edge_normalised: list[torch.Tensor] = field(default_factory=list)
-    edge_deviation: list[torch.Tensor] = field(default_factory=list)  # one over it, float32 [C, 6]
-    sum: list[torch.Tensor] = field(default_factory=list)
-    cell_hidden: list[torch.Tensor] = field(default_factory=list)
-    cell_normalised: list[torch.Tensor] = field(default_factory=list)
-    cell_deviation: list[torch.Tensor] = field(default_factory=list)
-    send: list[torch.Tensor] = field(default_factory=list)
-    receive: list[torch.Tensor] = field(default_factory=list)
-    product: torch.Tensor | None = None  # of the block's output, for the step that follows
-    next_at: int = 0  # weights of that product
-
-
 def feature_columns(config: NetworkConfig) -> int:
     """Columns of the encoder's input: features, one-hot material, padding to a power of two that matrix units take."""
     used = config.feature_width - config.material_embedding + len(config.materials)
     return max(16, triton.next_power_of_2(used))
 
 
-class Engine:
+class Engine(Buffers):
     """Runs a packed network on a DeviceGrid.
 
     `values` float32 [packed.size] are the parameters. In half precision and TF32 the products read `weights`, their
@@ -143,85 +122,8 @@ class Engine:
         self.fine = rounded and not training
         self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
         self.tuning = tuning or Tuning.of(precision)
-        self._allocate()
+        self._allocate(self.keeps_pair_hidden())
         self.refresh()
-
-    # buffers
-
-    def _operand(self, *shape: int) -> torch.Tensor:
-        return torch.zeros(shape, dtype=self.operand, device=self.device)
-
-    def _float(self, *shape: int) -> torch.Tensor:
-        return torch.zeros(shape, device=self.device)
-
-    def _allocate(self) -> None:
-        width, config, grid, packed = self.width, self.config, self.grid, self.packed
-        particles, levels, steps = grid.particles, config.levels, config.message_passing_steps
-        capacities = grid.capacities
-        self.latent = self._operand(particles, width)
-        self.by_particle_down, self.by_particle_up = self._operand(particles, width), self._operand(particles, width)
-        self.output = self._float(particles, OUT)
-        self.message = [self._operand(capacities[i], width) for i in range(levels - 1)]  # to the parents
-        if self.training:
-            self.decoder_input = self._operand(particles, width)
-            self.encode_hidden, self.decode_hidden = (self._operand(particles, width) for _ in range(2))
-            self.transfer_hidden_down, self.transfer_hidden_up = (
-                [self._operand(capacities[i], width) for i in range(levels - 1)] for _ in range(2)
-            )
-        else:
-            # Hidden rows are not kept, and what was read for the last time makes room for what is written later.
-            self.decoder_input = self.by_particle_down
-            self.encode_hidden = self.decode_hidden = self.latent
-            self.transfer_hidden_down = self.transfer_hidden_up = self.message
-        pairs = 8 * particles if self.training else 1
-        hidden = pairs if self.keeps_pair_hidden() else 1
-        # hidden layer, normalised output, one over its deviation
-        self.kept_down, self.kept_up = (
-            (self._operand(hidden, width), self._operand(pairs, width), self._float(pairs)) for _ in range(2)
-        )
-        shared_edge = None if self.training else self._operand(capacities[0], 6, width)
-        self.down = [Block(i, packed.passing_down[i]) for i in range(levels)]
-        self.up = [Block(i, packed.passing_up[i]) for i in range(levels - 1)]
-        for block in (*self.down, *self.up):
-            capacity = capacities[block.level]
-            down = self.down[block.level]
-            before = None if self.training or block is down else down  # whose buffers this block takes over
-            if before is None:
-                block.send, block.receive = ([self._operand(capacity, width) for _ in range(2)] for _ in range(2))
-            else:
-                block.send, block.receive = before.send, before.receive
-            kind = self._operand if self.tuning.half_cells else self._float
-            # particles are added to the first, by atomics: rounded sums cost the gradients precision
-            rounds = block is not self.down[0] or (self.tuning.half_sums and not self.training)
-            start = kind if rounds else self._float
-            if self.training:
-                block.cell = [start(capacity, width)] + [kind(capacity, width) for _ in range(steps)]
-                block.edge = [self._operand(capacity, 6, width) for _ in range(steps - 1)]
-                block.edge_hidden = [self._operand(capacity, 6, width) for _ in range(steps)]
-                block.edge_normalised = [self._operand(capacity, 6, width) for _ in range(steps)]
-                block.edge_deviation = [self._float(capacity, 6) for _ in range(steps)]
-                block.sum = [self._operand(capacity, width) for _ in range(steps)]
-                block.cell_hidden = [self._operand(capacity, width) for _ in range(steps)]
-                block.cell_normalised = [self._operand(capacity, width) for _ in range(steps)]
-                block.cell_deviation = [self._float(capacity) for _ in range(steps)]
-            else:
-                assert shared_edge is not None
-                first, second = kind(capacity, width), kind(capacity, width)
-                block.cell = [(first, second)[m % 2] for m in range(steps + 1)]
-                if start is not kind:
-                    block.cell[0] = start(capacity, width)
-                block.edge = [shared_edge.flatten(0, 1)[: 6 * capacity].view(capacity, 6, width)] * max(steps - 1, 0)
-                block.sum = [self._operand(capacity, width)] * steps if before is None else before.sum
-                # not kept
-                block.edge_hidden = block.edge_normalised = [block.send[0]] * steps
-                block.cell_hidden = block.cell_normalised = [block.send[0]] * steps
-                block.edge_deviation = block.cell_deviation = [block.cell[0]] * steps
-        for i in range(levels):
-            block = self.down[i] if i == levels - 1 else self.up[i]
-            # Where nothing is kept, parents have read what was sent to them by then.
-            sent = None if self.training or i == levels - 1 else self.message[i]
-            block.product = self._operand(capacities[i], width) if sent is None else sent
-            block.next_at = packed.cell_to_particle.parts[0] if i == 0 else packed.coarse_to_fine[i - 1].parts[0]
 
     # parameters
 

@@ -39,7 +39,8 @@ class PackedMessagePassing:
 
 @dataclass(frozen=True)
 class PackedNetwork:
-    """Where everything is. `index` maps packed elements to the concatenated parameters, -1 for padding."""
+    """Where everything is. `index` (int32, on the host) maps packed elements to the concatenated parameters, -1 for
+    padding."""
 
     encode: PackedFCN
     particle_to_cell: PackedFCN
@@ -55,9 +56,10 @@ class PackedNetwork:
 
     def gather(self, tensors: list[torch.Tensor]) -> torch.Tensor:
         """Packs tensors shaped as the network's parameters, in their order: float32 [size]."""
-        flat = torch.cat([tensor.detach().reshape(-1).float() for tensor in tensors])
-        index = self.index.to(flat.device)
-        return torch.where(index >= 0, flat[index.clamp(min=0)], 0.0)
+        # a zero behind them, which goes to the padding
+        zero = torch.zeros(1, device=tensors[0].device)
+        flat = torch.cat([*(tensor.detach().reshape(-1).float() for tensor in tensors), zero])
+        return flat.index_select(0, self.index.remainder(len(flat)).to(flat.device))
 
     def scatter(self, packed: torch.Tensor, tensors: list[torch.Tensor]) -> None:
         """The inverse of `gather`, into the tensors."""
@@ -72,7 +74,7 @@ class PackedNetwork:
 class _Packer:
     def __init__(self, network: HierarchicalGraphNetwork) -> None:
         parameters = list(network.parameters())
-        every = torch.arange(sum(parameter.numel() for parameter in parameters))
+        every = torch.arange(sum(parameter.numel() for parameter in parameters), dtype=torch.int32)
         pieces = every.split([parameter.numel() for parameter in parameters])
         self.places = dict(zip(map(id, parameters), pieces, strict=True))
         self.pieces: list[torch.Tensor] = []
@@ -85,7 +87,7 @@ class _Packer:
         offset = self.size
         flat = positions.reshape(-1)
         padding = -len(flat) % 16  # vector loads stay aligned
-        self.pieces += [flat, torch.full((padding,), -1)]
+        self.pieces += [flat, flat.new_full((padding,), -1)]
         self.size += len(flat) + padding
         return offset
 

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from hgn.kernels.buffers import OUT
 from hgn.kernels.capture import captured
-from hgn.kernels.engine import OUT, Engine, feature_columns
+from hgn.kernels.engine import Engine, feature_columns
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
 from hgn.kernels.rollout.kernel import DIVERGED, advance, integrate
@@ -29,12 +30,14 @@ from hgn.runtime.divergence import lost
 from hgn.runtime.path import kernel_precision
 from hgn.schema import ConfigError
 
-LOOK_FRAMES, FEWEST_FRAMES = 32, 8
+LOOK_FRAMES, FEWEST_FRAMES = 32, 4
 PATH_BYTES = 1 << 27  # of positions on their way to the host: fewer frames where there are many particles
-GROWTH = 2.0
+GROWTH = 2.0  # room for so many times the cells
+# The same where there are more than ROOMY_CELLS of them: at first, and for what was needed when there was too little.
+TIGHT_START, TIGHT_GROWTH = 1.25, 1.5
 HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie spread need up to six times as many,
 SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # so many a particle at most, on each level; coarser ones as the last
-ROOMY_CELLS = 65_536  # up to which there is such headroom: beyond, memory counts
+ROOMY_CELLS = 65_536  # of the finest level, up to which there is such headroom: beyond, memory counts
 CHECKED_PARTICLES = 50_000  # at most; the plain network needs memory
 INTEGRATE_BLOCK = 64  # particles
 
@@ -53,8 +56,13 @@ def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
     for level, count in enumerate(cells):
         spread = SPREAD_CELLS[min(level, len(SPREAD_CELLS) - 1)] * particles
         roomy = min(HEADROOM * count, spread, ROOMY_CELLS >> 2 * level)
-        found.append(max(256 >> level, int(GROWTH * count), int(roomy)))
+        found.append(max(256 >> level, _room(count, level, TIGHT_START), int(roomy)))
     return tuple(found)
+
+
+def _room(count: int, level: int, tight: float) -> int:
+    """GROWTH times the count, and less where that is more than for ROOMY_CELLS: at least `tight` times."""
+    return max(int(tight * count), int(GROWTH * min(count, ROOMY_CELLS >> 2 * level)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +359,17 @@ class FastRollout:
 
     def _grow(self) -> None:
         # all levels: those that still had room are as full, and would have the same captured again soon
-        needed = self.grid.needed_L.tolist()
-        capacities = [max(c, int(GROWTH * n)) for c, n in zip(self.grid.capacities, needed, strict=True)]
+        before, needed = self.grid.capacities, self.grid.needed_L.tolist()
+        pairs = zip(before, needed, strict=True)
+        capacities = tuple(max(c, _room(n, i, TIGHT_GROWTH)) for i, (c, n) in enumerate(pairs))
         self.growths += 1
-        self._build(tuple(capacities))
+        # Particles are kept elsewhere: what there is goes first, so that there is never room for both.
+        self.graph = None
+        del self.engine, self.grid
+        try:
+            self._build(capacities)
+            return
+        except torch.OutOfMemoryError as error:
+            reason = str(error)  # the error itself keeps what was allocated so far
+        self._build(before)
+        raise torch.OutOfMemoryError(reason)

@@ -166,8 +166,7 @@ class FastTraining:
         return flat
 
     def _packed(self, flat: torch.Tensor) -> torch.Tensor:
-        index = self.updates.packed.index.to(self.device)
-        return torch.where(index >= 0, flat[index.clamp(min=0)], 0.0)
+        return self.updates.packed.gather([flat])
 
     def _read_moments(self) -> None:
         index = self.updates.packed.index.to(self.device)

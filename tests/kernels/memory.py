@@ -23,7 +23,7 @@ class IllegalAccessError(AssertionError):
     """A kernel has read or written what is no tensor's memory."""
 
 
-def _tensors() -> list[torch.Tensor]:
+def living_tensors() -> list[torch.Tensor]:
     return [thing for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor)]
 
 
@@ -32,7 +32,7 @@ class Alive:
 
     def __init__(self, tensors: list[torch.Tensor] | None = None) -> None:
         found = {}
-        for tensor in _tensors() if tensors is None else tensors:
+        for tensor in living_tensors() if tensors is None else tensors:
             if tensor.device.type == "cpu":
                 found[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
         spans = np.array(sorted((at, at + size) for at, size in found.items() if at and size), np.uint64)
@@ -52,14 +52,14 @@ class Checked:
         self._module = module
         self._launch = ""
         # what is there at the start is looked for once, and leaves the collector's lists: they are long
-        self._old = [weakref.ref(tensor) for tensor in _tensors()]
+        self._old = [weakref.ref(tensor) for tensor in living_tensors()]
         gc.freeze()
         self._alive = self._now()
         self.launches: list[tuple[str, tuple[int, ...]]] = []  # each with the addresses of its tensors
 
     def _now(self) -> Alive:
         old = [tensor for tensor in (reference() for reference in self._old) if tensor is not None]
-        return Alive(old + _tensors())
+        return Alive(old + living_tensors())
 
     def begin(self, launch: str, arguments: tuple[Any, ...]) -> None:
         pointers = tuple(a.data_ptr() for a in arguments if isinstance(a, torch.Tensor))

@@ -27,7 +27,7 @@ from tools.bench.states import Workload, batch_of, state_of
 from tools.bench.timing import Timed, once
 
 PATH_PRECISION = {"fp32": "highest", "tf32": "high", "fp16": "half"}
-FRAMES_AT_ONCE = 16  # so that a frame's launch hides behind the one before, as in a simulation
+FRAMES_AT_ONCE = 16  # at most, so that a frame's launch hides behind the one before, as in a simulation
 UPDATES_AT_ONCE = 20
 OBSTACLE_CELL_SIZE = 1 / 64
 FIRST_MOMENT_SHARE = 0.1  # of Adam, of the gradient, after the first update
@@ -43,18 +43,23 @@ class FastFrame:
         network = bench_network(config, device)
         assert isinstance(network, HierarchicalGraphNetwork)
         self.network, self.state = network, state_of(work, config, device)
-        self.velocity_NV = self.state.velocity_NM3.flatten(1)
+        self.velocity_NV = self.state.velocity_NM3.flatten(1)  # a view
         self.rollout = FastRollout(network, self.state, PATH_PRECISION[precision])
         self.failure: str | None = None
+
+    @property
+    def frames_at_once(self) -> int:
+        """As many as the rollout has room to keep the positions of."""
+        return min(FRAMES_AT_ONCE, len(self.rollout.path_TN3))
 
     def restore(self) -> None:
         self.rollout.position_N3.copy_(self.state.position_N3)
         self.rollout.velocity_NV.copy_(self.velocity_NV)
 
     def run(self) -> None:
-        """FRAMES_AT_ONCE frames of the same state, each in a graph where there is a GPU."""
+        """`frames_at_once` frames of the same state, each in a graph where there is a GPU."""
         self.rollout.frame.zero_()
-        for _ in range(FRAMES_AT_ONCE):
+        for _ in range(self.frames_at_once):
             self.restore()
             if self.rollout.graph is None:
                 self.rollout.frame_launches()
@@ -65,8 +70,8 @@ class FastFrame:
         return Timed(self._sample)
 
     def _sample(self) -> list[float]:
-        milliseconds = once(self.run, self.device) / FRAMES_AT_ONCE
-        if int(self.rollout.frame) != FRAMES_AT_ONCE:
+        milliseconds = once(self.run, self.device) / self.frames_at_once
+        if int(self.rollout.frame) != self.frames_at_once:
             self.failure = "frames were left out for lack of room"
         return [milliseconds]
 

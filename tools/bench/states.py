@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -104,8 +104,16 @@ def batch_of_scenes(
 
 
 def state_of(workload: Workload, network: NetworkConfig, device: torch.device) -> ParticleState:
-    """The state that a simulation is in at such a frame."""
-    return batch_of(workload, network, device).state()
+    """The state that a simulation is in at such a frame, without the frames before it."""
+    state = batch_of(workload, network, torch.device("cpu")).state()
+    return replace(
+        state,
+        position_N3=state.position_N3.to(device, copy=True),
+        velocity_NM3=state.velocity_NM3.contiguous().to(device),
+        material_N=state.material_N.to(device),
+        scene_N=state.scene_N.to(device),
+        domain_S3=state.domain_S3.to(device),
+    )
 
 
 def _tile(count: int, generator: np.random.Generator) -> np.ndarray:

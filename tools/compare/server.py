@@ -154,11 +154,11 @@ class Server:
         from torch.profiler import ProfilerActivity, profile
 
         timed = self.cases[case].timed
-        at_once = fast.FRAMES_AT_ONCE if isinstance(timed, fast.FastFrame) else fast.UPDATES_AT_ONCE
         with profile(activities=[ProfilerActivity.CUDA if self.gpu else ProfilerActivity.CPU]) as found:
             timed.run()
             if self.gpu:
                 torch.cuda.synchronize()
+        at_once = int(timed.rollout.frame) if isinstance(timed, fast.FastFrame) else fast.UPDATES_AT_ONCE
         kernels = []
         for event in found.key_averages():
             total = event.self_device_time_total if self.gpu else event.self_cpu_time_total

@@ -1,0 +1,171 @@
+"""What the network's launches write: in training a buffer each, in inference shared by what lives at different times.
+
+Shape legend: N particles, C cells, W width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.kernels.grid.op import DeviceGrid
+from hgn.kernels.packing import PackedMessagePassing, PackedNetwork
+
+if TYPE_CHECKING:
+    from hgn.kernels.engine import Tuning
+
+OUT = 16  # the decoder's three outputs, padded
+
+
+@dataclass
+class Block:
+    """One message-passing block: its level, weights, and buffers (lists over iterations)."""
+
+    level: int
+    packed: PackedMessagePassing
+    cell: list[torch.Tensor] = field(default_factory=list)  # M + 1 of [C, W]
+    edge: list[torch.Tensor] = field(default_factory=list)  # M - 1 of [C, 6, W]
+    edge_hidden: list[torch.Tensor] = field(default_factory=list)
+    edge_normalised: list[torch.Tensor] = field(default_factory=list)
+    edge_deviation: list[torch.Tensor] = field(default_factory=list)  # one over it, float32 [C, 6]
+    sum: list[torch.Tensor] = field(default_factory=list)
+    cell_hidden: list[torch.Tensor] = field(default_factory=list)
+    cell_normalised: list[torch.Tensor] = field(default_factory=list)
+    cell_deviation: list[torch.Tensor] = field(default_factory=list)
+    send: list[torch.Tensor] = field(default_factory=list)  # 2, by turns
+    receive: list[torch.Tensor] = field(default_factory=list)
+    product: torch.Tensor | None = None  # of the block's output, for the step that follows
+    next_at: int = 0  # weights of that product
+
+
+class Buffers:
+    """`down` and `up` are the blocks; messages to parents and hidden layers of the steps between levels are lists over
+    the finer level.
+
+    Inference may share what it shares because each kernel that is launched without a wait inside runs when all before
+    it have ended, and those that begin early wait for all before them ahead of what they read and write here.
+    """
+
+    config: NetworkConfig
+    packed: PackedNetwork
+    grid: DeviceGrid
+    tuning: Tuning
+    training: bool
+    width: int
+    operand: torch.dtype
+    device: torch.device
+
+    latent: torch.Tensor  # [N, W]; likewise what is not said otherwise
+    by_particle_down: torch.Tensor
+    by_particle_up: torch.Tensor
+    decoder_input: torch.Tensor
+    output: torch.Tensor  # float32 [N, OUT]
+    message: list[torch.Tensor]  # [C, W], to the parents
+    encode_hidden: torch.Tensor
+    decode_hidden: torch.Tensor
+    transfer_hidden_down: list[torch.Tensor]
+    transfer_hidden_up: list[torch.Tensor]
+    down: list[Block]
+    up: list[Block]
+
+    def _operand(self, *shape: int) -> torch.Tensor:
+        return torch.zeros(shape, dtype=self.operand, device=self.device)
+
+    def _float(self, *shape: int) -> torch.Tensor:
+        return torch.zeros(shape, device=self.device)
+
+    def _cell(self, *shape: int) -> torch.Tensor:
+        return self._operand(*shape) if self.tuning.half_cells else self._float(*shape)
+
+    def _first_cell(self, *shape: int) -> torch.Tensor:
+        """Of the first block, which particles are added to by atomics: rounded sums cost the gradients precision."""
+        return self._cell(*shape) if self.tuning.half_sums and not self.training else self._float(*shape)
+
+    def _allocate(self, keeps_pair_hidden: bool) -> None:
+        packed, levels = self.packed, self.config.levels
+        self.down = [Block(i, packed.passing_down[i]) for i in range(levels)]
+        self.up = [Block(i, packed.passing_up[i]) for i in range(levels - 1)]
+        for i in range(levels):
+            into = packed.cell_to_particle if i == 0 else packed.coarse_to_fine[i - 1]
+            self._last(i).next_at = into.parts[0]
+        self.latent = self._operand(self.grid.particles, self.width)
+        self.by_particle_up = self._operand(self.grid.particles, self.width)
+        pairs = 8 * self.grid.particles if self.training else 1
+        hidden = pairs if keeps_pair_hidden else 1
+        # hidden layer, normalised output, one over its deviation
+        self.kept_down, self.kept_up = (
+            (self._operand(hidden, self.width), self._operand(pairs, self.width), self._float(pairs)) for _ in range(2)
+        )
+        if self.training:
+            self._allocate_training()
+        else:
+            self._allocate_inference()
+
+    def _last(self, level: int) -> Block:
+        """The last block on a level."""
+        return self.down[level] if level == self.config.levels - 1 else self.up[level]
+
+    def _allocate_training(self) -> None:
+        width, steps = self.width, self.config.message_passing_steps
+        particles, capacities = self.grid.particles, self.grid.capacities
+        self.by_particle_down, self.decoder_input = (self._operand(particles, width) for _ in range(2))
+        self.encode_hidden, self.decode_hidden = (self._operand(particles, width) for _ in range(2))
+        self.output = self._float(particles, OUT)
+        self.message, self.transfer_hidden_down, self.transfer_hidden_up = (
+            [self._operand(capacity, width) for capacity in capacities[:-1]] for _ in range(3)
+        )
+        for block in (*self.down, *self.up):
+            capacity = capacities[block.level]
+            start = self._first_cell if block is self.down[0] else self._cell
+            block.send, block.receive = ([self._operand(capacity, width) for _ in range(2)] for _ in range(2))
+            block.cell = [start(capacity, width)] + [self._cell(capacity, width) for _ in range(steps)]
+            block.edge = [self._operand(capacity, 6, width) for _ in range(steps - 1)]
+            block.edge_hidden = [self._operand(capacity, 6, width) for _ in range(steps)]
+            block.edge_normalised = [self._operand(capacity, 6, width) for _ in range(steps)]
+            block.edge_deviation = [self._float(capacity, 6) for _ in range(steps)]
+            block.sum = [self._operand(capacity, width) for _ in range(steps)]
+            block.cell_hidden = [self._operand(capacity, width) for _ in range(steps)]
+            block.cell_normalised = [self._operand(capacity, width) for _ in range(steps)]
+            block.cell_deviation = [self._float(capacity) for _ in range(steps)]
+        for level, capacity in enumerate(capacities):
+            self._last(level).product = self._operand(capacity, width)
+
+    def _allocate_inference(self) -> None:
+        """Edges of a block have one buffer, whatever the block. In it lie, at times when there are no edges: particles'
+        products until the first pairs have read them; a block's message to the parents, or product for who follows,
+        until it is read, which is before the next block's edges; and beside the last of these the decoder's input.
+
+        `output` lies where the features were, which only the encoder reads. Hidden rows are not kept.
+        """
+        width, steps = self.width, self.config.message_passing_steps
+        particles, capacities = self.grid.particles, self.grid.capacities
+        finest = capacities[0]
+        shared = self._operand(max(6 * finest, finest + particles), width)
+        self.by_particle_down = shared[:particles]
+        self.decoder_input = shared[finest : finest + particles]
+        self.output = self.grid.feature_NF.view(-1)[: particles * OUT].view(particles, OUT)
+        self.message = [shared[:capacity] for capacity in capacities[:-1]]
+        self.encode_hidden = self.decode_hidden = self.latent
+        self.transfer_hidden_down = self.transfer_hidden_up = self.message
+        for level, capacity in enumerate(capacities):
+            send, receive, total = (self._operand(capacity, width) for _ in range(3))
+            # A block's iterations write them by turns. The last that the way down wrote is read once more, when the way
+            # up begins with the other.
+            cells = [self._cell(capacity, width) for _ in range(2)]
+            blocks = [(self.down[level], cells)]
+            if level < self.config.levels - 1:
+                blocks.append((self.up[level], [cells[(steps + 1) % 2], cells[steps % 2]]))
+            for block, turns in blocks:
+                block.send, block.receive = [send] * 2, [receive] * 2
+                block.sum = [total] * steps
+                block.cell = [turns[m % 2] for m in range(steps + 1)]
+                block.edge = [shared[: 6 * capacity].view(capacity, 6, width)] * (steps - 1)
+                # not kept
+                block.edge_hidden = block.edge_normalised = block.cell_hidden = block.cell_normalised = [send] * steps
+                block.edge_deviation = block.cell_deviation = [total] * steps
+            self._last(level).product = shared[:capacity]
+        if self.tuning.half_cells and not self.tuning.half_sums:
+            self.down[0].cell[0] = self._first_cell(finest, width)
