@@ -175,7 +175,7 @@ class FastTraining:
             packed.copy_(self._packed(flat))
         self.updates.step.fill_(float(self._steps.max()))
         self._place = torch.empty_like(index[used])  # of each parameter element in the packed buffers
-        self._place[index[used]] = torch.nonzero(used).flatten()
+        self._place[index[used]] = torch.nonzero(used).flatten().to(index.dtype)
 
     def _write_back(self) -> None:
         updates = self.updates

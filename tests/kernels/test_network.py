@@ -7,11 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 from kernels.engines import device, engine_of, gradients, inference_of, run_forward
+from kernels.rounded import rounded, rounding
 from network.states import network_of, random_state
 
+from hgn.kernels.packing import rounded_to_tf32
 from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.agreement import relative_error
+from hgn.runtime.agreement import OUTPUT_BOUND, relative_error
 
 SEVERAL = (5, 1, 3)  # particles of three scenes
 gpu = pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
@@ -31,20 +33,25 @@ def flat(tensors: list[torch.Tensor]) -> torch.Tensor:
     return torch.cat([tensor.double().cpu().flatten() for tensor in tensors])
 
 
-def float32_state(counts: tuple[int, ...], obstacles: bool = True, spread: float = 0.3) -> ParticleState:
+def float32_state(counts: tuple[int, ...], obstacles: bool = True, spread: float = 0.3, seed: int = 3) -> ParticleState:
     """A state whose numbers float32 holds exactly, in float64."""
-    state = random_state(counts, 3, torch.float32, obstacles, spread)
+    state = random_state(counts, seed, torch.float32, obstacles, spread)
     doubled = {name: getattr(state, name).double() for name in ("position_N3", "velocity_NM3", "domain_S3")}
     return replace(state, **doubled)
+
+
+def drawn(network: HierarchicalGraphNetwork, state: ParticleState) -> tuple[torch.Tensor, torch.Tensor]:
+    """Origins of the scenes' grids, and weights of the outputs."""
+    generator = torch.Generator().manual_seed(1)
+    origin_S3 = (-network.config.cell_size * torch.rand(state.scene_count, 3, generator=generator)).double()
+    return origin_S3, torch.randn(state.position_N3.shape, generator=generator, dtype=torch.float64)
 
 
 def compare(
     network: HierarchicalGraphNetwork, state: ParticleState, precision: str, loss_scale: float, room: int
 ) -> tuple[float, float, list[float]]:
     """Relative errors of the output, of all gradients together, of each gradient."""
-    generator = torch.Generator().manual_seed(1)
-    origin_S3 = (-network.config.cell_size * torch.rand(state.scene_count, 3, generator=generator)).double()
-    weight_N3 = torch.randn(state.position_N3.shape, generator=generator, dtype=torch.float64)
+    origin_S3, weight_N3 = drawn(network, state)
     output, expected = reference(network, state, origin_S3, weight_N3)
     engine = engine_of(network, state, precision, (room,) * network.config.levels, loss_scale=loss_scale)
     found = run_forward(engine, network, state, origin_S3)
@@ -147,55 +154,58 @@ def test_without_obstacles_nothing_is_looked_up() -> None:
     assert torch.equal(*outputs)
 
 
+def test_rounded_reference() -> None:
+    """What the reference for rounded operands rounds to are TF32's numbers and float16's, halves aside; a network's
+    output and gradients then move by as much as such operands move them, not by nothing and not by far more."""
+    x = torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(rounded(x.double()), rounded_to_tf32(x).double(), rtol=0, atol=0)
+    torch.testing.assert_close(rounded(x.double()), x.half().double(), rtol=0, atol=2.0**-14)
+    network = network_of(width=16, levels=2, message_passing_steps=1)
+    state = float32_state((5,), spread=0.1)
+    for stored in (False, True):
+        output, together = rounding_errors(network, state, stored)
+        assert 1e-5 < output < 5e-3 and 1e-5 < together < 5e-2
+
+
 @gpu
 @pytest.mark.gpu
 @pytest.mark.parametrize(
-    ("precision", "width", "counts"),
-    [("tf32", 128, (300, 131, 77)), ("half", 128, (300, 131, 77)), ("tf32x3", 64, (131, 77)), ("tf32", 128, (1,))],
+    ("precision", "width", "counts", "draws"),
+    [
+        ("tf32", 128, (300, 131, 77), 5),
+        ("half", 128, (300, 131, 77), 5),
+        ("tf32x3", 64, (131, 77), 1),
+        ("tf32", 128, (1,), 9),
+    ],
 )
-def test_whole_networks_on_a_gpu(precision: str, width: int, counts: tuple[int, ...]) -> None:
-    """With all levels and steps the output is within 2e-3 of float64 in TF32 and float16, within 1e-5 in float32;
-    gradients are as near as those of the plain network with TF32 products, whose error comes from activations next to
-    their kink, and within 1e-3 in float32."""
+def test_whole_networks_on_a_gpu(precision: str, width: int, counts: tuple[int, ...], draws: int) -> None:
+    """With all levels and steps outputs are within 1e-5 of float64 in float32, gradients within 1e-3. In TF32 and
+    float16 the median error of several states is at most 1.5 times that of the plain network in float64 with operands
+    so rounded (and what float16 keeps rounded): that is what rounding does, most of it by activations next to their
+    kink, and how much is chance for each state."""
     network = network_of(width=width, levels=4, message_passing_steps=4)
-    state = float32_state(counts)
-    output, together, _ = compare(network, state, precision, 256.0 if precision == "half" else 1.0, 8192)
-    assert output < (1e-5 if precision == "tf32x3" else 2e-3)
-    origin_S3 = torch.zeros(state.scene_count, 3, dtype=torch.float64)
-    engine = inference_of(engine_of(network, state, precision, (8192,) * 4), network)
-    alone = run_forward(engine, network, state, origin_S3)
-    expected = network.normalised_acceleration(state, origin_S3).detach()
-    assert relative_error(alone, expected) < (1e-5 if precision == "tf32x3" else 2e-3)
-    assert together < (1e-3 if precision == "tf32x3" else max(2e-3, 2 * plain_tf32_errors(network, state)))
+    found, explained = [], []
+    for seed in range(3, 3 + draws):
+        state = float32_state(counts, seed=seed)
+        output, together, _ = compare(network, state, precision, 256.0 if precision == "half" else 1.0, 8192)
+        origin_S3, _ = drawn(network, state)
+        engine = inference_of(engine_of(network, state, precision, (8192,) * 4), network)
+        alone = run_forward(engine, network, state, origin_S3)
+        expected = network.normalised_acceleration(state, origin_S3).detach()
+        found.append((output, relative_error(alone, expected), together))
+        if precision != "tf32x3":
+            rounded_output, rounded_together = rounding_errors(network, state, precision == "half")
+            explained.append((rounded_output, rounded_output, rounded_together))
+    assert all(output < OUTPUT_BOUND and alone < OUTPUT_BOUND for output, alone, _ in found)
+    middle = torch.tensor(found).median(0).values
+    bounds = 1.5 * torch.tensor(explained).median(0).values if explained else torch.tensor([1e-5, 1e-5, 1e-3])
+    assert (middle < bounds).all(), (middle, bounds)
 
 
-def plain_tf32_errors(network: HierarchicalGraphNetwork, state: ParticleState) -> float:
-    """Relative error of all gradients of the plain network with TF32 products."""
-    generator = torch.Generator().manual_seed(1)
-    origin_S3 = (-network.config.cell_size * torch.rand(state.scene_count, 3, generator=generator)).double()
-    weight_N3 = torch.randn(state.position_N3.shape, generator=generator, dtype=torch.float64)
-    _, expected = reference(network, state, origin_S3, weight_N3)
-    where = device()
-    single = network_of(
-        torch.float32,
-        width=network.config.width,
-        levels=network.config.levels,
-        message_passing_steps=network.config.message_passing_steps,
-    ).to(where)
-    single.load_state_dict({name: value.float() for name, value in network.state_dict().items()})
-    assert state.obstacles is not None
-    moved = ParticleState(
-        state.position_N3.float().to(where),
-        state.velocity_NM3.float().to(where),
-        state.material_N.to(where),
-        state.scene_N.to(where),
-        state.domain_S3.float().to(where),
-        state.obstacles.to(where),
-    )
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high")
-    try:
-        _, found = reference(single, moved, origin_S3.float().to(where), weight_N3.float().to(where))
-    finally:
-        torch.set_float32_matmul_precision(before)
-    return relative_error(flat(found), flat(expected))
+def rounding_errors(network: HierarchicalGraphNetwork, state: ParticleState, stored: bool) -> tuple[float, float]:
+    """Relative errors of output and gradients that rounded operands make in the plain network."""
+    origin_S3, weight_N3 = drawn(network, state)
+    output, expected = reference(network, state, origin_S3, weight_N3)
+    with rounding(stored):
+        near, found = reference(network, state, origin_S3, weight_N3)
+    return relative_error(near, output), relative_error(flat(found), flat(expected))

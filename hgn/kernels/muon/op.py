@@ -11,6 +11,12 @@ from hgn.network.orthogonal import EPSILON, MOMENTUM, orthogonalised, square_blo
 WARPS = 8
 
 
+def direction_dtype(device: torch.device) -> torch.dtype:
+    """Of the directions. On a GPU they are orthogonal to a hundredth, as the iterations are: products in bfloat16,
+    summed in float32."""
+    return torch.float32 if device.type == "cpu" else torch.bfloat16
+
+
 class SquareBlocks:
     """The weights that Muon steps, in the packed layout: of each block the rows are pieces, equally far apart."""
 
@@ -31,9 +37,7 @@ class SquareBlocks:
         member = torch.zeros(len(index), dtype=torch.int8)
         member[packed_KWW.flatten()] = 1
         self.member = member.to(device)  # of each element of the packed buffers: whether it is stepped here
-        # orthogonal to a hundredth, as the iterations are: products in bfloat16, summed in float32
-        dtype = torch.float32 if device.type == "cpu" else torch.bfloat16
-        self._direction_KWW = torch.zeros(block_KWW.shape, dtype=dtype, device=device)
+        self._direction_KWW = torch.zeros(block_KWW.shape, dtype=direction_dtype(device), device=device)
 
     def step(
         self,
