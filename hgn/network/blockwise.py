@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Rows of edges or pairs of a block: at width 128 an intermediate result takes a megabyte. Smaller blocks stay in faster
 # caches, but each operation costs some microseconds of Python, in which all other threads wait.
 ROWS_AT_ONCE = 2048
-FEWEST_ROWS = 96  # worth a thread's waking
+FEWEST_ROWS = 256  # worth a thread's waking
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
@@ -66,17 +66,20 @@ class _Cells:
         # Rows of a table of all cells as senders, all as receivers, and the directions: what an edge sums of it.
         ends_E3 = torch.stack([level.sender_E, level.receiver_E + count, level.direction_E + 2 * count], -1)
         self.ends = _ends(ends_E3[:, :2], self.blocks.rows), _ends(ends_E3, self.blocks.rows)
+        self.edges = self.blocks.split(torch.bincount(level.receiver_E, minlength=count)[:, None])  # of each cell
         self.level = level
 
 
 def _passed(passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: int) -> torch.Tensor:
     """Message passing on one level, as MessagePassing.forward."""
     assert isinstance(passing.edge, nn.ModuleList) and isinstance(passing.cell, nn.ModuleList)
-    networks = [(_Weights(edge), _Weights(cell)) for edge, cell in zip(passing.edge, passing.cell, strict=True)]
+    *edge_networks, last = passing.edge
+    networks = list(zip([*map(_Weights, edge_networks), _Summed(last)], map(_Weights, passing.cell), strict=True))
     blocks, count = cells.blocks, len(cell_CW)
     result_CW, hidden_CW = cell_CW.clone(), torch.empty_like(cell_CW)
     own, hidden = blocks.split(result_CW), blocks.split(hidden_CW)
     edges: list[torch.Tensor | None] = [None] * len(blocks)
+    sums: list[torch.Tensor | None] = [None] * len(blocks)
     # A step reads what the cells of other blocks were before it, and writes what its own are after: tables in turns.
     tables = cell_CW.new_empty(2, 2 * count + len(DIRECTION_63), cell_CW.shape[1])
     tables[1, 2 * count :] = networks[0][0].project(2, -DIRECTION_63.to(cell_CW))
@@ -92,12 +95,17 @@ def _passed(passing: nn.Module, cell_CW: torch.Tensor, cells: _Cells, threads: i
     def update(step: int, block: int) -> None:
         edge, cell = networks[step]
         rows_EW = _sums_of(tables[(step + 1) % 2], cells.ends[step == 0][block])
-        before_EW = edges[block]
-        if before_EW is None:
-            edges[block] = rows_EW = edge.finish(rows_EW)
+        before_EW, before_CW = edges[block], sums[block]
+        if before_EW is not None:
+            edge.add_projection(rows_EW, 2, before_EW)
+        if isinstance(edge, _Summed):  # the last step: nothing but sums is wanted of its edges
+            sum_CW = edge.sums(rows_EW, blocks, block, cells.edges[block])
+            sum_CW = sum_CW if before_CW is None else sum_CW.add_(before_CW)
         else:
-            rows_EW = before_EW.add_(edge.finish(edge.add_projection(rows_EW, 2, before_EW)))
-        cell.add_projection(hidden[block], 1, blocks.sums(block, rows_EW))
+            rows_EW = edge.finish(rows_EW)
+            edges[block] = rows_EW = rows_EW if before_EW is None else before_EW.add_(rows_EW)
+            sums[block] = sum_CW = blocks.sums(block, rows_EW)
+        cell.add_projection(hidden[block], 1, sum_CW)
         own[block].add_(cell.finish(hidden[block]))
         if step + 1 < len(networks):
             project(step + 1, block)
@@ -116,7 +124,8 @@ class _Weights:
         first, second = network.first, network.second
         self.parts = first.weight.T.split(network.parts)
         self.first_bias, self.slope = first.bias, network.slope
-        self.second, self.second_bias = second.weight.T, second.bias
+        self.second: torch.Tensor = second.weight.T
+        self.second_bias: torch.Tensor = second.bias
         self.norm = None if network.norm is None else (network.norm.weight, network.norm.bias, network.norm.eps)
 
     def project(self, part: int, value: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
@@ -142,6 +151,39 @@ class _Weights:
             return out
         gain, shift, epsilon = self.norm
         return torch.layer_norm(out, gain.shape, gain, shift, epsilon)
+
+
+class _Summed(_Weights):
+    """Those of a network with a norm of which only weighted sums of rows are wanted.
+
+    Its second layer is less its mean over the outputs: what the norm divides.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__(network)
+        assert self.norm is not None
+        self.gain, self.shift, self.epsilon = self.norm
+        self.second = self.second - self.second.mean(1, keepdim=True)
+        self.second_bias = self.second_bias - self.second_bias.mean()
+
+    def centred(self, hidden_RW: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows [R, W] and what the norm multiplies each by [R]. Overwrites `hidden_RW`."""
+        out_RW = _product(nn.functional.leaky_relu_(hidden_RW, self.slope), self.second, self.second_bias)
+        square_R = torch.linalg.vector_norm(out_RW, dim=1).square_()
+        return out_RW, square_R.mul_(1 / out_RW.shape[1]).add_(self.epsilon).rsqrt_()
+
+    def sums(
+        self,
+        hidden_RW: torch.Tensor,
+        blocks: _Blocks,
+        block: int,
+        weights_C1: torch.Tensor,
+        weight_R: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Sums of each cell's rows times their weights [cells, W]; `weights_C1` are the weights' sums."""
+        out_RW, scale_R = self.centred(hidden_RW)
+        scale_R = scale_R if weight_R is None else scale_R.mul_(weight_R)
+        return blocks.sums(block, out_RW, scale_R).mul_(self.gain).addcmul_(weights_C1, self.shift)
 
 
 def _product(value: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
@@ -195,9 +237,9 @@ def _to_children(
 
 def _to_cells(module: FCN, particle_NW: torch.Tensor, grid: GridHierarchy, threads: int) -> torch.Tensor:
     """Step 1: the finest cells [C, W]."""
-    second, network = _Centred(module), _Weights(module)
+    network = _Summed(module)
     particles, count = len(particle_NW), grid.levels[0].cell_count
-    cell_P, pair_P = torch.sort(grid.cell_N8.flatten(), stable=True)
+    cell_P, pair_P = torch.sort(grid.cell_N8.flatten().int(), stable=True)  # half the time of int64
     blocks = _Blocks(cell_P, count, threads)
     weight_P = grid.weight_N8.flatten()[pair_P]
     ends = _ends(torch.stack([pair_P >> 3, (pair_P & 7) + particles], -1), blocks.rows)
@@ -216,9 +258,8 @@ def _to_cells(module: FCN, particle_NW: torch.Tensor, grid: GridHierarchy, threa
         network.add_projection(share[run], 1, offset[run])
 
     def add(block: int) -> None:
-        rows_PW, scale_P = second(_sums_of(table_NW, ends[block]))
-        sum_CW = blocks.sums(block, rows_PW, scale_P.mul_(weight[block])).mul_(second.gain)
-        torch.addcmul(sum_CW, weights[block], second.shift, out=sums[block])
+        rows_PW = _sums_of(table_NW, ends[block])
+        sums[block].copy_(network.sums(rows_PW, blocks, block, weights[block], weight[block]))
 
     for_each(project, range(len(runs)), threads)
     for_each(add, range(len(blocks)), threads)
@@ -233,8 +274,7 @@ def _to_particles(
     threads: int,
 ) -> torch.Tensor:
     """Steps 11 and 12: normalised accelerations [N, 3]."""
-    second, gather = _Centred(network.cell_to_particle), _Weights(network.cell_to_particle)
-    decode, width = _Weights(network.decode), particle_NW.shape[1]
+    gather, decode, width = _Summed(network.cell_to_particle), _Weights(network.decode), particle_NW.shape[1]
     cells, particles = len(cell_CW), len(particle_NW)
     # The share of the hidden layer of cells, of corners, and of a run's particles.
     corner_8W = gather.first_bias - gather.project(2, CORNER_83.to(particle_NW))
@@ -251,31 +291,14 @@ def _to_particles(
         hidden_NW = gather.add_projection(gather.project(1, latent[run]), 2, offset[run])
         rows_PW = _sums_of(shared_CW, ends[run])
         rows_PW.view(-1, 8, width).add_(hidden_NW[:, None])
-        rows_PW, scale_P = second(rows_PW)
+        rows_PW, scale_P = gather.centred(rows_PW)
         change_NW = torch.bmm(scale_P.mul_(weight[run]).view(-1, 1, 8), rows_PW.view(-1, 8, width))[:, 0]
         # Weights sum to 1, so the norm's shift is added once.
-        after_NW = torch.addcmul(latent[run] + second.shift, change_NW, second.gain)
+        after_NW = torch.addcmul(latent[run] + gather.shift, change_NW, gather.gain)
         result[run].copy_(decode.finish(decode.project(0, after_NW, decode.first_bias)))
 
     for_each(add, range(len(runs)), threads)
     return result_N3
-
-
-class _Centred:
-    """The second layer of a network with a norm, less its mean over the outputs: what the norm divides."""
-
-    def __init__(self, network: FCN) -> None:
-        assert network.norm is not None
-        self.slope, self.epsilon = network.slope, network.norm.eps
-        self.gain, self.shift = network.norm.weight, network.norm.bias
-        self.matrix = (network.second.weight - network.second.weight.mean(0)).T
-        self.bias = network.second.bias - network.second.bias.mean()
-
-    def __call__(self, hidden_RW: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Rows [R, W] and what the norm multiplies each by [R]. Overwrites `hidden_RW`."""
-        out_RW = _product(nn.functional.leaky_relu_(hidden_RW, self.slope), self.matrix, self.bias)
-        square_R = torch.linalg.vector_norm(out_RW, dim=1).square_()
-        return out_RW, square_R.mul_(1 / out_RW.shape[1]).add_(self.epsilon).rsqrt_()
 
 
 class _Blocks:
@@ -283,7 +306,7 @@ class _Blocks:
 
     def __init__(self, cell_R: torch.Tensor, count: int, threads: int) -> None:
         rows = len(cell_R)
-        offset_C1 = torch.searchsorted(cell_R, torch.arange(count + 1))
+        offset_C1 = torch.searchsorted(cell_R, torch.arange(count + 1, dtype=cell_R.dtype))
         wanted = torch.tensor(_runs(rows, ROWS_AT_ONCE, threads)[:-1], dtype=torch.int64).cumsum(0)
         cut = torch.searchsorted(offset_C1, wanted).clamp_(max=count)
         places = [[0, 0], *torch.stack([cut, offset_C1[cut]], -1).tolist(), [count, rows]]

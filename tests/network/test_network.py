@@ -114,6 +114,25 @@ def test_blocks_change_nothing(monkeypatch, dtype, tolerance, threads, rows, cou
     assert torch.equal(found, again)
 
 
+@pytest.mark.parametrize("steps", [1, 2])
+@pytest.mark.parametrize("lone", [False, True])
+def test_frames_without_earlier_steps_or_edges(steps, lone):
+    """One step of message passing and a scene of one cell without edges equal the output with gradients; weights that
+    change between frames are seen."""
+    network = network_of(cell_size=0.25, levels=2, message_passing_steps=steps)
+    state = random_state((1,) if lone else (21,), obstacles=False)
+    if lone:
+        state = replace(state, position_N3=torch.full((1, 3), 0.125, dtype=torch.float64))
+        grid = build_hierarchy(state.position_N3, state.scene_N, torch.zeros(1, 3), 0.25, 2)
+        assert all(level.cell_count == 1 and len(level.sender_E) == 0 for level in grid.levels)
+    for _ in range(2):
+        expected = network.normalised_acceleration(state).detach()
+        with torch.no_grad():
+            torch.testing.assert_close(network.normalised_acceleration(state), expected, rtol=1e-12, atol=1e-12)
+            for parameter in network.parameters():
+                parameter.data.mul_(1.5)
+
+
 def test_frames_of_batches_equal_single_scenes():
     """What shares a batch with a scene, and with it the blocks, changes no bit of a frame's output on a CPU."""
     counts = (40, 7, 1, 325)
