@@ -347,7 +347,6 @@ class TrainingConfig:
     rollout_scenes: int = 64  # simulated at once, on each device, from random frames of the training data on …
     rollout_frames: int = 16  # … for so many frames, each of which can be trained on
     rollout_pull: float = 0.1  # share of its distance from the truth that the network is to take back in a frame
-    rollout_noise: float = 1.0  # times the noise, of such frames: 0 leaves them as they were simulated
     seed: int = 0
     accelerator: str = "auto"  # or cpu, gpu
     devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
@@ -387,7 +386,6 @@ class TrainingConfig:
         require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates", "weight_decay")
         require(0 <= self.rollout_share < 1, "rollout_share", "0 or more and below 1", self.rollout_share)
         require(0 <= self.rollout_pull <= 1, "rollout_pull", "0 to 1", self.rollout_pull)
-        require(0 <= self.rollout_noise <= 1, "rollout_noise", "0 to 1", self.rollout_noise)
         require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
         require(0 <= self.noise_smooth <= 1, "noise_smooth", "0 to 1", self.noise_smooth)
         require(0 <= self.frame_importance < 1, "frame_importance", "0 or more and below 1", self.frame_importance)

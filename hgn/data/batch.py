@@ -37,7 +37,6 @@ class Batch:
     cursor: Cursor | None = None  # the order's state once this batch is trained on
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene: what training may show instead of it
     weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
-    noise_S: tuple[float, ...] = ()  # times the noise that all scenes get; empty: 1
     samples_S: tuple[tuple[Episode, int], ...] = ()  # episode and frame n of each scene
     starts: tuple[tuple[Episode, int], ...] = ()  # where the network is to simulate from before it trains on this batch
 

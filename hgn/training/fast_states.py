@@ -44,9 +44,7 @@ class FastOwnStates:
     def mixed(self, samples: list[DeviceSample], update: int) -> list[DeviceSample]:
         """The samples of an update with their share replaced; seeds stay."""
         chosen = drawn_entries(self.training, update, self.rank, len(self._entries))
-        factors = {"weight": 1.0, "noise": self.training.rollout_noise}
-        pairs = zip(chosen, samples, strict=False)
-        own = [DeviceSample(self._entries[e], 0, sample.seed, **factors) for e, sample in pairs]
+        own = [DeviceSample(self._entries[e], 0, sample.seed) for e, sample in zip(chosen, samples, strict=False)]
         return own + samples[len(own) :]
 
     def refresh(self, starts: Sequence[tuple[DeviceEpisode, int]], values: torch.Tensor) -> None:

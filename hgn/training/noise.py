@@ -47,15 +47,13 @@ def perturbed_window(batch: Batch, std_last: float, smooth: float = 0.0, cell_si
     last one, so the target becomes v_true^{n+1} - v_noisy^n: the network learns to undo the velocity error
     (the rule of GNS, Sanchez-Gonzalez et al. 2020). `smooth` is the share of the variance that neighbours have in
     common: in a rollout a body's particles err together, which independent noise, averaged over them, never shows.
-    A scene's factor in the batch scales both.
     """
     window_WN3 = batch.window_WN3
     if std_last == 0:
         return window_WN3
     shift = []
     first = 0
-    factor_S = batch.noise_S or (1.0,) * len(batch.particles_S)
-    for count, seed, factor in zip(batch.particles_S, batch.seeds_S, factor_S, strict=True):
+    for count, seed in zip(batch.particles_S, batch.seeds_S, strict=True):
         generator = torch.Generator(window_WN3.device).manual_seed(seed)
         history = len(window_WN3) - 2
         velocity_MN3 = random_walk((history, count, 3), std_last * math.sqrt(1 - smooth), generator)
@@ -65,7 +63,7 @@ def perturbed_window(batch: Batch, std_last: float, smooth: float = 0.0, cell_si
             std = std_last * math.sqrt(smooth)
             velocity_MN3 = velocity_MN3 + smooth_walk(position_N3, history, std, cell_size, generator)
         first += count
-        position_MN3 = factor * velocity_MN3.cumsum(0)
+        position_MN3 = velocity_MN3.cumsum(0)
         shift.append(torch.cat([torch.zeros_like(position_MN3[:1]), position_MN3, position_MN3[-1:]]))
     return window_WN3 + torch.cat(shift, dim=1)
 

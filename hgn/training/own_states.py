@@ -3,10 +3,9 @@
 The pushforward idea of Brandstetter et al. 2022, collected like DAgger (Ross et al. 2011). Every `rollout_every`
 updates the weights of now (their moving average where there is one) simulate `rollout_scenes` scenes, each from a
 random true frame on, and each simulated frame becomes a window; a share of the samples is taken from these until the
-next time. Noise shows a network errors that are drawn; its own are biased, common to a body, and where matter rests a
-tenth as large, which noise on top hides: `rollout_noise`. Everything is drawn from seed, update and rank. The pool is
-not part of a checkpoint: a training that goes on makes a new one, which is the old one where the checkpoint lies at a
-multiple of `rollout_every`.
+next time. Noise shows a network errors that are drawn; its own are biased, and common to a body. Everything is drawn
+from seed, update and rank. The pool is not part of a checkpoint: a training that goes on makes a new one, which is the
+old one where the checkpoint lies at a multiple of `rollout_every`.
 Shape legend: H velocity history, F simulated frames, W = H + 2 frames of a window, N particles, S scenes.
 """
 
@@ -125,7 +124,7 @@ class OwnStates:
         self.figures = figures_of(self.training, len(self._entries), squares, time.monotonic() - begun)
 
     def mixed(self, batch: Batch, update: int) -> Batch:
-        """The batch with its share of samples replaced; seeds stay, and with them jitter and symmetry."""
+        """The batch with its share of samples replaced; seeds stay, and with them noise, jitter and symmetry."""
         chosen = drawn_entries(self.training, update, self.rank, len(self._entries))
         if not chosen:
             return batch
@@ -136,8 +135,7 @@ class OwnStates:
             samples[slot] = episode, frame
         weights = [1.0] * len(chosen) + list(batch.weight_S[len(chosen) :]) if batch.weight_S else []
         made = make_batch(samples, config, batch.seeds_S, batch.cursor, weights, windows)
-        noise = [self.training.rollout_noise] * len(chosen) + [1.0] * (len(samples) - len(chosen))
-        return replace(made, noise_S=tuple(noise)).to(batch.window_WN3.device)
+        return made.to(batch.window_WN3.device)
 
     def _groups(self, starts: Sequence[tuple[Episode, int]]) -> list[list[tuple[Episode, int]]]:
         """What fits into memory at once."""

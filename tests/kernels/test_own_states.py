@@ -75,8 +75,7 @@ def test_the_pool_is_that_of_the_plain_path() -> None:
     samples = [DeviceSample(placed(scenes[0], network), 2, seed, 0.5) for seed in (5, 6, 7, 8)]
     mixed = fast.mixed(samples, 11)
     assert [sample.seed for sample in mixed] == [5, 6, 7, 8] and mixed[2:] == samples[2:]
-    assert all(sample.episode in fast._entries for sample in mixed[:2])
-    assert all((s.frame, s.weight, s.noise) == (0, 1.0, training.rollout_noise) for s in mixed[:2])
+    assert all(made in fast._entries and (frame, weight) == (0, 1.0) for made, frame, _, weight in mixed[:2])
 
 
 def test_lost_scenes_are_dropped() -> None:

@@ -13,7 +13,7 @@ from torch.nn.functional import huber_loss
 
 from hgn.data.chunk import WholeEpisode
 from hgn.kernels.grid.op import ObstacleHash
-from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
+from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
 from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
@@ -212,28 +212,6 @@ def test_smooth_noise() -> None:
     torch.testing.assert_close(walks[1.0], torch.cat(expected), rtol=0, atol=2e-6)
     assert 3e-4 < float(walks[1.0][:, 0].std()) < 3e-3
     torch.testing.assert_close(walks[0.5], (walks[0.0] + walks[1.0]) / 2**0.5, rtol=0, atol=2e-6)
-
-
-def test_a_factor_scales_a_samples_noise() -> None:
-    """Half of the noise, or none, for samples that say so; jitter and all else are those of their seeds."""
-    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
-    made, _ = episode(1, 40, False)
-    updates = updates_of(network, 3, (256,), noise_std=1e-3, grid_jitter=True, noise_smooth=0.5)
-    updates.particles, updates._reach = 128, (torch.zeros(3), torch.ones(3))
-    found = []
-    for factors in ((1.0, 1.0, 1.0), (1.0, 0.5, 0.0)):
-        updates._upload([[DeviceSample(made, 1, i, noise=factor) for i, factor in enumerate(factors)]], [1e-3])
-        updates._build()
-        updates._assemble()
-        window = made.position_TN3[1 : 1 + HISTORY + 1].cpu()
-        velocity = (window[1:] - window[:-1]).flip(0).transpose(0, 1).repeat(3, 1, 1)
-        moved = updates.position_N3[:120].cpu() - window[-1].repeat(3, 1)
-        found.append((updates.velocity_NV[:120].cpu().view(120, HISTORY, 3) - velocity, moved, updates.origin_S3.cpu()))
-    (walk, moved, origin), (scaled, moved_less, same) = found
-    factor_N = torch.tensor([1.0, 0.5, 0.0]).repeat_interleave(40)
-    torch.testing.assert_close(scaled, factor_N[:, None, None] * walk, rtol=0, atol=2e-7)
-    torch.testing.assert_close(moved_less, factor_N[:, None] * moved, rtol=0, atol=4e-7)
-    assert torch.equal(origin, same) and float(walk[:, 0].std()) > 5e-4
 
 
 def test_wrong_kernels_are_refused() -> None:

@@ -108,17 +108,6 @@ def test_noise_belongs_to_the_sample():
     assert not torch.equal(perturbed_window(batch_of(first, seeds=(8,)), STD), alone)
 
 
-def test_a_factor_scales_a_scenes_noise():
-    """Half of it, or none, for scenes that say so; the others' stays bitwise as it was."""
-    episodes = [episode(20, seed=i) for i in range(3)]
-    batch = batch_of(*episodes, seeds=(7, 8, 9))
-    whole = perturbed_window(batch, STD, 0.3, 0.05)
-    scaled = perturbed_window(replace(batch, noise_S=(1.0, 0.5, 0.0)), STD, 0.3, 0.05)
-    window, noise, part = (x.split(20, dim=1) for x in (batch.window_WN3, whole - batch.window_WN3, scaled))
-    assert torch.equal(part[0], whole[:, :20]) and torch.equal(part[2], window[2])
-    torch.testing.assert_close(part[1] - window[1], 0.5 * noise[1], rtol=0, atol=2e-7)
-
-
 def test_no_noise_is_no_copy():
     """With noise off, the window is used as it is."""
     batch = batch_of(episode(5))

@@ -33,8 +33,7 @@ HISTORY, CELL = 5, 0.1
 
 
 def training_of(**changes: Any) -> TrainingConfig:
-    values = {"batch_scenes": 4, "rollout_share": 0.5, "rollout_frames": 3, "rollout_scenes": 2}
-    values |= {"rollout_pull": 0.25, "rollout_noise": 0.5}
+    values = {"batch_scenes": 4, "rollout_share": 0.5, "rollout_frames": 3, "rollout_scenes": 2, "rollout_pull": 0.25}
     return TrainingConfig(**values | changes)
 
 
@@ -133,7 +132,6 @@ def test_the_pool_is_what_the_network_does(network: ParticleNetwork) -> None:
         np.testing.assert_array_equal(by_scene[slot].numpy(), own._entries[entry][2])
     kept = batch.window_WN3.split(list(batch.particles_S), dim=1)
     assert torch.equal(by_scene[2], kept[2]) and torch.equal(by_scene[3], kept[3])
-    assert mixed.noise_S == (own.training.rollout_noise,) * 2 + (1.0, 1.0) and own.training.rollout_noise != 1
 
 
 def falling(episode: Episode, domain: float) -> Episode:
@@ -174,7 +172,6 @@ def test_lost_scenes_are_dropped() -> None:
     [
         ({"rollout_share": 1.0}, "rollout_share must be 0 or more and below 1, got 1.0"),
         ({"rollout_pull": 1.5}, "rollout_pull must be 0 to 1, got 1.5"),
-        ({"rollout_noise": -0.5}, "rollout_noise must be 0 to 1, got -0.5"),
         ({"rollout_every": 0}, "rollout_every must be .*got 0"),
         ({"rollout_share": 0.5, "rollout_frames": 5}, "rollout_frames must be at most dataset.frames - 2 = 4 .*got 5"),
     ],

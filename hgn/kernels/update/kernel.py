@@ -1,9 +1,8 @@
 """What a training step needs around the network: assembling a batch, loss, Adam, bookkeeping; all on the device.
 
 Row of the sample table, int64, one for each scene of each update: address of the window's first frame of positions,
-particles, first row in the batch, seed, address of the materials (int32), weight of the loss and factor of the noise
-(the bits of float64), and the scene's row of the obstacle table, whose last column is the symmetry that the scene is
-shown under.
+particles, first row in the batch, seed, address of the materials (int32), weight of the loss (the bits of a float64),
+and the scene's row of the obstacle table, whose last column is the symmetry that the scene is shown under.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -15,7 +14,7 @@ import triton.language as tl
 from hgn.kernels.blocks import nearest_tf32
 from hgn.kernels.keys import settle_keys
 
-SAMPLE_COLUMNS = tl.constexpr(12)
+SAMPLE_COLUMNS = tl.constexpr(11)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
@@ -90,8 +89,7 @@ def assemble_batch(
     BLOCK: tl.constexpr,
 ):
     """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
-    with WAVES a part of it comes from the waves of the particle's scene, see draw_waves. All of it is multiplied by the
-    sample's factor.
+    with WAVES a part of it comes from the waves of the particle's scene, see draw_waves.
 
     The target is v_true^{n+1} - v_noisy^n, normalised. Grid origins are uniform in [-jitter, 0]. Noise and jitter are
     Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY the window is the image of the
@@ -134,7 +132,6 @@ def assemble_batch(
     tl.store(material_of + row, tl.load(materials + own, mask=live, other=0), mask=live)
     weight = tl.load(line + 5, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     tl.store(share_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
-    noise = tl.load(line + 6, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     first = address.to(tl.pointer_type(tl.float32)) + own * 3
     frame = particles * 3
     if SYMMETRY:
@@ -161,13 +158,12 @@ def assemble_batch(
             walk += noise_step * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
             if WAVES > 0:
                 walk += tl.sum(height * tl.load(wave + 4 + k * 3 + axis), 1)
-            error = noise * walk
-            moved += error
+            moved += walk
             now = tl.load(column + (k + 1) * frame, mask=live, other=0.0)
             step = now - before
             if SYMMETRY:
                 step = tl.where(mirrored, -step, step)
-            v = step + error
+            v = step + walk
             before = now
             # newest first
             tl.store(velocity + row * (3 * HISTORY) + 3 * (HISTORY - 1 - k) + axis, v, mask=live)
