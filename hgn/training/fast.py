@@ -174,8 +174,9 @@ class FastTraining:
         for flat, packed in zip(self._moments, (self.updates.first_moment, self.updates.second_moment), strict=True):
             packed.copy_(self._packed(flat))
         self.updates.step.fill_(float(self._steps.max()))
-        self._place = torch.empty_like(index[used])  # of each parameter element in the packed buffers
-        self._place[index[used]] = torch.nonzero(used).flatten().to(index.dtype)
+        # of each parameter element in the packed buffers
+        self._place = torch.empty_like(index[used], dtype=torch.int64)
+        self._place[index[used]] = torch.nonzero(used).flatten()
 
     def _write_back(self) -> None:
         updates = self.updates
