@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from tqdm import tqdm
@@ -24,7 +25,8 @@ from hgn.data.storage import PATIENCE_S
 from hgn.files import TEMPORARY_SUFFIX
 from hgn.picture import rollout_of_episode
 from hgn.progress import bar
-from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.trial import network_trials
 from hgn.scene.episode import Episode
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.errors import (
@@ -174,21 +176,22 @@ class Monitor(Callback):
     def _rollout(
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
+        """Errors are means over the scenes that came so far; told beside them is how many came to the end."""
         # frames of a GNS are captured on the plain path
         fast = not module.automatic_optimization and module.network.config.kind == "hgn"
         path = "fast" if fast else "plain"
         simulator = Simulator(module.result, episodes[0].frame_rate_hz, path, module.training_config.precision)
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
-        try:
-            predicted = simulator.rollout([InitialState.of_episode(episode) for episode in episodes], frames)
-        except DivergenceError as error:
-            return {"rollout/finished": 0.0, "rollout/frames": float(error.frame)}
-        error_T = rollout_errors(predicted, episodes)
-        values = {f"rollout/mse_frame_{n}": float(error_T["all"][n]) for n in REPORTED_FRAMES if n < frames}
-        values |= {"rollout/finished": 1.0, "rollout/frames": float(frames)}
+        trials = network_trials(simulator, [InitialState.of_episode(episode) for episode in episodes], frames)
+        error_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
+        reached = [n for n in REPORTED_FRAMES if n < len(error_T["all"])]
+        values = {f"rollout/mse_frame_{n}": float(error_T["all"][n]) for n in reached}
+        values["rollout/finished"] = sum(trial.cause is None for trial in trials) / len(trials)
+        values["rollout/frames"] = float(min(trial.frame_count for trial in trials))
         for name, mse_T in error_T.items():
-            values["rollout/mse" if name == "all" else f"rollout/mse_{name}"] = float(mse_T.mean())
-        show_rollout(trainer, self.run / "pictures", rollout_of_episode(episodes[0], predicted[0]), error_T)
+            values["rollout/mse" if name == "all" else f"rollout/mse_{name}"] = float(np.nanmean(mse_T))
+        shown = rollout_of_episode(episodes[0], trials[0].position_TN3)
+        show_rollout(trainer, self.run / "pictures", shown, error_T)
         return values
 
     def _interrupted(self, trainer: Trainer) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 from collections.abc import Callable, Collection
@@ -17,7 +18,9 @@ from training.runs import metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig
+from hgn.runtime.trial import Trial
 from hgn.schema import ConfigError
+from hgn.training import callbacks
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.module import TrainingModule
 
@@ -86,6 +89,23 @@ def gradients_with_faults(monkeypatch: pytest.MonkeyPatch, faulty: Collection[in
             next(iter(module.network.parameters())).grad.view(-1)[0] = float("nan")
 
     monkeypatch.setattr(TrainingModule, "on_after_backward", on_after_backward)
+
+
+def test_a_scene_that_diverges_leaves_the_others_measured(data, tmp_path, monkeypatch):
+    """Its frames count as far as it came, it is told how many came to the end, and pictures are made."""
+    real = callbacks.network_trials
+
+    def cut_short(*arguments):
+        first, *others = real(*arguments)
+        return [Trial(first.position_TN3[:2], "diverged"), *others]
+
+    monkeypatch.setattr(callbacks, "network_trials", cut_short)
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run, monitor_rollout_frames=4, monitor_scenes=2)) == 0
+    last = [record for record in metrics(run) if "rollout/finished" in record][-1]
+    assert (last["rollout/finished"], last["rollout/frames"]) == (0.5, 2.0)
+    assert all(math.isfinite(value) for name, value in last.items() if name.startswith("rollout/mse"))
+    assert (run / "pictures" / "rollout_000000012.png").is_file()
 
 
 def test_updates_without_a_finite_gradient_are_skipped(data, tmp_path, monkeypatch):
