@@ -102,6 +102,7 @@ def parameters_of(updates: Updates) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("huber", "optimizer", "decay", "directions"),
     [
+        (math.inf, "adam", 0.0, torch.float32),
         (0.5, "adam", 0.0, torch.float32),
         (math.inf, "muon", 2.0, torch.float32),
         (math.inf, "muon", 2.0, torch.bfloat16),
