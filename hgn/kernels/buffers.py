@@ -35,7 +35,7 @@ class Block:
     cell_hidden: list[torch.Tensor] = field(default_factory=list)
     cell_normalised: list[torch.Tensor] = field(default_factory=list)
     cell_deviation: list[torch.Tensor] = field(default_factory=list)
-    send: list[torch.Tensor] = field(default_factory=list)  # 2, by turns
+    send: list[torch.Tensor] = field(default_factory=list)  # 2, by turns; in inference one, read before it is written
     receive: list[torch.Tensor] = field(default_factory=list)
     product: torch.Tensor | None = None  # of the block's output, for the step that follows
     next_at: int = 0  # weights of that product

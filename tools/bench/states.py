@@ -105,15 +105,8 @@ def batch_of_scenes(
 
 def state_of(workload: Workload, network: NetworkConfig, device: torch.device) -> ParticleState:
     """The state that a simulation is in at such a frame, without the frames before it."""
-    state = batch_of(workload, network, torch.device("cpu")).state()
-    return replace(
-        state,
-        position_N3=state.position_N3.to(device, copy=True),
-        velocity_NM3=state.velocity_NM3.contiguous().to(device),
-        material_N=state.material_N.to(device),
-        scene_N=state.scene_N.to(device),
-        domain_S3=state.domain_S3.to(device),
-    )
+    state = batch_of(workload, network, device).state()
+    return replace(state, position_N3=state.position_N3.clone(), velocity_NM3=state.velocity_NM3.contiguous())
 
 
 def _tile(count: int, generator: np.random.Generator) -> np.ndarray:
