@@ -339,6 +339,7 @@ class TrainingConfig:
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
     huber: float | None = None  # normalised error from which the loss grows linearly, each axis apart; none: squared
     noise_smooth: float = 0.1  # share of its variance that neighbours have in common; 0: the paper's
+    noise_at_rest: float = 1.0  # smallest share of the noise in frames in which little happens; 1: the same in all
     grid_jitter: bool = True
     frame_importance: float = 0.0  # share of an episode's samples drawn by how much happens in a frame; weighted
     symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
@@ -388,6 +389,7 @@ class TrainingConfig:
         require(0 <= self.rollout_pull <= 1, "rollout_pull", "0 to 1", self.rollout_pull)
         require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
         require(0 <= self.noise_smooth <= 1, "noise_smooth", "0 to 1", self.noise_smooth)
+        require(0 < self.noise_at_rest <= 1, "noise_at_rest", "above 0 and at most 1", self.noise_at_rest)
         require(0 <= self.frame_importance < 1, "frame_importance", "0 or more and below 1", self.frame_importance)
         require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "optimizer", ("adam", "muon"))

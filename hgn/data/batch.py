@@ -37,6 +37,7 @@ class Batch:
     cursor: Cursor | None = None  # the order's state once this batch is trained on
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene: what training may show instead of it
     weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
+    noise_S: tuple[float, ...] = ()  # of each scene, in units of training.noise_std; empty: 1
     samples_S: tuple[tuple[Episode, int], ...] = ()  # episode and frame n of each scene
     starts: tuple[tuple[Episode, int], ...] = ()  # where the network is to simulate from before it trains on this batch
 
@@ -83,6 +84,7 @@ def make_batch(
     cursor: Cursor | None = None,
     weights: Sequence[float] = (),
     windows: Sequence[np.ndarray] | None = None,
+    noise: Sequence[float] = (),
 ) -> Batch:
     """Reads the windows of (episode, frame) pairs, where they are not given, and joins them, with what the network sees
     of the obstacles.
@@ -107,6 +109,7 @@ def make_batch(
         seeds_S=tuple(seeds) if seeds is not None else (0,) * len(episodes),
         cursor=cursor,
         weight_S=tuple(weights),
+        noise_S=tuple(noise),
         symmetries_S=tuple(scene_symmetries(e.gravity, e.domain_size, e.obstacle_grid.cell_size) for e in episodes),
         samples_S=tuple(samples),
     )

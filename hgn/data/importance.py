@@ -24,6 +24,7 @@ class FrameImportance:
     """An episode's frames with the share of its samples that each gets, a distribution over F frames."""
 
     cumulative_F: np.ndarray  # float64, ends with 1
+    acceleration_F: np.ndarray  # root mean square over axes and particles
 
     @staticmethod
     def of(episode: Episode, share: float) -> FrameImportance:
@@ -37,7 +38,7 @@ class FrameImportance:
         even_F = np.full(len(size_F), 1 / len(size_F))
         chance_F = (1 - share) * even_F + share * (size_F / total if total > 0 else even_F)
         cumulative_F = chance_F.cumsum()
-        return FrameImportance(cumulative_F / cumulative_F[-1])
+        return FrameImportance(cumulative_F / cumulative_F[-1], size_F)
 
     def draw(self, slot: int, seed: int) -> tuple[int, float]:
         """The frame for sample number `slot` of F, and its weight; together the slots cover the distribution.
@@ -48,6 +49,11 @@ class FrameImportance:
         place = (slot + _fraction(seed)) / len(cumulative)
         frame = min(bisect_right(cumulative, place), len(cumulative) - 1)
         return frame, weights[frame]
+
+    @cached_property
+    def accelerations(self) -> list[float]:
+        """Of each frame, root mean square, domain units per frame squared."""
+        return self.acceleration_F.tolist()
 
     @cached_property
     def _lists(self) -> tuple[list[float], list[float]]:

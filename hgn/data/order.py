@@ -33,6 +33,7 @@ class Sample(NamedTuple):  # which Python makes faster than other classes: a tho
     frame: int
     seed: int  # of its noise, grid jitter and symmetry
     weight: float = 1.0  # of its loss
+    noise: float = 1.0  # in units of training.noise_std, see hgn.data.rest_noise
 
 
 def epoch_permutation(seed: int, epoch: int, sample_count: int) -> np.ndarray:

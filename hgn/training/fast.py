@@ -90,7 +90,8 @@ class FastTraining:
             with self._timed("own states"):
                 self.own.refresh([(self._episodes[i], frame) for i, frame in chunk.starts], values)
         samples = [
-            [DeviceSample(self._episodes[s.episode], s.frame, s.seed, s.weight) for s in u] for u in chunk.samples
+            [DeviceSample(self._episodes[s.episode], s.frame, s.seed, s.weight, s.noise) for s in u]
+            for u in chunk.samples
         ]
         if self.own is not None:
             samples = [self.own.mixed(update, first_update + i) for i, update in enumerate(samples)]

@@ -15,6 +15,7 @@ from dataclasses import replace
 import torch
 
 from hgn.config import TrainingConfig
+from hgn.data.rest_noise import asked_acceleration, noise_at_rest
 from hgn.kernels.grid.op import ObstacleTable
 from hgn.kernels.rollout.kernel import DIVERGED
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
@@ -38,13 +39,16 @@ class FastOwnStates:
         self.network, self.training, self.rank = network, training, rank
         self.obstacle_cell_size = obstacle_cell_size
         self._rollout: FastRollout | None = None
-        self._entries: list[DeviceEpisode] = []
+        self._entries: list[tuple[DeviceEpisode, float]] = []  # with the acceleration that is asked for
         self.figures: dict[str, float] = {}
 
     def mixed(self, samples: list[DeviceSample], update: int) -> list[DeviceSample]:
         """The samples of an update with their share replaced; seeds stay."""
         chosen = drawn_entries(self.training, update, self.rank, len(self._entries))
-        own = [DeviceSample(self._entries[e], 0, sample.seed) for e, sample in zip(chosen, samples, strict=False)]
+        own = []
+        for (episode, acceleration), sample in zip([self._entries[e] for e in chosen], samples, strict=False):
+            noise, weight = noise_at_rest(self.training, acceleration, sample.seed)
+            own.append(DeviceSample(episode, 0, sample.seed, weight, noise))
         return own + samples[len(own) :]
 
     def refresh(self, starts: Sequence[tuple[DeviceEpisode, int]], values: torch.Tensor) -> None:
@@ -70,7 +74,10 @@ class FastOwnStates:
             episodes, truths, parts, torch.stack(found).tolist(), strict=True
         ):
             windows = own_windows(truth, part, self.training.rollout_pull, config.cell_size)[: int(kept)].contiguous()
-            self._entries += [replace(episode, position_TN3=window) for window in windows]
+            accelerations = asked_acceleration(windows).tolist()
+            self._entries += [
+                (replace(episode, position_TN3=w), a) for w, a in zip(windows, accelerations, strict=True)
+            ]
             squares += [square] if kept == frames else []
         self.figures = figures_of(self.training, len(self._entries), squares, time.monotonic() - begun)
 

@@ -19,6 +19,7 @@ from hgn.data.chunk import Chunk, WholeEpisode, whole_episode
 from hgn.data.importance import FrameImportance
 from hgn.data.order import Cursor, Sample, SampleOrder
 from hgn.data.reader import EpisodeStore
+from hgn.data.rest_noise import noise_at_rest
 from hgn.data.storage import without_patience
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
@@ -81,7 +82,8 @@ class Feed(LightningDataModule):
             samples, starts = self._by_importance(drawn[0]), drawn[1]
             pairs = [(self.store.episodes[sample.episode], sample.frame) for sample in samples]
             seeds, weights = [sample.seed for sample in samples], [sample.weight for sample in samples]
-            batch = make_batch(pairs, self.network, seeds, cursor, weights)
+            noise = [sample.noise for sample in samples]
+            batch = make_batch(pairs, self.network, seeds, cursor, weights, noise=noise)
             return replace(batch, starts=tuple((self.store.episodes[index], frame) for index, frame in starts))
 
         yield from self._ahead(draw, read)
@@ -123,10 +125,10 @@ class Feed(LightningDataModule):
 
     def _whole(self, indices: Sequence[int]) -> dict[int, WholeEpisode]:
         """Reads episodes, several at once: a data set's first pass is gigabytes, and copies release Python's lock."""
-        share = self.training.frame_importance
+        share, wanted = self.training.frame_importance, self._asks_what_happens
 
         def read(episode: Episode) -> tuple[WholeEpisode, FrameImportance | None]:
-            return whole_episode(episode, self.network), FrameImportance.of(episode, share) if share else None
+            return whole_episode(episode, self.network), FrameImportance.of(episode, share) if wanted else None
 
         opened = [self.store.episodes[index] for index in indices]
         with ThreadPoolExecutor(READERS) as readers:
@@ -134,18 +136,25 @@ class Feed(LightningDataModule):
         self._importance.update({index: importance for index, (_, importance) in found.items() if importance})
         return {index: whole for index, (whole, _) in found.items()}
 
+    @property
+    def _asks_what_happens(self) -> bool:
+        return self.training.frame_importance > 0 or self.training.noise_at_rest < 1
+
     def _by_importance(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
-        """The same samples with frames drawn as `training.frame_importance` says, and their weights."""
+        """The same samples with frames drawn as `training.frame_importance` says and noise as `noise_at_rest` does, and
+        their weights."""
         share = self.training.frame_importance
-        if share == 0:
+        if not self._asks_what_happens:
             return tuple(samples)
         drawn = []
         for sample in samples:
             if sample.episode not in self._importance:
                 episode = self.store.episodes[sample.episode]
                 self._importance[sample.episode] = FrameImportance.of(episode, share)
-            frame, weight = self._importance[sample.episode].draw(sample.frame, sample.seed)
-            drawn.append(Sample(sample.episode, frame, sample.seed, weight))
+            importance = self._importance[sample.episode]
+            frame, weight = importance.draw(sample.frame, sample.seed) if share > 0 else (sample.frame, 1.0)
+            noise, factor = noise_at_rest(self.training, importance.accelerations[frame], sample.seed)
+            drawn.append(Sample(sample.episode, frame, sample.seed, weight * factor, noise))
         return tuple(drawn)
 
     def _order(self) -> SampleOrder:

@@ -47,20 +47,22 @@ def perturbed_window(batch: Batch, std_last: float, smooth: float = 0.0, cell_si
     last one, so the target becomes v_true^{n+1} - v_noisy^n: the network learns to undo the velocity error
     (the rule of GNS, Sanchez-Gonzalez et al. 2020). `smooth` is the share of the variance that neighbours have in
     common: in a rollout a body's particles err together, which independent noise, averaged over them, never shows.
+    Each scene's noise is `batch.noise_S` times that.
     """
     window_WN3 = batch.window_WN3
     if std_last == 0:
         return window_WN3
     shift = []
     first = 0
-    for count, seed in zip(batch.particles_S, batch.seeds_S, strict=True):
+    scales = batch.noise_S or (1.0,) * len(batch.seeds_S)
+    for count, seed, scale in zip(batch.particles_S, batch.seeds_S, scales, strict=True):
         generator = torch.Generator(window_WN3.device).manual_seed(seed)
         history = len(window_WN3) - 2
-        velocity_MN3 = random_walk((history, count, 3), std_last * math.sqrt(1 - smooth), generator)
+        velocity_MN3 = random_walk((history, count, 3), scale * std_last * math.sqrt(1 - smooth), generator)
         if smooth > 0:
             generator.manual_seed(seed ^ SMOOTH_STREAM)
             position_N3 = window_WN3[-2, first : first + count]
-            std = std_last * math.sqrt(smooth)
+            std = scale * std_last * math.sqrt(smooth)
             velocity_MN3 = velocity_MN3 + smooth_walk(position_N3, history, std, cell_size, generator)
         first += count
         position_MN3 = velocity_MN3.cumsum(0)

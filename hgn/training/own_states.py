@@ -20,6 +20,7 @@ import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch, make_batch
+from hgn.data.rest_noise import asked_acceleration, noise_at_rest
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.divergence import lost
 from hgn.runtime.simulator import Simulator
@@ -110,7 +111,7 @@ class OwnStates:
         """`network` simulates."""
         self.network, self.training, self.rank = network, training, rank
         self._simulator = Simulator(network, frame_rate_hz)
-        self._entries: list[tuple[Episode, int, np.ndarray]] = []
+        self._entries: list[tuple[Episode, int, np.ndarray, float]] = []  # with the acceleration that is asked for
         self.figures: dict[str, float] = {}
 
     def refresh(self, starts: Sequence[tuple[Episode, int]]) -> None:
@@ -130,11 +131,12 @@ class OwnStates:
             return batch
         samples, config = list(batch.samples_S), self.network.config
         windows = [window(episode, frame, config.velocity_history) for episode, frame in samples]
+        weights, noise = (list(values or (1.0,) * len(samples)) for values in (batch.weight_S, batch.noise_S))
         for slot, entry in enumerate(chosen):
-            episode, frame, windows[slot] = self._entries[entry]
+            episode, frame, windows[slot], acceleration = self._entries[entry]
             samples[slot] = episode, frame
-        weights = [1.0] * len(chosen) + list(batch.weight_S[len(chosen) :]) if batch.weight_S else []
-        made = make_batch(samples, config, batch.seeds_S, batch.cursor, weights, windows)
+            noise[slot], weights[slot] = noise_at_rest(self.training, acceleration, batch.seeds_S[slot])
+        made = make_batch(samples, config, batch.seeds_S, batch.cursor, weights, windows, noise)
         return made.to(batch.window_WN3.device)
 
     def _groups(self, starts: Sequence[tuple[Episode, int]]) -> list[list[tuple[Episode, int]]]:
@@ -170,7 +172,8 @@ class OwnStates:
         true_TN3 = torch.from_numpy(window(episode, frame, config.velocity_history, frames + 1))
         kept, square = frames_kept(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), config.cell_size)
         windows = own_windows(true_TN3, simulated_FN3, self.training.rollout_pull, config.cell_size)
-        self._entries += [(episode, frame + k + 1, windows[k].numpy()) for k in range(int(kept))]
+        accelerations = asked_acceleration(windows).tolist()
+        self._entries += [(episode, frame + k + 1, windows[k].numpy(), accelerations[k]) for k in range(int(kept))]
         return [float(square)] if kept == frames else []
 
 

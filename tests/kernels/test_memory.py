@@ -86,11 +86,11 @@ def test_own_states_stay_within_memory() -> None:
         frames.setdefault(own._rollout, set()).add(tuple(checked.launches[last:]))
         samples = [DeviceSample(episodes[i % 3], i, 7 * i + turn) for i in range(4)]
         mixed = [own.mixed(samples, 5 * turn + i) for i in range(3)]
-        assert any(sample.episode in own._entries for update in mixed for sample in update) or not own._entries
+        assert any(sample.episode in dict(own._entries) for update in mixed for sample in update) or not own._entries
         updates._upload(mixed, [0.0] * 3)
         alive = Alive()
         for row in updates._samples[:3].flatten(0, 1).tolist():
-            address, count, _, _, materials, _, buckets, keys, normals, mask, _ = row
+            address, count, _, _, materials, _, _, buckets, keys, normals, mask, _ = row
             assert alive.holds(address, (HISTORY + 2) * count * 12) and alive.holds(materials, 4 * count)
             if buckets:
                 assert alive.holds(buckets, 4 * (mask + 2)) and alive.holds(keys, 8) and alive.holds(normals, 12)

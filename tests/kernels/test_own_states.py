@@ -20,6 +20,7 @@ from training.test_symmetry import scene_with_obstacles
 from hgn import train
 from hgn.config import DatagenConfig
 from hgn.data.chunk import whole_episode
+from hgn.data.rest_noise import noise_at_rest
 from hgn.data.statistics import Statistics
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.packing import pack_network
@@ -50,9 +51,10 @@ def assert_same_pools(fast: FastOwnStates, plain: OwnStates) -> None:
     for name, value in plain.figures.items():
         if name != "own_states/seconds":
             assert fast.figures[name] == pytest.approx(value, rel=1e-3), name
-    for found, (made, _, expected) in zip(fast._entries, plain._entries, strict=True):
+    for (found, asked), (made, _, expected, acceleration) in zip(fast._entries, plain._entries, strict=True):
         np.testing.assert_allclose(found.position_TN3.cpu().numpy(), expected, rtol=0, atol=1e-6)
         assert found.particles == made.particle_count and found.position_TN3.is_contiguous()
+        assert asked == pytest.approx(acceleration, abs=1e-6)
 
 
 def test_the_pool_is_that_of_the_plain_path() -> None:
@@ -60,7 +62,7 @@ def test_the_pool_is_that_of_the_plain_path() -> None:
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
-    training = training_of(precision="highest", rollout_frames=2)
+    training = training_of(precision="highest", rollout_frames=2, noise_std=0.5, noise_at_rest=0.1)
     fast, plain = FastOwnStates(network, training, CELL_SIZE, 0), OwnStates(network, training, 60.0, 0)
     rollouts = []
     for starts in ([(0, 0), (1, 4)], [(1, 0), (2, 6)], [(0, 5), (3, 2)]):
@@ -75,7 +77,11 @@ def test_the_pool_is_that_of_the_plain_path() -> None:
     samples = [DeviceSample(placed(scenes[0], network), 2, seed, 0.5) for seed in (5, 6, 7, 8)]
     mixed = fast.mixed(samples, 11)
     assert [sample.seed for sample in mixed] == [5, 6, 7, 8] and mixed[2:] == samples[2:]
-    assert all(made in fast._entries and (frame, weight) == (0, 1.0) for made, frame, _, weight in mixed[:2])
+    asked = dict(fast._entries)
+    for sample in mixed[:2]:
+        weight, noise = sample.weight, sample.noise
+        assert (noise, weight) == noise_at_rest(training, asked[sample.episode], sample.seed) and sample.frame == 0
+    assert len({sample.noise for sample in mixed[:2]} | {1.0}) == 3
 
 
 def test_lost_scenes_are_dropped() -> None:

@@ -13,7 +13,7 @@ from torch.nn.functional import huber_loss
 
 from hgn.data.chunk import WholeEpisode
 from hgn.kernels.grid.op import ObstacleHash
-from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
+from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.features import ParticleState
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
@@ -182,6 +182,11 @@ def test_noise_and_jitter() -> None:
     wanted = (window[-1] - window[-2]) - first["velocity_NV"][:400, :3]
     expected = network.float().normaliser.normalise_acceleration(wanted)
     torch.testing.assert_close(first["target_N3"][:400], expected, rtol=0, atol=1e-3)
+    updates._upload([[DeviceSample(made, 1, 5, 4.0, 0.25), DeviceSample(still, 0, 6)]], [1e-3])
+    updates._assemble()
+    calm = updates.velocity_NV[:400].cpu().view(400, HISTORY, 3) - clean
+    torch.testing.assert_close(calm, walk / 4, rtol=0, atol=1e-7)
+    torch.testing.assert_close(updates.share_N[:700].cpu(), torch.tensor([4 / 800] * 400 + [1 / 600] * 300))
 
 
 def test_smooth_noise() -> None:
@@ -212,6 +217,11 @@ def test_smooth_noise() -> None:
     torch.testing.assert_close(walks[1.0], torch.cat(expected), rtol=0, atol=2e-6)
     assert 3e-4 < float(walks[1.0][:, 0].std()) < 3e-3
     torch.testing.assert_close(walks[0.5], (walks[0.0] + walks[1.0]) / 2**0.5, rtol=0, atol=2e-6)
+    updates._upload([[DeviceSample(made, 1, 5), DeviceSample(still, 0, 6, noise=0.5)]], [1e-3])
+    updates._assemble()
+    walk = updates.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
+    torch.testing.assert_close(walk[:400], walks[1.0][:400], rtol=0, atol=0)
+    torch.testing.assert_close(walk[400:], walks[1.0][400:] / 2, rtol=0, atol=1e-6)
 
 
 def test_wrong_kernels_are_refused() -> None:

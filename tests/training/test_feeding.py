@@ -32,11 +32,12 @@ def streamed(folder: Path | str, training: TrainingConfig = SETTINGS[1]) -> list
     return list(islice(Feed(EpisodeStore(folder, "train"), SETTINGS[0], training).batches(), UPDATES))
 
 
-@pytest.mark.parametrize("importance", [0.0, 0.5])
-def test_resident_feeding_equals_streaming(folder: Path, importance: float) -> None:
+@pytest.mark.parametrize(("importance", "at_rest"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.01), (0.0, 0.01)])
+def test_resident_feeding_equals_streaming(folder: Path, importance: float, at_rest: float) -> None:
     """Whole episodes, which stay in a GPU's memory, hold the windows that streaming reads, bitwise, for samples of the
-    same order, seeds and weights; each episode comes once, and the cursors agree wherever a chunk ends."""
-    network, training = SETTINGS[0], replace(SETTINGS[1], frame_importance=importance)
+    same order, seeds, weights and noise; each episode comes once, and the cursors agree wherever a chunk ends."""
+    changes = {"frame_importance": importance, "noise_at_rest": at_rest, "noise_std": 1.0}  # nothing moves as much
+    network, training = SETTINGS[0], replace(SETTINGS[1], **changes)
     expected = streamed(folder, training)
     resident: dict[int, WholeEpisode] = {}
     update = 0
@@ -53,7 +54,11 @@ def test_resident_feeding_equals_streaming(folder: Path, importance: float) -> N
             assert torch.equal(torch.cat([resident[s.episode].material_N for s in samples]).long(), batch.material_N)
             assert tuple(sample.seed for sample in samples) == batch.seeds_S
             assert tuple(sample.weight for sample in samples) == batch.weight_S
-            assert (batch.weight_S == (1.0, 1.0)) == (importance == 0)
+            assert tuple(sample.noise for sample in samples) == batch.noise_S
+            assert (batch.weight_S == (1.0, 1.0)) == (importance == 0 and at_rest == 1)
+            assert all(noise == 1 if at_rest == 1 else at_rest < noise < 1 for noise in batch.noise_S)
+            if importance == 0:
+                assert batch.weight_S == pytest.approx([1 / noise**2 for noise in batch.noise_S])
             update += 1
         if update == UPDATES:
             break

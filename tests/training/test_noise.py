@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from hgn.config import NetworkConfig, TrainingConfig
@@ -106,6 +107,16 @@ def test_noise_belongs_to_the_sample():
     together = perturbed_window(batch_of(second, first, seeds=(9, 7)), STD)
     assert torch.equal(together[:, 30:], alone)
     assert not torch.equal(perturbed_window(batch_of(first, seeds=(8,)), STD), alone)
+
+
+@pytest.mark.parametrize("smooth", [0.0, 0.3])
+def test_a_scene_can_have_less_noise(smooth: float):
+    """Each scene's noise is its scale times what its seed draws; without scales it is all of it."""
+    batch = batch_of(episode(50), episode(30, seed=1))
+    clean, whole = (perturbed_window(batch, std, smooth, 0.035).double() for std in (0.0, STD))
+    scaled = perturbed_window(replace(batch, noise_S=(0.25, 1.0)), STD, smooth, 0.035).double()
+    torch.testing.assert_close(scaled[:, :50] - clean[:, :50], (whole - clean)[:, :50] / 4, rtol=0, atol=1e-7)
+    assert torch.equal(scaled[:, 50:], whole[:, 50:])
 
 
 def test_no_noise_is_no_copy():

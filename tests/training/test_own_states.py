@@ -120,7 +120,7 @@ def test_the_pool_is_what_the_network_does(network: ParticleNetwork) -> None:
             path.append(state.position_N3)
         true = torch.from_numpy(window(made, frame, HISTORY, 4))
         expected += list(own_windows(true, torch.stack(path), 0.25, network.config.cell_size))
-    for (made, _, found), wanted, origin in zip(own._entries, expected, [0, 0, 0, 1, 1, 1], strict=True):
+    for (made, _, found, _), wanted, origin in zip(own._entries, expected, [0, 0, 0, 1, 1, 1], strict=True):
         assert made is episodes[origin]
         np.testing.assert_allclose(found, wanted.numpy(), rtol=0, atol=1e-7)
     batch = make_batch([(e, 3) for e in [*episodes, *episodes]], network.config, (5, 6, 7, 8))
@@ -154,11 +154,11 @@ def test_lost_scenes_are_dropped() -> None:
     small, large = falling(episode(4, seed=1), 0.27), episode(4, seed=2)  # both around 0.5: 0.02, 0.06, 0.12 on
     own = own_states(network)
     own.refresh([(small, 2), (large, 2)])
-    assert [made is small for made, _, _ in own._entries] == [True, False, False, False]
+    assert [made is small for made, *_ in own._entries] == [True, False, False, False]
     assert own.figures["own_states/dropped"] == 2
     network.config = replace(network.config, cell_size=0.1)  # 0.02 sqrt(3) < 0.05 < 0.06 sqrt(3)
     own.refresh([(small, 2), (large, 2)])
-    assert [made is small for made, _, _ in own._entries] == [True, False]
+    assert [made is small for made, *_ in own._entries] == [True, False]
     with torch.no_grad():
         network.normaliser.acceleration_mean.fill_(torch.nan)
     own.refresh([(small, 2), (large, 2)])

@@ -1,8 +1,9 @@
 """What a training step needs around the network: assembling a batch, loss, Adam, bookkeeping; all on the device.
 
 Row of the sample table, int64, one for each scene of each update: address of the window's first frame of positions,
-particles, first row in the batch, seed, address of the materials (int32), weight of the loss (the bits of a float64),
-and the scene's row of the obstacle table, whose last column is the symmetry that the scene is shown under.
+particles, first row in the batch, seed, address of the materials (int32), weight of the loss, scale of the noise (the
+bits of a float64 each), and the scene's row of the obstacle table, whose last column is the symmetry that the scene is
+shown under.
 Shape legend: N particles of all scenes, S scenes, H velocity history.
 """
 
@@ -14,7 +15,7 @@ import triton.language as tl
 from hgn.kernels.blocks import nearest_tf32
 from hgn.kernels.keys import settle_keys
 
-SAMPLE_COLUMNS = tl.constexpr(11)
+SAMPLE_COLUMNS = tl.constexpr(12)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
@@ -44,7 +45,9 @@ def draw_waves(
     gains with each velocity, the oldest first.
     """
     scene = tl.program_id(0)
-    seed = tl.load(samples + (tl.load(update).to(tl.int64) * scenes + scene) * SAMPLE_COLUMNS + 3)
+    sample = samples + (tl.load(update).to(tl.int64) * scenes + scene) * SAMPLE_COLUMNS
+    seed = tl.load(sample + 3)
+    amplitude_step *= tl.load(sample + 6).to(tl.float64, bitcast=True).to(tl.float32)
     index = tl.arange(0, WAVES)
     columns: tl.constexpr = 4 + 3 * HISTORY
     line = waves + (scene * WAVES + index) * columns
@@ -132,6 +135,7 @@ def assemble_batch(
     tl.store(material_of + row, tl.load(materials + own, mask=live, other=0), mask=live)
     weight = tl.load(line + 5, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     tl.store(share_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
+    noise_row = noise_step * tl.load(line + 6, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     first = address.to(tl.pointer_type(tl.float32)) + own * 3
     frame = particles * 3
     if SYMMETRY:
@@ -155,7 +159,7 @@ def assemble_batch(
         before = tl.load(column, mask=live, other=0.0)
         v = walk
         for k in tl.static_range(HISTORY):
-            walk += noise_step * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
+            walk += noise_row * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
             if WAVES > 0:
                 walk += tl.sum(height * tl.load(wave + 4 + k * 3 + axis), 1)
             moved += walk

@@ -69,10 +69,10 @@ class DeviceEpisode:
 
     @cached_property
     def row(self) -> np.ndarray:
-        """A sample of frame 0 in the kernels' table, int64 [SAMPLE_COLUMNS], without seed, weight and symmetry."""
+        """A sample of frame 0 in the kernels' table, int64 [SAMPLE_COLUMNS], without seed, weight, noise, symmetry."""
         obstacles = self.obstacles.row() if self.obstacles is not None else [0] * OBSTACLE_COLUMNS
         return np.array(
-            [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, *obstacles], np.int64
+            [self.position_TN3.data_ptr(), self.particles, 0, 0, self.material_N.data_ptr(), 0, 0, *obstacles], np.int64
         )
 
 
@@ -83,6 +83,7 @@ class DeviceSample(NamedTuple):
     frame: int
     seed: int  # of noise, jitter and symmetry
     weight: float = 1.0  # of the loss
+    noise: float = 1.0  # of it, in units of the noise that the settings say
 
 
 AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
@@ -266,14 +267,15 @@ class Updates:
         assert all(len(samples) == scenes for samples in chunk)
         flat = [DeviceSample(*sample) for samples in chunk for sample in samples]
         # kernels read raw addresses: what is not there would be read all the same
-        for episode, frame, _, _ in flat:
+        for episode, frame, *_ in flat:
             assert 0 <= frame <= episode.frames - history - 2, "a window reaches beyond its episode"
         table = np.array([sample.episode.row for sample in flat]).reshape(len(chunk), scenes, SAMPLE_COLUMNS)
         count = table[..., 1]
         table[..., 0] += np.array([sample.frame for sample in flat]).reshape(count.shape) * count * 12
         table[..., 2] = count.cumsum(1) - count  # the first particle
         table[..., 3] = np.array([sample.seed for sample in flat]).reshape(count.shape)
-        table[..., 5] = np.array([sample.weight for sample in flat], np.float64).view(np.int64).reshape(count.shape)
+        real = np.array([(sample.weight, sample.noise) for sample in flat], np.float64)
+        table[..., 5:7] = real.view(np.int64).reshape(*count.shape, 2)
         if self.settings.symmetry:
             drawn = [drawn_symmetry(sample.episode.symmetries, sample.seed).code for sample in flat]
             table[..., -1] = np.array(drawn).reshape(count.shape)
