@@ -462,6 +462,23 @@ class ExportConfig:
 
 
 @dataclass(frozen=True)
+class AverageConfig:
+    """`python -m hgn.average`."""
+
+    weights: tuple[str, ...]
+    out: str
+    shares: tuple[float, ...] | None = None  # of each, together 1; none: equal ones
+    half: bool = False  # learned tensors as float16
+
+    def __post_init__(self) -> None:
+        require(len(self.weights) >= 2, "weights", "at least two files", len(self.weights))
+        if self.shares is not None:
+            count = f"one for each of the {len(self.weights)} files"
+            require(len(self.shares) == len(self.weights), "shares", count, len(self.shares))
+            require(abs(sum(self.shares) - 1) < 1e-6, "shares", "1 together", sum(self.shares))
+
+
+@dataclass(frozen=True)
 class RolloutConfig:
     """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
 

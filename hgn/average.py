@@ -1,0 +1,84 @@
+"""python -m hgn.average weights=[a,b] shares=[0.7,0.3] out=…: the mean of several networks' weights.
+
+Networks that were trained from the same weights on, each in another way, lie in one valley: between them the error is
+no larger, and what each has learned is there in part (model soups, Wortsman et al. 2022). One network as large as each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hgn.command import run_command
+from hgn.config import AverageConfig
+from hgn.network.base import ParticleNetwork
+from hgn.provenance import provenance
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
+from hgn.schema import ConfigError, from_mapping
+
+Loaded = tuple[ParticleNetwork, WeightsInfo]
+SHARED = ("network", "frame_rate_hz", "obstacle_cell_size", "gravity")  # of weights that can be averaged
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Writes the weights file; returns the exit code."""
+    config = from_mapping(AverageConfig, mapping)
+    average(config)
+    print(config.out)
+    return 0
+
+
+def average(config: AverageConfig) -> None:
+    """Writes the mean. Its number of updates is the most that one of them has; `provenance` lists all.
+
+    Raises: ConfigError when a file is missing, or they are of different networks, data or normalisers.
+    """
+    shares = config.shares or (1 / len(config.weights),) * len(config.weights)
+    files = [find_weights(name, f"weights[{i}]") for i, name in enumerate(config.weights)]
+    loaded = [load_weights(file, field=f"weights[{i}]") for i, file in enumerate(files)]
+    network, info = loaded[0]
+    for i in range(1, len(loaded)):
+        _require_same(loaded[0], loaded[i], config.weights, i)
+    sums = {name: torch.zeros_like(tensor) for name, tensor in network.state_dict().items()}
+    for (each, _), share in zip(loaded, shares, strict=True):
+        for name, tensor in each.state_dict().items():
+            sums[name] += share * tensor
+    for name in sums:
+        if name.startswith("normaliser."):
+            sums[name] = network.state_dict()[name]  # not the shares' rounding
+    network.load_state_dict(sums)
+    parts = [
+        {"file": file.name, "share": share, "updates": each.updates, "provenance": each.provenance}
+        for file, share, (_, each) in zip(files, shares, loaded, strict=True)
+    ]
+    updates = max(each.updates for _, each in loaded)
+    made = replace(info, updates=updates, provenance=provenance() | {"average_of": parts})
+    save_weights(Path(config.out), network, made, config.half)
+
+
+def _require_same(
+    first: tuple[ParticleNetwork, WeightsInfo],
+    other: tuple[ParticleNetwork, WeightsInfo],
+    names: tuple[str, ...],
+    i: int,
+) -> None:
+    for field in SHARED:
+        expected, found = getattr(first[1], field), getattr(other[1], field)
+        if expected != found:
+            raise ConfigError(
+                f"weights[{i}] must have the {field} of weights[0] ({names[0]}), {expected}, got {found} in "
+                f"{names[i]}; average weights of one network and data"
+            )
+    normalisers = [network.normaliser.state_dict() for network, _ in (first, other)]
+    if any(not torch.equal(normalisers[0][name], normalisers[1][name]) for name in normalisers[0]):
+        raise ConfigError(
+            f"weights[{i}] must have the normaliser of weights[0] ({names[0]}), got another in {names[i]}; average "
+            "weights whose training began with the same ones (training.weights)"
+        )
+
+
+if __name__ == "__main__":
+    run_command(main, "average")

@@ -1,0 +1,90 @@
+"""The mean of several networks' weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from training.test_weights import weights_file
+
+from hgn.average import average, main
+from hgn.config import AverageConfig
+from hgn.runtime.weights import load_weights, save_weights
+from hgn.schema import ConfigError
+
+
+def moved(path: Path, by: float, updates: int = 7, normaliser: float = 0.0, half: bool = False) -> Path:
+    """The weights of `weights_file`, each moved by a random number of this size."""
+    network, info = load_weights(weights_file(path, half=False))
+    generator = torch.Generator().manual_seed(updates)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += by * torch.randn(parameter.shape, generator=generator)
+        network.normaliser.velocity_std += normaliser
+    save_weights(path, network, replace(info, updates=updates, provenance={"part": path.name}), half)
+    return path
+
+
+@pytest.mark.parametrize(("shares", "expected"), [(None, (0.5, 0.5)), ((0.7, 0.3), (0.7, 0.3))])
+def test_the_mean(tmp_path: Path, shares: tuple[float, ...] | None, expected: tuple[float, ...]) -> None:
+    """Each tensor is the mean of the files' by their shares, halved where asked; the normaliser stays bit by bit, and
+    the file says what it was made of."""
+    files = [moved(tmp_path / "a.safetensors", 0.1, 5, half=True), moved(tmp_path / "b.safetensors", 0.1, 9)]
+    for half in (False, True):
+        out = tmp_path / "mean.safetensors"
+        assert main({"weights": [str(f) for f in files], "shares": shares, "out": str(out), "half": half}) == 0
+        (first, _), (second, _), (mean, info) = (load_weights(file) for file in (*files, out))
+        for name, tensor in mean.state_dict().items():
+            a, b = first.state_dict()[name], second.state_dict()[name]
+            wanted = a if name.startswith("normaliser.") else expected[0] * a + expected[1] * b
+            if half and not name.startswith("normaliser."):
+                wanted = wanted.half().float()
+            torch.testing.assert_close(tensor, wanted, rtol=0, atol=1e-3 if half else 1e-7)
+            assert not name.startswith("normaliser.") or torch.equal(tensor, a)
+        assert info.updates == 9
+        parts = info.provenance["average_of"]
+        assert [(p["file"], p["share"], p["updates"]) for p in parts] == [
+            ("a.safetensors", expected[0], 5),
+            ("b.safetensors", expected[1], 9),
+        ]
+        assert parts[1]["provenance"] == {"part": "b.safetensors"} and "commit" in info.provenance
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule"),
+    [
+        ({"cell_size": 1 / 32}, r"weights\[1\] must have the obstacle_cell_size of weights\[0\]"),
+        ({"width": 32}, r"weights\[1\] must have the network of weights\[0\]"),
+        ({"rate": 30.0}, r"weights\[1\] must have the frame_rate_hz of weights\[0\]"),
+    ],
+)
+def test_others_are_refused(tmp_path: Path, changes: dict[str, Any], rule: str) -> None:
+    """Weights of another network or of other data have no mean with these; nothing is written."""
+    files = [weights_file(tmp_path / "a.safetensors"), weights_file(tmp_path / "b.safetensors", **changes)]
+    out = tmp_path / "mean.safetensors"
+    with pytest.raises(ConfigError, match=rule):
+        average(AverageConfig(tuple(map(str, files)), str(out)))
+    assert not out.exists()
+
+
+def test_other_normalisers_are_refused(tmp_path: Path) -> None:
+    """Their latents have other units: trainings from nothing on data of their own."""
+    files = [moved(tmp_path / "a.safetensors", 0.1), moved(tmp_path / "b.safetensors", 0.1, normaliser=0.5)]
+    with pytest.raises(ConfigError, match=r"weights\[1\] must have the normaliser of weights\[0\] .*training.weights"):
+        average(AverageConfig(tuple(map(str, files)), str(tmp_path / "mean.safetensors")))
+
+
+@pytest.mark.parametrize(
+    ("count", "shares", "rule"),
+    [
+        (1, None, "weights must be at least two files, got 1"),
+        (2, (0.5, 0.3, 0.2), "shares must be one for each of the 2 files, got 3"),
+        (2, (0.7, 0.4), "shares must be 1 together, got 1.1"),
+    ],
+)
+def test_bad_options(count: int, shares: tuple[float, ...] | None, rule: str) -> None:
+    with pytest.raises(ConfigError, match=rule):
+        AverageConfig(("a.safetensors",) * count, "out.safetensors", shares)
