@@ -17,7 +17,7 @@ from hgn.network.keys import SCENE_LIMIT, unpack
 from hgn.network.obstacles import ObstacleCells
 
 MARK_BLOCK = 128
-FILL_BLOCK = 512
+FILL_BLOCK = 4096 if triton.knobs.runtime.interpret else 512  # slots; the interpreter's time goes by programs
 MARGIN_CELLS = 4  # of a window, around what it must hold
 OBSTACLE_COLUMNS = 5
 OVERFLOW = 1

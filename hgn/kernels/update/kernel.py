@@ -87,12 +87,13 @@ def assemble_batch(
     obstacle_cell_size,
     HISTORY: tl.constexpr,
     SYMMETRY: tl.constexpr,
+    NOISE: tl.constexpr,
     WAVES: tl.constexpr,
     SCENES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
-    with WAVES a part of it comes from the waves of the particle's scene, see draw_waves.
+    with NOISE each particle has its own, with WAVES a part comes from the waves of its scene, see draw_waves.
 
     The target is v_true^{n+1} - v_noisy^n, normalised. Grid origins are uniform in [-jitter, 0]. Noise and jitter are
     Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY the window is the image of the
@@ -135,7 +136,8 @@ def assemble_batch(
     tl.store(material_of + row, tl.load(materials + own, mask=live, other=0), mask=live)
     weight = tl.load(line + 5, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     tl.store(share_of + row, weight / (scenes * particles.to(tl.float32)), mask=live)
-    noise_row = noise_step * tl.load(line + 6, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
+    if NOISE:
+        noise_row = noise_step * tl.load(line + 6, mask=live, other=0).to(tl.float64, bitcast=True).to(tl.float32)
     first = address.to(tl.pointer_type(tl.float32)) + own * 3
     frame = particles * 3
     if SYMMETRY:
@@ -159,7 +161,8 @@ def assemble_batch(
         before = tl.load(column, mask=live, other=0.0)
         v = walk
         for k in tl.static_range(HISTORY):
-            walk += noise_row * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
+            if NOISE:
+                walk += noise_row * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
             if WAVES > 0:
                 walk += tl.sum(height * tl.load(wave + 4 + k * 3 + axis), 1)
             moved += walk

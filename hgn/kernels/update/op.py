@@ -392,13 +392,15 @@ class Updates:
 
     def _assemble(self) -> None:
         settings, config = self.settings, self.config
-        if settings.noise_smooth > 0:
+        smooth_step = settings.noise_std * math.sqrt(2 / SMOOTH_WAVES * settings.noise_smooth / config.velocity_history)
+        own_step = settings.noise_std * math.sqrt((1 - settings.noise_smooth) / config.velocity_history)
+        if smooth_step > 0:
             shortest, longest = (cells * config.cell_size for cells in SMOOTH_CELLS)
             kernel.draw_waves[(settings.scenes,)](
                 self._samples,
                 self.update,
                 self.waves_SKC,
-                settings.noise_std * math.sqrt(2 / SMOOTH_WAVES * settings.noise_smooth / config.velocity_history),
+                smooth_step,
                 2 * math.pi / shortest,
                 math.log(longest / shortest),
                 settings.scenes,
@@ -421,14 +423,15 @@ class Updates:
             self.particle_count,
             self.mean,
             self.std,
-            settings.noise_std * math.sqrt((1 - settings.noise_smooth) / config.velocity_history),
+            own_step,
             self.waves_SKC,
             config.cell_size if settings.grid_jitter else 0.0,
             settings.scenes,
             settings.obstacle_cell_size,
             HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry,
-            WAVES=SMOOTH_WAVES if settings.noise_smooth > 0 else 0,
+            NOISE=own_step > 0,
+            WAVES=SMOOTH_WAVES if smooth_step > 0 else 0,
             SCENES=triton.next_power_of_2(settings.scenes),
             BLOCK=BLOCK,
         )
