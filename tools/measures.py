@@ -1,4 +1,4 @@
-"""What is measured of trajectories besides positions: momentum, energy, obstacles, the domain.
+"""What is measured of trajectories besides positions: momentum, energy, density, the domain.
 
 All in frame units: displacement a frame for velocities, domain units a frame squared for accelerations.
 Shape legend: T frames, N particles.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 FRAMES_AT_ONCE = 50  # in float64
 
@@ -39,6 +40,14 @@ def energies(path_TN3: np.ndarray, gravity_3: np.ndarray) -> np.ndarray:
 def energy_scale(gravity_3: np.ndarray, domain_size: Sequence[float]) -> float:
     """The energy per mass of a fall through the domain; 1 without gravity."""
     return float(np.abs(gravity_3) @ np.asarray(domain_size)) or 1.0
+
+
+def neighbours(position_N3: np.ndarray, radius: float) -> float:
+    """How many others are within the radius of a particle, on average: how densely they lie."""
+    if len(position_N3) == 0:
+        return 0.0
+    tree = cKDTree(position_N3)
+    return float(tree.count_neighbors(tree, radius)) / len(position_N3) - 1
 
 
 def outside_domain(position_N3: np.ndarray, domain_size: Sequence[float]) -> float:

@@ -19,7 +19,10 @@ from hgn.network.features import ParticleState
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.trial import Trial
 from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.scene.material import MATERIALS
+from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError, from_mapping
+from tools.measures import neighbours
 from tools.stability.network import case_row, case_trials, energy_growth, initial_states, main, share_of_way
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
 from tools.stability.network_free_fall import free_fall_rows
@@ -164,6 +167,32 @@ def test_energy_growth_against_a_closed_form() -> None:
     thrown = fall + np.array([0, 1.4, 0]) * time
     assert energy_growth(Trial(thrown.astype(np.float32)), initial, 60.0) == pytest.approx(0.5 * 1.4**2 / 9.8, rel=5e-3)
     assert energy_growth(Trial(thrown[:1]), initial, 60.0) == 0
+
+
+@pytest.mark.parametrize(("stretch", "held"), [(1.0, True), (1.05, True), (1.6, False), (0.3, False)])
+def test_resting_snow_keeps_its_density(stretch: float, held: bool) -> None:
+    """A lattice of snow counts its neighbours by a closed form; stretched or squeezed after it has settled the case
+    does not hold, and says so. Other materials may spread, and what ends before it has settled says nothing."""
+    side, cell = 6, 1 / 64
+    lattice_N3 = 0.6 * cell * np.stack(np.meshgrid(*3 * [np.arange(side)]), -1).reshape(-1, 3) + 0.4
+    assert neighbours(lattice_N3, 0.7 * cell) == pytest.approx(6 * (side - 1) / side)
+    assert neighbours(lattice_N3, 0.3 * cell) == neighbours(lattice_N3[:0], cell) == 0
+    snow, sand = MATERIALS.index("snow"), MATERIALS.index("sand")
+    empty = ObstacleGrid(cell, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+
+    def row(material: int, settled: int) -> Row:
+        scene = InitialState(
+            lattice_N3, 0 * lattice_N3, np.full(len(lattice_N3), material), empty, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+        )
+        path = np.stack([lattice_N3] * 3 + [0.4 + stretch * (lattice_N3 - 0.4)]).astype(np.float32)
+        case = Case("4 frames", (), 4, settled=settled)
+        return case_row(Simulator(network_of(), 60.0), case, [scene], 1.0, [Trial(path)], None)
+
+    found = row(snow, 2)
+    assert found.held is held and (held or "times the neighbours that it had after 2 frames" in found.beyond)
+    assert stretch != 1.0 or found.more["snow_density"] == 1.0
+    for other in (row(sand, 2), row(snow, 4)):
+        assert other.held and other.more["snow_density"] is None
 
 
 def test_scenes_follow_the_network() -> None:

@@ -29,9 +29,10 @@ from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.trial import Trial, network_trials
+from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import from_mapping, to_mapping
-from tools.measures import energies, energy_scale, outside_domain
+from tools.measures import energies, energy_scale, neighbours, outside_domain
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
 from tools.stability.network_free_fall import free_fall_rows
 from tools.stability.row import Row, table
@@ -42,6 +43,7 @@ PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
 LONGEST = 100.0  # domain that is drawn whole, in heights
 DRAWN_EVERY_S = 5.0  # the picture of all cases so far, which takes longer with each
 WAY_BOUND = 0.2  # how far off a known way may be
+DENSITY_BOUND = 2.0  # times as many neighbours, or as few, may snow at rest have after thousands of frames
 FAR_DOMAINS = 100.0  # how far the guard's case throws particles
 
 
@@ -182,6 +184,8 @@ def case_row(
             for trial, scene in zip(trials, initial, strict=True)
         )
     astray = way is not None and abs(way - 1) > WAY_BOUND
+    density = snow_density(trials, initial, case.settled) if case.settled is not None else None
+    loose = density is not None and not 1 / DENSITY_BOUND <= density <= DENSITY_BOUND
     causes = [trial.cause for trial in trials if trial.cause is not None]
     if causes:
         beyond = causes[0]
@@ -191,6 +195,8 @@ def case_row(
         beyond = f"energy grows by {growth:.2g} of a fall through the domain"
     elif astray:
         beyond = f"comes {100 * (way or 0):.2g} % of its way in the first {case.known_frames} frames"
+    elif loose:
+        beyond = f"snow has {density:.2g} times the neighbours that it had after {case.settled} frames"
     elif outside:
         beyond = f"{100 * outside:.2g} % of the particles end outside of the domain"
     else:
@@ -199,7 +205,7 @@ def case_row(
         case.name,
         predicted=case.frames,
         measured=reached,
-        held=finite and not causes and growth <= energy_bound and not outside and not astray,
+        held=finite and not causes and growth <= energy_bound and not outside and not astray and not loose,
         beyond=beyond,
         more={
             "particles": sum(len(scene.position_N3) for scene in initial),
@@ -208,6 +214,7 @@ def case_row(
             "energy_growth": growth if math.isfinite(growth) else None,
             "outside_domain": outside,
             "share_of_way": way,
+            "snow_density": density,
             "failed_scenes": len(causes),
             "guard": "missed" if not finite else "raised" if causes else "not needed",
             "ms": milliseconds,
@@ -234,6 +241,22 @@ def share_of_way(trial: Trial, scene: InitialState, frame_rate_hz: float, known:
         return 1.0
     moved_N3 = trial.position_TN3[last].astype(np.float64) - trial.position_TN3[0] - seconds * scene.velocity_N3
     return float((moved_N3 @ known_3).mean() / (0.5 * seconds**2 * (known_3 @ known_3)))
+
+
+def snow_density(trials: Sequence[Trial], scenes: Sequence[InitialState], settled: int) -> float | None:
+    """How many neighbours within a cell snow has in the last frame, of those in frame `settled`: all scenes together.
+
+    Snow is the one material that keeps a shape: water and sand spread for as long as there is floor. None where there
+    is no snow, or no simulation came so far.
+    """
+    before = after = 0.0
+    for trial, scene in zip(trials, scenes, strict=True):
+        snow_N = scene.material_N == MATERIALS.index("snow")
+        if trial.frame_count > settled:
+            first_N3, last_N3 = (trial.position_TN3[frame][snow_N] for frame in (settled, -1))
+            before += neighbours(first_N3, scene.obstacle_grid.cell_size) * len(first_N3)
+            after += neighbours(last_N3, scene.obstacle_grid.cell_size) * len(last_N3)
+    return after / before if before > 0 else None
 
 
 def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:

@@ -70,6 +70,7 @@ class Case:
     frames: int
     known_3: tuple[float, float, float] | None = None  # acceleration along which the particles' way is known
     known_frames: int = 0  # for so long
+    settled: int | None = None  # frame from which on snow rests, and has to keep its density
 
 
 def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Case]:
@@ -82,11 +83,12 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
     base = replace(base, materials=tuple(name for name in base.materials if name in network.materials))
     side = base.domain_size[1]
 
-    def case(name: str, scene: SceneConfig, frames: int = config.frames) -> Case:
-        return Case(name, tuple(_scene(scene, REPORT_SEED + i) for i in range(config.seeds)), frames)
+    def case(name: str, scene: SceneConfig) -> Case:
+        return Case(name, tuple(_scene(scene, REPORT_SEED + i) for i in range(config.seeds)), config.frames)
 
     if "long" in wanted:
-        yield case(f"{config.long_frames} frames", base, config.long_frames)
+        long = case(f"{config.long_frames} frames", base)
+        yield replace(long, frames=config.long_frames, settled=min(config.frames, config.long_frames) - 1)
     if "particles" in wanted:
         size = base.group_size * config.particle_factor ** (1 / 3)
         yield case(f"particles x{config.particle_factor:g}", replace(base, group_size=size))
