@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from hgn.network.network import HierarchicalGraphNetwork
 
 # Rows of edges or pairs of a block: at width 128 an intermediate result takes a megabyte. Smaller blocks stay in faster
-# caches, but each operation costs some microseconds of Python, in which all other threads wait.
+# caches, but each operation costs some microseconds of Python, in which all other threads wait, and where rows are
+# compiled, matrices are transposed for each block.
 ROWS_AT_ONCE = 2048
 FEWEST_ROWS = 256  # worth a thread's waking
 
@@ -65,9 +66,10 @@ class _Cells:
     def __init__(self, level: Level, threads: int) -> None:
         count = level.cell_count
         self.blocks = _Blocks(level.receiver_E, count, threads)
-        # Rows of a table of all cells as senders, all as receivers, and the directions: what an edge sums of it.
+        # Rows of a table of all cells as senders, all as receivers, and the directions: what an edge sums of it. Only
+        # the first step sees directions.
         ends_E3 = torch.stack([level.sender_E, level.receiver_E + count, level.direction_E + 2 * count], -1)
-        self.ends = self.blocks.indices(ends_E3), self.blocks.indices(ends_E3[:, :2])  # of the first step, of others
+        self.ends_of_first, self.ends_of_others = self.blocks.indices(ends_E3), self.blocks.indices(ends_E3[:, :2])
         self.segments = self.blocks.segments()
         self.level = level
 
@@ -96,8 +98,8 @@ def _passed(
 
     def update(step: int, block: int) -> None:
         edge, cell = networks[step]
-        index, each = cells.ends[min(step, 1)][block], 2 if step else 3
-        seen = Hidden(tables[(step + 1) % 2], index, each, 2, edges[block])
+        ends_E, each = (cells.ends_of_others, 2) if step else (cells.ends_of_first, 3)
+        seen = Hidden(tables[(step + 1) % 2], ends_E[block], each, 2, edges[block])
         # Sums grow by the messages of each step, as the edges do; of the last step's edges nothing else is wanted.
         if step + 1 == len(networks):
             edge.add_sums(sums[block], seen, cells.segments[block])

@@ -12,6 +12,7 @@ import functools
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -41,6 +42,12 @@ def why_not_compiled(width: int, dtype: torch.dtype) -> str | None:
 def rows_class(width: int, dtype: torch.dtype) -> type[Rows]:
     """What computes an FCN's rows on a CPU."""
     return Rows if why_not_compiled(width, dtype) else CompiledRows
+
+
+def said(width: int) -> str:
+    """What computes float32 rows on a CPU, and why, for people."""
+    reason = why_not_compiled(width, torch.float32)
+    return "rows compiled for this CPU" if reason is None else f"rows in PyTorch ({reason})"
 
 
 class CompiledRows(Rows):
@@ -115,23 +122,30 @@ def _place(tensor: torch.Tensor | None) -> int | None:
 @functools.cache
 def _library(width: int) -> tuple[ctypes.CDLL | None, str | None]:
     """The functions of rows.c for rows so wide, or why there are none."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hgn" / "rows"
     options = (*FLAGS, f"-DWIDTH={width}")
-    path = cache / f"{hashlib.sha256(repr((SOURCE.read_bytes(), options, _cpu())).encode()).hexdigest()[:32]}.so"
-    if not path.exists():
-        compiler = os.environ.get("CC") or next(filter(shutil.which, COMPILERS), None)
-        if compiler is None:
-            return None, f"it needs a C compiler ({', '.join(COMPILERS)}, or CC=…)"
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            with temporary_file(path) as temporary:
-                command = [compiler, *options, str(SOURCE), "-o", str(temporary)]
+    try:
+        key = hashlib.sha256(repr((SOURCE.read_bytes(), options, _cpu())).encode()).hexdigest()
+        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hgn" / "rows" / f"{key[:32]}.so"
+        if not path.exists():
+            compiler = shlex.split(os.environ.get("CC", "")) or list(filter(shutil.which, COMPILERS))[:1]
+            if not compiler:
+                return None, f"it needs a C compiler: {', '.join(COMPILERS)} or CC=…"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with temporary_file(path) as temporary:  # other processes may be at it too
+                command = [*compiler, *options, str(SOURCE), "-o", str(temporary)]
                 subprocess.run(command, check=True, capture_output=True, text=True)
+                with temporary.open("rb") as file:
+                    os.fsync(file.fileno())
                 temporary.replace(path)
-        except subprocess.CalledProcessError as error:
-            return None, f"{compiler} does not compile {SOURCE.name}: {error.stderr.strip()[-200:]}"
-        except OSError as error:
-            return None, f"{error.filename}: {error.strerror}"
+        return _load(path), None
+    except subprocess.CalledProcessError as error:
+        return None, f"{compiler[0]} does not compile {SOURCE.name}: {error.stderr.strip()[:200]}"
+    except (OSError, RuntimeError) as error:  # no compiler of that name, no home, a folder that forbids it
+        return None, str(error)
+
+
+def _load(path: Path) -> ctypes.CDLL:
+    """The functions of a compiled rows.c, which run without the interpreter's lock."""
     library = ctypes.CDLL(str(path))
     pointer, count, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_float
     library.project.argtypes = [count, pointer, count, pointer, count, pointer, pointer]
@@ -141,7 +155,7 @@ def _library(width: int) -> tuple[ctypes.CDLL | None, str | None]:
         *(pointer, pointer, pointer, pointer, pointer),
     ]
     library.project.restype = library.outputs.restype = None
-    return library, None
+    return library
 
 
 def _cpu() -> list[str]:

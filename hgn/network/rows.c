@@ -47,6 +47,16 @@ INLINE float summed(vector value) {
     return number[0];
 }
 
+/* Each row less its mean. */
+INLINE void centre(int64_t rows, float *matrix) {
+    for (float *row = matrix; row < matrix + rows * WIDTH; row += WIDTH) {
+        vector total = {0};
+        for (int v = 0; v < VECTORS; v++) total += IN(row + v * LANES);
+        float mean = summed(total) / WIDTH;
+        for (int v = 0; v < VECTORS; v++) AT(row + v * LANES) = IN(row + v * LANES) - mean;
+    }
+}
+
 /* Adds rows times a matrix [depth, WIDTH] to a start: `bias` for each row, or what stands in `out` where it is null. */
 INLINE void multiply(int64_t rows, const float *value, int64_t depth, const float *matrix, const float *bias,
                      float *out, int activate, float slope) {
@@ -102,14 +112,16 @@ void project(int64_t rows, const float *value, int64_t depth, const float *weigh
 }
 
 /* The hidden layer of `rows` rows from `first` on, before products: the sum of `each` rows of a table. */
-INLINE void gather(int64_t first, int64_t rows, const float *table, const int64_t *index, int64_t each, float *hidden) {
+INLINE void gather(int64_t first, int64_t rows, const float *table, const int64_t *index, int64_t each, float *hidden,
+                   int activate, float slope) {
     for (int64_t row = 0; row < rows; row++) {
         vector sum[VECTORS];
-        const int64_t *place = index + (first + row) * each;
+        const int64_t own = first + row, *place = index ? index + own * each : &own;
         for (int v = 0; v < VECTORS; v++) sum[v] = IN(table + place[0] * WIDTH + v * LANES);
         for (int64_t i = 1; i < each; i++)
             for (int v = 0; v < VECTORS; v++) sum[v] += IN(table + place[i] * WIDTH + v * LANES);
-        for (int v = 0; v < VECTORS; v++) AT(hidden + row * WIDTH + v * LANES) = sum[v];
+        for (int v = 0; v < VECTORS; v++)
+            AT(hidden + row * WIDTH + v * LANES) = activate ? activated(sum[v], slope) : sum[v];
     }
 }
 
@@ -119,27 +131,28 @@ void outputs(int64_t rows, const float *table, const int64_t *index, int64_t eac
              const float *part, int64_t stride, float slope, const float *second, const float *second_bias,
              const float *gain, const float *shift, float epsilon, const float *residual, float *out,
              const float *weight, const int64_t *offset, float *sums) {
-    float first_matrix[WIDTH * WIDTH], second_matrix[WIDTH * WIDTH], hidden[CHUNK * WIDTH], result[CHUNK * WIDTH];
+    float first_matrix[WIDTH * WIDTH], second_matrix[WIDTH * WIDTH], bias[WIDTH];
+    float hidden[CHUNK * WIDTH], result[CHUNK * WIDTH];
     int64_t run = 0;
     if (value) transpose(depth, part, stride, first_matrix);
     transpose(WIDTH, second, WIDTH, second_matrix);
+    memcpy(bias, second_bias, sizeof bias);
+    centre(WIDTH, second_matrix), centre(1, bias); /* so outputs have a mean of 0, which the norm would subtract */
     for (int64_t first = 0; first < rows; first += CHUNK) {
         int64_t count = rows - first < CHUNK ? rows - first : CHUNK;
         if (count % TILE_ROWS) memset(hidden, 0, sizeof hidden);
-        if (index) gather(first, count, table, index, each, hidden);
-        else memcpy(hidden, table + first * WIDTH, count * WIDTH * sizeof(float));
-        if (value)
-            multiply(count, whole_tiles(count, value + first * depth, depth, result), depth, first_matrix, 0,
-                     hidden, 1, slope);
-        else
-            for (int64_t i = 0; i < count * WIDTH; i += LANES) AT(hidden + i) = activated(IN(hidden + i), slope);
-        multiply(count, hidden, WIDTH, second_matrix, second_bias, result, 0, 0);
+        if (value) {
+            const float *in = whole_tiles(count, value + first * depth, depth, result);
+            gather(first, count, table, index, each, hidden, 0, 0);
+            multiply(count, in, depth, first_matrix, 0, hidden, 1, slope);
+        } else
+            gather(first, count, table, index, each, hidden, 1, slope);
+        multiply(count, hidden, WIDTH, second_matrix, bias, result, 0, 0);
         for (int64_t row = 0; row < count; row++) {
             const float *from = result + row * WIDTH;
-            vector output[VECTORS], total = {0}, square = {0};
-            for (int v = 0; v < VECTORS; v++) total += output[v] = IN(from + v * LANES);
-            float mean = summed(total) / WIDTH;
-            for (int v = 0; v < VECTORS; v++) output[v] -= mean, square += output[v] * output[v];
+            vector output[VECTORS], square = {0};
+            for (int v = 0; v < VECTORS; v++) output[v] = IN(from + v * LANES);
+            for (int v = 0; v < VECTORS; v++) square += output[v] * output[v];
             float scale = 1 / __builtin_sqrtf(summed(square) / WIDTH + epsilon);
             for (int v = 0; v < VECTORS; v++)
                 output[v] = output[v] * scale * IN(gain + v * LANES) + IN(shift + v * LANES);

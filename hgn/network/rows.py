@@ -7,7 +7,7 @@ is wanted. Shape legend: R rows, K rows of a table, S segments, W width.
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import torch
@@ -20,7 +20,7 @@ class Hidden(NamedTuple):
     """A hidden layer before its activation: the sum of `each` rows of a table, plus the product with a part's value."""
 
     table_KW: torch.Tensor
-    chosen: torch.Tensor | None  # [R * each], int64; none: the table's rows in their order
+    chosen: torch.Tensor | None  # [R * each], int64; none: the table's rows in their order, which may be overwritten
     each: int
     part: int = 0
     value_RW: torch.Tensor | None = None  # none: no product
@@ -109,7 +109,7 @@ class Rows:
         elif each == 1:
             rows_RW = table_KW.index_select(0, chosen)
         else:
-            rows_RW = _summed(table_KW, torch.arange(0, len(chosen) + 1, each), chosen=chosen)
+            rows_RW = _summed(table_KW, _steps(len(chosen) + 1, each), chosen=chosen)
         return rows_RW if value_RW is None else self.add_projection(rows_RW, part, value_RW)
 
     @cached_property
@@ -132,8 +132,15 @@ def _summed(
     chosen: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Sums of runs of rows, or of those that are chosen, in one pass [S, W]."""
-    chosen = torch.arange(len(table_KW)) if chosen is None else chosen
+    chosen = _steps(len(table_KW)) if chosen is None else chosen
     result: torch.Tensor = torch.embedding_bag(
         table_KW, chosen, offset, per_sample_weights=weight_R, include_last_offset=True
     )[0]
     return result
+
+
+@lru_cache(64)
+def _steps(end: int, step: int = 1) -> torch.Tensor:
+    """0 to `end`, excluded; the same blocks come again and again."""
+    with torch.inference_mode(False):
+        return torch.arange(0, end, step)
