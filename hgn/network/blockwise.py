@@ -26,10 +26,10 @@ from hgn.network.rows import Hidden, Rows, Segments
 if TYPE_CHECKING:
     from hgn.network.network import HierarchicalGraphNetwork
 
-# Rows of edges or pairs of a block: at width 128 an intermediate result takes a megabyte. Smaller blocks stay in faster
-# caches, but each operation costs some microseconds of Python, in which all other threads wait, and where rows are
-# compiled, matrices are transposed for each block.
-ROWS_AT_ONCE = 2048
+# Rows of edges or pairs of a block: at width 128 an intermediate result takes two megabytes. Smaller blocks stay in
+# faster caches, but each operation costs some microseconds of Python, in which all other threads wait, and where rows
+# are compiled, matrices are transposed for each block.
+ROWS_AT_ONCE = 4096
 FEWEST_ROWS = 256  # worth a thread's waking
 
 

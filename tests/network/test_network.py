@@ -95,7 +95,7 @@ def test_batch_equals_single_scenes(spread, changes):
     [(torch.float64, 1e-12, Rows), (torch.float32, 1e-5, Rows), (torch.float32, 1e-5, None)],
 )
 @pytest.mark.parametrize("threads", [1, 2, 3])
-@pytest.mark.parametrize("rows", [20, 300, 2048])
+@pytest.mark.parametrize("rows", [20, 300, 4096])
 @pytest.mark.parametrize("counts", [(70, 1, 30), (1,), (400,)])
 def test_blocks_change_nothing(monkeypatch, dtype, tolerance, kind, threads, rows, counts):
     """Frames on a CPU, in blocks on several threads, equal the float64 output with gradients, the same every time."""
