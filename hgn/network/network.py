@@ -1,6 +1,6 @@
 """The hierarchical graph network (paper sec. 3.2, fig. 2): plain torch, the reference for every faster path.
 
-On a CPU, where no gradients are wanted, hgn.network.blockwise computes the same function.
+On a CPU, where no gradients are wanted, hgn.network.blockwise computes the same function, if it can by compiled C.
 
 Steps: encode particles (0), particles to cells (1), message passing on each level down (2, 4, …) with fine to
 coarse (3, 5, …) between, message passing on each level up (8, 10, …) after coarse to fine (7, 9, …), cells to

@@ -18,6 +18,7 @@ import torch
 
 from hgn.config import PATHS, PRECISIONS
 from hgn.device import choose_device
+from hgn.network import compiled
 from hgn.network.base import ParticleNetwork
 from hgn.network.edges import PlainEdges
 from hgn.network.features import ParticleState, material_rows
@@ -138,6 +139,8 @@ class Simulator:
         place = choose_device(device)
         network, info = load_weights(find_weights(str(weights)), place)
         chosen, said = path_on(place, network.config, path, precision)
+        if place.type == "cpu" and isinstance(network, HierarchicalGraphNetwork):
+            said = f"{said}, {compiled.said(network.config.width)}"
         set_matmul_precision(precision)
         simulator = Simulator(network, info.frame_rate_hz, chosen, precision)
         simulator._info, simulator.path_said = info, said

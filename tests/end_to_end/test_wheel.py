@@ -54,8 +54,11 @@ def run(python: Path, folder: Path, *arguments: str) -> str:
 
 
 def test_configs_travel_inside(wheel: Path) -> None:
-    """All of conf/ and the shipped weights are inside, byte for byte; tests, job files and caches are not."""
+    """All of conf/, the shipped weights and what the user's machine compiles are inside, byte for byte; tests, job
+    files and caches are not."""
     with zipfile.ZipFile(wheel) as archive:
+        source = "hgn/network/rows.c"
+        assert archive.read(source) == (ROOT / source).read_bytes()
         names = archive.namelist()
         for path in (ROOT / "conf").rglob("*"):
             if path.is_file():

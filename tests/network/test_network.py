@@ -16,6 +16,7 @@ from hgn.network.features import wall_distances
 from hgn.network.grid import build_hierarchy
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.rows import Rows
 
 
 @pytest.mark.parametrize(
@@ -89,16 +90,21 @@ def test_batch_equals_single_scenes(spread, changes):
         assert float((found - expected).abs().max()) / scale < 1e-6
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance", "kind"),
+    [(torch.float64, 1e-12, Rows), (torch.float32, 1e-5, Rows), (torch.float32, 1e-5, None)],
+)
 @pytest.mark.parametrize("threads", [1, 2, 3])
-@pytest.mark.parametrize("rows", [20, 300, 2048])
+@pytest.mark.parametrize("rows", [20, 300, 4096])
 @pytest.mark.parametrize("counts", [(70, 1, 30), (1,), (400,)])
-def test_blocks_change_nothing(monkeypatch, dtype, tolerance, threads, rows, counts):
+def test_blocks_change_nothing(monkeypatch, dtype, tolerance, kind, threads, rows, counts):
     """Frames on a CPU, in blocks on several threads, equal the float64 output with gradients, the same every time."""
     network = network_of(width=128, levels=4).train()
     state = random_state(counts, spread=0.15)
     expected = network.normalised_acceleration(state).detach()
     monkeypatch.setattr("hgn.network.blockwise.ROWS_AT_ONCE", rows)
+    if kind is not None:  # none: compiled, where there is a compiler
+        monkeypatch.setattr("hgn.network.blockwise.rows_class", lambda *_: kind)
     state = replace(state, position_N3=state.position_N3.to(dtype), velocity_NM3=state.velocity_NM3.to(dtype))
     state = replace(state, domain_S3=state.domain_S3.to(dtype))
     before = torch.get_num_threads()
@@ -133,8 +139,11 @@ def test_frames_without_earlier_steps_or_edges(steps, lone):
                 parameter.data.mul_(1.5)
 
 
-def test_frames_of_batches_equal_single_scenes():
+@pytest.mark.parametrize("kind", [Rows, None])
+def test_frames_of_batches_equal_single_scenes(monkeypatch, kind):
     """What shares a batch with a scene, and with it the blocks, changes no bit of a frame's output on a CPU."""
+    if kind is not None:  # none: compiled, where there is a compiler
+        monkeypatch.setattr("hgn.network.blockwise.rows_class", lambda *_: kind)
     counts = (40, 7, 1, 325)
     network = network_of(dtype=torch.float32, width=128, levels=4)
     state = random_state(counts, dtype=torch.float32, spread=0.2)
