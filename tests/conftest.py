@@ -14,9 +14,11 @@ import pytest
 # the networks of the tests are tiny: threads would wait for one another for most of the time, above all on busy cores
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# what a script runs in the background ignores Ctrl-C, and so would all that the tests start
+# what a script runs in the background ignores Ctrl-C, under nohup also SIGHUP, and so would all that the tests start
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 import torch
 

@@ -8,6 +8,7 @@ import tarfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hgn.provenance import commit_of, without_folders
 from hgn.schema import ConfigError, require
@@ -62,7 +63,8 @@ def _taken_out(name: str, folder: Path, field: str) -> tuple[str, Path]:
             f"git says: {said.decode(errors='replace').strip()}"
         ) from None
     with tarfile.open(fileobj=io.BytesIO(archive)) as file:
-        file.extractall(folder, filter="data")
+        safely: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # Python 3.11.4 on
+        file.extractall(folder, **safely)
     return commit[:12], folder
 
 
