@@ -42,14 +42,9 @@ def average(config: AverageConfig) -> None:
     network, info = loaded[0]
     for i in range(1, len(loaded)):
         _require_same(loaded[0], loaded[i], config.weights, i)
-    sums = {name: torch.zeros_like(tensor) for name, tensor in network.state_dict().items()}
-    for (each, _), share in zip(loaded, shares, strict=True):
-        for name, tensor in each.state_dict().items():
-            sums[name] += share * tensor
-    for name in sums:
-        if name.startswith("normaliser."):
-            sums[name] = network.state_dict()[name]  # not the shares' rounding
-    network.load_state_dict(sums)
+    with torch.no_grad():
+        for same in zip(*(each.parameters() for each, _ in loaded), strict=True):
+            same[0].copy_(sum(share * parameter for share, parameter in zip(shares, same, strict=True)))
     parts = [
         {"file": file.name, "share": share, "updates": each.updates, "provenance": each.provenance}
         for file, share, (_, each) in zip(files, shares, loaded, strict=True)

@@ -46,7 +46,8 @@ class FastOwnStates:
         """The samples of an update with their share replaced; seeds stay."""
         chosen = drawn_entries(self.training, update, self.rank, len(self._entries))
         own = []
-        for (episode, acceleration), sample in zip([self._entries[e] for e in chosen], samples, strict=False):
+        for entry, sample in zip(chosen, samples, strict=False):
+            episode, acceleration = self._entries[entry]
             noise, weight = noise_at_rest(self.training, acceleration, sample.seed)
             own.append(DeviceSample(episode, 0, sample.seed, weight, noise))
         return own + samples[len(own) :]

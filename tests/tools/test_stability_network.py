@@ -180,11 +180,12 @@ def test_resting_snow_keeps_its_density(stretch: float, held: bool) -> None:
     snow, sand = MATERIALS.index("snow"), MATERIALS.index("sand")
     empty = ObstacleGrid(cell, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
-    def row(material: int, settled: int) -> Row:
+    def row(material: int, settled: int, broken: float = 0.0) -> Row:
         scene = InitialState(
             lattice_N3, 0 * lattice_N3, np.full(len(lattice_N3), material), empty, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
         )
         path = np.stack([lattice_N3] * 3 + [0.4 + stretch * (lattice_N3 - 0.4)]).astype(np.float32)
+        path[-1, 5] += broken
         case = Case("4 frames", (), 4, settled=settled)
         return case_row(Simulator(network_of(), 60.0), case, [scene], 1.0, [Trial(path)], None)
 
@@ -193,6 +194,8 @@ def test_resting_snow_keeps_its_density(stretch: float, held: bool) -> None:
     assert stretch != 1.0 or found.more["snow_density"] == 1.0
     for other in (row(sand, 2), row(snow, 4)):
         assert other.held and other.more["snow_density"] is None
+    lost = row(snow, 2, np.nan)
+    assert not lost.held and lost.beyond.startswith("positions are not finite") and lost.more["guard"] == "missed"
 
 
 def test_scenes_follow_the_network() -> None:

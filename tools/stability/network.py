@@ -187,6 +187,7 @@ def case_row(
     density = snow_density(trials, initial, case.settled) if case.settled is not None else None
     loose = density is not None and not 1 / DENSITY_BOUND <= density <= DENSITY_BOUND
     causes = [trial.cause for trial in trials if trial.cause is not None]
+    beyond = None
     if causes:
         beyond = causes[0]
     elif not finite:
@@ -199,14 +200,12 @@ def case_row(
         beyond = f"snow has {density:.2g} times the neighbours that it had after {case.settled} frames"
     elif outside:
         beyond = f"{100 * outside:.2g} % of the particles end outside of the domain"
-    else:
-        beyond = "nothing seen"
     return Row(
         case.name,
         predicted=case.frames,
         measured=reached,
-        held=finite and not causes and growth <= energy_bound and not outside and not astray and not loose,
-        beyond=beyond,
+        held=beyond is None,
+        beyond=beyond or "nothing seen",
         more={
             "particles": sum(len(scene.position_N3) for scene in initial),
             "scenes": len(initial),
@@ -247,13 +246,15 @@ def snow_density(trials: Sequence[Trial], scenes: Sequence[InitialState], settle
     """How many neighbours within a cell snow has in the last frame, of those in frame `settled`: all scenes together.
 
     Snow is the one material that keeps a shape: water and sand spread for as long as there is floor. None where there
-    is no snow, or no simulation came so far.
+    is no snow, or no simulation came so far with numbers for positions.
     """
     before = after = 0.0
     for trial, scene in zip(trials, scenes, strict=True):
         snow_N = scene.material_N == MATERIALS.index("snow")
-        if trial.frame_count > settled:
-            first_N3, last_N3 = (trial.position_TN3[frame][snow_N] for frame in (settled, -1))
+        if trial.frame_count <= settled:
+            continue
+        first_N3, last_N3 = (trial.position_TN3[frame][snow_N] for frame in (settled, -1))
+        if np.isfinite(first_N3).all() and np.isfinite(last_N3).all():
             before += neighbours(first_N3, scene.obstacle_grid.cell_size) * len(first_N3)
             after += neighbours(last_N3, scene.obstacle_grid.cell_size) * len(last_N3)
     return after / before if before > 0 else None
