@@ -58,6 +58,7 @@ class SceneConfig:
     particles_per_cell: float = 8.0
     clearance_cells: float = 2.0  # between obstacles, groups and walls, in solver cells
     maximum_initial_speed: float = 0.0  # domain units per second; each group draws one velocity
+    initial_speed_share: float = 1.0  # of the groups, that begin with their velocity; the others begin at rest
     lone_particles: int = 0  # far from all others; else a network learns that what is alone lies on the floor
 
     def __post_init__(self) -> None:
@@ -68,6 +69,7 @@ class SceneConfig:
         require_positive(self, "cell_size", "group_size", "particles_per_cell")
         require_non_negative(self, "obstacle_count", "group_count", "clearance_cells", "maximum_initial_speed")
         require_non_negative(self, "lone_particles")
+        require(0 <= self.initial_speed_share <= 1, "initial_speed_share", "from 0 to 1", self.initial_speed_share)
         low, high = self.obstacle_size
         require(0 < low <= high < math.inf, "obstacle_size", "0 < smallest <= largest", list(self.obstacle_size))
         for i, name in enumerate(self.materials):

@@ -1,5 +1,6 @@
 import hashlib
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -156,6 +157,15 @@ def test_lone_particles_are_far_from_all_others(seed):
 def test_scenes_at_rest_have_no_velocity():
     """With maximum_initial_speed 0 every velocity is exactly zero."""
     assert not generate_scene(PAPER, 3).velocity_N3.any()
+
+
+def test_a_share_of_the_groups_begins_with_a_velocity():
+    """With initial_speed_share 0.25 about a quarter of 240 groups moves, the others are exactly at rest."""
+    config = SceneConfig(obstacle_count=0, maximum_initial_speed=3.0, initial_speed_share=0.25)
+    groups = [group for seed in range(60) for group in generate_scene(config, seed).specification["groups"]]
+    moving = [group for group in groups if any(group["velocity"])]
+    assert 0.17 < len(moving) / len(groups) < 0.33
+    assert not any(generate_scene(replace(config, initial_speed_share=0.0), 1).velocity_N3.flat)
 
 
 def test_draws_cover_their_ranges():
