@@ -1,4 +1,4 @@
-"""The queue of one machine: its GPUs share a list, barriers hold, it stops and goes on; and the list of networks."""
+"""The queue of one machine: its GPUs share a list, barriers hold, it stops and goes on; and the lists of networks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from processes import processes_of_session, wait_until
 
 from datagen.generate import datagen_config
 from hgn.command import _compose
-from hgn.config import DatagenConfig, EvaluateConfig, ExportConfig, TrainConfig
+from hgn.config import AverageConfig, DatagenConfig, EvaluateConfig, ExportConfig, TrainConfig
 from hgn.data.identity import dataset_identity
 from hgn.runtime.weights import shipped_weights
 from hgn.schema import from_mapping
@@ -282,16 +282,45 @@ def test_lists_are_refused(machine: Path) -> None:
     assert usage.returncode == 2 and usage.stderr.startswith("usage: jobs/queue.sh LIST [FOLDER]")
 
 
-def calls(machine: Path, **variables: str) -> dict[str, list[list[str]]]:
-    """The modules that each line of jobs/networks.txt runs, with their arguments, in the order of the lines."""
+def calls(machine: Path, file: str, **variables: str) -> dict[str, list[list[str]]]:
+    """The modules that each line of a list in jobs runs, with their arguments, in the order of the lines."""
     write_program(machine, "python", PYTHON)
-    done = run(machine, JOBS / "networks.txt", CUDA_VISIBLE_DEVICES="", **variables)
+    done = run(machine, JOBS / file, CUDA_VISIBLE_DEVICES="", **variables)
     assert done.returncode == 0, done.stderr
     names = [name for _, name, what in events(done.stdout) if what == "begin"]
     logs = {name: (machine / "runs" / "queue" / f"{name}.log").read_text().splitlines() for name in names}
     made = {name: [json.loads(line) for line in lines] for name, lines in logs.items()}
     assert all(call[0] == "-m" for lines in made.values() for call in lines)
     return {name: [call[1:] for call in lines] for name, lines in made.items()}
+
+
+def settings(lines: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
+    """What each module of a line is given, by its name."""
+    mappings: dict[str, dict[str, Any]] = {}
+    for module, *arguments in lines:
+        monkeypatch.setattr("sys.argv", [module, *arguments])
+        (mappings[module],) = _compose(module.rpartition(".")[2])
+    return mappings
+
+
+def trained_and_scored(
+    name: str, mappings: dict[str, dict[str, Any]], data: dict[str, DatagenConfig]
+) -> tuple[TrainConfig, EvaluateConfig]:
+    """A line that trains a network on data made before, exports it and scores it."""
+    assert list(mappings) == ["hgn.train", "hgn.export", "hgn.evaluate"]
+    mappings["hgn.train"].pop("name")
+    config = from_mapping(TrainConfig, mappings["hgn.train"])
+    assert config.run == f"runs/{name}" and config.training.precision == "half"
+    made = data[config.dataset.folder]
+    assert config.dataset.training_scenes == made.dataset.training_scenes
+    assert dataset_identity(config.datagen) == dataset_identity(made)
+    assert made.scene.obstacle_count > 0 or not config.network.sees_obstacles
+    export = from_mapping(ExportConfig, mappings["hgn.export"])
+    assert (export.checkpoint, export.half) == (f"runs/{name}/checkpoints/last.ckpt", True)
+    score = from_mapping(EvaluateConfig, mappings["hgn.evaluate"])
+    assert score.weights == export.out
+    assert (score.split, score.scenes, score.frame_stride, score.precision) == ("test", 20, 5, "half")
+    return config, score
 
 
 def test_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,11 +330,8 @@ def test_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data: dict[str, DatagenConfig] = {}
     exported: dict[str, str] = {}  # weights to data
     reported: set[str] = set()
-    for name, lines in calls(tmp_path).items():
-        mappings: dict[str, dict[str, Any]] = {}
-        for module, *arguments in lines:
-            monkeypatch.setattr("sys.argv", [module, *arguments])
-            (mappings[module],) = _compose(module.rpartition(".")[2])
+    for name, lines in calls(tmp_path, "networks.txt").items():
+        mappings = settings(lines, monkeypatch)
         if list(mappings) == ["datagen"]:
             made = datagen_config(mappings["datagen"])
             data[made.dataset.folder] = made
@@ -315,28 +341,51 @@ def test_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             assert set(report.weights) == {file for file, folder in exported.items() if folder == report.data}
             reported |= set(report.weights)
         else:
-            assert list(mappings) == ["hgn.train", "hgn.export", "hgn.evaluate"]
-            mappings["hgn.train"].pop("name")
-            config = from_mapping(TrainConfig, mappings["hgn.train"])
-            assert config.run == f"runs/{name}" and config.training.precision == "half"
-            made = data[config.dataset.folder]
-            assert config.dataset.training_scenes == made.dataset.training_scenes == 800
-            assert dataset_identity(config.datagen) == dataset_identity(made)
-            assert made.scene.obstacle_count > 0 or not config.network.sees_obstacles
-            export = from_mapping(ExportConfig, mappings["hgn.export"])
-            assert (export.checkpoint, export.half) == (f"runs/{name}/checkpoints/last.ckpt", True)
-            score = from_mapping(EvaluateConfig, mappings["hgn.evaluate"])
-            assert (score.weights, score.data) == (export.out, config.dataset.folder)
-            assert (score.split, score.scenes, score.frame_stride, score.precision) == ("test", 20, 5, "half")
-            exported[export.out] = score.data
+            config, score = trained_and_scored(name, mappings, data)
+            assert config.dataset.training_scenes == 800 and score.data == config.dataset.folder
+            exported[score.weights] = score.data
     assert reported == set(exported) and set(shipped_weights()) <= {Path(file).stem for file in exported}
+
+
+def test_own_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """jobs/own_states.txt: it begins with weights that jobs/networks.txt exports; each training goes on from weights
+    that are there, on data that an earlier line makes; means are of weights that are there, and the last one ships."""
+    data: dict[str, DatagenConfig] = {}
+    there = {"runs/obstacles/obstacles.safetensors"}
+    trained: set[str] = set()
+    for name, lines in calls(tmp_path, "own_states.txt").items():
+        mappings = settings(lines, monkeypatch)
+        if list(mappings) == ["datagen"]:
+            made = datagen_config(mappings["datagen"])
+            data[made.dataset.folder] = made
+        elif "hgn.average" in mappings:
+            mean = from_mapping(AverageConfig, mappings["hgn.average"])
+            assert set(mean.weights) <= there and mean.half
+            there.add(mean.out)
+        else:
+            config, score = trained_and_scored(name, mappings, data)
+            assert config.training.weights in there and score.data == "data/obstacles"
+            trained.add(config.dataset.folder)
+            there.add(score.weights)
+    assert trained == set(data) and name == "shipped"
+    assert mean.out == from_mapping(EvaluateConfig, mappings["hgn.evaluate"]).weights
+    assert Path(mean.out).stem in shipped_weights()
+
+
+def test_trial_of_own_states(tmp_path: Path) -> None:
+    """SCENES and SHARE shorten data and trainings."""
+    lines = calls(tmp_path, "own_states.txt", SCENES="2", SHARE="1")
+    used = [argument for line in lines.values() for call in line for argument in call]
+    assert {argument for argument in used if "training_scenes" in argument} == {"dataset.training_scenes=2"}
+    updates = [int(argument.partition("=")[2]) for argument in used if argument.startswith("training.maximum_updates")]
+    assert len(updates) == 5 and max(updates) < 1000
 
 
 def test_trial_of_networks(tmp_path: Path) -> None:
     """SCENES, SHARE and REPORT_SECONDS shorten data, trainings and reports, and change nothing else."""
     (tmp_path / "trial").mkdir()
-    whole = calls(tmp_path)
-    trial = calls(tmp_path / "trial", SCENES="40", SHARE="1", REPORT_SECONDS="60")
+    whole = calls(tmp_path, "networks.txt")
+    trial = calls(tmp_path / "trial", "networks.txt", SCENES="40", SHARE="1", REPORT_SECONDS="60")
     shorter = {
         "scenes=800": "scenes=40",
         "dataset.training_scenes=800": "dataset.training_scenes=40",
