@@ -1,0 +1,228 @@
+"""Every kernel by itself against float64, of the numbers that it is given in a real pass: its outputs and gradients.
+
+A whole network's gradients in TF32 or float16 differ by a hundredth from float64's, for some activations lie so close
+to their kink that rounding turns their sign. What one kernel leaves is within its operands' rounding, at those signs.
+`pytest -s` prints the largest error of each kernel and output.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from kernels.engines import device, engine_of, inference_of, run_forward
+from kernels.launches import Launch, watched_edges, watched_engine
+from kernels.references import ELSEWHERE, REFERENCES
+from kernels.test_network import drawn, float32_state
+from network.states import gns_of, network_of
+from network.test_edges import output_and_gradients
+from triton.runtime.jit import KernelInterface
+
+import hgn.kernels
+from hgn.kernels.backward import TrainingEngine
+from hgn.kernels.engine import Tuning
+from hgn.kernels.gns.op import FusedEdges
+from hgn.kernels.gns.op import Tuning as EdgeTuning
+from hgn.network.features import ParticleState
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.agreement import relative_error
+from hgn.runtime.weights import find_weights, load_weights
+
+NATIVE = device().type == "cuda"
+FLOAT32 = "tf32x3" if NATIVE else "ieee"
+BOUND = {"ieee": 1e-5, "tf32x3": 1e-5, "tf32": 2e-3, "half": 2e-3}
+LOSS_SCALE = {"half": 256.0}
+gpu = pytest.mark.skipif(not NATIVE, reason="needs a CUDA device")
+
+Table = dict[tuple[str, str, str], float]  # the largest error of a kernel's output at a precision
+
+
+@pytest.fixture(scope="module")
+def table() -> Iterator[Table]:
+    """Printed when all is done."""
+    largest: Table = {}
+    yield largest
+    print()
+    for (kernel, output, precision), error in sorted(largest.items()):
+        print(f"{kernel:24} {output:24} {precision:8} {error:.1e}")
+
+
+class Judge:
+    """Compares launches with their references at one precision."""
+
+    def __init__(self, table: Table, precision: str) -> None:
+        self.table, self.precision = table, precision
+        self.kernels: set[str] = set()
+        self.wrong: list[str] = []
+
+    def __call__(self, launch: Launch) -> None:
+        if launch.kernel in ELSEWHERE:
+            return
+        assert launch.kernel in REFERENCES, f"{launch.kernel} has no reference"
+        self.kernels.add(launch.kernel)
+        with torch.enable_grad():
+            pairs = REFERENCES[launch.kernel](launch)
+        for output, (found, expected, *summands) in pairs.items():
+            error = relative_error(found, expected)
+            name = output.split()[0]  # of weights without their number
+            self._note(launch.kernel, name, error)
+            if summands and summands[0] > float(expected.norm()):
+                error = float((found - expected).norm()) / summands[0]
+                self._note(launch.kernel, f"{name} (of summands)", error)
+            if not error < BOUND[self.precision]:
+                self.wrong.append(f"{launch.kernel}: {output} {error:.2e}")
+
+    def _note(self, kernel: str, output: str, error: float) -> None:
+        key = kernel, output, self.precision
+        self.table[key] = max(error, self.table.get(key, 0.0))
+
+
+def kernels_of(*modules: str) -> set[str]:
+    """Those that modules of hgn.kernels launch."""
+    found = [vars(importlib.import_module(f"hgn.kernels.{module}")).values() for module in modules]
+    return {value.__name__ for values in found for value in values if isinstance(value, KernelInterface)}
+
+
+def trained(engine: TrainingEngine, network: HierarchicalGraphNetwork, state: ParticleState, judge: Judge) -> None:
+    """A forward and a backward pass."""
+    origin_S3, weight_N3 = drawn(network, state)
+    with watched_engine(judge, engine):
+        run_forward(engine, network, state, origin_S3)
+        scale = 1 / engine.unscale
+        engine.output_gradient[: len(weight_N3), :3] = (scale * weight_N3).float()
+        engine.backward()
+    assert int(engine.grid.status) == 0
+
+
+def made(network: HierarchicalGraphNetwork, state: ParticleState, precision: str, room: int) -> TrainingEngine:
+    """Tiles are larger in the interpreter, whose time goes by their number."""
+    tuning = Tuning.of(precision)
+    if not NATIVE:
+        tuning = replace(tuning, cell_block=16, few_cells=0, row_block=64, small_block=64, pair_particles=4)
+    capacities, scale = (room,) * network.config.levels, LOSS_SCALE.get(precision, 1.0)
+    return engine_of(network, state, precision, capacities, loss_scale=scale, tuning=tuning)
+
+
+@pytest.fixture(autouse=True)
+def small_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not NATIVE:
+        monkeypatch.setattr("hgn.kernels.backward.CHUNK_ROWS", (64, 128))
+
+
+@pytest.fixture
+def many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every level is one of many rows, and so few programs run that each takes several tiles."""
+    monkeypatch.setattr("hgn.kernels.engine.FEW_ROWS", 0)
+    if not NATIVE:
+        monkeypatch.setattr("hgn.kernels.engine.PROCESSORS", 2)
+        monkeypatch.setattr("hgn.kernels.engine.RESIDENT_PROGRAMS", 2)
+
+
+def crowd(cell_size: float) -> ParticleState:
+    """Scenes of five, one and three particles, the first five on borders, corners and centres of cells."""
+    state = float32_state((5, 1, 3), spread=0.06)
+    half = torch.tensor([[0, 0, 0], [1, 3, 2], [2, 2, 2], [2, 3, 1], [3, 2, 4]], dtype=torch.float64)
+    state.position_N3[:5] = half * cell_size / 2
+    return state
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half", FLOAT32])
+@pytest.mark.usefixtures("many_rows")
+def test_several_scenes(precision: str, table: Table) -> None:
+    """Scenes of odd numbers of particles, one with a single one, one with particles on their cells' borders, and the
+    kernels for many rows: every kernel that an engine has is within its bound."""
+    network = network_of(width=16, levels=2, message_passing_steps=2, cell_size=0.03125)
+    state = crowd(network.config.cell_size)
+    judge = Judge(table, precision)
+    trained(made(network, state, precision, 96), network, state, judge)
+    assert not judge.wrong
+    if precision in ("half", "ieee"):
+        assert judge.kernels == kernels_of("engine", "backward")
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half", FLOAT32])
+def test_one_particle(precision: str, table: Table) -> None:
+    """A single particle, and the kernels for few rows."""
+    network = network_of(width=16, levels=1, message_passing_steps=2)
+    state = float32_state((1,), spread=0.06, seed=8)
+    judge = Judge(table, precision)
+    trained(made(network, state, precision, 16), network, state, judge)
+    assert not judge.wrong
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half"])
+def test_empty_levels(precision: str, table: Table) -> None:
+    """Without particles no level has a cell: nothing is written, and gradients are zero."""
+    network = network_of(width=16, levels=2, message_passing_steps=1)
+    state = float32_state((2,))
+    judge = Judge(table, precision)
+    engine = made(network, state, precision, 32)
+    engine.particle_count.zero_()
+    trained(engine, network, state, judge)
+    assert not judge.wrong and not engine.grid.counts_L.any() and not engine.totals.any()
+
+
+@pytest.mark.parametrize(
+    ("precision", "half_cells", "half_sums"),
+    [("tf32", False, False), ("half", False, False), ("half", True, True)],
+)
+@pytest.mark.usefixtures("many_rows")
+def test_inference(precision: str, half_cells: bool, half_sums: bool, table: Table) -> None:
+    """The kernels where nothing is kept for gradients, and buffers are shared; with cells in float16 too, and so
+    summed."""
+    network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.03125)
+    state = crowd(network.config.cell_size)
+    judge = Judge(table, precision)
+    engine = inference_of(made(network, state, precision, 96), network, half_cells, half_sums)
+    with watched_engine(judge, engine):
+        run_forward(engine, network, state, drawn(network, state)[0])
+    assert not judge.wrong
+
+
+@cache
+def shipped(name: str) -> HierarchicalGraphNetwork:
+    network, _ = load_weights(find_weights(name))
+    assert isinstance(network, HierarchicalGraphNetwork)
+    return network.double()
+
+
+# in the interpreter the one with four iterations a level takes three times as long
+@pytest.mark.parametrize(("precision", "name"), [("tf32", "obstacles_steps_1"), ("half", "obstacles")])
+def test_a_trained_network(precision: str, name: str, table: Table) -> None:
+    """Of width 128, with all its levels."""
+    network = shipped(name)
+    state = float32_state((7,), spread=0.04)
+    judge = Judge(table, precision)
+    trained(made(network, state, precision, 48), network, state, judge)
+    assert not judge.wrong
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half", FLOAT32])
+def test_gns(precision: str, table: Table) -> None:
+    """The kernels of GNS's edges, forward and backward."""
+    if precision == "tf32x3":
+        pytest.skip("GNS has no kernels in float32")
+    network = gns_of(torch.float32, message_passing_steps=2).to(device())
+    state = float32_state((13, 1, 6), spread=0.08)
+    names = ("position_N3", "velocity_NM3", "domain_S3")
+    state = replace(state, **{name: getattr(state, name).float() for name in names})
+    judge = Judge(table, precision)
+    with watched_edges(judge):
+        output_and_gradients(network, FusedEdges(precision, EdgeTuning(64, backward_block=64)), state, 1e-3)
+    assert not judge.wrong and judge.kernels == kernels_of("gns.op")
+
+
+def test_no_kernel_is_left_out() -> None:
+    """Every kernel has a reference here, or has no products and is compared elsewhere."""
+    found = set()
+    for module in pkgutil.walk_packages(hgn.kernels.__path__, "hgn.kernels."):
+        if module.name.endswith(".kernel"):
+            values = vars(importlib.import_module(module.name)).items()
+            own = [(name, value) for name, value in values if isinstance(value, KernelInterface)]
+            found |= {name for name, value in own if value.fn.__module__ == module.name and name[0] != "_"}
+    assert found == REFERENCES.keys() | ELSEWHERE and not REFERENCES.keys() & ELSEWHERE
