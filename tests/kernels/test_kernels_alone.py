@@ -153,8 +153,8 @@ def test_several_scenes(precision: str, table: Table) -> None:
 
 @pytest.mark.parametrize("precision", ["tf32", "half", FLOAT32])
 def test_one_particle(precision: str, table: Table) -> None:
-    """A single particle, and the kernels for few rows. Of sixteen places this is the one where the summands of the
-    pairs' offsets cancel most: nine tenths of them."""
+    """A single particle, and the kernels for few rows. What is left of the gradient of the pairs' offsets is a fifth of
+    its summands here, and by itself misses the bound."""
     network = network_of(width=width_for(precision), levels=1, message_passing_steps=2)
     state = float32_state((1,), spread=0.06, seed=6)
     judge = Judge(table, precision)
