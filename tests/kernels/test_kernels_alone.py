@@ -12,7 +12,6 @@ import importlib
 import pkgutil
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
 
 import pytest
 import torch
@@ -165,7 +164,7 @@ def test_one_particle(precision: str, table: Table) -> None:
 @pytest.mark.parametrize("precision", ["tf32", "half"])
 def test_empty_levels(precision: str, table: Table) -> None:
     """Without particles no level has a cell: nothing is written, and gradients are zero."""
-    network = network_of(width=width_for(precision), levels=2, message_passing_steps=1)
+    network = network_of(width=width_for(precision), levels=2, message_passing_steps=2)
     state = float32_state((2,))
     judge = Judge(table, precision)
     engine = made(network, state, precision, 32)
@@ -183,7 +182,7 @@ def test_empty_levels(precision: str, table: Table) -> None:
 def test_inference(precision: str, half_cells: bool, half_sums: bool, table: Table) -> None:
     """The kernels where nothing is kept for gradients and buffers are shared, in half precision with cells rounded
     between kernels, and so summed."""
-    network = network_of(width=width_for(precision), levels=2, message_passing_steps=1, cell_size=0.03125)
+    network = network_of(width=width_for(precision), levels=2, message_passing_steps=2, cell_size=0.03125)
     state = crowd(network.config.cell_size)
     judge = Judge(table, precision)
     engine = inference_of(made(network, state, precision, ROOM), network, half_cells, half_sums)
@@ -191,23 +190,15 @@ def test_inference(precision: str, half_cells: bool, half_sums: bool, table: Tab
     assert not judge.wrong
 
 
-@cache
-def shipped(name: str) -> HierarchicalGraphNetwork:
-    network, _ = load_weights(find_weights(name))
+@pytest.mark.parametrize("precision", ["tf32", "half"])
+def test_a_trained_network(precision: str, table: Table) -> None:
+    """The shipped one, of width 128, with four iterations on each of four levels."""
+    network, _ = load_weights(find_weights("obstacles"))
     assert isinstance(network, HierarchicalGraphNetwork)
-    return network.double()
-
-
-# In the interpreter the one with four iterations a level takes three times as long.
-@pytest.mark.parametrize(
-    ("precision", "name"), [("tf32", "obstacles" if NATIVE else "obstacles_steps_1"), ("half", "obstacles")]
-)
-def test_a_trained_network(precision: str, name: str, table: Table) -> None:
-    """Of width 128, with all its levels."""
-    network = shipped(name)
+    network.double()
     state = float32_state((300, 131), spread=0.2) if NATIVE else float32_state((7,), spread=0.04)
     judge = Judge(table, precision)
-    judged(judge, made(network, state, precision, ROOM), network, state)
+    judged(judge, made(network, state, precision, ROOM if NATIVE else 32), network, state)
     assert not judge.wrong
 
 
