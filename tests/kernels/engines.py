@@ -25,6 +25,7 @@ def engine_of(
     capacities: tuple[int, ...] = (),
     spare_particles: int = 3,
     loss_scale: float = 1.0,
+    tuning: Tuning | None = None,
 ) -> TrainingEngine:
     """All buffers that the forward pass writes are NaN before, so that what nobody writes shows."""
     config, where = network.config, device()
@@ -45,7 +46,7 @@ def engine_of(
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)
     count = torch.tensor([particles], dtype=torch.int32, device=where)
-    return TrainingEngine(config, packed, values, grid, count, precision, loss_scale)
+    return TrainingEngine(config, packed, values, grid, count, precision, loss_scale, tuning)
 
 
 def inference_of(

@@ -1,0 +1,226 @@
+"""Every kernel by itself against float64, of the numbers that it is given in a real pass: its outputs and gradients.
+
+A whole network's gradients in TF32 or float16 differ by a hundredth from float64's, for some activations lie so close
+to their kink that rounding turns their sign. What one kernel leaves is within its operands' rounding, at those signs.
+Whether the right numbers go from one to the next is seen by the whole network in float32 (test_network).
+`pytest -s` prints the largest error of each kernel and output.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from kernels.engines import device, engine_of, inference_of, run_forward
+from kernels.launches import Launch, watched_edges, watched_engine
+from kernels.references import ELSEWHERE, REFERENCES
+from kernels.test_gns import on_device
+from kernels.test_network import drawn, float32_state
+from network.states import gns_of, network_of, random_state
+from network.test_edges import output_and_gradients
+from triton.runtime.jit import KernelInterface
+
+import hgn.kernels
+from hgn.kernels.backward import TrainingEngine
+from hgn.kernels.engine import Engine, Tuning
+from hgn.kernels.gns.op import FusedEdges
+from hgn.network.features import ParticleState
+from hgn.network.network import HierarchicalGraphNetwork
+from hgn.runtime.agreement import relative_error
+from hgn.runtime.weights import find_weights, load_weights
+
+NATIVE = device().type == "cuda"
+FLOAT32 = "tf32x3" if NATIVE else "ieee"
+BOUND = {"ieee": 1e-5, "tf32x3": 1e-5, "tf32": 2e-3, "half": 2e-3}
+LOSS_SCALE = {"half": 256.0}
+ROOM = 2048 if NATIVE else 64  # for cells on each level
+
+Table = dict[tuple[str, str, str], float]  # the largest error of a kernel's output at a precision
+
+
+@pytest.fixture(scope="module")
+def table() -> Iterator[Table]:
+    """Printed when all is done."""
+    largest: Table = {}
+    yield largest
+    print()
+    for (kernel, output, precision), error in sorted(largest.items()):
+        print(f"{kernel:24} {output:24} {precision:8} {error:.1e}")
+
+
+class Judge:
+    """Compares launches with their references at one precision."""
+
+    def __init__(self, table: Table, precision: str) -> None:
+        self.table, self.precision = table, precision
+        self.kernels: set[str] = set()
+        self.wrong: list[str] = []
+
+    def __call__(self, launch: Launch) -> None:
+        if launch.kernel in ELSEWHERE:
+            return
+        assert launch.kernel in REFERENCES, f"{launch.kernel} has no reference"
+        self.kernels.add(launch.kernel)
+        with torch.enable_grad():
+            pairs = REFERENCES[launch.kernel](launch)
+        for output, (found, expected, *summands) in pairs.items():
+            error = relative_error(found, expected)
+            name = output.split()[0]  # of weights without their number
+            self._note(launch.kernel, name, error)
+            if summands and summands[0] > float(expected.norm()):
+                error = float((found - expected).norm()) / summands[0]
+                self._note(launch.kernel, f"{name} (of summands)", error)
+            if not error < BOUND[self.precision]:
+                self.wrong.append(f"{launch.kernel}: {output} {error:.2e}")
+
+    def _note(self, kernel: str, output: str, error: float) -> None:
+        key = kernel, output, self.precision
+        self.table[key] = max(error, self.table.get(key, 0.0))
+
+
+def kernels_of(*modules: str) -> set[str]:
+    """Those that modules of hgn.kernels launch."""
+    found = [vars(importlib.import_module(f"hgn.kernels.{module}")).values() for module in modules]
+    return {value.__name__ for values in found for value in values if isinstance(value, KernelInterface)}
+
+
+def judged(judge: Judge, engine: Engine, network: HierarchicalGraphNetwork, state: ParticleState) -> None:
+    """A forward pass, and a backward pass where the engine has one. The grids' origins are those of space."""
+    with watched_engine(judge, engine):
+        run_forward(engine, network, state, torch.zeros_like(state.domain_S3))
+        if isinstance(engine, TrainingEngine):
+            _, weight_N3 = drawn(network, state)
+            engine.output_gradient[: len(weight_N3), :3] = (weight_N3 / engine.unscale).float()
+            engine.backward()
+    assert int(engine.grid.status) == 0
+
+
+def made(network: HierarchicalGraphNetwork, state: ParticleState, precision: str, room: int) -> TrainingEngine:
+    """Tiles are larger in the interpreter, whose time goes by their number."""
+    tuning = Tuning.of(precision)
+    if not NATIVE:
+        tuning = replace(tuning, cell_block=16, few_cells=0, row_block=64, small_block=64, pair_particles=4)
+    capacities, scale = (room,) * network.config.levels, LOSS_SCALE.get(precision, 1.0)
+    return engine_of(network, state, precision, capacities, loss_scale=scale, tuning=tuning)
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the weights' products: the interpreter takes as long for rows that are not there."""
+    if not NATIVE:
+        monkeypatch.setattr("hgn.kernels.backward.CHUNK_ROWS", (64, 128))
+
+
+@pytest.fixture
+def many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every level is one of many rows, and so few programs run that each takes several tiles."""
+    monkeypatch.setattr("hgn.kernels.engine.FEW_ROWS", 0)
+    monkeypatch.setattr("hgn.kernels.engine.PROCESSORS", 2)
+    monkeypatch.setattr("hgn.kernels.engine.RESIDENT_PROGRAMS", 2)
+
+
+def width_for(precision: str) -> int:
+    """On a GPU the one that trainings have; compiling for it takes more than a second a kernel."""
+    return 128 if NATIVE and precision in ("tf32", "half") else 16
+
+
+def crowd(cell_size: float) -> ParticleState:
+    """Three scenes of odd numbers of particles, the first five on borders, corners and centres of cells."""
+    state = float32_state((301, 1, 131), spread=0.2) if NATIVE else float32_state((5, 1, 3), spread=0.06)
+    halves = torch.tensor([[0, 0, 0], [1, 3, 2], [2, 2, 2], [2, 3, 1], [3, 2, 4]], dtype=torch.float64)
+    state.position_N3[:5] = halves * cell_size / 2
+    return state
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half", FLOAT32])
+@pytest.mark.usefixtures("many_rows")
+def test_several_scenes(precision: str, table: Table) -> None:
+    """Scenes of odd numbers of particles, one with a single one, one with particles on their cells' borders, and the
+    kernels for many rows: every kernel that an engine has is within its bound."""
+    network = network_of(width=width_for(precision), levels=2, message_passing_steps=2, cell_size=0.03125)
+    state = crowd(network.config.cell_size)
+    judge, engine = Judge(table, precision), made(network, state, precision, ROOM)
+    judged(judge, engine, network, state)
+    assert not judge.wrong and (engine.grid.weight_N8[:5] == 0).any()  # cells on whose borders particles are
+    if precision in ("half", "ieee"):
+        assert judge.kernels == kernels_of("engine", "backward")
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half", FLOAT32])
+def test_one_particle(precision: str, table: Table) -> None:
+    """A single particle, and the kernels for few rows. What is left of the gradient of the pairs' offsets is a fifth of
+    its summands here, and by itself misses the bound."""
+    network = network_of(width=width_for(precision), levels=1, message_passing_steps=2)
+    state = float32_state((1,), spread=0.06, seed=6)
+    judge = Judge(table, precision)
+    judged(judge, made(network, state, precision, 16), network, state)
+    assert not judge.wrong
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half"])
+def test_empty_levels(precision: str, table: Table) -> None:
+    """Without particles no level has a cell: nothing is written, and gradients are zero."""
+    network = network_of(width=width_for(precision), levels=2, message_passing_steps=2)
+    state = float32_state((2,))
+    judge = Judge(table, precision)
+    engine = made(network, state, precision, 32)
+    engine.particle_count.zero_()
+    judged(judge, engine, network, state)
+    assert not judge.wrong and not engine.grid.counts_L.any()
+    assert not engine.totals.any() and not engine.output.any()
+
+
+@pytest.mark.parametrize(
+    ("precision", "half_cells", "half_sums"),
+    [("tf32", False, False), ("half", True, True)],
+)
+@pytest.mark.usefixtures("many_rows")
+def test_inference(precision: str, half_cells: bool, half_sums: bool, table: Table) -> None:
+    """The kernels where nothing is kept for gradients and buffers are shared, in half precision with cells rounded
+    between kernels, and so summed."""
+    network = network_of(width=width_for(precision), levels=2, message_passing_steps=2, cell_size=0.03125)
+    state = crowd(network.config.cell_size)
+    judge = Judge(table, precision)
+    engine = inference_of(made(network, state, precision, ROOM), network, half_cells, half_sums)
+    judged(judge, engine, network, state)
+    assert not judge.wrong
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half"])
+def test_a_trained_network(precision: str, table: Table) -> None:
+    """The shipped one, of width 128, with four iterations on each of four levels."""
+    network, _ = load_weights(find_weights("obstacles"))
+    assert isinstance(network, HierarchicalGraphNetwork)
+    network.double()
+    state = float32_state((300, 131), spread=0.2) if NATIVE else float32_state((7,), spread=0.04)
+    judge = Judge(table, precision)
+    judged(judge, made(network, state, precision, ROOM if NATIVE else 32), network, state)
+    assert not judge.wrong
+
+
+@pytest.mark.parametrize("precision", ["tf32", "half"] if NATIVE else ["tf32", "half", "ieee"])
+def test_gns(precision: str, table: Table) -> None:
+    """The kernels of GNS's edges, forward and backward."""
+    network = gns_of(torch.float32, width=width_for(precision), message_passing_steps=2).to(device())
+    counts = (301, 1, 81) if NATIVE else (13, 1, 6)
+    state = on_device(random_state(counts, dtype=torch.float32, spread=0.1))
+    edges = FusedEdges.in_tf32() if precision == "tf32" else FusedEdges(precision)
+    judge = Judge(table, precision)
+    with watched_edges(judge):
+        output_and_gradients(network, edges, state, 1e-3)
+    assert not judge.wrong and judge.kernels == kernels_of("gns.op")
+
+
+def test_no_kernel_is_left_out() -> None:
+    """Every kernel has a reference here, or has no products and is compared elsewhere."""
+    found = set()
+    for module in pkgutil.walk_packages(hgn.kernels.__path__, "hgn.kernels."):
+        if module.name.endswith(".kernel"):
+            values = vars(importlib.import_module(module.name)).items()
+            own = [(name, value) for name, value in values if isinstance(value, KernelInterface)]
+            found |= {name for name, value in own if value.fn.__module__ == module.name and name[0] != "_"}
+    assert found == REFERENCES.keys() | ELSEWHERE and not REFERENCES.keys() & ELSEWHERE
