@@ -265,6 +265,7 @@ class TrainingEngine(Engine):
                 CHUNK=chunk,
                 STEP=32 if self.precision != "half" else 64,
                 PRECISION=self.precision,
+                PIPELINED=not triton.knobs.runtime.interpret,
                 num_warps=8,
                 maxnreg=self.tuning.weight_registers,
             )

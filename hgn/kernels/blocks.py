@@ -292,6 +292,17 @@ def prefetch(x, row, live, WIDTH: tl.constexpr):
 
 
 @triton.jit
+def settled(total):
+    """A product as it is, in a loop whose next tiles are copied to shared memory meanwhile; no instruction.
+
+    For a product that nothing in the loop reads the compiler waits one round later. Of a tile that is read twice, by
+    the product and by others, it keeps one buffer too few for that (Triton 3.6 and 3.9): the tile after the next would
+    be copied over the one that is being multiplied. The interpreter knows no such thing.
+    """
+    return tl.inline_asm_elementwise("", "=f,0", [total], dtype=tl.float32, is_pure=True, pack=1)
+
+
+@triton.jit
 def added(x, y):
     """x + y in their type, as a reduction: so they are added where they were loaded, after both loads began.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import column_sums
+from hgn.kernels.blocks import column_sums, settled
 from hgn.kernels.keys import settle_keys
 
 JOB_COLUMNS = 8
@@ -29,8 +29,12 @@ def weight_gradient(
     CHUNK: tl.constexpr,
     STEP: tl.constexpr,
     PRECISION: tl.constexpr,
+    PIPELINED: tl.constexpr,
 ):
-    """Program i adds its chunk's part of A^T B [width A, width B] to totals; widths are at most TILE."""
+    """Program i adds its chunk's part of A^T B [width A, width B] to totals; widths are at most TILE.
+
+    PIPELINED: the compiler has tiles copied to shared memory two ahead, as it has not in the interpreter.
+    """
     job = jobs + tl.load(chunk_job + tl.program_id(0)) * 8
     first = tl.load(chunk_first + tl.program_id(0))
     rows = tl.load(counts + tl.load(job + 3)) * tl.load(job + 6)
@@ -58,6 +62,8 @@ def weight_gradient(
             total = tl.dot(tl.trans(a.to(tl.float16)), b.to(tl.float16), total)
         else:
             total = tl.dot(tl.trans(a), b, total, input_precision=PRECISION)
+        if PIPELINED:
+            total = settled(total)
     bias_at = tl.load(job + 7)
     if bias_at >= 0:
         tl.atomic_add(totals + bias_at + column, tl.sum(lines, 0) * unscale, mask=column < a_width, sem="relaxed")

@@ -1,0 +1,30 @@
+"""The weights' products of a training as compiled for an H100, a line each: the kernel, how many of its tiles are copied
+ahead, and how many products may be under way while the next tile is copied."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import triton
+
+from hgn.config import NetworkConfig
+from hgn.kernels.ahead import AheadJob, launches_of, use_target
+from hgn.kernels.update.op import UpdateSettings
+
+
+class NoGpu:
+    """A driver without a GPU."""
+
+
+triton.runtime.driver.set_active(NoGpu())
+use_target(90)
+settings = UpdateSettings(2, 1e-3, True, 1 / 64)
+network = NetworkConfig(levels=2, message_passing_steps=1)
+found: dict[str, Any] = {}
+for function, data in launches_of(AheadJob(network, settings, "half", False, False, 24_000, (9_000, 3_000), 90)).values():
+    if function.__name__ in ("weight_gradient", "pairs_weight_gradient"):
+        text = function.preload(data).asm["ttgir"]
+        ahead = len(re.findall(r"local_alloc : \(\) -> !ttg.memdesc<[2-9]x", text))
+        pending = max(map(int, re.findall(r"warp_group_dot_wait.*pendings = (\d+)", text)))
+        print(function.__name__, ahead, pending)
