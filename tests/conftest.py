@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import sys
@@ -20,10 +21,13 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+import interpreter
 import torch
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # kernels run in Triton's interpreter; said before any of them is defined
+    if importlib.util.find_spec("triton"):
+        interpreter.spare_repeated_work()
 
 sys.path.insert(0, str(Path(__file__).parent / "datagen"))  # spawned workers find the stand-in by name
 
