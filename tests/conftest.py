@@ -38,6 +38,20 @@ from datagen.worker import Backend
 from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 
+LONGEST_FILES = (  # half a minute and more on one core; begun last, one of them would run alone
+    *("jobs/test_jobs", "training/test_ddp", "datagen/mpm/test_solver", "datagen/test_pool", "kernels/test_update"),
+    *("kernels/test_rollout", "network/test_network", "training/test_resume", "training/test_ahead"),
+    *("training/test_live_service", "training/test_train", "datagen/mpm/test_collider", "datagen/test_kills"),
+    *("tools/test_error_vs_time", "tools/test_scaling", "tools/test_stability_solver", "datagen/test_command"),
+    *("datagen/test_service", "kernels/test_own_states", "end_to_end/test_bad_input"),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first."""
+    place = {Path(__file__).parent / f"{name}.py": number for number, name in enumerate(LONGEST_FILES)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
+
 
 @pytest.fixture(autouse=True)
 def keep_signal_handlers() -> Iterator[None]:
