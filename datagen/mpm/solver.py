@@ -124,7 +124,7 @@ def _arrays_freed_here() -> Iterator[None]:
     try:
         yield
     finally:
-        gc.collect(1)  # all that the launch made is younger than generation 2, which takes a third of a second with torch
+        gc.collect(1)  # all that was made here; generation 2 is older, and takes a third of a second with torch
         if automatic:
             gc.enable()
 
