@@ -7,6 +7,9 @@ RUN := $(VENV)/bin/python
 DEMO := runs/demo
 TEST_PROCESSES ?= 2
 
+# the tests start a hundred processes, each of which would compile the package anew
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: setup demo test check format lint types layers clean
 
 setup: $(VENV)/.installed
@@ -35,7 +38,7 @@ demo: setup
 	@echo "picture: $(DEMO)/pictures/rollout.png, moving: $(DEMO)/pictures/rollout.gif"
 
 test: setup
-	$(RUN) -m pytest -n $(TEST_PROCESSES) --dist loadfile
+	$(RUN) -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
 check: setup format lint types layers test
 

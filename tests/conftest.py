@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import sys
@@ -20,10 +21,13 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+import interpreter
 import torch
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # kernels run in Triton's interpreter; said before any of them is defined
+    if importlib.util.find_spec("triton"):
+        interpreter.spare_repeated_work()
 
 sys.path.insert(0, str(Path(__file__).parent / "datagen"))  # spawned workers find the stand-in by name
 
@@ -33,6 +37,20 @@ import ballistic_solver
 from datagen.worker import Backend
 from datagen.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
+
+LONGEST_FILES = (  # half a minute and more on one core; begun last, one of them would run alone
+    *("jobs/test_jobs", "training/test_ddp", "datagen/mpm/test_solver", "datagen/test_pool", "kernels/test_update"),
+    *("kernels/test_rollout", "network/test_network", "training/test_resume", "training/test_ahead"),
+    *("training/test_live_service", "training/test_train", "datagen/mpm/test_collider", "datagen/test_kills"),
+    *("tools/test_error_vs_time", "tools/test_scaling", "tools/test_stability_solver", "datagen/test_command"),
+    *("datagen/test_service", "kernels/test_own_states", "end_to_end/test_bad_input"),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first."""
+    place = {Path(__file__).parent / f"{name}.py": number for number, name in enumerate(LONGEST_FILES)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
 
 
 @pytest.fixture(autouse=True)

@@ -263,13 +263,19 @@ class TrainingEngine(Engine):
                 self.unscale,
                 TILE=max(self.width, grid.features, OUT),
                 CHUNK=chunk,
-                STEP=32 if self.precision != "half" else 64,
+                STEP=self._rows_at_once(),
                 PRECISION=self.precision,
                 PIPELINED=not triton.knobs.runtime.interpret,
                 num_warps=8,
                 maxnreg=self.tuning.weight_registers,
             )
         self._encode_gradients()
+
+    def _rows_at_once(self) -> int:
+        """Of a weight's product; in the interpreter, whose time goes by operations, more."""
+        if triton.knobs.runtime.interpret:
+            return 128
+        return 64 if self.precision == "half" else 32
 
     def _gradient_of(self, block: Block) -> torch.Tensor:
         """Where the gradient of a block's output is collected, and left as that of its input."""

@@ -10,10 +10,9 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hgn.config import SceneConfig, is_mesh_file
 from hgn.scene.distance import contains
@@ -22,8 +21,11 @@ from hgn.scene.material import material_index
 from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import mesh_sha256, shape_obstacle, unit_shape
-from hgn.scene.surface import split_long_edges
+from hgn.scene.surface import point_tree, split_long_edges
 from hgn.schema import ConfigError, require
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 REPORT_SEED = 1_000_000  # the first of scenes that reports draw for themselves: a data set's seeds are hashes
 LAYOUTS = 5  # whole scenes begun afresh before giving up
@@ -115,9 +117,7 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
             record |= {"position": list(position), "quaternion": list(quaternion)}
             if is_mesh_file(shape):
                 record["sha256"] = mesh_sha256(shape)
-            return _Placed(
-                obstacle, point, gap, cKDTree(point, balanced_tree=False), low + centre, high + centre, record
-            )
+            return _Placed(obstacle, point, gap, point_tree(point), low + centre, high + centre, record)
     raise _NoRoomError(
         f"obstacle_count must leave room for each obstacle, got no place for number {index + 1} of "
         f"{config.obstacle_count}; lower obstacle_count, obstacle_size or clearance_cells, or raise domain_size"

@@ -18,7 +18,6 @@ from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
-from hgn.scene.mesh import load_mesh
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
@@ -219,6 +218,9 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:
         assert entry.shape is not None and entry.size is not None and entry.position is not None
         name = f"obstacle_{index}_{entry.shape}"
         return shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name)
+    # trimesh takes a second to load
+    from hgn.scene.mesh import load_mesh
+
     return load_mesh(
         folder / entry.mesh,
         f"obstacles[{index}].mesh",

@@ -5,10 +5,14 @@ Shape legend: V vertices, F triangles, S samples.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hgn.schema import ConfigError
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 CANDIDATES = 1.0  # per spacing^2 and round; a dense Poisson-disk set holds about 0.7
 MINIMUM_ROUNDS, MAXIMUM_ROUNDS = 4, 12
@@ -47,7 +51,7 @@ def sample_surface(
         owner = usable[np.minimum(chosen, len(usable) - 1)]
         point = _uniform_in_triangles(corner[owner], rng)
         if len(points):
-            near = cKDTree(points, balanced_tree=False).query(point, distance_upper_bound=spacing)[0]
+            near = point_tree(points).query(point, distance_upper_bound=spacing)[0]
             free = near >= spacing  # infinite where nothing is nearer
             point, owner = point[free], owner[free]
         kept = _spread_out(point, spacing)
@@ -101,6 +105,13 @@ def _weights(corner: np.ndarray, spacing: float) -> np.ndarray:
     return np.where(sliver, spacing * length, area)
 
 
+def point_tree(point_S3: np.ndarray) -> cKDTree:
+    """A nearest-neighbour tree; SciPy's take half a second to load, and most commands need none."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(point_S3, balanced_tree=False)
+
+
 def _uniform_in_triangles(corner_S33: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     u = np.sqrt(rng.random(len(corner_S33)))[:, None]
     v = rng.random(len(corner_S33))[:, None]
@@ -111,7 +122,7 @@ def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
     """Indices that a loop over the points would keep, each unless it is too near to one kept before."""
     if len(point) == 0:
         return np.zeros(0, np.int64)
-    pair = cKDTree(point, balanced_tree=False).query_pairs(spacing, output_type="ndarray").astype(np.int64)
+    pair = point_tree(point).query_pairs(spacing, output_type="ndarray").astype(np.int64)
     earlier, later = pair.min(axis=1), pair.max(axis=1)
     undecided = np.ones(len(point), bool)
     kept = np.zeros(len(point), bool)

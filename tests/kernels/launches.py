@@ -13,7 +13,7 @@ from typing import Any
 from unittest import mock
 
 import torch
-from kernels.interpreter import interpreting
+from kernels.interpreter import dropped_bits
 from triton.runtime.jit import KernelInterface
 
 from hgn.kernels.engine import Engine
@@ -81,7 +81,7 @@ def watched(
 
         return launch
 
-    with mock.patch.object(KernelInterface, "__getitem__", watching), interpreting():
+    with mock.patch.object(KernelInterface, "__getitem__", watching), dropped_bits():
         yield
 
 

@@ -1,10 +1,9 @@
-"""The weights' products of a training as compiled for an H100, a line each: the kernel, how many of its tiles are copied
-ahead, and how many products may be under way while the next tile is copied."""
+"""The weights' products of a training as compiled for an H100, a line each: the kernel, how many of its tiles are
+copied ahead, and how many products may be under way while the next tile is copied."""
 
 from __future__ import annotations
 
 import re
-from typing import Any
 
 import triton
 
@@ -21,8 +20,7 @@ triton.runtime.driver.set_active(NoGpu())
 use_target(90)
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 network = NetworkConfig(levels=2, message_passing_steps=1)
-found: dict[str, Any] = {}
-for function, data in launches_of(AheadJob(network, settings, "half", False, False, 24_000, (9_000, 3_000), 90)).values():
+for function, data in launches_of(AheadJob(network, settings, "half", False, False, 300, (200, 60), 90)).values():
     if function.__name__ in ("weight_gradient", "pairs_weight_gradient"):
         text = function.preload(data).asm["ttgir"]
         ahead = len(re.findall(r"local_alloc : \(\) -> !ttg.memdesc<[2-9]x", text))

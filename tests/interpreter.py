@@ -1,0 +1,60 @@
+"""Triton's interpreter without what it does again and again, or for nothing; kernels compute the same in it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from types import ModuleType
+from typing import Any
+
+
+def spare_repeated_work() -> None:
+    """For the rest of this process (Triton 3.6 to 3.9). More than half of the kernels' time goes there without it."""
+    from triton import language
+    from triton.runtime import interpreter
+
+    builder = interpreter.interpreter_builder
+    if not builder.options.debug:  # seven operations on each sum of integers, for a condition that only debug looks at
+        builder.options = replace(builder.options, sanitize_overflow=False)
+    interpreter._patch_lang = PatchOnce(interpreter._patch_lang, {language, language.core})
+    find, found = interpreter._get_np_dtype, {}
+
+    def np_dtype(dtype: Any) -> Any:
+        """Of a type of the language; the interpreter makes a table of all of them at each call."""
+        if dtype.name not in found:
+            found[dtype.name] = find(dtype)
+        return found[dtype.name]
+
+    interpreter._get_np_dtype = np_dtype
+
+
+class PatchOnce:
+    """Puts the interpreter's functions into the language once a launch, not at each call of a function in it."""
+
+    def __init__(self, patch: Callable[[Any], Any], languages: set[ModuleType]) -> None:
+        self._patch, self._languages = patch, languages
+        self._patched: set[ModuleType] = set()  # in the launch under way
+        self._seen = functools.cache(self._seen_by)
+
+    def _seen_by(self, function: Any) -> frozenset[ModuleType]:
+        values = function.__globals__.values()
+        return frozenset(value for value in values if isinstance(value, ModuleType) and value in self._languages)
+
+    def __call__(self, function: Any) -> Any:
+        """The scope that ends with the launch; of functions called in it nobody looks at theirs."""
+        seen = self._seen(function)
+        if seen and seen <= self._patched:
+            return None
+        scope = self._patch(function)
+        self._patched |= seen
+        return _Scope(scope, self._patched)
+
+
+class _Scope:
+    def __init__(self, scope: Any, patched: set[ModuleType]) -> None:
+        self._scope, self._patched = scope, patched
+
+    def restore(self) -> None:
+        self._patched.clear()
+        self._scope.restore()
