@@ -43,11 +43,11 @@ from tools.error_vs_time.contenders import (
     solver_row,
 )
 from tools.error_vs_time.earlier import Earlier, is_among
-from tools.error_vs_time.launches import Setting, SolverLaunches
 from tools.error_vs_time.plot import CONVENTION
 from tools.error_vs_time.run import Run, draw
 from tools.error_vs_time.score import pay_back, table
 from tools.error_vs_time.settings import PRECISIONS, ErrorVsTimeConfig
+from tools.solver_launches import Setting, SolverLaunches
 from tools.trial import other_grid
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from hgn.runtime.trial import Trial, network_trials
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError
-from tools.error_vs_time.launches import Setting, SolverLaunches
+from tools.solver_launches import Setting, SolverLaunches
 from tools.trial import FrameClock
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The solver's simulations for the report: all settings of one grid side by side, as a launch lasts as long as its
+"""The solver's simulations for reports: all settings of one grid side by side, as a launch lasts as long as its
 longest scene, whatever runs beside it; each is simulated once, and scenes get their colliders once.
 """
 
