@@ -166,15 +166,14 @@ class Report:
         mse_ST = departure(trials, references, self.frames)
         told = [frame for frame in sorted({*TOLD_FRAMES, self.frames - 1}) if frame < self.frames]
         causes = [trial.cause for trial in trials if trial.cause is not None]
-        curve_T = mean_so_far(mse_ST)
+        curves = {"mean": mean_so_far(mse_ST), "median": median_so_far(mse_ST)}
         self.rows.append(
             {
                 "system": system,
                 "name": name,
-                "mean": {str(frame): number(curve_T[frame]) for frame in told},
-                "median": {str(frame): number(median(mse_ST[:, frame])) for frame in told},
+                **{which: {str(frame): number(curve_T[frame]) for frame in told} for which, curve_T in curves.items()},
                 "scenes": {str(frame): [number(value) for value in mse_ST[:, frame]] for frame in told},
-                "curve": [number(value) for value in curve_T],
+                "curves": {which: [number(value) for value in curve_T] for which, curve_T in curves.items()},
                 "failed_scenes": len(causes),
                 "first_failure": causes[0] if causes else None,
             }
@@ -192,10 +191,10 @@ def departure(trials: Sequence[Trial], references: Sequence[Trial], frames: int)
     return mse_ST
 
 
-def median(value_S: np.ndarray) -> float:
-    """Over the scenes that came so far; NaN where none did."""
-    there_S = value_S[np.isfinite(value_S)]
-    return float(np.median(there_S)) if len(there_S) else np.nan
+def median_so_far(value_ST: np.ndarray) -> np.ndarray:
+    """The median at each frame over the scenes that came so far, float64 [T]; NaN where none did."""
+    there = ((value_S, np.isfinite(value_S)) for value_S in value_ST.T)
+    return np.array([np.median(value_S[there_S]) if there_S.any() else np.nan for value_S, there_S in there])
 
 
 def number(value: float) -> float | None:
@@ -218,17 +217,20 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def draw(rows: Sequence[dict[str, Any]]) -> bytes:
-    """Mean position MSE over the frames; PNG bytes. Full lines: paths and precisions; dotted: floors."""
-    figure, ((panel,),) = new_figure(1, 1, (10.5, 5.6))
-    for row in rows:
-        curve_T = np.array([np.nan if value is None else value for value in row["curve"]])
-        time_T = np.flatnonzero(curve_T > 0)
-        floor = row["system"] == "solver" or "displaced" in row["name"]
-        style = {"linestyle": "--" if row["system"] == "solver" else ":", "linewidth": 1.6} if floor else {}
-        panel.plot(time_T, curve_T[time_T], label=f"{row['system']}, {row['name']}", **style)
-    panel.set(xlabel="frame", ylabel="position MSE (domain lengths²), mean of the scenes", yscale="log")
-    panel.grid(alpha=0.25)
-    panel.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0, fontsize=9, frameon=False)
+    """Mean and median position MSE over the frames; PNG bytes. Full lines are paths, precisions and the error; dotted
+    ones the network's floors, broken ones the solver's.
+    """
+    figure, (panels,) = new_figure(1, 2, (14.5, 5.4), share_y=True)
+    for panel, which in zip(panels, ("mean", "median"), strict=True):
+        for row in rows:
+            curve_T = np.array([np.nan if value is None else value for value in row["curves"][which]])
+            time_T = np.flatnonzero(curve_T > 0)
+            line = "--" if row["system"] == "solver" else ":" if "displaced" in row["name"] else "-"
+            panel.plot(time_T, curve_T[time_T], line, label=f"{row['system']}, {row['name']}")
+        panel.set(xlabel="frame", yscale="log", title=f"{which} of the scenes")
+        panel.grid(alpha=0.25)
+    panels[0].set_ylabel("position MSE (domain lengths²)")
+    panels[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0, fontsize=9, frameon=False)
     return as_png(figure)
 
 
