@@ -10,17 +10,13 @@ import sys
 from dataclasses import replace
 from typing import Any
 
-import triton
+from no_gpu import use_h100
 from triton.compiler import ASTSource
 from triton.runtime.jit import JITFunction
 
 from hgn.config import NetworkConfig
-from hgn.kernels.ahead import AheadJob, launches_of, use_target
+from hgn.kernels.ahead import AheadJob, launches_of
 from hgn.kernels.update.op import UpdateSettings
-
-
-class NoGpu:
-    """A driver without a GPU."""
 
 
 def key_of(function: JITFunction[Any], signature: Any, constants: Any, attributes: Any, options: Any) -> str:
@@ -34,8 +30,7 @@ def not_compiled(
     print(key_of(self, signature, constants, attributes, options))
 
 
-triton.runtime.driver.set_active(NoGpu())
-use_target(90)
+use_h100()
 settings = UpdateSettings(2, 1e-3, True, 1 / 64, True, 0.5)
 network, sizes = NetworkConfig(width=16, levels=2, message_passing_steps=2), (200, 60)
 if "gns" in sys.argv:

@@ -5,19 +5,13 @@ from __future__ import annotations
 
 import re
 
-import triton
+from no_gpu import use_h100
 
 from hgn.config import NetworkConfig
-from hgn.kernels.ahead import AheadJob, launches_of, use_target
+from hgn.kernels.ahead import AheadJob, launches_of
 from hgn.kernels.update.op import UpdateSettings
 
-
-class NoGpu:
-    """A driver without a GPU."""
-
-
-triton.runtime.driver.set_active(NoGpu())
-use_target(90)
+use_h100()
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 network = NetworkConfig(levels=2, message_passing_steps=1)
 for function, data in launches_of(AheadJob(network, settings, "half", False, False, 300, (200, 60), 90)).values():

@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
-import triton
+from no_gpu import use_h100
 
 from hgn.config import NetworkConfig
-from hgn.kernels.ahead import AheadJob, FrameJob, compile_share, launches_of, use_target
+from hgn.kernels.ahead import AheadJob, FrameJob, compile_share, launches_of
 from hgn.kernels.update.op import UpdateSettings
 
-
-class NoGpu:
-    """What of a driver compiling asks for."""
-
-    @staticmethod
-    def launcher_cls(source: Any, metadata: Any) -> None: ...
-
-
-triton.runtime.driver.set_active(NoGpu())
-use_target(90)
+use_h100()
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 network = NetworkConfig(width=16, levels=2, message_passing_steps=2)
 job = AheadJob(network, settings, "half", True, True, 300, (200, 60), 90)
