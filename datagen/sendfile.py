@@ -1,8 +1,8 @@
 """Files over HTTP without their bytes passing through Python: the kernel sends them.
 
 `FileRange` answers a request for a file or one range of it, in any ASGI server. In one that knows the ASGI extension
-`http.response.zerocopysend` it asks for that; `SendfileProtocol` teaches it to Uvicorn. On two cores and eight readers
-this carries half as much again as sending pieces, and holds none of them in memory.
+`http.response.zerocopysend` it asks for that; `SendfileProtocol` teaches it to Uvicorn on asyncio's own loop. On two
+cores and eight readers this carries half as much again as sending pieces, and holds none of them in memory.
 """
 
 from __future__ import annotations

@@ -176,6 +176,7 @@ def make_server(app: ASGIApp, connections: int) -> uvicorn.Server:
         uvicorn.Config(
             app,
             http=SendfileProtocol,
+            loop="asyncio",  # uvloop, which Uvicorn takes where it is installed, cannot send files
             lifespan="off",
             ws="none",
             log_level="warning",

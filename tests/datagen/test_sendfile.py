@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import http.client
 import logging
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from starlette.applications import Starlette
@@ -42,6 +45,29 @@ def port(file: Path) -> Iterator[int]:
     yield listener.getsockname()[1]
     server.should_exit = True
     thread.join()
+
+
+class LoopOfUvloop(asyncio.SelectorEventLoop):
+    """As far as it differs: it cannot send files."""
+
+    sendfile = asyncio.AbstractEventLoop.sendfile
+
+
+@pytest.fixture
+def uvloop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Installed, as with Uvicorn's own extras: Uvicorn takes it where nobody asks for a loop."""
+    monkeypatch.setitem(sys.modules, "uvloop", SimpleNamespace(new_event_loop=LoopOfUvloop))
+    monkeypatch.delitem(sys.modules, "uvicorn.loops.uvloop", raising=False)
+
+
+@pytest.mark.usefixtures("uvloop")
+def test_uvloop_is_left_alone(port: int, file: Path) -> None:
+    """Where it is installed files come all the same."""
+    connection = http.client.HTTPConnection("127.0.0.1", port)
+    connection.request("GET", "/file")
+    with connection.getresponse() as response:
+        assert response.read() == file.read_bytes()
+    connection.close()
 
 
 def test_ranges_on_one_connection(port: int, file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from kernels.engines import device
 
 from hgn.schema import ConfigError, from_mapping
 from tools.bench import contenders, fast
@@ -21,7 +23,7 @@ from tools.compare.__main__ import main
 from tools.compare.children import Children
 from tools.compare.config import CompareConfig
 from tools.compare.report import Report
-from tools.compare.server import Server
+from tools.compare.server import MOST_SAMPLES, Server
 from tools.compare.trees import TAKEN, Tree, find_trees
 from tools.compare.turns import Comparison
 
@@ -72,11 +74,11 @@ def test_this_tree_its_last_commit_and_a_wrong_copy(
 
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    """Of this tree, in this process."""
+    """Of this tree, in this process, where kernels run natively if there is a GPU."""
     for name in ("reference_acceleration", "reference_gradients", "verdict", "FRAMES_AT_ONCE", "UPDATES_AT_ONCE"):
         monkeypatch.setattr(fast, name, getattr(fast, name))  # which the server replaces
     before = torch.get_float32_matmul_precision()
-    yield Server(SMALL | {"precision": "half", "references": str(tmp_path)})
+    yield Server(SMALL | {"precision": "half", "references": str(tmp_path), "device": str(device())})
     torch.set_float32_matmul_precision(before)
 
 
@@ -86,7 +88,7 @@ def test_an_update_is_checked_and_timed(server: Server) -> None:
     server.prepare("update_1")
     found = server.check("update_1")
     assert found["check"] == PASS and found["errors"].keys() == {"loss", "gradient"}
-    assert len(server.sample("update_1")["ms"]) == 1
+    assert 1 <= len(server.sample("update_1")["ms"]) <= MOST_SAMPLES
 
 
 def test_a_profile(server: Server) -> None:
@@ -261,7 +263,11 @@ def test_compilers(
     monkeypatch.setattr(Children, "compile", once_one_failed)
     assert compare("does_not_compile", "compiles_for_ever", seconds=4.0).green()
     told = capsys.readouterr().err
-    assert "1 of them were stopped" in told and "tree_0 failed" in told and "AssertionError: no such kernel" in told
+    assert (
+        re.search("[1-9][0-9]* of them were stopped", told)
+        and "tree_0 failed" in told
+        and "AssertionError: no such kernel" in told
+    )
 
 
 def test_rounds_end_in_time(compare: Callable[..., Report], capsys: pytest.CaptureFixture[str]) -> None:

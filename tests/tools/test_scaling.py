@@ -128,6 +128,7 @@ def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pyt
     assert measure._row(contender, config, torch.device("cpu"))["ms"] is None
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the interpreter, which takes tensors of the CPU, is off here")
 def test_the_fast_path_is_timed_alike(alone: dist.ProcessGroup) -> None:
     """Its updates are those of the plain path on the same scenes: weights agree after them; averages are checked."""
     small = {"network": {"width": 16, "levels": 1, "message_passing_steps": 1}, "particles": 6}

@@ -83,27 +83,33 @@ def test_service_restarted_midway(
     held.touch()
     service.start()
 
+    ended = threading.Event()
+
     def steer() -> None:
         try:
-            wait_until(lambda: updates(run) >= 8)
+            wait_until(lambda: ended.is_set() or updates(run) >= 8)
             service.kill()
             held.unlink()
             seen["published"] = Manifest.load(service.folder).published("train")
             seen["killed at"] = updates(run)
-            wait_until(lambda: updates(run) >= seen["killed at"] + 8)
+            wait_until(lambda: ended.is_set() or updates(run) >= seen["killed at"] + 8)
             service.start()
-            wait_until(lambda: any(record.get("episodes") == SCENES for record in metrics(run)))
+            wait_until(lambda: ended.is_set() or any(record.get("episodes") == SCENES for record in metrics(run)))
         finally:
-            os.kill(os.getpid(), signal.SIGUSR1)
+            if not ended.is_set():  # else it would end this process, which listens no more
+                os.kill(os.getpid(), signal.SIGUSR1)
 
     steering = threading.Thread(target=steer)
     steering.start()
-    code = train.main(
-        train_mapping(
-            config, run, maximum_updates=10**6, minimum_episodes=1, log_every=4, monitor_every=8, monitor_scenes=1
+    try:
+        code = train.main(
+            train_mapping(
+                config, run, maximum_updates=10**6, minimum_episodes=1, log_every=4, monitor_every=8, monitor_scenes=1
+            )
         )
-    )
-    steering.join()
+    finally:
+        ended.set()
+        steering.join()
     log = (tmp_path / "service.log").read_text()
     assert code == 128 + signal.SIGUSR1, log
     lines = [record for record in metrics(run) if "loss" in record]

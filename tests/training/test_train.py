@@ -193,6 +193,12 @@ def test_a_finished_run_stays_finished(data, tmp_path):
     assert all(torch.equal(before[name], tensor) for name, tensor in after["state_dict"].items())
 
 
+def test_a_gpu_that_is_left_alone_is_no_warning(data, tmp_path, monkeypatch):
+    """Training on a CPU where there is a GPU: training.accelerator=cpu has said so."""
+    monkeypatch.setattr("lightning.pytorch.trainer.setup.CUDAAccelerator.is_available", lambda: True)
+    assert train.main(train_mapping(data, tmp_path / "run", maximum_updates=1)) == 0
+
+
 def test_training_learns(make_config, make_dataset, tmp_path):
     """On free fall with strong velocity noise, 240 updates learn to undo a good part of the noise."""
     config = make_config(training_scenes=6, frames=30)

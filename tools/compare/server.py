@@ -154,7 +154,8 @@ class Server:
         from torch.profiler import ProfilerActivity, profile
 
         timed = self.cases[case].timed
-        with profile(activities=[ProfilerActivity.CUDA if self.gpu else ProfilerActivity.CPU]) as found:
+        activity = ProfilerActivity.CUDA if self.gpu else ProfilerActivity.CPU
+        with profile(activities=[activity], acc_events=True) as found:  # without it PyTorch 2.11 warns of more rounds
             timed.run()
             if self.gpu:
                 torch.cuda.synchronize()

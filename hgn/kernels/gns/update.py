@@ -83,6 +83,11 @@ class GnsEngine:
         self.totals = torch.zeros(len(values) + tail, device=values.device)
         self._place_N = torch.arange(tables.particles, device=values.device)
         self._decoded_N3: torch.Tensor | None = None
+        if (
+            values.is_cuda
+        ):  # autograd's thread has no CUDA context before it launches something, and cuBLAS would say so
+            with torch.enable_grad():
+                (values[:1].clone().requires_grad_() * 2).sum().backward()
 
     def forward(self) -> None:
         """The output of every particle, [N, 3] of `output`."""
