@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Any
 
-from datagen.pool import LocalCrew, Pool, Stopped, memory_of_machine, plan_workers, visible_gpus
+from datagen.pool import LocalCrew, Pool, Stopped, plan_workers, visible_gpus
 from datagen.progress import Progress
 from datagen.worker import Backend
 from datagen.writer import DatasetWriter
 from hgn.command import section
 from hgn.config import DatagenConfig
-from hgn.cpus import available_cpus
+from hgn.machine import available_cpus, available_memory
 from hgn.schema import from_mapping, require
 
 # an experiment file serves all commands: what only hgn.train needs is left out
@@ -89,7 +89,7 @@ def generate(
                     with RayCrew(config, backend) as crew:
                         Pool(config, writer, progress, crew.plan, crew, should_stop).run()
                 else:
-                    plan = plan_workers(config, visible_gpus(), available_cpus(), memory_of_machine())
+                    plan = plan_workers(config, visible_gpus(), available_cpus(), available_memory())
                     Pool(config, writer, progress, plan, LocalCrew(config, backend, plan), should_stop).run()
             except Stopped:
                 progress.message(

@@ -99,11 +99,6 @@ def visible_gpus() -> tuple[str, ...]:
     return () if count == 0 or "-1" in devices or "NoDevFiles" in devices else devices
 
 
-def memory_of_machine() -> int:
-    """Bytes of physical memory."""
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-
-
 class Crew(Protocol):
     """Where workers come from."""
 

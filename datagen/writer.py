@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
-import os
 import shutil
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -36,11 +35,12 @@ from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest, QuarantinedScene, ShardEntry
 from hgn.files import TEMPORARY_SUFFIX, sync_folder, temporary_file, temporary_target
+from hgn.machine import available_cpus
 from hgn.schema import ConfigError
 
 # seeds tried for one episode before the scene distribution itself is held to be at fault
 MAXIMUM_REPLACEMENTS = 20
-PACKED_AT_ONCE = max(4, min(12, (os.cpu_count() or 1) - 1))  # shards, where so many are ready; 0.1 GB each
+PACKED_AT_ONCE = max(4, min(12, available_cpus() - 1))  # shards, where so many are ready; 0.1 GB each
 
 
 _Packed = tuple[ExitStack, Path, ShardEntry]

@@ -1,7 +1,7 @@
 """What all commands share: Hydra composes the config, and faults a person can mend end in one line, no traceback.
 
 Exit codes: 0 done, 1 the machine is at fault (a full disk, no permission, a path that is taken), 2 the input is at
-fault, 130 Ctrl-C.
+fault, 130 Ctrl-C, 141 nobody reads any more what it prints (as in `… | head`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import errno
 import itertools
 import os
 import re
+import select
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any, NoReturn
 from hgn.config import config_directory
 from hgn.schema import ConfigError, known_keys, require
 
-EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
 
 _HYDRA_OPTIONS = (
     *("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--resolve", "--package", "-p", "--run", "-r"),
@@ -57,10 +58,24 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
     with its comments. `main` returns an exit code or None for 0. ConfigError, an unknown key and a full disk are
     printed as one line, `error: ...`.
     """
+    try:
+        code = _exit_code(main, config_name)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        if not _unread():
+            raise
+        for stream in (sys.stdout, sys.stderr):  # what is left in them has nowhere to go when Python ends
+            with Path(os.devnull).open("wb") as nowhere:
+                os.dup2(nowhere.fileno(), stream.fileno())
+        code = EXIT_UNREAD
+    sys.exit(code)
+
+
+def _exit_code(main: Callable[[dict[str, Any]], int | None], config_name: str) -> int:
     file = config_directory() / "command" / f"{config_name}.yaml"
     if sys.argv[1:] in (["--help"], ["-h"]) and file.is_file():
         print(_described(), "", file.read_text(encoding="utf-8"), sep="\n", end="")
-        sys.exit(0)
+        return 0
     try:
         code = 0
         for mapping in _compose(config_name):
@@ -77,7 +92,15 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
         code = _fail(f"{error.strerror}{place}; {remedy} and run the same command again to go on", EXIT_MACHINE)
     except KeyboardInterrupt:
         code = _fail("interrupted", EXIT_INTERRUPTED)
-    sys.exit(code)
+    return code
+
+
+def _unread() -> bool:
+    """Whether standard output or error lead into a pipe whose reader has gone."""
+    poll = select.poll()
+    for stream in (sys.stdout, sys.stderr):
+        poll.register(stream.fileno(), 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def section(mapping: Mapping[str, Any], known: Mapping[str, str | None]) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.order import Cursor
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import UnreachableError, is_remote
+from hgn.device import keep_to_quota
 from hgn.files import write_atomically
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
@@ -111,6 +112,7 @@ def _fit(
     path, text = _path(config)
     if first_rank():
         print(text, file=sys.stderr)
+    keep_to_quota()
     set_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
     module = TrainingModule(build_network(config.network), training, data, path)

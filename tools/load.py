@@ -29,6 +29,7 @@ from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.statistics import merge_statistics
 from hgn.data.storage import file_sha256
 from hgn.files import write_json
+from hgn.machine import available_cpus
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
 from hgn.schema import from_mapping, require_positive, to_mapping
@@ -91,7 +92,7 @@ def main(mapping: dict[str, Any]) -> None:
         speed, low, high = (row[key] / 1e9 for key in ("bytes_per_second", "slowest", "fastest"))
         print(f"{row['way']:31} {speed:5.2f} GB/s ({low:.2f} to {high:.2f})  {row['ratio']:.2f} of the plain one")
     if config.json is not None:
-        meta = provenance() | {"cpus": os.cpu_count(), "config": without_folders(to_mapping(config))}
+        meta = provenance() | {"cpus": available_cpus(), "config": without_folders(to_mapping(config))}
         write_json(config.json, {"meta": meta, "rows": rows})
 
 

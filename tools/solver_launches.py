@@ -4,7 +4,6 @@ longest scene, whatever runs beside it; each is simulated once, and scenes get t
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hgn.config import MpmConfig
+from hgn.machine import available_cpus
 from hgn.runtime.trial import Trial
 from hgn.scene.episode import Episode
 from hgn.scene.scene import Scene
@@ -89,7 +89,7 @@ class SolverLaunches:
         from datagen.mpm.collider import build_collider
 
         missing = {episode.key: episode for episode in episodes if episode.key not in self._colliders}
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
+        with ThreadPoolExecutor(available_cpus()) as threads:
             built = threads.map(
                 lambda e: build_collider(solver_scene(e, self.cell_size), self.config.collider_band_cells),
                 missing.values(),

@@ -9,7 +9,6 @@ whose scenes fail, or end with a position that is not finite, gets no time.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import subprocess
 import time
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from datagen.mpm.collider import Collider, build_collider
 from hgn.command import run_command
 from hgn.config import MpmConfig, SceneConfig
 from hgn.files import write_json
+from hgn.machine import available_cpus
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
@@ -136,7 +136,7 @@ def _beside_taichi_elements(config: SolverTimesConfig, kind: str) -> list[dict[s
     theirs: dict[str, Any] = {"case": "Taichi Elements, four cubes", "scenes": 1, "particles": scene.particle_count}
     try:
         _, seconds = run_theirs(
-            scene, config.taichi_elements, config.scene_frames, 0 if kind == "gpu" else os.cpu_count() or 1
+            scene, config.taichi_elements, config.scene_frames, 0 if kind == "gpu" else available_cpus()
         )
         theirs |= {"substeps": taichi_elements_substeps(), "ms": 1e3 * seconds}
     except subprocess.CalledProcessError as error:  # it has said why

@@ -7,6 +7,7 @@ import io
 import os
 from dataclasses import dataclass
 
+from hgn.machine import available_cpus
 from hgn.schema import ConfigError, require, require_one_of
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # stdout belongs to the command
@@ -55,7 +56,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     has_gpu = device != "cpu" and ti.lang.misc.is_arch_supported(ti.cuda)
     if device == "gpu" and not has_gpu:
         raise ConfigError("device must be cpu or auto where CUDA finds no device, got 'gpu'")
-    threads = cpu_threads or len(os.sched_getaffinity(0))
+    threads = cpu_threads or available_cpus()
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
             arch=ti.cuda if has_gpu else ti.cpu,

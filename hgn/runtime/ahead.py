@@ -21,8 +21,8 @@ from typing import Self
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.cpus import available_cpus
 from hgn.kernels.ahead import AheadJob, FrameJob, job_text
+from hgn.machine import available_cpus
 from hgn.parent import die_with_parent
 from hgn.runtime.path import why_not_fast
 

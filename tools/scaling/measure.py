@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import datetime
 import json
-import os
 import time
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,6 +24,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
+from hgn.machine import available_cpus
 from hgn.network.network import HierarchicalGraphNetwork
 from hgn.runtime.agreement import relative_error
 from hgn.runtime.path import kernel_precision, why_not_fast
@@ -190,7 +190,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
     if device.type == "cuda":
         torch.cuda.set_device(device)
     else:
-        torch.set_num_threads(max(1, (os.cpu_count() or 1) // count))
+        torch.set_num_threads(max(1, available_cpus() // count))
     torch.set_float32_matmul_precision(_plain_precision(config, device))
     # all processes talk through this group when nothing is timed; it leaves the devices alone
     dist.init_process_group(

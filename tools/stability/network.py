@@ -22,8 +22,8 @@ import torch
 from PIL import Image
 
 from hgn.command import run_command
-from hgn.cpus import available_cpus
 from hgn.files import write_json
+from hgn.machine import available_cpus
 from hgn.picture import compare_picture, spread, stacked, write_picture
 from hgn.progress import bar
 from hgn.provenance import provenance, without_folders

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
-import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Any
@@ -22,6 +21,7 @@ from datagen.mpm.collider import build_collider
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from datagen.mpm.sweep import near_pairs
 from hgn.config import MpmConfig
+from hgn.machine import available_cpus
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.material import MATERIALS
 from hgn.scene.rotation import euler_rotation
@@ -62,7 +62,7 @@ def leaks(base: MpmConfig, seconds: float, block_cells: float, offsets: int = le
     frames = 1 + max(1, round(seconds * FRAME_RATE_HZ))
     # Taichi's process cannot be forked; a few scenes are done sooner here
     many = len(keys) * offsets * frames >= PROCESSES_FROM_FRAMES
-    workers = max(1, len(os.sched_getaffinity(0)) - 1) if hasattr(os, "sched_getaffinity") else 1
+    workers = max(1, available_cpus() - 1)
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) if many else ThreadPoolExecutor() as pool:
         scenes = [scene(*key, offset, block_cells) for key in keys for offset in OFFSETS[:offsets]]
         colliders = list(pool.map(build_collider, scenes, [base.collider_band_cells] * len(scenes)))

@@ -1,0 +1,64 @@
+"""What of the machine this process may use: cores and memory, a container's limits among them.
+
+Containers are limited by control groups (Linux, cgroups(7)): a process sees all cores and all memory of the machine,
+is held back when it uses more cores than its quota, and killed when it uses more memory than its limit.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path("/")  # of the file system
+
+
+def available_cpus() -> int:
+    """The cores that this process may keep busy: those that it may run on, at most its groups' quota, rounded up."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quotas = [quota for group in _groups("cpu") if (quota := _quota(group)) is not None]
+    return max(1, min([cores, *(math.ceil(quota) for quota in quotas)]))
+
+
+def available_memory() -> int:
+    """Bytes of memory that this process may use: the machine's, or the least of its groups' limits."""
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    told = [_read(group / name) for group in _groups("memory") for name in ("memory.max", "memory.limit_in_bytes")]
+    return min([machine, *(int(limit) for limit in told if limit not in (None, "max"))])
+
+
+def _groups(controller: str) -> Iterator[Path]:
+    """Folders of the control groups that this process is in: its own, and those around it up to the outermost that can
+    be seen.
+    """
+    folder = ROOT / "sys" / "fs" / "cgroup"
+    for line in (_read(ROOT / "proc" / "self" / "cgroup") or "").splitlines():
+        _, controllers, own = line.split(":", 2)
+        if not controllers:  # version 2, where all controllers share one tree
+            mount = folder
+        elif controller in controllers.split(","):
+            mount = folder / controllers if (folder / controllers).is_dir() else folder / controller
+        else:
+            continue
+        yield mount
+        group = mount
+        for part in Path(own.lstrip("/")).parts:
+            group = group / part
+            if part == ".." or not group.is_dir():  # a container may see its own group alone, as the outermost
+                break
+            yield group
+
+
+def _quota(group: Path) -> float | None:
+    """Cores' time that a group may use; none without a limit of its own."""
+    told = _read(group / "cpu.max")
+    if told is None:
+        told = f"{_read(group / 'cpu.cfs_quota_us') or 'max'} {_read(group / 'cpu.cfs_period_us') or 0}"
+    quota, _, period = told.partition(" ")
+    return None if quota == "max" or int(quota) <= 0 else int(quota) / int(period)
+
+
+def _read(file: Path) -> str | None:
+    """Its text; none where a system, or a group, has no such file."""
+    return file.read_text(encoding="ascii").strip() if file.is_file() else None
