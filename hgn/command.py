@@ -154,7 +154,7 @@ def _compose(config_name: str) -> list[dict[str, Any]]:
                     run()
                 break
             except HydraException as error:
-                if not _appended(sys.argv, str(error)):
+                if not _appended(sys.argv, str(error)) and not _quoted(sys.argv):
                     raise
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=True) for config in composed]
     except MissingMandatoryValue as error:
@@ -196,6 +196,40 @@ def _appended(arguments: list[str], message: str) -> bool:
             arguments[place] = f"+{argument}"
             return True
     return False
+
+
+def _quoted(arguments: list[str]) -> bool:
+    """Puts quotes around values that Hydra's grammar refuses as they are: names with ü, &, # or (1) in them, say, and
+    ~/, which is the home folder. False where that is no help."""
+    changed = False
+    for place, argument in enumerate(arguments):
+        key, _, value = argument.partition("=")
+        if place and value and not argument.startswith("-") and not _understood(value):
+            quoted = _in_quotes(value)
+            changed |= quoted != value
+            arguments[place] = f"{key}={quoted}"
+    return changed
+
+
+def _in_quotes(value: str) -> str:
+    """A value that is not understood, or such values of a flat list, in quotes; unchanged where they are no help."""
+    if value[0] == "[" and value[-1] == "]" and not re.search("[\"'{}[\\]]", value[1:-1]):
+        items = [item.strip() for item in value[1:-1].split(",")]
+        return f"[{','.join(_in_quotes(item) if item and not _understood(item) else item for item in items)}]"
+    meant = str(Path(value).expanduser()) if value.startswith("~/") else value
+    quoted = "'" + re.sub(r"(\\*)('|$)", lambda end: end[1] * 2 + end[2].replace("'", "\\'"), meant) + "'"
+    return quoted if value[0] not in "\"'[{" and _understood(quoted) == [meant] else value
+
+
+def _understood(value: str) -> list[Any]:
+    """What Hydra takes a value for, alone in a list; an empty one for what its grammar refuses."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        return [OverridesParser.create().parse_override(f"key={value}").value()]
+    except HydraException:
+        return []
 
 
 def _require_options(arguments: list[str]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from hgn.command import EXIT_UNREAD, _compose, run_command
+from hgn.schema import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -27,6 +28,39 @@ def test_composed_once(command: str, arguments: list[str], monkeypatch: pytest.M
     once = _compose(command)
     monkeypatch.setattr("sys.argv", [command, *arguments, "hydra.job.name=x"])
     assert _compose(command) == once and len(once) == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("../my data/dé mo", "../my data/dé mo"),
+        ("weights (1).safetensors", "weights (1).safetensors"),
+        ("a&b#1!;x=y", "a&b#1!;x=y"),
+        ("it's", "it's"),
+        ("data(1)", "data(1)"),  # to Hydra a function
+        ("ends in \\", "ends in \\"),
+        ("ü\\", "ü\\"),
+        ("ü\\'", "ü\\'"),
+        ("~/runs/ü", f"{Path.home()}/runs/ü"),
+        ("plain", "plain"),
+        ("'ü'", "ü"),
+    ],
+)
+def test_names_that_hydra_refuses(given: str, meant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files and folders are called what people call them; what stands beside them is taken as ever."""
+    monkeypatch.setattr("sys.argv", ["drift", f"data={given}", "out=x", "weights=null", "displacements=[1e-6]"])
+    (composed,) = _compose("drift")
+    assert composed["data"] == meant and composed["weights"] is None and composed["displacements"] == [1e-6]
+
+
+def test_names_in_lists(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each by itself; what is no name is refused as ever."""
+    monkeypatch.setattr("sys.argv", ["compare", "trees=[a, dé mo (1),3]", "out=ü", "+new=[x&y]"])
+    (composed,) = _compose("compare")
+    assert (composed["trees"], composed["out"], composed["new"]) == (["a", "dé mo (1)", 3], "ü", ["x&y"])
+    monkeypatch.setattr("sys.argv", ["compare", "trees=[a,{ü]", "out=x"])
+    with pytest.raises(ConfigError, match="trees="):
+        _compose("compare")
 
 
 @pytest.mark.parametrize(

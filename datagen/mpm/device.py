@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 
 from hgn.machine import available_cpus
 from hgn.schema import ConfigError, require, require_one_of
 
+# Taichi aborts the process where HOME is not set, as in a system's service; a user without a name has none
+os.environ.setdefault("HOME", os.path.expanduser("~").replace("~", "/nonexistent"))  # noqa: PTH111
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # stdout belongs to the command
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # a simulation makes no network calls
 
@@ -62,6 +66,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             arch=ti.cuda if has_gpu else ti.cpu,
             cpu_max_num_threads=threads,
             offline_cache=True,
+            offline_cache_file_path=str(_kernel_folder()),
             default_fp=ti.f32,
             default_ip=ti.i32,
             fast_math=False,  # it reorders sums by what stands beside them, and drops tests for NaN
@@ -70,6 +75,21 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
         )
     _started = Device("gpu", 1) if has_gpu else Device("cpu", threads)
     return _started
+
+
+def _kernel_folder() -> Path:
+    """Where compiled kernels are kept: Taichi's own folder, or one of this user's among temporary files where that
+    cannot be written to, as in a container. There Taichi would crash as the process ends.
+    """
+    usual = Path(ti.lang.impl.default_cfg().offline_cache_file_path)
+    with contextlib.suppress(OSError):
+        usual.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=usual):
+            return usual
+    own = Path(tempfile.gettempdir()) / f"taichi-{os.getuid()}"
+    own.mkdir(mode=0o700, exist_ok=True)
+    trusted = not own.is_symlink() and own.stat().st_uid == os.getuid()
+    return own if trusted else Path(tempfile.mkdtemp(prefix="taichi-"))
 
 
 @dataclass(frozen=True)

@@ -103,11 +103,19 @@ def dataset_token() -> str | None:
 
 
 def cache_folder() -> Path:
-    """Where shards of URLs are kept."""
+    """Where shards of URLs are kept.
+
+    Raises: ConfigError where nothing is named and there is no home folder.
+    """
     named = os.environ.get(CACHE_VARIABLE)
     if named:
         return Path(named) / "shards"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hgn" / "shards"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hgn" / "shards"
+    except RuntimeError:
+        raise ConfigError(
+            f"{CACHE_VARIABLE} must name a folder for a server's shards where there is no home folder, got none"
+        ) from None
 
 
 def file_sha256(path: Path) -> str:

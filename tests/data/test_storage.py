@@ -369,3 +369,16 @@ def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv(CACHE_VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder() == tmp_path / "hgn" / "shards"
+
+
+def test_no_folder_for_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user without a home, as in some containers, is told what to name."""
+    for name in (CACHE_VARIABLE, "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    with pytest.raises(ConfigError, match=f"{CACHE_VARIABLE} must name a folder"):
+        cache_folder()

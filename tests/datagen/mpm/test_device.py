@@ -1,0 +1,55 @@
+"""datagen.mpm.device: Taichi starts, works and ends in any environment."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAM = """
+from datagen.mpm.device import initialise, ti
+print(initialise("cpu", 1))
+numbers = ti.field(ti.f32, 10)
+
+@ti.kernel
+def count():
+    for i in numbers:
+        numbers[i] = i
+
+count()
+assert numbers[7] == 7
+"""
+
+
+def ends(changes: dict[str, str | None], folder: Path) -> None:
+    file = folder / "program.py"
+    file.write_text(PROGRAM)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])} | changes
+    kept = {name: value for name, value in environment.items() if value is not None}
+    ended = subprocess.run([sys.executable, str(file)], env=kept, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, "Device(kind='cpu', threads=1)\n"), ended.stderr
+
+
+def test_without_a_home(tmp_path: Path) -> None:
+    """Where HOME is not set, as in a system's service, Taichi would abort the process."""
+    ends({"HOME": None}, tmp_path)
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_a_home_that_cannot_be_written_to(tmp_path: Path, taken: bool) -> None:
+    """As of a container's user: compiled kernels are kept among temporary files, where nobody else writes, and
+    the process ends well; Taichi would crash then. A link that somebody else has put there is left alone."""
+    (tmp_path / "file").touch()
+    temporary, elsewhere = tmp_path / "temporary", tmp_path / "elsewhere"
+    temporary.mkdir()
+    elsewhere.mkdir()
+    own = temporary / f"taichi-{os.getuid()}"
+    if taken:
+        own.symlink_to(elsewhere)
+    ends({"HOME": str(tmp_path / "file" / "home"), "TMPDIR": str(temporary)}, tmp_path)
+    (used,) = [path for path in temporary.glob("taichi-*") if not path.is_symlink()]
+    assert used.stat().st_mode & 0o777 == 0o700 and list(used.iterdir()) and not list(elsewhere.iterdir())
+    assert (used == own) == (not taken)
