@@ -58,6 +58,9 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
     with its comments. `main` returns an exit code or None for 0. ConfigError, an unknown key and a full disk are
     printed as one line, `error: ...`.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # the process was started without
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - as long as the process
     try:
         code = _exit_code(main, config_name)
         sys.stdout.flush()

@@ -81,6 +81,14 @@ def test_a_reader_that_leaves(arguments: list[str]) -> None:
     assert ended.returncode == EXIT_UNREAD and not ended.stderr
 
 
+def test_nothing_is_open() -> None:
+    """A command that is started without standard output and error does its work."""
+    program = "import sys; from hgn.command import run_command; from hgn.progress import bar"
+    program += "; sys.argv[1:] = []; run_command(lambda mapping: bar('x', total=1, unit='y').close(), 'bench')"
+    command = ["bash", "-c", 'exec "$0" -c "$1" >&- 2>&-', sys.executable, program]
+    assert subprocess.run(command, check=False).returncode == 0
+
+
 def test_other_broken_pipes_are_faults(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a process or a server that the command talks to: nothing is hidden."""
 
