@@ -1,4 +1,4 @@
-"""What of the machine this process may use: cores and memory, a container's limits among them.
+"""What of the machine this process may use: cores and memory, a container's limits among them, and folders.
 
 Containers are limited by control groups (Linux, cgroups(7)): a process sees all cores and all memory of the machine,
 is held back when it uses more cores than its quota, and killed when it uses more memory than its limit.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +27,19 @@ def available_memory() -> int:
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     told = [_read(group / name) for group in _groups("memory") for name in ("memory.max", "memory.limit_in_bytes")]
     return min([machine, *(int(limit) for limit in told if limit not in (None, "max"))])
+
+
+def writable_folder(usual: Path, name: str) -> Path:
+    """A cache's usual folder, or where that cannot be written to, as in a container, one of this user's own among
+    temporary files, NAME-UID, which nobody else can have put there.
+    """
+    there = next((folder for folder in (usual, *usual.parents) if os.path.lexists(folder)), usual)
+    if usual.is_absolute() and there.is_dir() and os.access(there, os.W_OK | os.X_OK):
+        return usual
+    own = Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"
+    own.mkdir(mode=0o700, exist_ok=True)
+    trusted = not own.is_symlink() and own.stat().st_uid == os.getuid()
+    return own if trusted else Path(tempfile.mkdtemp(prefix=f"{name}-"))
 
 
 def _groups(controller: str) -> Iterator[Path]:

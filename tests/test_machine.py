@@ -1,15 +1,18 @@
-"""hgn.machine: the cores and the memory that a process may use, by the files that Linux tells them with."""
+"""hgn.machine: the cores and the memory that a process may use, by the files that Linux tells of them, and folders."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 import torch
 
 from hgn import device, machine
-from hgn.machine import available_cpus, available_memory
+from hgn.machine import available_cpus, available_memory, writable_folder
 
 GIB = 2**30
 
@@ -98,3 +101,38 @@ def test_threads_keep_to_a_quota(monkeypatch: pytest.MonkeyPatch) -> None:
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
+
+
+def test_folders_that_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The usual one, there or not yet, and nothing is made. Else this user's own, the same one each time, which nobody
+    else reads; and not a link that stands in its place."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    (tmp_path / "file").touch()
+    for usual in (tmp_path, tmp_path / "a" / "b"):
+        assert writable_folder(usual, "x") == usual
+    assert not (tmp_path / "a").exists()
+    own = tmp_path / "temporary" / f"x-{os.getuid()}"
+    for usual in (tmp_path / "file", tmp_path / "file" / "a", Path("~") / "a"):
+        assert writable_folder(usual, "x") == own and own.stat().st_mode & 0o777 == 0o700
+    own.rmdir()
+    own.symlink_to(tmp_path)
+    other = writable_folder(tmp_path / "file", "x")
+    assert other.parent == own.parent and other != own and other.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("named", [None, "TRITON_HOME", "TRITON_CACHE_DIR"])
+def test_where_triton_keeps_what_it_compiles(tmp_path: Path, named: str | None) -> None:
+    """A home that cannot be written to is in nobody's way, unless somebody named a folder; how sums and products are
+    rounded is said, which Triton's next version would do otherwise."""
+    (tmp_path / "file").touch()
+    program = (
+        "import os, hgn.kernels; print(os.environ.get('TRITON_CACHE_DIR'), os.environ['TRITON_DEFAULT_FP_FUSION'])"
+    )
+    names = {"TRITON_HOME", "TRITON_CACHE_DIR", "TRITON_DEFAULT_FP_FUSION"}
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    environment |= {"HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
+    environment |= {"PYTHONPATH": str(Path(__file__).parents[1])} | ({named: "/mine"} if named else {})
+    ended = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    folder = {None: str(tmp_path / f"triton-{os.getuid()}"), "TRITON_HOME": "None", "TRITON_CACHE_DIR": "/mine"}[named]
+    assert ended.stdout == f"{folder} 1\n"

@@ -5,11 +5,10 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from hgn.machine import available_cpus
+from hgn.machine import available_cpus, writable_folder
 from hgn.schema import ConfigError, require, require_one_of
 
 # Taichi aborts the process where HOME is not set, as in a system's service; a user without a name has none
@@ -61,12 +60,14 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     if device == "gpu" and not has_gpu:
         raise ConfigError("device must be cpu or auto where CUDA finds no device, got 'gpu'")
     threads = cpu_threads or available_cpus()
+    # where it cannot write to its cache Taichi crashes as the process ends
+    kernels = writable_folder(Path(ti.lang.impl.default_cfg().offline_cache_file_path), "taichi")
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
             arch=ti.cuda if has_gpu else ti.cpu,
             cpu_max_num_threads=threads,
             offline_cache=True,
-            offline_cache_file_path=str(_kernel_folder()),
+            offline_cache_file_path=str(kernels),
             default_fp=ti.f32,
             default_ip=ti.i32,
             fast_math=False,  # it reorders sums by what stands beside them, and drops tests for NaN
@@ -75,21 +76,6 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
         )
     _started = Device("gpu", 1) if has_gpu else Device("cpu", threads)
     return _started
-
-
-def _kernel_folder() -> Path:
-    """Where compiled kernels are kept: Taichi's own folder, or one of this user's among temporary files where that
-    cannot be written to, as in a container. There Taichi would crash as the process ends.
-    """
-    usual = Path(ti.lang.impl.default_cfg().offline_cache_file_path)
-    with contextlib.suppress(OSError):
-        usual.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=usual):
-            return usual
-    own = Path(tempfile.gettempdir()) / f"taichi-{os.getuid()}"
-    own.mkdir(mode=0o700, exist_ok=True)
-    trusted = not own.is_symlink() and own.stat().st_uid == os.getuid()
-    return own if trusted else Path(tempfile.mkdtemp(prefix="taichi-"))
 
 
 @dataclass(frozen=True)
