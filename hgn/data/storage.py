@@ -102,6 +102,19 @@ def dataset_token() -> str | None:
     return token
 
 
+def _make_folder(folder: Path) -> None:
+    """Raises: ConfigError, which says what to name, where it may not be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR):
+            raise
+        raise ConfigError(
+            f"{CACHE_VARIABLE} must name a folder for a server's shards that can be written to, got {folder} "
+            f"({error.strerror})"
+        ) from None
+
+
 def cache_folder() -> Path:
     """Where shards of URLs are kept.
 
@@ -245,7 +258,7 @@ class _Remote:
 
     def _fetch(self, name: str, sha256: str, size: int, path: Path, patience_s: float) -> None:
         self._require_not_away(name, patience_s)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_folder(path.parent)
         with _owned(path, f"{self._url}/{name}", patience_s) as file:
             if file is None:
                 return

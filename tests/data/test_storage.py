@@ -371,6 +371,14 @@ def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert cache_folder() == tmp_path / "hgn" / "shards"
 
 
+def test_a_cache_that_cannot_be(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is said what to name, as in a container whose user has no home of its own."""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
+    with pytest.raises(ConfigError, match=rf"{CACHE_VARIABLE} must name a folder .* got .*shards \(Not a directory\)"):
+        EpisodeStore(in_memory(folder, "uncached"), "train").episodes[0]
+
+
 def test_no_folder_for_shards(monkeypatch: pytest.MonkeyPatch) -> None:
     """A user without a home, as in some containers, is told what to name."""
     for name in (CACHE_VARIABLE, "XDG_CACHE_HOME"):
