@@ -74,5 +74,8 @@ def _quota(group: Path) -> float | None:
 
 
 def _read(file: Path) -> str | None:
-    """Its text; none where a system, or a group, has no such file."""
-    return file.read_text(encoding="ascii").strip() if file.is_file() else None
+    """Its text; none where a system, or a group, has no such file, or does not show it: then nothing is known to limit."""
+    try:
+        return file.read_text(encoding="ascii").strip()
+    except OSError:
+        return None

@@ -40,6 +40,9 @@ def test_where_nothing_limits(root: Path) -> None:
     assert (available_cpus(), available_memory()) == (16, 64 * GIB)
     write(root, {"sys/fs/cgroup/cpu.max": "max 100000", "sys/fs/cgroup/memory.max": "max"})
     assert (available_cpus(), available_memory()) == (16, 64 * GIB)
+    (root / "sys/fs/cgroup/memory.max").unlink()
+    (root / "sys/fs/cgroup/memory.max").mkdir()  # cannot be read
+    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
 
 
 @pytest.mark.parametrize(("quota", "cpus"), [("150000", 2), ("200000", 2), ("10000", 1), ("9900000", 16)])
