@@ -74,7 +74,7 @@ def _quota(group: Path) -> float | None:
 
 
 def _read(file: Path) -> str | None:
-    """Its text; none where a system, or a group, has no such file or does not show it: nothing is known to limit then."""
+    """Its text; none where a system, or a group, has no such file or does not show it: nothing known limits then."""
     try:
         return file.read_text(encoding="ascii").strip()
     except OSError:
