@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import replace
 
 import torch
@@ -12,6 +11,7 @@ from hgn.network.edges import Edges, PlainEdges
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.runtime.agreement import GRADIENT_BOUND, OUTPUT_BOUND, relative_error
+from hgn.runtime.triton_host import why_no_triton
 from hgn.schema import ConfigError
 
 CHECKED_PARTICLES = 10_000  # of the first scene; autograd needs memory
@@ -28,7 +28,7 @@ def edges_for(device: torch.device, width: int, precision: str) -> Edges | None:
 
     On a CPU such blocks are twice as fast, for they stay in its caches.
     """
-    if precision == "half" and device.type == "cuda" and importlib.util.find_spec("triton") is not None:
+    if precision == "half" and device.type == "cuda" and why_no_triton() is None:
         # Triton, which nothing else here needs, is loaded here.
         from hgn.kernels.gns.op import FusedEdges, fits
 

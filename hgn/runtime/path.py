@@ -5,11 +5,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import torch
 
 from hgn.config import NetworkConfig
+from hgn.runtime.triton_host import why_no_triton
 from hgn.schema import ConfigError
 
 # what the configuration calls them, and what the kernels do; float32 in three TF32 products
@@ -59,9 +58,7 @@ def why_not_trained_fast(
 def _why_no_kernels(device: torch.device) -> str | None:
     if device.type != "cuda":
         return f"it needs a CUDA device, not {device.type}"
-    if importlib.util.find_spec("triton") is None:
-        return "it needs the package triton"
-    return None
+    return why_no_triton()
 
 
 def _why_not_wide_so(config: NetworkConfig) -> str | None:

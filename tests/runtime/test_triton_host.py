@@ -1,0 +1,57 @@
+"""hgn.runtime.triton_host: what is missing is named, and the fast path does not begin without it."""
+
+from __future__ import annotations
+
+import shutil
+import sysconfig
+from pathlib import Path
+
+import pytest
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.runtime.path import path_on
+from hgn.runtime.triton_host import why_no_triton
+from hgn.schema import ConfigError
+
+
+@pytest.fixture
+def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine with a GPU, nothing compiled yet, a compiler and no headers."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(sysconfig, "get_paths", lambda scheme: {"include": str(tmp_path / "include")})
+    monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/clang" if name == "clang" else None)
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path / "cache"))
+    for name in ("CC", "CPATH", "C_INCLUDE_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path
+
+
+def test_what_is_missing(host: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Headers, then a compiler; nothing with both, or CC, or where they were used before."""
+    assert f"headers: {host}/include/Python.h, on Debian" in str(why_no_triton())
+    (host / "more").mkdir()
+    (host / "more" / "Python.h").touch()
+    with monkeypatch.context() as patch:
+        patch.setenv("CPATH", f"/nowhere:{host}/more")
+        assert why_no_triton() is None
+    (host / "include").mkdir()
+    (host / "include" / "Python.h").touch()
+    assert why_no_triton() is None
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert why_no_triton() == "Triton needs a C compiler: gcc, clang or CC=…"
+    monkeypatch.setenv("CC", "/opt/cc")
+    assert why_no_triton() is None
+    monkeypatch.delenv("CC")
+    (host / "cache" / "ABC").mkdir(parents=True)
+    (host / "cache" / "ABC" / "cuda_utils.so").touch()
+    assert why_no_triton() is None
+
+
+def test_it_is_said(host: Path) -> None:
+    """The plain path runs instead, and says why; who asks for the fast one is told what to install."""
+    device = torch.device("cuda")
+    path, said = path_on(device, NetworkConfig(), "auto", "high")
+    assert path == "plain" and "Python.h" in said
+    with pytest.raises(ConfigError, match="path must be plain or auto here, got fast: Triton needs Python's headers"):
+        path_on(device, NetworkConfig(), "fast", "high")
