@@ -17,12 +17,12 @@ from pathlib import Path
 
 from datagen.plan import ShardRange
 from hgn.data.manifest import SPLITS
+from hgn.files import NO_LOCKS
 from hgn.schema import ConfigError
 
 LOCK_NAME = ".lock"
 _MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
 _EPISODES_OF_A_SPLIT = 1 << 40  # bytes from one split to the next; a lock needs no byte to be there
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
 
 
 class Claims:
@@ -81,7 +81,7 @@ class Claims:
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EACCES) and not wait:
                 return False
-            if error.errno in _NO_LOCKS:
+            if error.errno in NO_LOCKS:
                 raise ConfigError(
                     f"{self._path} must lie on a file system with file locks, got {error.strerror}; mount it with them "
                     "(NFS with its lock service, Lustre with -o flock) or choose another out=..."

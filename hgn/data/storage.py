@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from hgn.files import TEMPORARY_SUFFIX, sync_folder
+from hgn.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
 from hgn.schema import ConfigError, require
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
@@ -370,6 +370,13 @@ def _owned(path: Path, url: str, patience_s: float) -> Iterator[io.BufferedRando
                 fcntl.flock(file, fcntl.LOCK_EX | (0 if patience_s else fcntl.LOCK_NB))
             except BlockingIOError:
                 raise UnreachableError(url, patience_s, "it is being fetched") from None
+            except OSError as error:
+                if error.errno not in NO_LOCKS:
+                    raise
+                raise ConfigError(
+                    f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {path.parent} "
+                    f"({error.strerror}); take one of this machine's own disks"
+                ) from None
             if not _is_same(file, partial):
                 continue  # whoever had it before has given it its name
             if path.exists():

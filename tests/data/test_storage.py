@@ -379,6 +379,21 @@ def test_a_cache_that_cannot_be(folder: Path, tmp_path: Path, monkeypatch: pytes
         EpisodeStore(in_memory(folder, "uncached"), "train").episodes[0]
 
 
+def test_a_cache_without_locks(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on Lustre without -o flock: another folder is asked for, and what stands in the way is named."""
+
+    def lustre(*arguments: object) -> None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    store = EpisodeStore(in_memory(folder, "unlocked"), "train")
+    with monkeypatch.context() as patch:
+        patch.setattr(fcntl, "flock", lustre)
+        message = rf"{CACHE_VARIABLE} must name a folder on a file system with file locks, got .*shards \(Function not"
+        with pytest.raises(ConfigError, match=message):
+            store.episodes[0]
+    assert store.episodes[0].key == "train-000000"
+
+
 def test_no_folder_for_shards(monkeypatch: pytest.MonkeyPatch) -> None:
     """A user without a home, as in some containers, is told what to name."""
     for name in (CACHE_VARIABLE, "XDG_CACHE_HOME"):
