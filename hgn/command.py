@@ -61,8 +61,12 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # the process was started without
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 - as long as the process
+    code: int | str | None
     try:
-        code = _exit_code(main, config_name)
+        try:
+            code = _exit_code(main, config_name)
+        except SystemExit as end:  # Hydra's own, after --help
+            code = end.code
         sys.stdout.flush()
     except BrokenPipeError:
         if not _unread():
