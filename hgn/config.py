@@ -107,6 +107,7 @@ class MpmConfig:
     water_volume_update: str = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
     water_minimum_volume_ratio: float = 0.1  # floor on J; hits are counted
     minimum_singular_value: float = 0.05  # floor on the singular values of F; hits are counted
+    time_integration: str = "leapfrog"  # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
     time_step: str = "adaptive"  # or fixed
     fixed_time_step_s: float = 0.02 / 64
     stability_fraction: float = 0.5  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
@@ -155,6 +156,7 @@ class MpmConfig:
         require_one_of(self, "sand_volume_correction", ("tampubolon", "taichi_elements"))
         require_one_of(self, "water_equation", ("linear", "stiffening"))
         require_one_of(self, "water_volume_update", ("trace", "taichi_elements"))
+        require_one_of(self, "time_integration", ("leapfrog", "symplectic_euler"))
         require_one_of(self, "time_step", ("adaptive", "fixed"))
         require_one_of(self, "wall_contact", ("slip", "stick"))
         require_one_of(self, "device", ("auto", "cpu", "gpu"))

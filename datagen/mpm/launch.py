@@ -253,6 +253,7 @@ class Launch(ABC):
             setting[SETTING.fixed_substeps] = fixed_substeps(config, frame_rate_hz)
         setting[SETTING.speed_fraction] = config.speed_fraction
         setting[SETTING.transfer_interval] = cell_size / config.transfer_speed_m_s if config.transfer_speed_m_s else 0
+        setting[SETTING.leapfrog] = config.time_integration == "leapfrog"
         setting[SETTING.friction] = config.collider_friction
         setting[SETTING.low : SETTING.low + 3] = low
         setting[SETTING.high : SETTING.high + 3] = high

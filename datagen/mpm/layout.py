@@ -70,7 +70,8 @@ class SceneValue(NamedTuple):
     interval_remaining: int = 11  # after the present substep, s; at 0 velocities go back to the particles
     begins: int = 12  # 1 where the present substep is the first of its interval, else 0
     stability_fraction: int = 13  # of the limit of stability: the longest step of stress
-    length: int = 14
+    gravity_time: int = 14  # for which gravity acts in the present substep, s: see mls_mpm
+    length: int = 15
 
 
 class Status(NamedTuple):
@@ -93,7 +94,8 @@ class Setting(NamedTuple):
     high: int = 9  # 9, 10, 11: largest
     size: int = 12  # 12, 13, 14: of the domain
     transfer_interval: int = 15  # s; 0 where every substep is a transfer
-    length: int = 16
+    leapfrog: int = 16  # 1 where velocities belong to the middle of an interval, 0 to its end
+    length: int = 17
 
 
 class Shape(NamedTuple):

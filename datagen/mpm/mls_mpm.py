@@ -13,6 +13,11 @@ force alone, as in the Lagrangian phase of the classical method (Sulsky et al. 1
 and gradient, and move by the interval times that velocity: momentum and angular momentum are kept, as stresses are
 symmetric and each particle moves along its velocity. Within an interval no velocity is smoothed.
 
+Positions belong to the ends of intervals, velocities to their middles (leapfrog): gravity acts for half the last and
+half the present interval, at first for half of the first, so that free fall is v t + g t² / 2 at the end of each,
+whatever their lengths. Only gravity is known that far ahead; stresses and contacts act as in the symplectic Euler
+scheme, which Taichi Elements has for gravity too.
+
 Everything is per scene: time step, interval, remaining time, state, counters. A scene that is done, or failed, idles.
 """
 
@@ -125,6 +130,7 @@ def choose_time_step(
         elapsed = scene_value[scene, VALUE.interval_elapsed]
         left = scene_value[scene, VALUE.interval_remaining]
         begins = left == 0.0
+        shift = 0.0  # from the middle of the last interval to that of the present one is not its length
         if begins:
             elapsed = 0.0
             longest = ti.max(limit, setting[SETTING.transfer_interval])
@@ -134,6 +140,9 @@ def choose_time_step(
             # equal intervals to the end of the frame: no sliver at its end
             interval = remaining / _parts(remaining, longest)
             left = interval
+            if fixed > 0.0:
+                interval = fixed
+            shift = 0.5 * setting[SETTING.leapfrog] * (scene_value[scene, VALUE.interval] - interval)
         # steps in this interval, and with those after it
         ahead = _parts(left, limit)
         total = ahead
@@ -150,7 +159,6 @@ def choose_time_step(
             step = left / ahead
             if fixed > 0.0:
                 step = fixed
-                interval = fixed
             remaining -= step
             left -= step
             elapsed += step
@@ -165,6 +173,7 @@ def choose_time_step(
             scene_value[scene, VALUE.interval_elapsed] = elapsed
             scene_value[scene, VALUE.interval_remaining] = left
             scene_value[scene, VALUE.begins] = ti.cast(begins, ti.f32)
+            scene_value[scene, VALUE.gravity_time] = step + shift
             scene_value[scene, VALUE.substeps_ahead] = total - 1.0
             counter[scene, COUNT.transfers] += ti.cast(begins, ti.i64)
             scene_value[scene, VALUE.smallest_time_step] = ti.min(scene_value[scene, VALUE.smallest_time_step], step)
@@ -322,7 +331,7 @@ def node_velocity(
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
         gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
-        v = before + momentum / mass + scene_value[scene, VALUE.time_step] * gravity
+        v = before + momentum / mass + scene_value[scene, VALUE.gravity_time] * gravity
         if ti.static(bool(variant & VARIANT.contact)):
             entry = contact[place]
             if entry >= 0:
