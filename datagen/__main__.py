@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from datagen.generate import StopRequest, datagen_config, generate
-from datagen.progress import PROGRESS_KINDS, make_progress
-from datagen.worker import Backend
+from datagen.pool.progress import PROGRESS_KINDS, make_progress
+from datagen.pool.worker import Backend
 from hgn.command import run_command
 from hgn.schema import require
 

@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Any
 
-from datagen.pool import LocalCrew, Pool, Stopped, plan_workers, visible_gpus
-from datagen.progress import Progress
-from datagen.worker import Backend
-from datagen.writer import DatasetWriter
+from datagen.pool.pool import LocalCrew, Pool, Stopped, plan_workers, visible_gpus
+from datagen.pool.progress import Progress
+from datagen.pool.worker import Backend
+from datagen.pool.writer import DatasetWriter
 from hgn.command import section
 from hgn.config import DatagenConfig
-from hgn.machine import available_cpus, available_memory
 from hgn.schema import from_mapping, require
+from hgn.system.machine import available_cpus, available_memory
 
 # an experiment file serves all commands: what only hgn.train needs is left out
 KEYS = {
@@ -84,9 +84,9 @@ def generate(
         if not writer.complete:
             try:
                 if config.dataset.pool == "ray":
-                    from datagen.ray_crew import RayCrew
+                    from datagen.pool.ray_workers import RayWorkerFactory
 
-                    with RayCrew(config, backend) as crew:
+                    with RayWorkerFactory(config, backend) as crew:
                         Pool(config, writer, progress, crew.plan, crew, should_stop).run()
                 else:
                     plan = plan_workers(config, visible_gpus(), available_cpus(), available_memory())

@@ -11,10 +11,10 @@ from typing import Any
 
 from hgn.command import run_command
 from hgn.config import SolveConfig
-from hgn.progress import bar
 from hgn.scene.rollout_file import Rollout, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.system.progress import bar
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -17,8 +17,8 @@ from hgn.command import run_command
 from hgn.config import UploadConfig
 from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
 from hgn.data.storage import is_remote, open_storage, verify_file, write_remote
-from hgn.progress import bar
 from hgn.schema import ConfigError, from_mapping, require
+from hgn.system.progress import bar
 
 _LOOK_S = 0.2  # between looks for a signal
 

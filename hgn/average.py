@@ -15,9 +15,9 @@ import torch
 from hgn.command import run_command
 from hgn.config import AverageConfig
 from hgn.network.base import ParticleNetwork
-from hgn.provenance import provenance
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping
+from hgn.system.provenance import provenance
 
 Loaded = tuple[ParticleNetwork, WeightsInfo]
 SHARED = ("network", "frame_rate_hz", "obstacle_cell_size", "gravity")  # of weights that can be averaged

@@ -10,19 +10,19 @@ import numpy as np
 
 from hgn.command import run_command
 from hgn.config import EvaluateConfig
+from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
-from hgn.data.select import first_episodes
-from hgn.files import write_json
 from hgn.network.base import ParticleNetwork
-from hgn.progress import bar
-from hgn.provenance import provenance
+from hgn.runtime.rollouts import RolloutResult, network_trials
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.trial import Trial, network_trials
 from hgn.runtime.weights import require_frame_rate
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.schema import from_mapping
+from hgn.system.files import write_json
+from hgn.system.progress import bar
+from hgn.system.provenance import provenance
 from hgn.training.errors import (
     REPORTED_FRAMES,
     frame_batches,
@@ -100,7 +100,7 @@ def _told(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
     return {str(n): float(mse_T[n]) for n in frames if n < len(mse_T) and np.isfinite(mse_T[n])}
 
 
-def end_of_rollout(trial: Trial, episode: Episode) -> dict[str, Any]:
+def end_of_rollout(trial: RolloutResult, episode: Episode) -> dict[str, Any]:
     """Shares of the particles within closed obstacles, beside the data's, and beyond the domain, in the last frame that
     a scene came to, and why it came no farther.
     """

@@ -7,9 +7,9 @@ from typing import Any
 
 from hgn.command import run_command
 from hgn.config import ExportConfig
-from hgn.provenance import provenance
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.schema import from_mapping
+from hgn.system.provenance import provenance
 from hgn.training.checkpoint import data_of_checkpoint, network_of_checkpoint, read_checkpoint, updates_of_checkpoint
 
 

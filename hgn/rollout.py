@@ -5,7 +5,7 @@ Writes a VTKHDF file, and pictures beside it.
 
 from __future__ import annotations
 
-import hgn.idle_threads  # noqa: F401  # isort: skip  # before torch is loaded
+import hgn.system.threads  # noqa: F401  # isort: skip  # before torch is loaded
 
 import hashlib
 import sys
@@ -15,9 +15,8 @@ from typing import Any
 
 from hgn.command import run_command
 from hgn.config import RolloutConfig, SceneConfig
-from hgn.data.select import find_episode
-from hgn.picture import animate, compare_picture, spread, write_picture
-from hgn.progress import bar
+from hgn.data.lookup import find_episode
+from hgn.render.pictures import animate, compare_picture, spread, write_picture
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
 from hgn.scene.random_scene import generate_scene
@@ -25,6 +24,7 @@ from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, sheets_of_meshes
 from hgn.schema import ConfigError, from_mapping
+from hgn.system.progress import bar
 
 PICTURES = 4  # in the PNG
 EVERY = 3  # frames of the rollout for one picture of the GIF

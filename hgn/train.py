@@ -22,17 +22,17 @@ from hgn.command import run_command
 from hgn.config import TrainConfig
 from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
 from hgn.data.manifest import SPLITS, Manifest
-from hgn.data.order import Cursor
 from hgn.data.reader import EpisodeStore
+from hgn.data.sampler import SamplerState
 from hgn.data.storage import UnreachableError, is_remote
-from hgn.device import keep_to_quota
-from hgn.files import write_atomically
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
-from hgn.progress import bar
-from hgn.provenance import provenance
-from hgn.runtime.path import choose_path, set_matmul_precision, why_not_trained_fast
+from hgn.runtime.backend import choose_path, set_matmul_precision, why_not_trained_fast
 from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.system.device import keep_to_quota
+from hgn.system.files import write_atomically
+from hgn.system.progress import bar
+from hgn.system.provenance import provenance
 from hgn.training.checkpoint import (
     DataInfo,
     check_checkpoint,
@@ -46,7 +46,7 @@ from hgn.training.launch import default_run, first_on_machine, first_rank, layou
 from hgn.training.stop import StopRequest
 
 if TYPE_CHECKING:
-    from hgn.runtime.ahead import AheadCompilation
+    from hgn.runtime.precompile import Precompilation
 
 BETWEEN_LOOKS_S = 10.0  # at the data set's manifest, for the progress line
 
@@ -85,11 +85,11 @@ def _fit(
     config: TrainConfig,
     run: Path,
     store: EpisodeStore,
-    checkpoint: tuple[Path, Cursor] | None,
+    checkpoint: tuple[Path, SamplerState] | None,
     begin_with: ParticleNetwork | None,
     stop: StopRequest,
     generator: Generator | None,
-    ahead: AheadCompilation | None,
+    ahead: Precompilation | None,
 ) -> int:
     # Lightning loads for seconds: not before the waiting is over, and never for the other commands.
     from lightning.pytorch import Trainer, seed_everything
@@ -97,10 +97,10 @@ def _fit(
 
     from hgn.training.callbacks import Checkpoints, LogLines, Monitor, Stopper
     from hgn.training.checkpoint_writer import CheckpointWriter
-    from hgn.training.feed import Feed
+    from hgn.training.data_module import EpisodeDataModule
+    from hgn.training.distributed import SameStart, gradient_averaging
     from hgn.training.gradients import GradientGuard
     from hgn.training.module import TrainingModule
-    from hgn.training.ranks import SameStart, gradient_averaging
     from hgn.training.tensorboard import FinalMetrics
 
     training = config.training
@@ -120,7 +120,7 @@ def _fit(
         module.set_statistics(store.statistics())
     else:
         module.begin_with(begin_with)
-    feed = Feed(store, config.network, training, chunks=path == "fast", interrupted=lambda: stop.requested)
+    feed = EpisodeDataModule(store, config.network, training, chunks=path == "fast", interrupted=lambda: stop.requested)
     if checkpoint is not None:
         feed.cursor = checkpoint[1]
     _write_run_files(config, run)
@@ -168,7 +168,7 @@ def _path(config: TrainConfig) -> tuple[str, str]:
     return choose_path("training.path", training.path, training.precision, reason, half_plainly)
 
 
-def _compile_ahead(config: TrainConfig, stack: ExitStack) -> AheadCompilation | None:
+def _compile_ahead(config: TrainConfig, stack: ExitStack) -> Precompilation | None:
     """Lets the kernels be compiled while others wait for data, where this process leads its machine's on GPUs."""
     training = config.training
     path, _ = _path(config)
@@ -176,23 +176,23 @@ def _compile_ahead(config: TrainConfig, stack: ExitStack) -> AheadCompilation | 
     if path != "fast" or not on_gpu or not first_on_machine():
         return None
     # Triton, which the plain path does without, is loaded here.
-    from hgn.runtime.ahead import AheadCompilation
-    from hgn.training.ahead import job_of_training
+    from hgn.runtime.precompile import Precompilation
+    from hgn.training.precompile import job_of_training
 
     devices, nodes = layout(training)
-    ahead = AheadCompilation(job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1))
+    ahead = Precompilation(job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1))
     stack.callback(ahead.stop)
     return ahead
 
 
-def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Cursor]:
+def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, SamplerState]:
     """The run's last checkpoint, checked before anything is started, and where in the data it stood."""
     checkpoint = read_checkpoint(path)
     check_checkpoint(checkpoint, config, identity_hash(dataset_identity(config.datagen)), path)
     return path, cursor_of_checkpoint(checkpoint)
 
 
-def _weights_to_begin_with(config: TrainConfig, checkpoint: tuple[Path, Cursor] | None) -> ParticleNetwork | None:
+def _weights_to_begin_with(config: TrainConfig, checkpoint: tuple[Path, SamplerState] | None) -> ParticleNetwork | None:
     """The network of training.weights, for a new run alone: a checkpoint wins."""
     weights = config.training.weights
     if weights is None:

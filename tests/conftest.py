@@ -34,8 +34,8 @@ sys.path.insert(0, str(Path(__file__).parent / "datagen"))  # spawned workers fi
 import ballistic_dataset
 import ballistic_solver
 
-from datagen.worker import Backend
-from datagen.writer import DatasetWriter
+from datagen.pool.worker import Backend
+from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 
 LONGEST_FILES = (  # half a minute and more on one core; begun last, one of them would run alone

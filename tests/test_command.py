@@ -83,7 +83,7 @@ def test_a_reader_that_leaves(arguments: list[str]) -> None:
 
 def test_nothing_is_open() -> None:
     """A command that is started without standard output and error does its work."""
-    program = "import sys; from hgn.command import run_command; from hgn.progress import bar"
+    program = "import sys; from hgn.command import run_command; from hgn.system.progress import bar"
     program += "; sys.argv[1:] = []; run_command(lambda mapping: bar('x', total=1, unit='y').close(), 'bench')"
     command = ["bash", "-c", 'exec "$0" -c "$1" >&- 2>&-', sys.executable, program]
     assert subprocess.run(command, check=False).returncode == 0

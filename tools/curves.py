@@ -20,9 +20,9 @@ from typing import Any
 import yaml
 
 from hgn.command import run_command
-from hgn.files import write_atomically, write_json
-from hgn.provenance import provenance
 from hgn.schema import ConfigError, from_mapping, require
+from hgn.system.files import write_atomically, write_json
+from hgn.system.provenance import provenance
 from tools.figure import as_png, new_figure
 
 ROW_KEYS = (

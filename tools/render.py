@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.data.select import find_episode
-from hgn.picture import (
+from hgn.data.lookup import find_episode
+from hgn.render.pictures import (
     animate,
     compare_picture,
     error_curve,
@@ -25,9 +25,9 @@ from hgn.picture import (
     spread,
     write_picture,
 )
-from hgn.progress import bar
 from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.schema import ConfigError, from_mapping, require, require_positive
+from hgn.system.progress import bar
 
 PICTURES = 4  # in the PNG, where frames does not say
 ANIMATIONS = (".gif", ".webp")

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from hgn.config import MpmConfig
-from hgn.machine import available_cpus
-from hgn.runtime.trial import Trial
+from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.episode import Episode
 from hgn.scene.scene import Scene
-from tools.trial import solver_scene, solver_trials
+from hgn.system.machine import available_cpus
+from tools.solver_rollouts import solver_scene, solver_trials
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class SolverLaunches:
     def __init__(self, config: MpmConfig, cell_size: float, frame_rate_hz: float, frames: int) -> None:
         self.config, self.cell_size, self.frame_rate_hz, self.frames = config, cell_size, frame_rate_hz, frames
         self._settings: list[Setting] = []
-        self._known: dict[tuple[Setting, str], Trial] = {}
+        self._known: dict[tuple[Setting, str], RolloutResult] = {}
         self._colliders: dict[str, Any] = {}
 
     def add(self, setting: Setting) -> Setting:
@@ -47,7 +47,7 @@ class SolverLaunches:
 
     def trials(
         self, setting: Setting, episodes: Sequence[Episode], on_frame: Callable[[int], None] | None = None
-    ) -> list[Trial]:
+    ) -> list[RolloutResult]:
         """Trajectories of `frames` frames from the episodes' first ones."""
         missing = [episode for episode in episodes if (setting, episode.key) not in self._known]
         if missing:
@@ -58,13 +58,13 @@ class SolverLaunches:
 
     def timed(
         self, setting: Setting, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None]
-    ) -> list[Trial]:
+    ) -> list[RolloutResult]:
         """A few frames with one setting alone, for the clock."""
         return self._simulate([(setting, episode) for episode in episodes], frames, on_frame)
 
     def _simulate(
         self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: Callable[[int], None] | None
-    ) -> list[Trial]:
+    ) -> list[RolloutResult]:
         self._collide([episode for _, episode in pairs])
         # a scene's steps are its own; where all are alike the config says so
         alike = replace(self.config, stability_fraction=pairs[0][0].step)

@@ -8,8 +8,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from hgn.machine import available_cpus, writable_folder
 from hgn.schema import ConfigError, require, require_one_of
+from hgn.system.machine import available_cpus, writable_folder
 
 # Taichi aborts the process where HOME is not set, as in a system's service; a user without a name has none
 os.environ.setdefault("HOME", os.path.expanduser("~").replace("~", "/nonexistent"))  # noqa: PTH111

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.data.order import Cursor
+from hgn.data.sampler import SamplerState
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.episode import Episode
@@ -34,7 +34,7 @@ class Batch:
     obstacles: ObstacleCells | None
     surface: SurfaceParticles | None  # where the network sees obstacles as particles
     seeds_S: tuple[int, ...]  # of noise, jitter and symmetry
-    cursor: Cursor | None = None  # the order's state once this batch is trained on
+    cursor: SamplerState | None = None  # the order's state once this batch is trained on
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene: what training may show instead of it
     weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
     noise_S: tuple[float, ...] = ()  # of each scene, in units of training.noise_std; empty: 1
@@ -81,7 +81,7 @@ def make_batch(
     samples: Sequence[tuple[Episode, int]],
     network: NetworkConfig,
     seeds: Sequence[int] | None = None,
-    cursor: Cursor | None = None,
+    cursor: SamplerState | None = None,
     weights: Sequence[float] = (),
     windows: Sequence[np.ndarray] | None = None,
     noise: Sequence[float] = (),

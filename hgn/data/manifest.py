@@ -14,9 +14,9 @@ from typing import Any
 
 from hgn.data.statistics import Statistics, merge_statistics
 from hgn.data.storage import PATIENCE_S, open_storage
-from hgn.files import write_atomically
 from hgn.scene.episode import SCHEMA_VERSION, require_schema_version
 from hgn.schema import ConfigError, from_mapping, require, require_non_negative, require_one_of, to_mapping
+from hgn.system.files import write_atomically
 
 MANIFEST_NAME = "manifest.json"
 SPLITS = ("train", "validation", "test")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 
 from hgn.config import TrainingConfig
-from hgn.splitmix import splitmix64
+from hgn.system.splitmix import splitmix64
 
 REST_STREAM = 0x9E6D62D06F6A9A9B  # of other streams than noise, jitter, symmetry and frame
 

@@ -22,8 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from hgn.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
 from hgn.schema import ConfigError, require
+from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 CACHE_VARIABLE = "HGN_CACHE"

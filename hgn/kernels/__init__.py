@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from hgn.machine import writable_folder
+from hgn.system.machine import writable_folder
 
 # a product and a sum beside it round once: what Triton 3.9 warns of and 3.10 would change
 os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")

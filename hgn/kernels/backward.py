@@ -12,20 +12,20 @@ import triton
 
 from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT, Block
-from hgn.kernels.cells.kernel import cell_backward
+from hgn.kernels.cell_mlp.kernel import cell_backward
 from hgn.kernels.edges.kernel import edge_backward
-from hgn.kernels.engine import Engine, Tuning
+from hgn.kernels.forward import FusedNetwork, Tuning
 from hgn.kernels.grid.op import DeviceGrid
+from hgn.kernels.mlp.kernel import gather_project_backward, rows_backward
 from hgn.kernels.packing import PackedFCN, PackedNetwork
-from hgn.kernels.pairs.kernel import pairs_backward, pairs_weight_gradient
-from hgn.kernels.rows.kernel import gather_project_backward, rows_backward
+from hgn.kernels.particle_cell.kernel import pairs_backward, pairs_weight_gradient
 from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
 
 CHUNK_ROWS = (512, 2048)  # of a program of the weights' products: where there are few rows, and many
 MANY_ROWS = 16384
 
 
-class TrainingEngine(Engine):
+class FusedTrainingNetwork(FusedNetwork):
     """An engine whose `backward` leaves the gradients in `totals`, float32, laid out as `values`."""
 
     def __init__(

@@ -11,9 +11,9 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.keys import settle_keys
+from hgn.kernels.triton_compat import settle_keys
 
-LEAKY = tl.constexpr(0.01)  # hgn.network.fcn.LEAKY_SLOPE
+LEAKY = tl.constexpr(0.01)  # hgn.network.mlp.LEAKY_SLOPE
 LAST_TILE = tl.constexpr(1 << 20)  # beyond all: elements are addressed in int32
 EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
 

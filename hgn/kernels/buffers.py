@@ -15,7 +15,7 @@ from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.packing import PackedMessagePassing, PackedNetwork
 
 if TYPE_CHECKING:
-    from hgn.kernels.engine import Tuning
+    from hgn.kernels.forward import Tuning
 
 OUT = 16  # the decoder's three outputs, padded
 

@@ -1,6 +1,6 @@
-"""The network's parameters in one flat buffer, each FCN a contiguous block that the kernels can read in whole tiles.
+"""The network's parameters in one flat buffer, each MLP a contiguous block that the kernels can read in whole tiles.
 
-Block of an FCN: the first layer's wide parts, each [hidden, part] row-major; its narrow parts (offsets), each
+Block of an MLP: the first layer's wide parts, each [hidden, part] row-major; its narrow parts (offsets), each
 transposed to [part, hidden]; bias; second layer [out, hidden]; its bias; the norm's gain and shift.
 An output of 3 is padded with zero rows to PADDED_OUT. Padding never receives a gradient.
 """
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import torch
 
-from hgn.network.fcn import FCN
-from hgn.network.network import HierarchicalGraphNetwork, MessagePassing
+from hgn.network.hgn import HierarchicalGraphNetwork, MessagePassing
+from hgn.network.mlp import MLP
 
 NARROW = 8  # parts of fewer columns are offsets
 PADDED_OUT = 16
@@ -20,7 +20,7 @@ PADDED_OUT = 16
 
 @dataclass(frozen=True)
 class PackedFCN:
-    """Offsets of an FCN's tensors in the flat buffer, in elements."""
+    """Offsets of an MLP's tensors in the flat buffer, in elements."""
 
     parts: tuple[int, ...]
     first_bias: int
@@ -91,7 +91,7 @@ class _Packer:
         self.size += len(flat) + padding
         return offset
 
-    def fcn(self, fcn: FCN, whole_first: bool = False) -> PackedFCN:
+    def fcn(self, fcn: MLP, whole_first: bool = False) -> PackedFCN:
         out = max(len(fcn.second.weight), PADDED_OUT)
         missing = out - len(fcn.second.weight)
         first = self.positions(fcn.first.weight)
@@ -106,7 +106,7 @@ class _Packer:
         return PackedFCN(tuple(offsets), bias, second, second_bias, gain, shift, out)
 
     def fcns(self, modules: torch.nn.ModuleList) -> tuple[PackedFCN, ...]:
-        return tuple(self.fcn(module) for module in modules if isinstance(module, FCN))
+        return tuple(self.fcn(module) for module in modules if isinstance(module, MLP))
 
     def passings(self, modules: torch.nn.ModuleList) -> tuple[PackedMessagePassing, ...]:
         return tuple(

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from hgn.config import NetworkConfig
-from hgn.network.fcn import FCN, LEAKY_SLOPE
 from hgn.network.features import Normaliser, ParticleState, wall_distances
+from hgn.network.mlp import LEAKY_SLOPE, MLP
 
 
 class ParticleNetwork(nn.Module, ABC):
@@ -26,7 +26,7 @@ class ParticleNetwork(nn.Module, ABC):
         self.embedding = nn.Embedding(embeddings or len(config.materials), config.material_embedding)
         normal_width = 3 if config.obstacle_features else 0
         parts = (3 * config.velocity_history, normal_width, 6, config.material_embedding)
-        self.encode = FCN(parts, config.width, config.width, slope=slope)
+        self.encode = MLP(parts, config.width, config.width, slope=slope)
 
     @property
     def parameter_count(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 
 
 def build_network(config: NetworkConfig) -> ParticleNetwork:

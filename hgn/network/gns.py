@@ -17,9 +17,9 @@ from torch import nn
 
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
-from hgn.network.edges import Edges, Ends, Graph, Weights, encoded_edges, passed_messages, scaling_gradients
-from hgn.network.fcn import FCN, linear
 from hgn.network.features import ParticleState
+from hgn.network.gns_edges import Edges, Ends, Graph, Weights, encoded_edges, passed_messages, scaling_gradients
+from hgn.network.mlp import MLP, linear
 from hgn.network.neighbours import NeighbourList, neighbour_list
 
 RELU = 0.0  # slope below zero
@@ -32,8 +32,8 @@ class InteractionStep(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.edge = FCN((width, width, width), width, width, slope=RELU)  # sender, receiver, edge
-        self.node = FCN((width, width), width, width, slope=RELU)  # particle, sum of the edges' updates
+        self.edge = MLP((width, width, width), width, width, slope=RELU)  # sender, receiver, edge
+        self.node = MLP((width, width), width, width, slope=RELU)  # particle, sum of the edges' updates
 
     def update(self, node_NW: torch.Tensor, sum_NW: torch.Tensor) -> torch.Tensor:
         """The particles' new state [N, W]."""
@@ -49,10 +49,10 @@ class GraphNetworkSimulator(ParticleNetwork):
         # One kind more, where there are static particles.
         super().__init__(config, len(config.materials) + config.obstacle_particles, RELU)
         width = config.width
-        self.encode_edges = FCN((3, 1), width, width, slope=RELU)
+        self.encode_edges = MLP((3, 1), width, width, slope=RELU)
         self.steps = nn.ModuleList(InteractionStep(width) for _ in range(config.message_passing_steps))
-        self.decode = FCN((width,), width, 3, layer_norm=False, slope=RELU)
-        # What works on the edges, as hgn.runtime.gns_edges chooses it; none: PyTorch and its own gradients.
+        self.decode = MLP((width,), width, 3, layer_norm=False, slope=RELU)
+        # What works on the edges, as hgn.runtime.gns_backend chooses it; none: PyTorch and its own gradients.
         self.edges: Edges | None = None
 
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:

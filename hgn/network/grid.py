@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 
-from hgn.network.keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, unpack
+from hgn.network.cell_keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, unpack
 
 # The 8 corners of a unit cube, z fastest: the offsets of a particle's cells, and of children in a parent.
 CORNER_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])

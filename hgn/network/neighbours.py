@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import torch
 
+from hgn.network.cell_keys import AXIS_STRIDE, COORDINATE_LIMIT, pack
 from hgn.network.grid import GridRangeError
-from hgn.network.keys import AXIS_STRIDE, COORDINATE_LIMIT, pack
 from hgn.network.segments import Segments
 
 REACH = 2  # cells on each side

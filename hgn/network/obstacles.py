@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from hgn.network.keys import find, of_scene, pack, unpack
+from hgn.network.cell_keys import find, of_scene, pack, unpack
 from hgn.scene.obstacle_grid import ObstacleGrid
 
 CELL_DIAGONAL = 3**0.5 + 1e-3  # points of two cells are at most this much nearer than the cells' corners

@@ -10,7 +10,7 @@ import math
 import torch
 
 from hgn.network.base import ParticleNetwork
-from hgn.network.fcn import FCN
+from hgn.network.mlp import MLP
 
 # Keller Jordan 2024 (Muon): the slope at zero is the steepest that keeps singular values between 0.7 and 1.2
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
@@ -36,7 +36,7 @@ def square_blocks(network: ParticleNetwork) -> torch.Tensor:
 
     blocks = []
     for module in network.modules():
-        if isinstance(module, FCN):
+        if isinstance(module, MLP):
             first = () if module is network.encode else places(module.first.weight).split(module.parts, dim=1)
             blocks += [piece for piece in (*first, places(module.second.weight)) if piece.shape == (width, width)]
     return torch.stack(blocks) if blocks else torch.zeros(0, width, width, dtype=torch.int64)

@@ -17,20 +17,19 @@ import numpy as np
 import torch
 
 from hgn.config import PATHS, PRECISIONS
-from hgn.device import choose_device
-from hgn.network import compiled
+from hgn.cpu import compiled
+from hgn.cpu.allocator import keep_freed_memory
 from hgn.network.base import ParticleNetwork
-from hgn.network.edges import PlainEdges
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.gns_edges import PlainEdges
 from hgn.network.grid import GridRangeError
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.runtime.backend import path_on, set_matmul_precision
 from hgn.runtime.divergence import lost
-from hgn.runtime.freed_memory import keep_freed_memory
-from hgn.runtime.gns_edges import require_agreement, use_edges
+from hgn.runtime.gns_backend import require_agreement, use_edges
 from hgn.runtime.gns_graph import GnsGraphs
-from hgn.runtime.path import path_on, set_matmul_precision
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_positions
@@ -38,9 +37,10 @@ from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_p
 from hgn.scene.rollout_file import cell_obstacles, episode_surface
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import require
+from hgn.system.device import choose_device
 
 if TYPE_CHECKING:
-    from hgn.runtime.fast import FastRollout
+    from hgn.runtime.triton_rollout import TritonRollout
 
 KEPT = 2  # simulations of the fast path, of different numbers of scenes
 FILLED = 0.5  # of the room of one that is kept, at least: launches are as large as the room
@@ -107,7 +107,7 @@ class Simulator:
     def __init__(
         self, network: ParticleNetwork, frame_rate_hz: float, path: str = "plain", precision: str = "high"
     ) -> None:
-        """`path` is plain or fast, as hgn.runtime.path chooses it; `precision` is that of the fast path, and
+        """`path` is plain or fast, as hgn.runtime.backend chooses it; `precision` is that of the fast path, and
         of a GNS, which works on its edges accordingly from now on."""
         self.network = network
         self.frame_rate_hz = frame_rate_hz
@@ -116,7 +116,7 @@ class Simulator:
         self.path, self.precision = path, precision
         self.device = next(network.parameters()).device
         self.growths = 0  # of the fast path's buffers, in all rollouts
-        self._kept: dict[int, FastRollout] = {}
+        self._kept: dict[int, TritonRollout] = {}
         self.predict: Callable[[ParticleState], torch.Tensor] = network
         use_edges(network, precision)
         if self.device.type == "cpu":
@@ -250,15 +250,15 @@ class Simulator:
             yield state.position_N3.cpu().numpy()
 
     @contextmanager
-    def _fast(self, state: ParticleState) -> Iterator[FastRollout]:
+    def _fast(self, state: ParticleState) -> Iterator[TritonRollout]:
         """A simulation on the fast path, which is kept for others once it is over."""
         # Triton, which the plain path does without, is loaded here.
-        from hgn.runtime.fast import CHECKED_PARTICLES, FastRollout, LeftDomainError
+        from hgn.runtime.triton_rollout import CHECKED_PARTICLES, LeftDomainError, TritonRollout
 
         assert isinstance(self.network, HierarchicalGraphNetwork)
         rollout = self._begun(state)
         if rollout is None:
-            rollout = FastRollout(self.network, state, self.precision)
+            rollout = TritonRollout(self.network, state, self.precision)
             if len(state.position_N3) <= CHECKED_PARTICLES:
                 rollout.require_agreement(self.network, state)
         before = rollout.growths
@@ -273,7 +273,7 @@ class Simulator:
                 del self._kept[next(iter(self._kept))]
             self._kept[state.scene_count] = rollout
 
-    def _begun(self, state: ParticleState) -> FastRollout | None:
+    def _begun(self, state: ParticleState) -> TritonRollout | None:
         """An earlier simulation of the same network begun anew, its launches captured already; none that fits.
 
         Nobody else has it while it runs, and one that does not fit goes before another is allocated.

@@ -15,10 +15,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from hgn.config import NetworkConfig
-from hgn.files import write_atomically
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.system.files import write_atomically
 
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"

@@ -27,7 +27,6 @@ import h5py
 import numpy as np
 
 from hgn.config import is_mesh_file
-from hgn.files import sync_folder, temporary_path
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
@@ -35,6 +34,7 @@ from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import mesh_sha256, shape_obstacle
 from hgn.schema import ConfigError
+from hgn.system.files import sync_folder, temporary_path
 
 FORMAT_NAME = "hgn rollout"
 FORMAT_VERSION = 1

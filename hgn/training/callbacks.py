@@ -19,16 +19,17 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from tqdm import tqdm
 
+from hgn.data.lookup import first_indices
 from hgn.data.reader import EpisodeStore
-from hgn.data.select import first_indices
 from hgn.data.storage import PATIENCE_S
-from hgn.files import TEMPORARY_SUFFIX
-from hgn.picture import rollout_of_episode
-from hgn.progress import bar
+from hgn.render.pictures import rollout_of_episode
+from hgn.runtime.rollouts import network_trials
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.trial import network_trials
 from hgn.scene.episode import Episode
+from hgn.system.files import TEMPORARY_SUFFIX
+from hgn.system.progress import bar
 from hgn.training.checkpoint_writer import CheckpointWriter
+from hgn.training.data_module import EpisodeDataModule, agreed_count
 from hgn.training.errors import (
     REPORTED_FRAMES,
     SquaredError,
@@ -38,7 +39,6 @@ from hgn.training.errors import (
     rollout_errors,
     trivial_predictors,
 )
-from hgn.training.feed import Feed, agreed_count
 from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
@@ -204,7 +204,9 @@ class LogLines(Callback):
     The loss is the mean over all ranks; speed, waiting for data and GPU memory are those of rank 0.
     """
 
-    def __init__(self, run: Path, monitor: Monitor, guard: GradientGuard, feed: Feed, published: Callable[[], str]):
+    def __init__(
+        self, run: Path, monitor: Monitor, guard: GradientGuard, feed: EpisodeDataModule, published: Callable[[], str]
+    ):
         self.run, self.monitor, self.guard, self.feed, self.published = run, monitor, guard, feed, published
         self._bar: tqdm[Any] | None = None
         self._time, self._update, self._waited_s = time.monotonic(), 0, 0.0

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from hgn.config import NetworkConfig, TrainConfig
-from hgn.data.order import Cursor
+from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.runtime.weights import find_weights, load_weights
@@ -107,9 +107,9 @@ def network_of_checkpoint(checkpoint: dict[str, Any]) -> ParticleNetwork:
     return network
 
 
-def cursor_of_checkpoint(checkpoint: dict[str, Any]) -> Cursor:
+def cursor_of_checkpoint(checkpoint: dict[str, Any]) -> SamplerState:
     """Where in the order of samples the run stood."""
-    return from_mapping(Cursor, checkpoint[SECTION]["cursor"], "cursor")
+    return from_mapping(SamplerState, checkpoint[SECTION]["cursor"], "cursor")
 
 
 def data_of_checkpoint(checkpoint: dict[str, Any]) -> DataInfo:

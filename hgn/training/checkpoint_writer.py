@@ -14,7 +14,7 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning_utilities.core.apply_func import apply_to_collection
 
-from hgn.files import write_atomically
+from hgn.system.files import write_atomically
 
 TURN_S = 1e-4  # for which a checkpoint's writing keeps Python's lock from the training; Python's own are 5e-3
 

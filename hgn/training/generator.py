@@ -14,8 +14,8 @@ from typing import Any
 import yaml
 
 from hgn.config import DatagenConfig
-from hgn.parent import die_with_parent
 from hgn.schema import ConfigError, to_mapping
+from hgn.system.processes import die_with_parent
 
 STOP_PATIENCE_S = 60.0
 

@@ -15,11 +15,11 @@ from lightning.pytorch import LightningModule
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
-from hgn.data.chunk import Chunk
-from hgn.data.order import Cursor
+from hgn.data.episode_tensors import UpdateChunk
+from hgn.data.sampler import SamplerState
 from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
-from hgn.runtime.gns_edges import require_agreement, use_edges
+from hgn.runtime.gns_backend import require_agreement, use_edges
 from hgn.schema import to_mapping
 from hgn.training.checkpoint import (
     AVERAGED,
@@ -29,10 +29,10 @@ from hgn.training.checkpoint import (
     cursor_of_checkpoint,
     updates_of_checkpoint,
 )
+from hgn.training.distributed import sum_over_ranks
 from hgn.training.muon import Muon
 from hgn.training.noise import jittered_origin, perturbed_window
-from hgn.training.own_states import OwnStates
-from hgn.training.ranks import sum_over_ranks
+from hgn.training.pushforward import PushforwardPool
 from hgn.training.symmetry import drawn_symmetries, under_symmetries
 
 
@@ -40,14 +40,14 @@ class TrainingModule(LightningModule):
     """Trains a network on one-step accelerations (paper sec. 3.3)."""
 
     def __init__(self, network: ParticleNetwork, training: TrainingConfig, data: DataInfo, path: str = "plain") -> None:
-        """`path` is plain or fast, as hgn.runtime.path chooses it: a training step is an update, or a chunk of them."""
+        """`path` is plain or fast, see hgn.runtime.backend: a training step is one update, or a chunk of them."""
         super().__init__()
         self.automatic_optimization = path == "plain"
         self.network = network
         self.averaged = copy.deepcopy(network).requires_grad_(False) if training.ema_decay else None
         self.training_config = training
         self.data = data
-        self.cursor = Cursor()
+        self.cursor = SamplerState()
         # Sum of finite losses and their number since the last log line, kept on the device: no synchronisation.
         self.loss_sum: torch.Tensor
         self.register_buffer("loss_sum", torch.zeros(2), persistent=False)
@@ -55,7 +55,7 @@ class TrainingModule(LightningModule):
         self.gradient_counters: torch.Tensor
         self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
         self._fast: Any = None
-        self._own: OwnStates | None = None
+        self._own: PushforwardPool | None = None
         self._unchecked = True  # whether kernels compute on this machine what they should
 
     def set_statistics(self, statistics: Statistics) -> None:
@@ -126,14 +126,14 @@ class TrainingModule(LightningModule):
     def on_train_start(self) -> None:
         config = self.training_config
         if self.automatic_optimization and config.rollout_share > 0:
-            self._own = OwnStates(self.result, config, self.data.frame_rate_hz, self.trainer.global_rank)
+            self._own = PushforwardPool(self.result, config, self.data.frame_rate_hz, self.trainer.global_rank)
         if not self.automatic_optimization:
             # Triton, which the plain path does without, is loaded here.
-            from hgn.training.fast import FastTraining
+            from hgn.training.graph_trainer import GraphTrainer
 
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Adam)
-            self._fast = FastTraining(
+            self._fast = GraphTrainer(
                 self.network,
                 optimizer,
                 self.training_config,
@@ -146,8 +146,8 @@ class TrainingModule(LightningModule):
                 self.trainer.global_rank,
             )
 
-    def training_step(self, batch: Batch | Chunk, batch_index: int) -> torch.Tensor | None:
-        if isinstance(batch, Chunk):
+    def training_step(self, batch: Batch | UpdateChunk, batch_index: int) -> torch.Tensor | None:
+        if isinstance(batch, UpdateChunk):
             self._train_chunk(batch)
             return None
         if self._unchecked:
@@ -164,7 +164,7 @@ class TrainingModule(LightningModule):
         self.cursor = batch.cursor
         return loss
 
-    def _train_chunk(self, chunk: Chunk) -> None:
+    def _train_chunk(self, chunk: UpdateChunk) -> None:
         first, count = self.global_step, len(chunk.samples)
         new = self._fast.agreement is None
         updates = range(first, first + count)

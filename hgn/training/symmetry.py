@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 
 from hgn.data.batch import Batch
-from hgn.network.keys import pack, unpack
+from hgn.network.cell_keys import pack, unpack
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.symmetry import Symmetry, drawn_symmetry
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import hgn.data.storage
-from datagen.shard import locate_members
-from datagen.writer import DatasetWriter
+from datagen.pool.shard import locate_members
+from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore

@@ -23,8 +23,8 @@ import pytest
 import uvicorn
 
 import hgn.data.storage
-from datagen.server import make_app, make_server
-from datagen.supervisor import PoolState
+from datagen.service.server import make_app, make_server
+from datagen.service.supervisor import PoolState
 from hgn.command import run_command
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import ballistic_solver
 
-from datagen.shard import stage_episode
-from datagen.worker import MadeScene, make_episode
-from datagen.writer import DatasetWriter
+from datagen.pool.shard import stage_episode
+from datagen.pool.worker import MadeScene, make_episode
+from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig
 
 

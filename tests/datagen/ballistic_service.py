@@ -6,7 +6,7 @@ from functools import partial
 
 from ballistic_solver import BALLISTIC
 
-from datagen.service import main
+from datagen.service.__main__ import main
 from hgn.command import run_command
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.worker import Backend
+from datagen.pool.worker import Backend
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Obstacle, Scene

@@ -16,17 +16,17 @@ from typing import Any
 
 from ballistic_dataset import make_dataset
 
-import datagen.claims
-import datagen.shard
-import datagen.writer
-import hgn.files
+import datagen.pool.locks
+import datagen.pool.shard
+import datagen.pool.writer
+import hgn.system.files
 from hgn.config import DatagenConfig, DatasetConfig
 from hgn.data.manifest import Manifest
 from hgn.data.storage import file_sha256
-from tools.kills import verified_shards
+from tools.studies.kills import verified_shards
 
 # whatever touches the folder; most lines are in the writing of tar files, so every other kill leaves those out
-OURS = {module.__file__ for module in (datagen.claims, datagen.shard, datagen.writer, hgn.files)}
+OURS = {module.__file__ for module in (datagen.pool.locks, datagen.pool.shard, datagen.pool.writer, hgn.system.files)}
 TRACED = (OURS, OURS | {tarfile.__file__})
 
 

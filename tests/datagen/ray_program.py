@@ -16,11 +16,11 @@ from ballistic_solver import BALLISTIC
 from ray.cluster_utils import Cluster
 
 from datagen.generate import generate
-from datagen.progress import Progress
+from datagen.pool.progress import Progress
 from hgn.config import DatagenConfig, DatasetConfig
 from hgn.data.manifest import Manifest
-from hgn.provenance import provenance
-from tools.kills import differences, equal_shards
+from hgn.system.provenance import provenance
+from tools.studies.kills import differences, equal_shards
 
 STORE_BYTES = 80 * 2**20
 

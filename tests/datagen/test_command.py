@@ -17,7 +17,7 @@ import yaml
 from processes import processes_of_session, wait_until
 
 from datagen.__main__ import main
-from datagen.progress import BarProgress, JsonProgress
+from datagen.pool.progress import BarProgress, JsonProgress
 from hgn.command import run_command
 from hgn.config import DatagenConfig, DatasetConfig, SceneConfig, config_directory
 from hgn.data.manifest import Manifest

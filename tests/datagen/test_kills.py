@@ -1,4 +1,4 @@
-"""SIGKILL of anything, at any moment, costs time and nothing else. `python -m tools.kills` does the same at length."""
+"""SIGKILL of anything, at any moment, costs time and nothing else; `python -m tools.studies.kills` is longer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError
-from tools.kills import TARGETS, KillsConfig, differences, equal_shards, generate_with_kills
+from tools.studies.kills import TARGETS, KillsConfig, differences, equal_shards, generate_with_kills
 
 ROOT = Path(__file__).resolve().parents[2]
 MakeConfig = Callable[..., DatagenConfig]

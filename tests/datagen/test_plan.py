@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.plan import (
+from datagen.pool.plan import (
     ShardRange,
     episode_key,
     generation_order,

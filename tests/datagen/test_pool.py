@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.plan import scene_seed
-from datagen.pool import LocalCrew, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
-from datagen.progress import Progress
-from datagen.worker import Backend, Worker
-from datagen.writer import DatasetWriter
+from datagen.pool.plan import scene_seed
+from datagen.pool.pool import LocalCrew, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
+from datagen.pool.progress import Progress
+from datagen.pool.worker import Backend, Worker
+from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
@@ -89,7 +89,7 @@ def test_scenes_are_spread_over_solvers(make_config: MakeConfig, backend: Backen
     config = make_config(training_scenes=11, validation_scenes=0, test_scenes=0)
     batches: dict[int, list[int]] = {}
 
-    class Crew(LocalCrew):
+    class WorkerFactory(LocalCrew):
         def start_solver(self, number: int) -> Worker:
             worker = super().start_solver(number)
             give = worker.give
@@ -107,7 +107,7 @@ def test_scenes_are_spread_over_solvers(make_config: MakeConfig, backend: Backen
         batches.clear()
         plan = WorkerPlan(3, None, 1, 9, first)
         with DatasetWriter(config) as writer:
-            Pool(config, writer, Recorder(), plan, Crew(config, backend, plan)).run()
+            Pool(config, writer, Recorder(), plan, WorkerFactory(config, backend, plan)).run()
         assert batches == expected
 
 

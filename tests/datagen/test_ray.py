@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from datagen.pool import WorkerPlan
-from datagen.ray_crew import RayCrew, plan_cluster
-from datagen.worker import Backend
+from datagen.pool.pool import WorkerPlan
+from datagen.pool.ray_workers import RayWorkerFactory, plan_cluster
+from datagen.pool.worker import Backend
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
 from hgn.schema import ConfigError
 
@@ -48,7 +48,7 @@ def test_no_cluster(make_config: Callable[..., DatagenConfig], monkeypatch: pyte
     """Without Ray, or without a cluster, the message says what to do."""
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"needs Ray, which is not installed; pip install 'hgn\[ray\]'"):
-        RayCrew(make_config(pool="ray"), Backend())
+        RayWorkerFactory(make_config(pool="ray"), Backend())
 
 
 def test_cluster_plans() -> None:

@@ -19,8 +19,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from datagen.sendfile import EXTENSION, FileRange
-from datagen.server import make_server
+from datagen.service.sendfile import EXTENSION, FileRange
+from datagen.service.server import make_server
 
 SIZE = 5_000_001
 

@@ -18,12 +18,12 @@ from urllib.parse import unquote
 import pytest
 from processes import processes_of_session, wait_until
 
-import datagen.supervisor
-from datagen.progress import Progress
-from datagen.server import make_app
-from datagen.service import main
-from datagen.supervisor import PoolState, Supervisor
-from datagen.worker import Backend
+import datagen.service.supervisor
+from datagen.pool.progress import Progress
+from datagen.pool.worker import Backend
+from datagen.service.__main__ import main
+from datagen.service.server import make_app
+from datagen.service.supervisor import PoolState, Supervisor
 from hgn.command import run_command
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
@@ -39,7 +39,7 @@ SHARD = "/train-000002-000004.tar"
 
 @pytest.fixture(autouse=True)
 def no_long_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(datagen.supervisor, "_FIRST_PAUSE_S", 0.1)
+    monkeypatch.setattr(datagen.service.supervisor, "_FIRST_PAUSE_S", 0.1)
 
 
 @pytest.fixture

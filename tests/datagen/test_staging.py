@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from written_files import MakeConfig, MakeDataset, Stage, claim_all, hashes, snapshot
 
-import datagen.shard
-import datagen.writer
-from datagen.plan import scene_seed
-from datagen.writer import MAXIMUM_REPLACEMENTS, DatasetWriter
+import datagen.pool.shard
+import datagen.pool.writer
+from datagen.pool.plan import scene_seed
+from datagen.pool.writer import MAXIMUM_REPLACEMENTS, DatasetWriter
 from hgn.config import DatagenConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
@@ -49,7 +49,7 @@ def test_resume_after_a_crash_makes_the_same_shards(
         if calls == call:
             raise InterruptionError
 
-    stage_parts = datagen.shard.stage_parts
+    stage_parts = datagen.pool.shard.stage_parts
 
     def stage_and_crash(folder: Path, key: str, parts: Iterable[bytes]) -> None:
         stage_parts(folder, key, parts)
@@ -57,9 +57,9 @@ def test_resume_after_a_crash_makes_the_same_shards(
 
     with monkeypatch.context() as patch:
         # the last step of each staging and of each shard, so a crash there is a crash between files
-        patch.setattr(datagen.shard, "stage_parts", stage_and_crash)
-        patch.setattr(datagen.writer, "sync_folder", crash)
-        patch.setattr("hgn.files.sync_folder", crash)
+        patch.setattr(datagen.pool.shard, "stage_parts", stage_and_crash)
+        patch.setattr(datagen.pool.writer, "sync_folder", crash)
+        patch.setattr("hgn.system.files.sync_folder", crash)
         try:
             make_dataset(config)
         except InterruptionError:
@@ -201,7 +201,7 @@ def test_generators_share_a_folder(
 
 def test_first_writer_wins(make_config: MakeConfig, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where locks do not hold, two generators make a shard; the second copy is dropped, and it is listed once."""
-    monkeypatch.setattr("datagen.claims.Claims.take", lambda self, shard: True)
+    monkeypatch.setattr("datagen.pool.locks.ShardLocks.take", lambda self, shard: True)
     messages: list[str] = []
     with DatasetWriter(make_config()) as writer, DatasetWriter(make_config(), messages.append) as other:
         assert writer.claim_next() == other.claim_next()

@@ -19,9 +19,9 @@ import pytest
 import webdataset
 from written_files import MakeConfig, MakeDataset, Stage, claim_all, hashes
 
-from datagen.plan import ShardRange
-from datagen.shard import locate_members
-from datagen.writer import DatasetWriter
+from datagen.pool.plan import ShardRange
+from datagen.pool.shard import locate_members
+from datagen.pool.writer import DatasetWriter
 from hgn.config import DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore

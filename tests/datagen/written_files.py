@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
-from datagen.writer import DatasetWriter
+from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig
 
 MakeConfig = Callable[..., DatagenConfig]

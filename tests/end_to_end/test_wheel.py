@@ -57,7 +57,7 @@ def test_configs_travel_inside(wheel: Path) -> None:
     """All of conf/, the shipped weights and what the user's machine compiles are inside, byte for byte; tests, job
     files and caches are not."""
     with zipfile.ZipFile(wheel) as archive:
-        source = "hgn/network/rows.c"
+        source = "hgn/cpu/rows.c"
         assert archive.read(source) == (ROOT / source).read_bytes()
         names = archive.namelist()
         for path in (ROOT / "conf").rglob("*"):

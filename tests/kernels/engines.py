@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import torch
 
-from hgn.kernels.backward import TrainingEngine
-from hgn.kernels.engine import Engine, Tuning, feature_columns
+from hgn.kernels.backward import FusedTrainingNetwork
+from hgn.kernels.forward import FusedNetwork, Tuning, feature_columns
 from hgn.kernels.grid.op import DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
 from hgn.network.features import ParticleState
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 
 
 def device() -> torch.device:
@@ -26,7 +26,7 @@ def engine_of(
     spare_particles: int = 3,
     loss_scale: float = 1.0,
     tuning: Tuning | None = None,
-) -> TrainingEngine:
+) -> FusedTrainingNetwork:
     """All buffers that the forward pass writes are NaN before, so that what nobody writes shows."""
     config, where = network.config, device()
     particles = len(state.position_N3)
@@ -46,20 +46,20 @@ def engine_of(
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)
     count = torch.tensor([particles], dtype=torch.int32, device=where)
-    return TrainingEngine(config, packed, values, grid, count, precision, loss_scale, tuning)
+    return FusedTrainingNetwork(config, packed, values, grid, count, precision, loss_scale, tuning)
 
 
 def inference_of(
-    engine: TrainingEngine, network: HierarchicalGraphNetwork, half_cells: bool = False, half_sums: bool = False
-) -> Engine:
+    engine: FusedTrainingNetwork, network: HierarchicalGraphNetwork, half_cells: bool = False, half_sums: bool = False
+) -> FusedNetwork:
     """An engine that keeps nothing, on the same grid: other kernels than those of training."""
     tuning = replace(Tuning.of(engine.precision), half_cells=half_cells, half_sums=half_sums)
     given = (network.config, engine.packed, engine.values, engine.grid, engine.particle_count, engine.precision)
-    return Engine(*given, tuning=tuning)
+    return FusedNetwork(*given, tuning=tuning)
 
 
 def run_forward(
-    engine: Engine, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
+    engine: FusedNetwork, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
 ) -> torch.Tensor:
     """The engine's normalised accelerations of the state, [N, 3]."""
     where, grid, config = engine.device, engine.grid, network.config
@@ -96,7 +96,7 @@ def run_forward(
     return engine.output[: len(state.position_N3), :3].cpu()
 
 
-def gradients(engine: TrainingEngine, network: HierarchicalGraphNetwork) -> list[torch.Tensor]:
+def gradients(engine: FusedTrainingNetwork, network: HierarchicalGraphNetwork) -> list[torch.Tensor]:
     """What `backward` left, shaped as the network's parameters."""
     found = [torch.zeros_like(p, dtype=torch.float32) for p in network.parameters()]
     engine.packed.scatter(engine.totals[: engine.packed.size].cpu(), found)

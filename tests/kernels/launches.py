@@ -16,7 +16,7 @@ import torch
 from kernels.interpreter import dropped_bits
 from triton.runtime.jit import KernelInterface
 
-from hgn.kernels.engine import Engine
+from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.gns.op import FusedEdges
 
 
@@ -86,7 +86,7 @@ def watched(
 
 
 @contextmanager
-def watched_engine(see: Callable[[Launch], None], engine: Engine) -> Iterator[None]:
+def watched_engine(see: Callable[[Launch], None], engine: FusedNetwork) -> Iterator[None]:
     values = engine.values.double()
     parameters = {
         engine.weights.data_ptr(): values,
@@ -112,7 +112,7 @@ def watched_edges(see: Callable[[Launch], None]) -> Iterator[None]:
         yield
 
 
-def _encoder(engine: Engine, values: torch.Tensor) -> torch.Tensor:
+def _encoder(engine: FusedNetwork, values: torch.Tensor) -> torch.Tensor:
     """Its first layer on features and one-hot materials."""
     first, embedding, bias = engine._encode_views(values)
     used = engine.config.feature_width - engine.config.material_embedding

@@ -14,8 +14,8 @@ import torch
 from kernels.launches import Launch
 from torch.nn import functional
 
-from hgn.network.fcn import LEAKY_SLOPE
 from hgn.network.grid import CORNER_83, DIRECTION_63
+from hgn.network.mlp import LEAKY_SLOPE
 
 # Found and expected, by what they are. Where summands cancel, third the size that they have: see pairs_backward.
 Pairs = dict[str, tuple[torch.Tensor, torch.Tensor] | tuple[torch.Tensor, torch.Tensor, float]]

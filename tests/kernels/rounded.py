@@ -12,8 +12,8 @@ from unittest import mock
 
 import torch
 
-from hgn.network import fcn, network
-from hgn.network.fcn import FCN
+from hgn.network import hgn, mlp
+from hgn.network.mlp import MLP
 
 MANTISSA_BITS = 10  # of TF32 and float16, the leading one not counted
 
@@ -61,17 +61,17 @@ def rounding(stored: bool) -> Iterator[None]:
         out = _Product.apply(value, weight)
         return out if bias is None else out + bias
 
-    def add_projection(self: FCN, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
+    def add_projection(self: MLP, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
         return hidden.add_(self.project(part, value))
 
     def kept(function: Any) -> Any:
         return lambda *values: _Stored.apply(function(*values)) if stored else function(*values)
 
     with (
-        mock.patch.object(fcn, "linear", linear),
-        mock.patch.object(FCN, "add_projection", add_projection),
-        mock.patch.object(FCN, "project", kept(FCN.project)),
-        mock.patch.object(FCN, "finish", kept(FCN.finish)),
-        mock.patch.object(network, "_scatter", kept(network._scatter)),
+        mock.patch.object(mlp, "linear", linear),
+        mock.patch.object(MLP, "add_projection", add_projection),
+        mock.patch.object(MLP, "project", kept(MLP.project)),
+        mock.patch.object(MLP, "finish", kept(MLP.finish)),
+        mock.patch.object(hgn, "_scatter", kept(hgn._scatter)),
     ):
         yield

@@ -11,11 +11,11 @@ from network.states import gns_of, random_state
 from network.test_edges import output_and_gradients
 
 from hgn.kernels.gns.op import FusedEdges, Tuning, fits
-from hgn.network.edges import PlainEdges
 from hgn.network.features import ParticleState
-from hgn.runtime.agreement import relative_error
-from hgn.runtime.gns_edges import edges_for, require_agreement
+from hgn.network.gns_edges import PlainEdges
+from hgn.runtime.gns_backend import edges_for, require_agreement
 from hgn.runtime.gns_graph import padded
+from hgn.runtime.parity import relative_error
 from hgn.schema import ConfigError
 
 SMALL = Tuning(block=16, backward_block=16, product_rows=16)

@@ -11,14 +11,14 @@ from kernels.engines import device
 from kernels.test_update import CELL_SIZE, episode, parameters_of, plain_updates
 from network.states import gns_of
 
-from hgn.data.chunk import WholeEpisode
+from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.update.op import UpdateSettings
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.runtime.gns_edges import use_edges
+from hgn.runtime.gns_backend import use_edges
 from hgn.schema import ConfigError
-from hgn.training.agreement import require_agreement
 from hgn.training.muon import Muon
+from hgn.training.parity import require_agreement
 
 PRECISION = "ieee" if device().type == "cpu" else "half"
 
@@ -80,7 +80,7 @@ def test_wrong_kernels_are_refused() -> None:
     none = torch.zeros(0, 3)
     cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
     episodes = [
-        WholeEpisode(each.position_TN3, each.material_N, *obstacles, each.domain_size)
+        EpisodeTensors(each.position_TN3, each.material_N, *obstacles, each.domain_size)
         for each, obstacles in ((made, cells), (still, (none.int(), none)))
     ]
     samples = [(made, 1, 3), (still, 0, 4)]

@@ -25,12 +25,12 @@ from network.test_edges import output_and_gradients
 from triton.runtime.jit import KernelInterface
 
 import hgn.kernels
-from hgn.kernels.backward import TrainingEngine
-from hgn.kernels.engine import Engine, Tuning
+from hgn.kernels.backward import FusedTrainingNetwork
+from hgn.kernels.forward import FusedNetwork, Tuning
 from hgn.kernels.gns.op import FusedEdges
 from hgn.network.features import ParticleState
-from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.agreement import relative_error
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.parity import relative_error
 from hgn.runtime.weights import find_weights, load_weights
 
 NATIVE = device().type == "cuda"
@@ -88,18 +88,18 @@ def kernels_of(*modules: str) -> set[str]:
     return {value.__name__ for values in found for value in values if isinstance(value, KernelInterface)}
 
 
-def judged(judge: Judge, engine: Engine, network: HierarchicalGraphNetwork, state: ParticleState) -> None:
+def judged(judge: Judge, engine: FusedNetwork, network: HierarchicalGraphNetwork, state: ParticleState) -> None:
     """A forward pass, and a backward pass where the engine has one. The grids' origins are those of space."""
     with watched_engine(judge, engine):
         run_forward(engine, network, state, torch.zeros_like(state.domain_S3))
-        if isinstance(engine, TrainingEngine):
+        if isinstance(engine, FusedTrainingNetwork):
             _, weight_N3 = drawn(network, state)
             engine.output_gradient[: len(weight_N3), :3] = (weight_N3 / engine.unscale).float()
             engine.backward()
     assert int(engine.grid.status) == 0
 
 
-def made(network: HierarchicalGraphNetwork, state: ParticleState, precision: str, room: int) -> TrainingEngine:
+def made(network: HierarchicalGraphNetwork, state: ParticleState, precision: str, room: int) -> FusedTrainingNetwork:
     """Tiles are larger in the interpreter, whose time goes by their number."""
     tuning = Tuning.of(precision)
     if not NATIVE:
@@ -118,9 +118,9 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every level is one of many rows, and so few programs run that each takes several tiles."""
-    monkeypatch.setattr("hgn.kernels.engine.FEW_ROWS", 0)
-    monkeypatch.setattr("hgn.kernels.engine.PROCESSORS", 2)
-    monkeypatch.setattr("hgn.kernels.engine.RESIDENT_PROGRAMS", 2)
+    monkeypatch.setattr("hgn.kernels.forward.FEW_ROWS", 0)
+    monkeypatch.setattr("hgn.kernels.forward.PROCESSORS", 2)
+    monkeypatch.setattr("hgn.kernels.forward.RESIDENT_PROGRAMS", 2)
 
 
 def width_for(precision: str) -> int:

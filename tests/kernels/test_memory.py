@@ -19,7 +19,7 @@ from triton.runtime.errors import InterpreterError
 
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW
 from hgn.kernels.update.op import DeviceSample
-from hgn.training.fast_states import FastOwnStates
+from hgn.training.graph_pushforward import GraphPushforwardPool
 
 cpu_only = pytest.mark.skipif(device().type != "cpu", reason="the checker sees what the interpreter does")
 
@@ -74,7 +74,9 @@ def test_own_states_stay_within_memory() -> None:
     same buffers launches what was captured, on the same memory."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     scenes = [scene_with_obstacles(0, 4), falling_episode(3, seed=1), scene_with_obstacles(3, 14)]
-    own = FastOwnStates(network, training_of(precision="highest", rollout_frames=2, rollout_share=0.9), CELL_SIZE, 0)
+    own = GraphPushforwardPool(
+        network, training_of(precision="highest", rollout_frames=2, rollout_share=0.9), CELL_SIZE, 0
+    )
     episodes = [placed(scene, network) for scene in scenes]
     updates = updates_of(network, 4)
     frames: dict[object, set[tuple]] = {}

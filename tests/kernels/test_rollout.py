@@ -16,10 +16,10 @@ from network.states import network_of, random_grid
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import DeviceGrid, Window
 from hgn.network.features import ParticleState
-from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime import fast
-from hgn.runtime.fast import FastRollout, LeftDomainError, first_capacities
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime import triton_rollout
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.runtime.triton_rollout import LeftDomainError, TritonRollout, first_capacities
 from hgn.schema import ConfigError
 
 GRAVITY = (0.0, -9.8, 0.0)
@@ -58,8 +58,8 @@ def test_overflow_loses_nothing() -> None:
     with torch.no_grad():
         spreading.normaliser.acceleration_std.fill_(0.03)
     state = Simulator(spreading, 60.0).start([scene(5)])
-    roomy = FastRollout(spreading, state, "highest", (64,))
-    tight = FastRollout(spreading, state, "highest", (16,))
+    roomy = TritonRollout(spreading, state, "highest", (64,))
+    tight = TritonRollout(spreading, state, "highest", (16,))
     expected = roomy.run(3)
     found = np.concatenate([tight.run(1), tight.run(2)])
     assert tight.growths > 0 and roomy.growths == 0
@@ -91,7 +91,7 @@ def test_later_simulations_begin_anew() -> None:
 def test_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames that are asked for one by one are bitwise those of a rollout, beside another simulation of the same
     simulator; the one that ends last is kept. What diverges gives its good frames first."""
-    monkeypatch.setattr(fast, "LOOK_FRAMES", 2)
+    monkeypatch.setattr(triton_rollout, "LOOK_FRAMES", 2)
     first, second = scene(3), scene(2, 1)
     simulator = Simulator(network(), 60.0, "fast", "highest")
     (expected,) = simulator.rollout([first], 4)
@@ -124,7 +124,7 @@ def test_memory_of_a_simulation(particles: int, side: int, most: float, monkeypa
     """In half precision the network of the paper's size simulates a million particles, of which a cell has three as on
     the bench, within 2.35 KB each, and 4,296 within 0.055 GB; what is asked are 3 KB and 0.1 GB. Counted over all
     tensors of a simulation without memory: weights, state and positions on their way to the host too."""
-    monkeypatch.setattr(FastRollout, "_window", lambda _: Window((0, 0, 0), (side, side, side)))
+    monkeypatch.setattr(TritonRollout, "_window", lambda _: Window((0, 0, 0), (side, side, side)))
     cells = tuple(round(share * particles) for share in (0.32, 0.0569, 0.0107, 0.0015))
     before = set(on_meta())
     with torch.device("meta"):
@@ -132,7 +132,7 @@ def test_memory_of_a_simulation(particles: int, side: int, most: float, monkeypa
         position_N3, velocity_NM3 = torch.zeros(particles, 3), torch.zeros(particles, 5, 3)
         index_N = torch.zeros(particles, dtype=torch.int64)
         state = ParticleState(position_N3, velocity_NM3, index_N, index_N, torch.zeros(1, 3), None)
-    rollout = FastRollout(whole, state, "half", first_capacities(cells, particles))
+    rollout = TritonRollout(whole, state, "half", first_capacities(cells, particles))
     gc.collect()
     held = sum(size for storage, size in on_meta().items() if storage not in before)
     assert 0.8 * most < held <= most
@@ -152,8 +152,8 @@ def test_growing_gives_back_first(monkeypatch: pytest.MonkeyPatch) -> None:
     with torch.no_grad():
         spreading.normaliser.acceleration_std.fill_(0.03)
     state = Simulator(spreading, 60.0).start([scene(5)])
-    expected = FastRollout(spreading, state, "highest", (64,)).run(3)
-    tight = FastRollout(spreading, state, "highest", (16,))
+    expected = TritonRollout(spreading, state, "highest", (64,)).run(3)
+    tight = TritonRollout(spreading, state, "highest", (16,))
     old = [weakref.ref(tight.grid), weakref.ref(tight.engine)]
     build, asked = DeviceGrid.__init__, []
 
@@ -175,14 +175,14 @@ def test_growing_gives_back_first(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_frames_taken_away_beside_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames that are started before those before them are looked at are the same bitwise, where buffers grow too: what
     was started in vain moves nothing; and the frame of a divergence is the same."""
-    monkeypatch.setattr(fast, "LOOK_FRAMES", 1)
+    monkeypatch.setattr(triton_rollout, "LOOK_FRAMES", 1)
     spreading = network()
     with torch.no_grad():
         spreading.normaliser.acceleration_std.fill_(0.03)
     state = Simulator(spreading, 60.0).start([scene(5)])
     paths, growths, lost = [], [], []
     for overlap in (False, True):
-        tight = FastRollout(spreading, state, "highest", (16,))
+        tight = TritonRollout(spreading, state, "highest", (16,))
         tight.overlap = overlap
         seen: list[int] = []
         paths.append(tight.run(3, seen.append))
@@ -215,7 +215,7 @@ def test_wrong_kernels_are_refused() -> None:
     """A rollout whose first output is not the plain network's is refused before it moves anything."""
     plain = network()
     state = Simulator(plain, 60.0).start([scene(5)])
-    rollout = FastRollout(plain, state, "highest")
+    rollout = TritonRollout(plain, state, "highest")
     rollout.require_agreement(plain, state)
     other = network()
     with torch.no_grad():

@@ -16,18 +16,18 @@ from training.test_symmetry import CELL_SIZE, CYCLIC, EIGHT, doubled, scene_with
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import make_batch
-from hgn.data.chunk import Chunk, whole_episode
-from hgn.data.order import Cursor, Sample
+from hgn.data.episode_tensors import UpdateChunk, whole_episode
+from hgn.data.sampler import Sample, SamplerState
 from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.update.op import DeviceEpisode
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.agreement import relative_error
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.parity import relative_error
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import scene_symmetries
-from hgn.training.fast import FastTraining
+from hgn.training.graph_trainer import GraphTrainer
 from hgn.training.symmetry import under_symmetries
 
 FRAME = 6
@@ -71,10 +71,10 @@ def test_an_update_under_symmetries_is_the_plain_one(kind: str) -> None:
     training = TrainingConfig(batch_scenes=8, noise_std=0.0, grid_jitter=False, symmetry="gravity", precision="highest")
     loss_sum, counters = torch.zeros(2, device=device()), torch.zeros(5, device=device())
     optimizer = torch.optim.Adam(trained.parameters())
-    fast = FastTraining(trained, optimizer, training, CELL_SIZE, loss_sum, counters)
+    fast = GraphTrainer(trained, optimizer, training, CELL_SIZE, loss_sum, counters)
     samples = tuple(Sample(i, FRAME, seed) for i, seed in enumerate(seeds))
     wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}
-    fast.run(Chunk((samples,), wholes, Cursor()), [0.0])
+    fast.run(UpdateChunk((samples,), wholes, SamplerState()), [0.0])
     updates, count, width = fast.updates, len(state.position_N3), 3 * HISTORY
     assert fast.agreement is not None and max(fast.agreement) < 1e-3
     near = {"rtol": 0, "atol": 1e-7}

@@ -14,10 +14,10 @@ from training.runs import metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
-from hgn.runtime.path import choose_path, path_on, why_not_fast, why_not_trained_fast
+from hgn.runtime.backend import choose_path, path_on, why_not_fast, why_not_trained_fast
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.feed import UPDATES_AT_ONCE, chunk_length
+from hgn.training.data_module import UPDATES_AT_ONCE, chunk_length
 
 NETWORK = {"width": 16, "levels": 1, "message_passing_steps": 1, "material_embedding": 2, "cell_size": 0.2}
 
@@ -42,7 +42,7 @@ def test_fast_training_is_the_plain_one(
     """Without noise and jitter both paths make the same updates: every count and log line is there, weights,
     their average and moments agree; a training may change path at any checkpoint, and ends where the others do."""
     if device().type == "cpu":
-        monkeypatch.setattr("hgn.runtime.path.why_not_fast", lambda *_: None)  # kernels run in the interpreter
+        monkeypatch.setattr("hgn.runtime.backend.why_not_fast", lambda *_: None)  # kernels run in the interpreter
     same = {"noise_std": 0.0, "grid_jitter": False, "warmup_updates": 3, "ema_decay": 0.7}
     ends = {}
     for name, parts in {

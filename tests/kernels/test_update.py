@@ -11,16 +11,16 @@ from kernels.engines import device
 from network.states import network_of, random_grid
 from torch.nn.functional import huber_loss
 
-from hgn.data.chunk import WholeEpisode
+from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.features import ParticleState
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.orthogonal import orthogonalised
 from hgn.schema import ConfigError
-from hgn.training.agreement import require_agreement
 from hgn.training.muon import Muon
+from hgn.training.parity import require_agreement
 
 HISTORY = 5
 CELL_SIZE = 1 / 64
@@ -234,7 +234,7 @@ def test_wrong_kernels_are_refused() -> None:
     none = torch.zeros(0, 3)
     cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
     episodes = [
-        WholeEpisode(each.position_TN3, each.material_N, *obstacles, each.domain_size)
+        EpisodeTensors(each.position_TN3, each.material_N, *obstacles, each.domain_size)
         for each, obstacles in ((made, cells), (still, (none.int(), none)))
     ]
     samples = [(made, 1, 3), (still, 0, 4)]

@@ -1,6 +1,6 @@
 """The network of the paper written the slow, literal way, over the weights of the real one.
 
-Cells live in dictionaries, pairs and edges in Python lists, and every FCN sees its concatenated input: no splitting
+Cells live in dictionaries, pairs and edges in Python lists, and every MLP sees its concatenated input: no splitting
 of first layers, no keys, no sorting. Used only to check the real network.
 """
 
@@ -12,7 +12,7 @@ import math
 import torch
 
 from hgn.network.features import ParticleState
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 
 
 def naive_normalised_acceleration(

@@ -10,7 +10,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.obstacle_grid import ObstacleGrid
 

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hgn.network.cell_keys import COORDINATE_LIMIT, SCENE_LIMIT, find, pack, unpack
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridRangeError, build_hierarchy
-from hgn.network.keys import COORDINATE_LIMIT, SCENE_LIMIT, find, pack, unpack
 
 SIZE = 0.25  # a power of two: centres and halves are exact
 

@@ -11,12 +11,12 @@ from network.naive import naive_normalised_acceleration
 from network.states import network_of, random_grid, random_state, scene_of
 
 from hgn.config import NetworkConfig
-from hgn.network.fcn import FCN
+from hgn.cpu.rows import Rows
 from hgn.network.features import wall_distances
 from hgn.network.grid import build_hierarchy
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.mlp import MLP
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.rows import Rows
 
 
 @pytest.mark.parametrize(
@@ -30,9 +30,9 @@ def test_parameter_counts_are_the_papers(changes, millions):
 
 
 def test_fcn_halves_equal_the_definition():
-    """Projecting parts where they live and summing equals the FCN of the concatenation."""
+    """Projecting parts where they live and summing equals the MLP of the concatenation."""
     torch.manual_seed(0)
-    network = FCN((5, 3, 2), 8, 4).double()
+    network = MLP((5, 3, 2), 8, 4).double()
     parts = [torch.randn(7, width, dtype=torch.float64) for width in network.parts]
     hidden = sum(network.project(i, part) for i, part in enumerate(parts)) + network.first.bias
     torch.testing.assert_close(network.finish(hidden), network(*parts), rtol=1e-12, atol=1e-12)
@@ -102,9 +102,9 @@ def test_blocks_change_nothing(monkeypatch, dtype, tolerance, kind, threads, row
     network = network_of(width=128, levels=4).train()
     state = random_state(counts, spread=0.15)
     expected = network.normalised_acceleration(state).detach()
-    monkeypatch.setattr("hgn.network.blockwise.ROWS_AT_ONCE", rows)
+    monkeypatch.setattr("hgn.cpu.network.ROWS_AT_ONCE", rows)
     if kind is not None:  # none: compiled, where there is a compiler
-        monkeypatch.setattr("hgn.network.blockwise.rows_class", lambda *_: kind)
+        monkeypatch.setattr("hgn.cpu.network.rows_class", lambda *_: kind)
     state = replace(state, position_N3=state.position_N3.to(dtype), velocity_NM3=state.velocity_NM3.to(dtype))
     state = replace(state, domain_S3=state.domain_S3.to(dtype))
     before = torch.get_num_threads()
@@ -143,7 +143,7 @@ def test_frames_without_earlier_steps_or_edges(steps, lone):
 def test_frames_of_batches_equal_single_scenes(monkeypatch, kind):
     """What shares a batch with a scene, and with it the blocks, changes no bit of a frame's output on a CPU."""
     if kind is not None:  # none: compiled, where there is a compiler
-        monkeypatch.setattr("hgn.network.blockwise.rows_class", lambda *_: kind)
+        monkeypatch.setattr("hgn.cpu.network.rows_class", lambda *_: kind)
     counts = (40, 7, 1, 325)
     network = network_of(dtype=torch.float32, width=128, levels=4)
     state = random_state(counts, dtype=torch.float32, spread=0.2)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from network.states import network_of, random_grid
 
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.obstacle_grid import ObstacleGrid

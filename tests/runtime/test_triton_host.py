@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.runtime.path import path_on
+from hgn.runtime.backend import path_on
 from hgn.runtime.triton_host import why_no_triton
 from hgn.schema import ConfigError
 

@@ -213,7 +213,7 @@ def test_failed_save_leaves_the_old_file(weights: Path, monkeypatch: pytest.Monk
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("hgn.files.os.fsync", full)
+    monkeypatch.setattr("hgn.system.files.os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
         save_weights(weights, network, info, half=True)
     assert weights.read_bytes() == before

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 
-from hgn.data.order import SampleOrder
+from hgn.data.sampler import EpisodeSampler
 from hgn.scene.symmetry import Symmetry, drawn_symmetry, scene_symmetries
 
 CUBE = (1.0, 1.0, 1.0)
@@ -70,7 +70,7 @@ def test_draws_are_uniform_and_belong_to_the_seed() -> None:
     """Over 16,000 seeds of an order, or in a row, each of the eight is drawn within five standard deviations as often
     as the others; the same seed draws the same."""
     group = scene_symmetries(DOWN, CUBE, CELL_SIZE)
-    order = SampleOrder(0, 16_000, lambda _: [1_001] * 16)
+    order = EpisodeSampler(0, 16_000, lambda _: [1_001] * 16)
     spread = (16_000 / 8 * 7 / 8) ** 0.5
     for seeds in ([sample.seed for sample in order.next_batch()], range(16_000)):
         drawn = [drawn_symmetry(group, seed) for seed in seeds]

@@ -289,7 +289,13 @@ def test_an_interrupted_run_keeps_what_it_has(tmp_path: Path, compare: Callable[
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """One with a tree as small as can be, with weights in it, as the current folder."""
     folder = tmp_path / "repository"
-    files = ("hgn/kernels/ahead.py", "tools/bench/fast.py", "pyproject.toml", "hgn/weights/a.safetensors", "tests/t.py")
+    files = (
+        "hgn/kernels/precompile.py",
+        "tools/bench/fast.py",
+        "pyproject.toml",
+        "hgn/weights/a.safetensors",
+        "tests/t.py",
+    )
     for file in files:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).write_text(file)
@@ -309,7 +315,7 @@ def test_trees_by_name(repository: Path, tmp_path: Path) -> None:
     assert (branch.name, branch.number, folder.name, folder.number) == ("main", 0, "..", 1)
     assert len(branch.commit) == 12 and folder.commit == branch.commit and folder.folder == repository
     taken = sorted(str(path.relative_to(branch.folder)) for path in branch.folder.rglob("*") if path.is_file())
-    assert taken == ["hgn/kernels/ahead.py", "pyproject.toml", "tools/bench/fast.py"]
+    assert taken == ["hgn/kernels/precompile.py", "pyproject.toml", "tools/bench/fast.py"]
     (repository / "pyproject.toml").write_text("changed")
     assert find_trees([str(repository)], tmp_path) == [Tree(0, "repository", repository, f"{branch.commit}+changes")]
 
@@ -319,7 +325,10 @@ def test_trees_by_name(repository: Path, tmp_path: Path) -> None:
     [
         (["no_branch"], r"trees\[0\] must be a folder, or a commit or branch .* got 'no_branch'; git says: fatal"),
         (["main", "--help"], r"trees\[1\] must be a folder, or a commit"),
-        ([".."], r"trees\[0\] must be a tree with hgn/kernels/ahead.py and .* got '..'; name the folder above hgn"),
+        (
+            [".."],
+            r"trees\[0\] must be a tree with hgn/kernels/precompile.py and .* got '..'; name the folder above hgn",
+        ),
         (["{other}/x", "{here}/x"], r"trees\[1\] must be of another name than the others, got 'x'"),
     ],
 )

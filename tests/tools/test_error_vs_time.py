@@ -21,8 +21,8 @@ from datagen.mpm.solver import SceneFailure, Simulated
 from hgn.config import DatagenConfig, MpmConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
+from hgn.runtime.rollouts import RolloutResult, network_trials
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.trial import Trial, network_trials
 from hgn.runtime.weights import WeightsInfo, save_weights, shipped_weights
 from hgn.scene.distance import share_inside
 from hgn.scene.shapes import shape_obstacle
@@ -36,7 +36,7 @@ from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergence, sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
-from tools.trial import FrameClock, other_grid
+from tools.solver_rollouts import FrameClock, other_grid
 
 CPU = torch.device("cpu")
 FRAMES = 6
@@ -379,7 +379,7 @@ def test_scenes_that_failed_leave_the_means(data: str) -> None:
     episodes = list(EpisodeStore(data, "validation").episodes)
     config = ErrorVsTimeConfig(data="d", out="x", sinkhorn_points=4)
     paths = [np.array(episode.position_TN3) for episode in episodes]
-    trials = [Trial(paths[0] + np.float32(0.1)), Trial(paths[1][:3] + np.float32(0.2), "why")]
+    trials = [RolloutResult(paths[0] + np.float32(0.1)), RolloutResult(paths[1][:3] + np.float32(0.2), "why")]
     row = score.rollout_figures(trials, episodes, config, CPU)
     np.testing.assert_allclose(row["curve"], [*[0.075] * 3, *[0.03] * 3], rtol=1e-4)
     assert row["scenes_reached"] == {"5": 1} and row["first_failure_frame"] == 3 and row["first_failure"] == "why"

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.runtime.agreement import relative_error
+from hgn.runtime.parity import relative_error
 from hgn.schema import ConfigError
 from tools.bench.public_gns import PublicFrame, PublicGns, PublicTrain, load_public
 from tools.bench.states import Workload

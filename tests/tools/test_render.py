@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from hgn.config import DatagenConfig
-from hgn.data.select import find_episode
-from hgn.picture import rollout_of_episode
+from hgn.data.lookup import find_episode
+from hgn.render.pictures import rollout_of_episode
 from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
 from hgn.schema import ConfigError
 from tools.render import RenderConfig, main

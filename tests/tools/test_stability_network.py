@@ -16,8 +16,8 @@ from PIL import Image
 
 from hgn.config import SceneConfig
 from hgn.network.features import ParticleState
+from hgn.runtime.rollouts import RolloutResult
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.trial import Trial
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -151,7 +151,7 @@ def test_a_slope_against_a_closed_form() -> None:
     seconds = np.arange(case.frames)[:, None, None] / 60
     for share in (1.0, 0.7):
         slid = (scene.position_N3 + 0.5 * share * pull * seconds**2).astype(np.float32)
-        found = share_of_way(Trial(slid), InitialState.of_scene(scene), 60.0, case.known_3, case.known_frames)
+        found = share_of_way(RolloutResult(slid), InitialState.of_scene(scene), 60.0, case.known_3, case.known_frames)
         assert found == pytest.approx(share, rel=1e-3)
     low, high = slope.vertex_V3.min(0), slope.vertex_V3.max(0)
     assert ((slid.mean(1) >= low - 0.08) & (slid.mean(1) <= high + 0.08)).all()
@@ -163,10 +163,12 @@ def test_energy_growth_against_a_closed_form() -> None:
     initial = InitialState.of_scene(scene)
     time = np.arange(12)[:, None, None] / 60
     fall = scene.position_N3 + 0.5 * np.array(scene.gravity) * time**2
-    assert energy_growth(Trial(fall.astype(np.float32)), initial, 60.0) < 1e-4
+    assert energy_growth(RolloutResult(fall.astype(np.float32)), initial, 60.0) < 1e-4
     thrown = fall + np.array([0, 1.4, 0]) * time
-    assert energy_growth(Trial(thrown.astype(np.float32)), initial, 60.0) == pytest.approx(0.5 * 1.4**2 / 9.8, rel=5e-3)
-    assert energy_growth(Trial(thrown[:1]), initial, 60.0) == 0
+    assert energy_growth(RolloutResult(thrown.astype(np.float32)), initial, 60.0) == pytest.approx(
+        0.5 * 1.4**2 / 9.8, rel=5e-3
+    )
+    assert energy_growth(RolloutResult(thrown[:1]), initial, 60.0) == 0
 
 
 @pytest.mark.parametrize(("stretch", "held"), [(1.0, True), (1.05, True), (1.6, False), (0.3, False)])
@@ -187,7 +189,7 @@ def test_resting_snow_keeps_its_density(stretch: float, held: bool) -> None:
         path = np.stack([lattice_N3] * 3 + [0.4 + stretch * (lattice_N3 - 0.4)]).astype(np.float32)
         path[-1, 5] += broken
         case = Case("4 frames", (), 4, settled=settled)
-        return case_row(Simulator(network_of(), 60.0), case, [scene], 1.0, [Trial(path)], None)
+        return case_row(Simulator(network_of(), 60.0), case, [scene], 1.0, [RolloutResult(path)], None)
 
     found = row(snow, 2)
     assert found.held is held and (held or "times the neighbours that it had after 2 frames" in found.beyond)

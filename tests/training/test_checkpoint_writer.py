@@ -16,7 +16,7 @@ from training.runs import train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig
-from hgn.files import write_atomically
+from hgn.system.files import write_atomically
 from hgn.training import checkpoint_writer
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
@@ -27,7 +27,7 @@ KILLED = """
 import sys, time
 from pathlib import Path
 import torch
-from hgn import files
+from hgn.system import files
 from hgn.training.checkpoint_writer import CheckpointWriter
 
 def forever(descriptor):

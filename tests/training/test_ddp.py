@@ -20,7 +20,7 @@ from training.runs import metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig, TrainingConfig
-from hgn.data.order import SampleOrder
+from hgn.data.sampler import EpisodeSampler
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.launch import default_run, first_rank, layout
@@ -161,10 +161,10 @@ def test_two_ranks_train_as_one(reference: Reference, tmp_path: Path) -> None:
         original = TrainingModule.training_step
         patch.setattr(TrainingModule, "training_step", lambda m, b, i: (seen.append(b.seeds_S), original(m, b, i))[1])
         assert train.main(alone) == 0
-    order = SampleOrder(alone["training"].get("seed", 0), 2, lambda _: [6] * 5)
+    order = EpisodeSampler(alone["training"].get("seed", 0), 2, lambda _: [6] * 5)
     for _ in range(20):
         order.next_batch()
-    rest = SampleOrder(order.seed, 1, lambda _: [6] * 5, order.cursor)
+    rest = EpisodeSampler(order.seed, 1, lambda _: [6] * 5, order.cursor)
     assert seen == [tuple(sample.seed for sample in rest.next_batch()) for _ in range(20)]
 
 

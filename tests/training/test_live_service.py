@@ -17,8 +17,8 @@ from processes import wait_until
 from training.runs import metrics, train_mapping
 
 import hgn.data.storage
-import hgn.training.feed
-from datagen.plan import scene_seed
+import hgn.training.data_module
+from datagen.pool.plan import scene_seed
 from hgn import train
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
@@ -130,7 +130,7 @@ def test_stopped_while_its_service_is_away(
     """SIGTERM that finds a training waiting for a server that is gone ends it at once, after a checkpoint of all that
     was trained on; the same command goes on there."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setattr(hgn.training.feed, "LOOK_S", 0.05)
+    monkeypatch.setattr(hgn.training.data_module, "LOOK_S", 0.05)
     make_dataset(make_config())
     files = fsspec.filesystem("memory")
     for path in (tmp_path / "data").glob("*.*"):

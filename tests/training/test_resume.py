@@ -18,10 +18,10 @@ from training.runs import NETWORK, TRAINING, train_mapping
 from hgn import train
 from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch
-from hgn.data.order import Cursor, SampleOrder
 from hgn.data.reader import EpisodeStore
+from hgn.data.sampler import EpisodeSampler, SamplerState
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.feed import Feed
+from hgn.training.data_module import EpisodeDataModule
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
@@ -36,7 +36,7 @@ class Samples:
     def __init__(self) -> None:
         self.epochs: dict[int, list[tuple[int, int]]] = {}
 
-    def take(self, orders: Sequence[SampleOrder]) -> None:
+    def take(self, orders: Sequence[EpisodeSampler]) -> None:
         """One global batch: the ranks' shares follow each other, and may run over the end of an epoch."""
         cursor = orders[0].cursor
         left = len(orders[0]._order) - cursor.position
@@ -44,7 +44,7 @@ class Samples:
             self.epochs.setdefault(cursor.epoch + (number >= left), []).append((sample.episode, sample.frame))
         assert all(order.cursor == orders[0].cursor for order in orders)
 
-    def require_each_once(self, cursor: Cursor, frames: Callable[[int], Sequence[int]]) -> None:
+    def require_each_once(self, cursor: SamplerState, frames: Callable[[int], Sequence[int]]) -> None:
         """Every epoch before the cursor's has each sample of episodes of `frames` frames once, its own none twice."""
         for epoch, samples in self.epochs.items():
             expected = [(e, n) for e, count in enumerate(frames(epoch)) for n in range(count - 1)]
@@ -55,9 +55,9 @@ class Samples:
 
 
 def ranks_of(
-    world_size: int, batch: int, published: Callable[[int], Sequence[int]], cursor: Cursor | None = None
-) -> list[SampleOrder]:
-    return [SampleOrder(5, batch, published, cursor, rank, world_size) for rank in range(world_size)]
+    world_size: int, batch: int, published: Callable[[int], Sequence[int]], cursor: SamplerState | None = None
+) -> list[EpisodeSampler]:
+    return [EpisodeSampler(5, batch, published, cursor, rank, world_size) for rank in range(world_size)]
 
 
 @settings(max_examples=80, deadline=None)
@@ -67,7 +67,7 @@ def test_each_sample_once_an_epoch_through_any_interruptions(
 ) -> None:
     """However often a training is interrupted, and on whatever number of ranks and batch size it goes on, each epoch
     has every sample exactly once."""
-    total, seen, cursor = sum(frames) - len(frames), Samples(), Cursor()
+    total, seen, cursor = sum(frames) - len(frames), Samples(), SamplerState()
     for world_size, batch, batches in starts:
         orders = ranks_of(world_size, min(batch, max(1, total // world_size)), lambda _: frames, cursor)
         if world_size * orders[0].batch_scenes > total:
@@ -99,7 +99,7 @@ def test_an_epoch_keeps_the_revision_it_began_with(
             begun[epoch] = len(published)
         return list(published)
 
-    seen, cursor = Samples(), Cursor()
+    seen, cursor = Samples(), SamplerState()
     for batches, grown_meanwhile in starts:
         published.extend([2] * grown_meanwhile)
         orders = ranks_of(world_size, 1, look, cursor)
@@ -124,9 +124,9 @@ def test_reading_ahead_changes_nothing(data: DatagenConfig) -> None:
     network, training = NetworkConfig(**NETWORK), TrainingConfig(**TRAINING)
     store = EpisodeStore(data.dataset.folder, "train")
 
-    def batches(ahead: int, count: int, cursor: Cursor | None = None) -> list[Batch]:
-        feed = Feed(store, network, training, batches_ahead=ahead)
-        feed.cursor = cursor or Cursor()
+    def batches(ahead: int, count: int, cursor: SamplerState | None = None) -> list[Batch]:
+        feed = EpisodeDataModule(store, network, training, batches_ahead=ahead)
+        feed.cursor = cursor or SamplerState()
         return list(islice(feed.batches(), count))
 
     expected = batches(0, 30)
@@ -155,7 +155,7 @@ def test_feeds_of_all_ranks_resume_anywhere(data: DatagenConfig) -> None:
     at that moment, the ranks together get the samples of one uninterrupted process, each once and in its order."""
     network = NetworkConfig(**NETWORK)
     store = EpisodeStore(data.dataset.folder, "train")
-    whole = SampleOrder(TrainingConfig(**TRAINING).seed, 1, lambda _: [6] * 5)
+    whole = EpisodeSampler(TrainingConfig(**TRAINING).seed, 1, lambda _: [6] * 5)
     expected = [whole.next_batch()[0].seed for _ in range(8 * 2 * 3 * 4)]
 
     @settings(max_examples=25, deadline=None, derandomize=True)
@@ -168,12 +168,12 @@ def test_feeds_of_all_ranks_resume_anywhere(data: DatagenConfig) -> None:
     )
     def interrupted(starts: list[tuple[int, int, int, int]]) -> None:
         seen: list[int] = []
-        cursor = Cursor()
+        cursor = SamplerState()
         for world_size, batch_scenes, ahead, count in starts:
             training = TrainingConfig(**TRAINING | {"batch_scenes": batch_scenes})
             ranks = []
             for rank in range(world_size):
-                feed = Feed(store, network, training, batches_ahead=ahead)
+                feed = EpisodeDataModule(store, network, training, batches_ahead=ahead)
                 feed.cursor, feed.trainer = cursor, Shared(rank, world_size)
                 ranks.append(list(islice(feed.batches(), count)))
             for batches in zip(*ranks, strict=True):
@@ -236,7 +236,7 @@ def test_resume_equals_no_interruption(data: DatagenConfig, stop_at: Callable[[i
 
     with tempfile.TemporaryDirectory() as folder:
         whole = trained(Path(folder) / "whole", [])
-    assert dataclasses.asdict(Cursor(1, 7, 5)) == whole["hgn"]["cursor"]
+    assert dataclasses.asdict(SamplerState(1, 7, 5)) == whole["hgn"]["cursor"]
 
     @settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
     @given(st.lists(st.integers(1, UPDATES - 1), min_size=1, max_size=2, unique=True).map(sorted))

@@ -18,7 +18,7 @@ from training.runs import metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig
-from hgn.runtime.trial import Trial
+from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError
 from hgn.training import callbacks
 from hgn.training.checkpoint import read_checkpoint
@@ -97,7 +97,7 @@ def test_a_scene_that_diverges_leaves_the_others_measured(data, tmp_path, monkey
 
     def cut_short(*arguments):
         first, *others = real(*arguments)
-        return [Trial(first.position_TN3[:2], "diverged"), *others]
+        return [RolloutResult(first.position_TN3[:2], "diverged"), *others]
 
     monkeypatch.setattr(callbacks, "network_trials", cut_short)
     run = tmp_path / "run"

@@ -12,8 +12,8 @@ from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig, EvaluateConfig, NetworkConfig, TrainingConfig
+from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
-from hgn.data.select import first_episodes
 from hgn.evaluate import one_step_rows
 from hgn.export import export
 from hgn.network.build import build_network

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 
 from hgn.command import run_command
-from hgn.device import choose_device
-from hgn.files import write_json
-from hgn.progress import bar
-from hgn.provenance import provenance, without_folders
-from hgn.runtime.path import why_not_fast, why_not_trained_fast
+from hgn.runtime.backend import why_not_fast, why_not_trained_fast
 from hgn.schema import from_mapping, to_mapping
+from hgn.system.device import choose_device
+from hgn.system.files import write_json
+from hgn.system.progress import bar
+from hgn.system.provenance import provenance, without_folders
 from tools.bench.config import CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
 from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, NaiveFrame, Train, checked_workload
 from tools.bench.fast import PATH_PRECISION, FastFrame, FastTrain

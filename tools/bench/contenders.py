@@ -21,9 +21,9 @@ from hgn.network.build import build_network
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import build_hierarchy
-from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.agreement import relative_error
-from hgn.runtime.gns_edges import use_edges
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.gns_backend import use_edges
+from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule

@@ -11,9 +11,9 @@ import torch
 
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.agreement import relative_error
-from hgn.runtime.path import kernel_precision
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.backend import kernel_precision
+from hgn.runtime.parity import relative_error
 from tools.bench.contenders import (
     BOUNDS,
     GRADIENT_BOUNDS,
@@ -37,14 +37,14 @@ class FastFrame:
     """One frame of a simulation; what is timed puts the same state back before each."""
 
     def __init__(self, precision: str, config: NetworkConfig, work: Workload, device: torch.device) -> None:
-        from hgn.runtime.fast import FastRollout  # loads Triton
+        from hgn.runtime.triton_rollout import TritonRollout  # loads Triton
 
         self.device = device
         network = bench_network(config, device)
         assert isinstance(network, HierarchicalGraphNetwork)
         self.network, self.state = network, state_of(work, config, device)
         self.velocity_NV = self.state.velocity_NM3.flatten(1)  # a view
-        self.rollout = FastRollout(network, self.state, PATH_PRECISION[precision])
+        self.rollout = TritonRollout(network, self.state, PATH_PRECISION[precision])
         self.failure: str | None = None
 
     @property

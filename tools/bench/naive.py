@@ -1,6 +1,6 @@
-"""The network as one writes it first: each FCN sees its inputs beside each other, for all pairs and edges at once.
+"""The network as one writes it first: each MLP sees its inputs beside each other, for all pairs and edges at once.
 
-The same function of the same weights as hgn.network.network, which multiplies inputs where they live instead, and takes
+The same function of the same weights as hgn.network.hgn, which multiplies inputs where they live instead, and takes
 a CPU's rows in blocks. Shape legend: N particles, C cells, E directed edges, W width.
 """
 
@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import torch
 
-from hgn.network.fcn import FCN
 from hgn.network.features import ParticleState, wall_distances
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level
-from hgn.network.network import HierarchicalGraphNetwork, MessagePassing
+from hgn.network.hgn import HierarchicalGraphNetwork, MessagePassing
+from hgn.network.mlp import MLP
 
 
 class NaiveNetwork(HierarchicalGraphNetwork):
@@ -64,7 +64,7 @@ def _passed(passing: torch.nn.Module, cell_CW: torch.Tensor, level: Level) -> to
 
 
 def _output(network: torch.nn.Module, *parts: torch.Tensor) -> torch.Tensor:
-    assert isinstance(network, FCN)
+    assert isinstance(network, MLP)
     hidden = torch.nn.functional.leaky_relu(network.first(torch.cat(parts, -1)), network.slope)
     out: torch.Tensor = network.second(hidden)
     return out if network.norm is None else network.norm(out)

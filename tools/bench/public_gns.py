@@ -25,10 +25,10 @@ from torch import nn
 
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch
-from hgn.network.fcn import FCN
 from hgn.network.gns import GraphNetworkSimulator, InteractionStep
+from hgn.network.mlp import MLP
 from hgn.network.neighbours import neighbour_list
-from hgn.runtime.agreement import relative_error
+from hgn.runtime.parity import relative_error
 from hgn.schema import ConfigError, require
 from hgn.training.noise import perturbed_window
 from tools.bench.contenders import BOUNDS, bench_network, reference_output, verdict
@@ -209,7 +209,7 @@ class PublicTrain(PublicGns):
         return verdict("loss", relative_error(self.loss(self.batch).double(), expected), BOUNDS[precision])
 
 
-def _copy(theirs: Any, ours: FCN, same_input: bool = True) -> None:
+def _copy(theirs: Any, ours: MLP, same_input: bool = True) -> None:
     """Layers and norm, but for the first layer's matrix where its columns are in another order."""
     layers = theirs[0]
     if same_input:

@@ -17,10 +17,10 @@ import torch
 
 from hgn.command import run_command
 from hgn.config import NetworkConfig
-from hgn.device import choose_device
-from hgn.provenance import provenance, without_folders
-from hgn.runtime.path import why_not_fast
+from hgn.runtime.backend import why_not_fast
 from hgn.schema import from_mapping, require, to_mapping
+from hgn.system.device import choose_device
+from hgn.system.provenance import provenance, without_folders
 from tools.compare.children import Children
 from tools.compare.config import CompareConfig
 from tools.compare.report import Report

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
-from hgn.parent import die_with_parent
+from hgn.system.processes import die_with_parent
 from tools.compare.trees import Tree
 
 PROGRAMS = Path(__file__).parent

@@ -12,10 +12,10 @@ from typing import Any
 import torch
 
 from hgn.config import NetworkConfig, TrainingConfig
-from hgn.kernels import ahead
+from hgn.kernels import precompile
 from hgn.kernels.update.op import UpdateSettings
 from hgn.network.grid import build_hierarchy
-from hgn.runtime.path import KERNEL_PRECISION
+from hgn.runtime.backend import KERNEL_PRECISION
 from hgn.schema import from_mapping
 from tools.bench.contenders import checked_workload
 from tools.bench.fast import OBSTACLE_CELL_SIZE
@@ -25,23 +25,23 @@ from tools.bench.states import Workload, state_of
 def compile_share(settings: dict[str, Any], share: int, shares: int) -> int:
     """Compiles every `shares`-th kernel of all cases, from number `share` on; how many those are."""
     jobs = _jobs(settings)
-    ahead.use_target(settings["capability"])
-    found: ahead.Launches = {}
+    precompile.use_target(settings["capability"])
+    found: precompile.Launches = {}
     for job in jobs:  # all before the first is compiled: what is would be launched
-        found |= ahead.launches_of(job)
+        found |= precompile.launches_of(job)
     mine = list(found.values())[share::shares]
     for function, data in mine:
         kernel = function.preload(data)
-        ahead.triton.runtime.driver.active.launcher_cls(kernel.src, kernel.metadata)  # C, compiled as well
+        precompile.triton.runtime.driver.active.launcher_cls(kernel.src, kernel.metadata)  # C, compiled as well
     return len(mine)
 
 
-def _jobs(settings: dict[str, Any]) -> list[ahead.AheadJob | ahead.FrameJob]:
+def _jobs(settings: dict[str, Any]) -> list[precompile.PrecompileJob | precompile.FrameJob]:
     """The cases. The updates that are checked, without noise, launch the same kernels."""
     network = from_mapping(NetworkConfig, settings["network"])
     precision, capability, particles = settings["precision"], settings["capability"], settings["particles"]
     training = TrainingConfig()
-    jobs: list[ahead.AheadJob | ahead.FrameJob] = []
+    jobs: list[precompile.PrecompileJob | precompile.FrameJob] = []
     frames: set[int] = set()
     for case in settings["cases"]:
         kind, _, count = case.partition("_")
@@ -52,9 +52,11 @@ def _jobs(settings: dict[str, Any]) -> list[ahead.AheadJob | ahead.FrameJob]:
         update = UpdateSettings(scenes, training.noise_std, training.grid_jitter, OBSTACLE_CELL_SIZE)
         cells = tuple(scenes * of_scene for of_scene in _cells(network, particles))
         kernels = KERNEL_PRECISION[precision]
-        jobs.append(ahead.AheadJob(network, update, kernels, False, False, scenes * particles, cells, capability))
+        jobs.append(
+            precompile.PrecompileJob(network, update, kernels, False, False, scenes * particles, cells, capability)
+        )
     sizes = tuple((count, _cells(network, count)[0]) for count in sorted(frames))
-    return [*jobs, ahead.FrameJob(((network, precision),), sizes, capability)]
+    return [*jobs, precompile.FrameJob(((network, precision),), sizes, capability)]
 
 
 def _cells(network: NetworkConfig, particles: int) -> tuple[int, ...]:

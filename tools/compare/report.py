@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hgn.files import write_json
+from hgn.system.files import write_json
 from tools.bench.contenders import PASS
 
 PROFILE_LINES = 16

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hgn.provenance import commit_of, without_folders
 from hgn.schema import ConfigError, require
+from hgn.system.provenance import commit_of, without_folders
 
 TAKEN = ("hgn", "tools", "conf", "datagen", "pyproject.toml")  # of a commit
 LEFT_OUT = ":(exclude)hgn/weights/*.safetensors"
-NEEDED = ("hgn/kernels/ahead.py", "tools/bench/fast.py")  # by which a folder is known, and which the server imports
+NEEDED = (
+    "hgn/kernels/precompile.py",
+    "tools/bench/fast.py",
+)  # by which a folder is known, and which the server imports
 
 
 @dataclass(frozen=True)

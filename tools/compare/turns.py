@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 
-from hgn.machine import available_cpus
+from hgn.system.machine import available_cpus
 from tools.compare.children import Child, Children
 from tools.compare.config import CompareConfig
 from tools.compare.report import Report

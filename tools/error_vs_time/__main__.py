@@ -21,16 +21,16 @@ import torch
 
 from hgn.command import EXIT_MACHINE, run_command
 from hgn.config import MpmConfig
+from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
-from hgn.data.select import first_episodes
-from hgn.device import choose_device
-from hgn.files import write_json
-from hgn.progress import bar
-from hgn.provenance import provenance, without_folders
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, shipped_weights
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.system.device import choose_device
+from hgn.system.files import write_json
+from hgn.system.progress import bar
+from hgn.system.provenance import provenance, without_folders
 from tools.error_vs_time.comparisons import comparisons
 from tools.error_vs_time.contenders import (
     COARSE_GRIDS,
@@ -48,10 +48,10 @@ from tools.error_vs_time.run import Run, draw
 from tools.error_vs_time.score import pay_back, table
 from tools.error_vs_time.settings import PRECISIONS, ErrorVsTimeConfig
 from tools.solver_launches import Setting, SolverLaunches
-from tools.trial import other_grid
+from tools.solver_rollouts import other_grid
 
 if TYPE_CHECKING:
-    from hgn.runtime.ahead import AheadCompilation
+    from hgn.runtime.precompile import Precompilation
 
 COMPILING_SHARE = 0.4  # of the seconds given, until when kernels that are compiled ahead are waited for
 HGN_ORDER, GNS_ORDER = ("tf32", "fp16", "fp32"), ("fp16", "tf32", "fp32")  # what tells most for its time first
@@ -215,13 +215,13 @@ def _why_unfit(info: WeightsInfo, episodes: Sequence[Episode]) -> str | None:
 
 def _kernels_ahead(
     networks: Sequence[NetworkContender], episodes: Sequence[Episode], device: torch.device
-) -> AheadCompilation | None:
+) -> Precompilation | None:
     """Compiles what the fast networks launch: beside the solver, which needs one core."""
     fast = [contender for contender in networks if contender.path == "fast"]
     if not fast:
         return None
     # Triton, which the plain path does without, is loaded here.
-    from hgn.runtime.ahead import frames_ahead
+    from hgn.runtime.precompile import frames_ahead
 
     particles = max(len(episode.material_N) for episode in episodes)
     sizes = [particles, 8 * particles, PARTICLES_AT_ONCE]

@@ -20,18 +20,18 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.data.batch import Batch, make_batch
 from hgn.network.features import ParticleState
-from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.path import path_on, set_matmul_precision
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.backend import path_on, set_matmul_precision
+from hgn.runtime.rollouts import RolloutResult, network_trials
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.trial import Trial, network_trials
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError
 from tools.solver_launches import Setting, SolverLaunches
-from tools.trial import FrameClock
+from tools.solver_rollouts import FrameClock
 
 if TYPE_CHECKING:
-    from hgn.runtime.fast import FastRollout
+    from hgn.runtime.triton_rollout import TritonRollout
 
 PARTICLES_PER_BATCH = 32_768
 PARTICLES_AT_ONCE = 150_000  # of the fast path's one-step errors
@@ -59,7 +59,9 @@ class Contender(Protocol):
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep | None:
         """Errors of the accelerations of every stride-th frame; none where the contender has no such thing."""
 
-    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
+    def trials(
+        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
+    ) -> list[RolloutResult]:
         """Rollouts from the episodes' first frames, side by side."""
 
     def release(self) -> None:
@@ -129,7 +131,9 @@ class NetworkContender:
                 return one_step(self._fast, config, episode, stride, rest_speed, self.device, PARTICLES_AT_ONCE)
             return one_step(lambda b: self.network(b.state()), config, episode, stride, rest_speed, self.device)
 
-    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
+    def trials(
+        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
+    ) -> list[RolloutResult]:
         frames = frames if self.frames is None or on_frame is not None else min(frames, self.frames)
         with self.matmul():
             return network_trials(self.simulator, [InitialState.of_episode(e) for e in episodes], frames, on_frame)
@@ -168,11 +172,13 @@ class SolverContender:
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> None:
         """None: a step begins from stresses and volumes, which positions do not tell."""
 
-    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
+    def trials(
+        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
+    ) -> list[RolloutResult]:
         if on_frame is not None:
             return self.launches.timed(self.setting, episodes, frames, on_frame)
         trials, most = self.launches.trials(self.setting, episodes), min(frames, self.frames)
-        return [Trial(trial.position_TN3[:most], trial.cause) for trial in trials]
+        return [RolloutResult(trial.position_TN3[:most], trial.cause) for trial in trials]
 
     def release(self) -> None:
         """Nothing is kept on the device."""
@@ -194,7 +200,9 @@ class TrivialContender:
             lambda b: acceleration_3.expand_as(b.window_WN3[0]), network, episode, stride, rest_speed, self.device
         )
 
-    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None) -> list[Trial]:
+    def trials(
+        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
+    ) -> list[RolloutResult]:
         trials = []
         for episode in episodes:
             time_T11 = np.arange(frames)[:, None, None]
@@ -203,7 +211,7 @@ class TrivialContender:
             # As the networks integrate: the velocity first, and the history before frame 0 falls freely.
             velocity_N3 = velocity_N3 - 0.5 * np.asarray(episode.gravity) / episode.frame_rate_hz**2
             path_TN3 = velocity_N3 * time_T11 + acceleration_3 * (0.5 * time_T11 * (time_T11 + 1))
-            trials.append(Trial((episode.position_TN3[0] + path_TN3).astype(np.float32)))
+            trials.append(RolloutResult((episode.position_TN3[0] + path_TN3).astype(np.float32)))
         return trials
 
     def release(self) -> None:
@@ -215,7 +223,7 @@ class FastPredictor:
 
     def __init__(self, network: HierarchicalGraphNetwork, precision: str) -> None:
         self.network, self.precision = network, precision
-        self._rollout: FastRollout | None = None
+        self._rollout: TritonRollout | None = None
 
     def __call__(self, batch: Batch) -> torch.Tensor:
         state = batch.state()
@@ -229,10 +237,10 @@ class FastPredictor:
         rollout.run(1)
         return rollout.velocity_NV[: len(state.position_N3), :3] - state.velocity_NM3[:, 0]
 
-    def _made(self, state: ParticleState, room: int) -> FastRollout:
-        from hgn.runtime.fast import FastRollout  # loads Triton
+    def _made(self, state: ParticleState, room: int) -> TritonRollout:
+        from hgn.runtime.triton_rollout import TritonRollout  # loads Triton
 
-        return FastRollout(self.network, state, self.precision, room=room)
+        return TritonRollout(self.network, state, self.precision, room=room)
 
 
 def one_step(

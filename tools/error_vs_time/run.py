@@ -14,10 +14,10 @@ from typing import Any
 
 import torch
 
-from hgn.files import write_atomically, write_json
-from hgn.progress import bar
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
+from hgn.system.files import write_atomically, write_json
+from hgn.system.progress import bar
 from tools.error_vs_time.contenders import GNS_FIRST, Contender, SolverContender, TrivialContender
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, report, score

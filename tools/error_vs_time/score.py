@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hgn.runtime.trial import Trial
+from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
@@ -35,7 +35,7 @@ def score(
     """The row without run times."""
     steps = [contender.one_step(episode, config.frame_stride, config.rest_speed) for episode in references]
     frames = len(references[0].position_TN3)
-    trials: list[Trial] = []
+    trials: list[RolloutResult] = []
     together = len(references) if contender.all_at_once else config.batch_scenes
     for first in range(0, len(references), together):
         some = references[first : first + together]
@@ -61,7 +61,7 @@ def one_step_figures(steps: Sequence[OneStep]) -> dict[str, Any]:
 
 
 def rollout_figures(
-    trials: Sequence[Trial], references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
+    trials: Sequence[RolloutResult], references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
 ) -> dict[str, Any]:
     """Everything that rollouts tell; `curve` is the position MSE of each frame, none where no scene came so far."""
     frames = len(references[0].position_TN3)
@@ -149,12 +149,12 @@ def report(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[s
     return {"meta": meta, "rows": _plain(list(rows))}
 
 
-def _position_mse(trial: Trial, reference: Episode) -> np.ndarray:
+def _position_mse(trial: RolloutResult, reference: Episode) -> np.ndarray:
     return position_mse(trial.position_TN3, reference.position_TN3[: trial.frame_count])
 
 
 def _by_material(
-    trials: Sequence[Trial], references: Sequence[Episode], frames: Sequence[int]
+    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int]
 ) -> dict[str, dict[str, float]]:
     """Position MSE of a material's particles: means over the scenes that hold it and reached the frame."""
     found: dict[str, dict[str, list[float]]] = {}
@@ -169,7 +169,7 @@ def _by_material(
     return {name: {frame: float(np.mean(v)) for frame, v in values.items()} for name, values in found.items()}
 
 
-def _motion(trial: Trial, reference: Episode) -> dict[str, float]:
+def _motion(trial: RolloutResult, reference: Episode) -> dict[str, float]:
     result = {"momentum_error": momentum_error(trial.position_TN3, reference.position_TN3)}
     if trial.frame_count < 2:
         return result | {"energy_drift": 0.0, "energy_growth": 0.0}
@@ -181,7 +181,7 @@ def _motion(trial: Trial, reference: Episode) -> dict[str, float]:
     return result | {"energy_drift": float(drift), "energy_growth": float(max(growth, 0.0))}
 
 
-def _end(trial: Trial, reference: Episode) -> dict[str, float]:
+def _end(trial: RolloutResult, reference: Episode) -> dict[str, float]:
     last_N3 = trial.position_TN3[-1]
     return {
         "penetration": share_inside(last_N3, obstacles_of_episode(reference)),
@@ -206,7 +206,7 @@ def _reference_penetration(reference: Episode, frame: int) -> float:
 
 
 def _sinkhorn(
-    trials: Sequence[Trial],
+    trials: Sequence[RolloutResult],
     references: Sequence[Episode],
     frames: Sequence[int],
     config: ErrorVsTimeConfig,

@@ -18,11 +18,11 @@ import torch
 import torch.multiprocessing
 
 from hgn.command import run_command
-from hgn.files import write_json
 from hgn.network.build import build_network
-from hgn.provenance import provenance, without_folders
 from hgn.schema import ConfigError, from_mapping, to_mapping
-from hgn.training.ranks import MESSAGE_MB
+from hgn.system.files import write_json
+from hgn.system.provenance import provenance, without_folders
+from hgn.training.distributed import MESSAGE_MB
 from tools.bench.contenders import PASS
 from tools.scaling.config import ScalingConfig
 from tools.scaling.measure import measure

@@ -24,14 +24,14 @@ from torch.nn.parallel import DistributedDataParallel
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
-from hgn.machine import available_cpus
-from hgn.network.network import HierarchicalGraphNetwork
-from hgn.runtime.agreement import relative_error
-from hgn.runtime.path import kernel_precision, why_not_fast
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.backend import kernel_precision, why_not_fast
+from hgn.runtime.parity import relative_error
+from hgn.system.machine import available_cpus
 from hgn.training.checkpoint import DataInfo
+from hgn.training.distributed import averaging_options
 from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
-from hgn.training.ranks import averaging_options
 from tools.bench.contenders import FRAME_RATE_HZ, PASS, bench_network
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.timing import once

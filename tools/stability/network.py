@@ -22,21 +22,21 @@ import torch
 from PIL import Image
 
 from hgn.command import run_command
-from hgn.files import write_json
-from hgn.machine import available_cpus
-from hgn.picture import compare_picture, spread, stacked, write_picture
-from hgn.progress import bar
-from hgn.provenance import provenance, without_folders
+from hgn.render.pictures import compare_picture, spread, stacked, write_picture
+from hgn.runtime.rollouts import RolloutResult, network_trials
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.trial import Trial, network_trials
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import from_mapping, to_mapping
+from hgn.system.files import write_json
+from hgn.system.machine import available_cpus
+from hgn.system.progress import bar
+from hgn.system.provenance import provenance, without_folders
 from tools.measures import energies, energy_scale, neighbours, outside_domain
+from tools.solver_rollouts import FrameClock
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
 from tools.stability.network_free_fall import free_fall_rows
 from tools.stability.row import Row, table
-from tools.trial import FrameClock
 
 PART = "network"
 PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
@@ -76,7 +76,7 @@ def main(mapping: dict[str, Any]) -> int:
         ahead = None
         if path == "fast":
             # Triton, which the plain path does without, is loaded here.
-            from hgn.runtime.ahead import frames_ahead
+            from hgn.runtime.precompile import frames_ahead
 
             particles = [sum(len(scene.position_N3) for scene in case.scenes) for case in made]
             ahead = frames_ahead([network.config], [config.precision], device, particles)
@@ -115,9 +115,9 @@ def late_kernels(path: str) -> Callable[[], int]:
     """How many kernels were compiled in this process by now: each holds a simulation up for a second or more."""
     if path != "fast":
         return lambda: 0
-    from hgn.kernels.late import LateKernels
+    from hgn.kernels.jit_misses import JitMisses
 
-    late = LateKernels()
+    late = JitMisses()
     return lambda: late.count
 
 
@@ -125,13 +125,15 @@ def initial_states(case: Case) -> list[InitialState]:
     return [InitialState.of_scene(scene) for scene in case.scenes]
 
 
-def case_trials(simulator: Simulator, case: Case, initial: Sequence[InitialState]) -> tuple[list[Trial], float | None]:
+def case_trials(
+    simulator: Simulator, case: Case, initial: Sequence[InitialState]
+) -> tuple[list[RolloutResult], float | None]:
     """Simulates a case; the milliseconds of a frame too."""
     clock = FrameClock()
     return network_trials(simulator, initial, case.frames, clock), clock.milliseconds()
 
 
-def case_picture(simulator: Simulator, case: Case, trial: Trial, weights: str) -> Image.Image:
+def case_picture(simulator: Simulator, case: Case, trial: RolloutResult, weights: str) -> Image.Image:
     """Some frames of a case's first scene."""
     scene = case.scenes[0]
     rollout = Rollout(
@@ -164,7 +166,7 @@ def case_row(
     case: Case,
     initial: Sequence[InitialState],
     energy_bound: float,
-    trials: Sequence[Trial],
+    trials: Sequence[RolloutResult],
     milliseconds: float | None,
 ) -> Row:
     """Says whether a case held."""
@@ -221,7 +223,7 @@ def case_row(
     )
 
 
-def energy_growth(trial: Trial, scene: InitialState, frame_rate_hz: float) -> float:
+def energy_growth(trial: RolloutResult, scene: InitialState, frame_rate_hz: float) -> float:
     """The most that kinetic and potential energy exceed those at the start, of a fall through the domain."""
     if trial.frame_count < 2:
         return 0.0
@@ -232,7 +234,9 @@ def energy_growth(trial: Trial, scene: InitialState, frame_rate_hz: float) -> fl
     return max(0.0, float(energy_T.max()) - start) / energy_scale(gravity_3, scene.domain_size)
 
 
-def share_of_way(trial: Trial, scene: InitialState, frame_rate_hz: float, known: Sequence[float], frames: int) -> float:
+def share_of_way(
+    trial: RolloutResult, scene: InitialState, frame_rate_hz: float, known: Sequence[float], frames: int
+) -> float:
     """How far the particles came in so many frames along a known acceleration, of what that and their velocity make."""
     last = min(frames, trial.frame_count - 1)
     known_3, seconds = np.asarray(known, np.float64), last / frame_rate_hz
@@ -242,7 +246,7 @@ def share_of_way(trial: Trial, scene: InitialState, frame_rate_hz: float, known:
     return float((moved_N3 @ known_3).mean() / (0.5 * seconds**2 * (known_3 @ known_3)))
 
 
-def snow_density(trials: Sequence[Trial], scenes: Sequence[InitialState], settled: int) -> float | None:
+def snow_density(trials: Sequence[RolloutResult], scenes: Sequence[InitialState], settled: int) -> float | None:
     """How many neighbours within a cell snow has in the last frame, of those in frame `settled`: all scenes together.
 
     Snow is the one material that keeps a shape: water and sand spread for as long as there is floor. None where there

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from hgn.config import MpmConfig
-from hgn.files import write_json
-from hgn.progress import bar
-from hgn.provenance import provenance, without_folders
 from hgn.schema import from_mapping, require, require_one_of, require_positive, to_mapping
+from hgn.system.files import write_json
+from hgn.system.progress import bar
+from hgn.system.provenance import provenance, without_folders
 from tools.stability.row import Row, table
 from tools.stability.solver_leak import OFFSETS, leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses

@@ -21,12 +21,12 @@ from datagen.mpm.collider import build_collider
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from datagen.mpm.sweep import near_pairs
 from hgn.config import MpmConfig
-from hgn.machine import available_cpus
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.material import MATERIALS
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
+from hgn.system.machine import available_cpus
 from tools.stability.row import Row
 from tools.stability.solver_scenes import CELL, block
 

@@ -19,9 +19,9 @@ import numpy as np
 from datagen.mpm.layout import lame_parameters
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from hgn.config import MpmConfig
-from hgn.files import write_atomically
 from hgn.scene.material import SAND, SNOW, WATER
 from hgn.scene.scene import Scene
+from hgn.system.files import write_atomically
 from tools.figure import as_png, new_figure
 from tools.stability.row import Row
 from tools.stability.solver_scenes import CELL, block, particles

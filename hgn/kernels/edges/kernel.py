@@ -39,7 +39,7 @@ from hgn.kernels.blocks import (
     transposed,
     weighted_sums,
 )
-from hgn.kernels.keys import settle_keys
+from hgn.kernels.triton_compat import settle_keys
 
 
 @triton.jit

@@ -1,4 +1,4 @@
-"""GNS's work on edges through the fused kernels; the reference is hgn.network.edges.PlainEdges.
+"""GNS's work on edges through the fused kernels; the reference is hgn.network.gns_edges.PlainEdges.
 
 Shape legend: N particles, E directed edges, W width, P programs.
 """
@@ -21,7 +21,7 @@ from hgn.kernels.gns.kernel import (
     weight_products,
 )
 from hgn.kernels.packing import rounded_to_tf32
-from hgn.network.edges import Edges, Ends, Graph, Weights
+from hgn.network.gns_edges import Edges, Ends, Graph, Weights
 
 SUM_BLOCK, SUM_WARPS = 16, 4  # edges and warps of a sum
 

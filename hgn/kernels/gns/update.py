@@ -15,14 +15,14 @@ import torch
 import triton
 from torch.nn import functional
 
-from hgn.kernels.engine import feature_columns
+from hgn.kernels.forward import feature_columns
 from hgn.kernels.gns.op import FusedEdges
 from hgn.kernels.grid.kernel import prepare_features
 from hgn.kernels.grid.op import OUT_OF_WINDOW
 from hgn.kernels.neighbours.op import DeviceNeighbours
 from hgn.kernels.update.op import TAIL, Layout, Tables, TrainedEngine, Updates
+from hgn.network.cell_keys import COORDINATE_LIMIT
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.keys import COORDINATE_LIMIT
 from hgn.schema import ConfigError
 
 OUT = 4  # the decoder's three outputs, padded
@@ -61,7 +61,7 @@ class GnsEngine:
     """Forward and backward passes of a network on a neighbour list of fixed capacity."""
 
     copy_precision = "ieee"  # products read the values themselves
-    unscale = 1.0  # gradients are scaled on the way, see hgn.network.edges
+    unscale = 1.0  # gradients are scaled on the way, see hgn.network.gns_edges
 
     def __init__(
         self,

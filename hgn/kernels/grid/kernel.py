@@ -13,7 +13,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.keys import settle_keys
+from hgn.kernels.triton_compat import settle_keys
 
 GEOMETRY_COLUMNS = tl.constexpr(8)
 OBSTACLE_COLUMNS = tl.constexpr(5)

@@ -13,7 +13,7 @@ import torch
 import triton
 
 from hgn.kernels.grid import kernel
-from hgn.network.keys import SCENE_LIMIT, unpack
+from hgn.network.cell_keys import SCENE_LIMIT, unpack
 from hgn.network.obstacles import ObstacleCells
 
 MARK_BLOCK = 128

@@ -1,7 +1,7 @@
 """Neighbour lists on the device (hgn.network.neighbours): keys of cells, runs of candidates, two walks through them.
 
-Keys are those of hgn.network.keys; a particle's candidates are 25 runs of the particles sorted by key. The first walk
-counts neighbours, the second writes them down. Nothing here waits for the host.
+Keys are those of hgn.network.cell_keys; a particle's candidates are 25 runs of the particles sorted by key. The first
+walk counts neighbours, the second writes them down. Nothing here waits for the host.
 Shape legend: N particles, E directed edges.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.keys import settle_keys
+from hgn.kernels.triton_compat import settle_keys
 
 COORDINATE_BITS = tl.constexpr(17)
 COORDINATE_LIMIT = tl.constexpr(65536)

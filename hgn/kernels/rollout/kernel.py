@@ -8,7 +8,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.keys import settle_keys
+from hgn.kernels.triton_compat import settle_keys
 
 DIVERGED = tl.constexpr(4)
 

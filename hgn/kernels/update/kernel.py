@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import nearest_tf32
-from hgn.kernels.keys import settle_keys
+from hgn.kernels.triton_compat import settle_keys
 
 SAMPLE_COLUMNS = tl.constexpr(12)
 OBSTACLE_COLUMNS = tl.constexpr(5)

@@ -19,15 +19,15 @@ import torch
 import triton
 
 from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES, TrainingConfig
-from hgn.kernels.backward import TrainingEngine
+from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.capture import captured
-from hgn.kernels.engine import feature_columns
+from hgn.kernels.forward import feature_columns
 from hgn.kernels.grid.op import OBSTACLE_COLUMNS, OUT_OF_WINDOW, DeviceGrid, ObstacleHash, ObstacleTable, Window
 from hgn.kernels.muon.op import SquareBlocks
 from hgn.kernels.packing import PackedNetwork, pack_network
 from hgn.kernels.update import kernel
 from hgn.network.base import ParticleNetwork
-from hgn.network.network import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.scene.symmetry import Symmetry, drawn_symmetry
 from hgn.schema import ConfigError
 
@@ -312,7 +312,7 @@ class Updates:
     # launches
 
     def allocate(self, particles: int, cells: Sequence[int]) -> None:
-        """Buffers for about so many particles and cells of each level, without samples: for hgn.kernels.ahead."""
+        """Buffers for about so many particles and cells of each level, without samples: for hgn.kernels.precompile."""
         self._allocate_tables(1)
         self.particles, self.capacities = 16 * math.ceil(particles / 16), self._rounded(cells)
         self._build()
@@ -498,7 +498,7 @@ class Updates:
         assert isinstance(self.grid, DeviceGrid) and isinstance(self.packed, PackedNetwork)
         # gradients of the mean over particles are small: float16 would lose them
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "half" else 1.0
-        return TrainingEngine(
+        return FusedTrainingNetwork(
             self.config, self.packed, self.values, self.grid, self.particle_count, self.precision, scale, tail=TAIL
         )
 

@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import column_sums, settled
-from hgn.kernels.keys import settle_keys
+from hgn.kernels.triton_compat import settle_keys
 
 JOB_COLUMNS = 8
 

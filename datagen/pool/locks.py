@@ -1,0 +1,95 @@
+"""Claims on episodes, so that several generators share one folder without a coordinator.
+
+A data set's `.lock` file stands for its state, byte by byte: who changes the manifest locks the first byte, every
+generator shares the second, and an episode that is being made has its byte locked by its generator. The kernel frees
+the locks of a process that ends, however it ends: no claim goes stale, and no clock is asked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+from datagen.pool.plan import ShardRange
+from hgn.data.manifest import SPLITS
+from hgn.schema import ConfigError
+from hgn.system.files import NO_LOCKS
+
+LOCK_NAME = ".lock"
+_MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
+_EPISODES_OF_A_SPLIT = 1 << 40  # bytes from one split to the next; a lock needs no byte to be there
+
+
+class ShardLocks:
+    """One generator's locks on a folder; a context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises: ConfigError where the file system knows no locks."""
+        self._path = folder / LOCK_NAME
+        self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            self._lock(fcntl.F_RDLCK, _GENERATORS_BYTE, wait=True)
+        except BaseException:
+            os.close(self._file)
+            raise
+
+    def close(self) -> None:
+        """Frees every lock."""
+        os.close(self._file)
+
+    @contextlib.contextmanager
+    def manifest(self) -> Iterator[None]:
+        """The right to change the manifest; waits until no other generator has it."""
+        self._lock(fcntl.F_WRLCK, _MANIFEST_BYTE, wait=True)
+        try:
+            yield
+        finally:
+            self._lock(fcntl.F_UNLCK, _MANIFEST_BYTE)
+
+    def take(self, shard: ShardRange) -> bool:
+        """Claims the episodes of a range; False when another generator has any of them."""
+        return self._lock(fcntl.F_WRLCK, *_bytes_of(shard))
+
+    def free(self, shard: ShardRange) -> None:
+        """Gives a claim back."""
+        self._lock(fcntl.F_UNLCK, *_bytes_of(shard))
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[bool]:
+        """Whether this is the only generator; while it is, another one waits before it begins."""
+        alone = self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE)
+        try:
+            yield alone
+        finally:
+            if alone:
+                self._lock(fcntl.F_RDLCK, _GENERATORS_BYTE)
+
+    def _lock(self, kind: int, start: int, length: int = 1, wait: bool = False) -> bool:
+        try:
+            if hasattr(fcntl, "F_OFD_SETLK"):
+                # a lock of the open file, not of the process: two generators in one process exclude each other too
+                request = struct.pack("hhqqi4x", kind, os.SEEK_SET, start, length, 0)
+                fcntl.fcntl(self._file, fcntl.F_OFD_SETLKW if wait else fcntl.F_OFD_SETLK, request)
+            else:
+                flags = {fcntl.F_RDLCK: fcntl.LOCK_SH, fcntl.F_WRLCK: fcntl.LOCK_EX, fcntl.F_UNLCK: fcntl.LOCK_UN}
+                fcntl.lockf(self._file, flags[kind] | (0 if wait else fcntl.LOCK_NB), length, start)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EACCES) and not wait:
+                return False
+            if error.errno in NO_LOCKS:
+                raise ConfigError(
+                    f"{self._path} must lie on a file system with file locks, got {error.strerror}; mount it with them "
+                    "(NFS with its lock service, Lustre with -o flock) or choose another out=..."
+                ) from None
+            raise
+        return True
+
+
+def _bytes_of(shard: ShardRange) -> tuple[int, int]:
+    start = _FIRST_EPISODE_BYTE + SPLITS.index(shard.split) * _EPISODES_OF_A_SPLIT
+    return start + shard.first, shard.stop - shard.first

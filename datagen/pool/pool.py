@@ -1,0 +1,398 @@
+"""Workers that make the missing episodes of a data set: scene makers in front, solvers behind.
+
+The pool hands out work, publishes shards and replaces workers that die. A scene whose worker dies is tried again,
+alone; after `maximum_attempts` it is quarantined and the next seed takes its place. Workers are processes of this
+machine, or of a Ray cluster (datagen/pool/ray_workers.py).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from datagen.pool.plan import SceneTask, generation_order
+from datagen.pool.progress import Progress
+from datagen.pool.worker import (
+    Backend,
+    BuiltGrid,
+    GridTask,
+    LocalWorker,
+    MadeScene,
+    Worker,
+    receive,
+    start_maker,
+    start_solver,
+)
+from datagen.pool.writer import DatasetWriter
+from hgn.config import DatagenConfig
+from hgn.schema import ConfigError
+
+_WAIT_SECONDS = 0.2  # at most until a stop request is seen
+_PACKING_SECONDS = 0.02  # at most until a packed shard is published
+_LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
+GPU_SCENES_PER_LAUNCH = 832  # all of the paper's data set: long scenes begin first, and short ones fill the gaps
+GPU_NODES_PER_LAUNCH = GPU_SCENES_PER_LAUNCH * 64**3  # of the grids of all scenes, about 30 bytes each
+GPU_EARLY_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
+_LAUNCH_GROWTH = 32  # from one launch to the next, up to the full size
+MAXIMUM_MAKERS = 32
+
+
+class Stopped(Exception):  # noqa: N818 - a request, not an error
+    """The run was asked to stop; what is staged is kept."""
+
+
+@dataclass(frozen=True)
+class WorkerPlan:
+    """How many processes of each kind, and how much each takes at once."""
+
+    solvers: int
+    threads: int | None  # of each solver; none on a GPU
+    makers: int
+    scenes_per_launch: int
+    first_launch: int
+    gpus: tuple[str, ...] = ()  # CUDA devices, dealt out to the solvers in turn
+
+
+def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float) -> WorkerPlan:
+    """One solver for two cores on a CPU; one for each GPU, with scene makers on the cores."""
+    workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
+    if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
+        solvers = workers or max(1, len(gpus))
+        launch = launch or gpu_scenes_per_launch(config, memory_bytes / solvers)
+        makers = max(1, min(MAXIMUM_MAKERS, cpu_count - 1))
+        return WorkerPlan(solvers, None, makers, launch, gpu_first_launch(config, launch), gpus)
+    solvers = workers or max(1, cpu_count // 2)
+    threads = max(1, cpu_count // solvers)
+    return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
+
+
+def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
+    """As many as give every part of a GPU work; fewer where their grids are large, or their frames, which the host
+    holds until they are published, would take more than half of its memory.
+    """
+    scene = config.scene
+    nodes = math.prod(math.ceil(length / scene.cell_size) for length in scene.domain_size)
+    particles = scene.group_count * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
+    held = memory_bytes / 2 / (12 * config.dataset.frames * max(particles, 1))
+    return max(1, int(min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes, held)))
+
+
+def gpu_first_launch(config: DatagenConfig, launch: int) -> int:
+    """Few scenes where something waits for the first episodes; else all: a launch of few lasts as long as its longest
+    scene, which costs more than it takes to make the others.
+    """
+    return min(launch, GPU_EARLY_LAUNCH) if config.dataset.early_episodes else launch
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """The CUDA devices of this machine that CUDA_VISIBLE_DEVICES leaves, without starting CUDA."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    count = len(list(Path("/dev").glob("nvidia[0-9]*"))) or int(Path("/dev/dxg").exists())
+    if visible is None:
+        return tuple(str(i) for i in range(count))
+    devices = tuple(device.strip() for device in visible.split(",") if device.strip())
+    return () if count == 0 or "-1" in devices or "NoDevFiles" in devices else devices
+
+
+class WorkerFactory(Protocol):
+    """Where workers come from."""
+
+    def start_maker(self) -> Worker: ...
+
+    def start_solver(self, number: int) -> Worker: ...
+
+    def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]: ...
+
+
+class LocalCrew:
+    """Processes of this machine."""
+
+    def __init__(self, config: DatagenConfig, backend: Backend, plan: WorkerPlan) -> None:
+        self._config, self._backend, self._plan = config, backend, plan
+
+    def start_maker(self) -> Worker:
+        return start_maker(self._config, self._backend)
+
+    def start_solver(self, number: int) -> Worker:
+        gpus = self._plan.gpus
+        gpu = gpus[number % len(gpus)] if self._plan.solvers > 1 and gpus else None
+        return start_solver(self._config, self._backend, self._plan.threads, gpu, self._plan.first_launch)
+
+    def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
+        return receive([worker for worker in workers if isinstance(worker, LocalWorker)], timeout)
+
+
+class Pool:
+    """Makes every episode of `writer`'s share that no other generator makes, and publishes the shards."""
+
+    def __init__(
+        self,
+        config: DatagenConfig,
+        writer: DatasetWriter,
+        progress: Progress,
+        plan: WorkerPlan,
+        crew: WorkerFactory,
+        should_stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._config, self._writer, self._progress = config, writer, progress
+        self._plan, self._crew, self._should_stop = plan, crew, should_stop
+        self._launch_size = self._largest_launch = plan.first_launch
+        self._launches = 0
+        self._deaths_in_a_row = 0
+        self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
+        self._group: dict[str, int] = {}  # keys whose worker died: which others they are tried again with
+        self._grid_deaths: dict[SceneTask, int] = {}
+
+    def run(self) -> None:
+        """Returns when the share is published.
+
+        Raises: Stopped; ConfigError, OSError or RuntimeError from a worker. Workers are gone in any case.
+        """
+        self._order = {item: place for place, item in enumerate(generation_order(self._writer.requested))}
+        self._todo: list[SceneTask] = []
+        self._ready: list[MadeScene] = []
+        self._gridless: list[MadeScene] = []  # what lacks its obstacle grid, and nobody builds it
+        self._makers: list[Worker] = []
+        self._solvers: list[Worker] = []
+        self._counted, self._next_look, self._said_waiting = self._writer.done, 0.0, False
+        self._progress.start(self._writer.done, self._writer.total, self._config.dataset.frames)
+        try:
+            while True:
+                if self._should_stop():
+                    raise Stopped
+                self._claim()
+                if self._todo and not self._solvers:
+                    self._start_workers()
+                self._hand_out()
+                published = self._publish()
+                if not published and self._writer.complete:
+                    return
+                self._receive(0.0 if published else _PACKING_SECONDS if self._writer.packing else _WAIT_SECONDS)
+        finally:
+            for worker in (*self._makers, *self._solvers):
+                worker.kill()
+            self._progress.close()
+
+    def _start_workers(self) -> None:
+        missing = self._writer.total - self._writer.done
+        # a solver needs seconds to start, so all start before the first scene is asked for
+        self._solvers = [self._crew.start_solver(i) for i in range(min(self._plan.solvers, missing))]
+        self._makers = [self._crew.start_maker() for _ in range(min(self._plan.makers, missing))]
+        self._launch_size = min(self._largest_launch, self._share(0))
+
+    def _share(self, taken: int) -> int:
+        """Scenes for each solver of those that none has, `taken` of which are about to be given to one."""
+        left = self._writer.total - self._writer.done - sum(len(solver.tasks) for solver in self._solvers) - taken
+        return max(1, math.ceil(left / len(self._solvers)))
+
+    def _claim(self) -> None:
+        """Claims shards as the makers need them, so that other generators on the folder find work too."""
+        if len(self._todo) >= self._plan.makers or time.monotonic() < self._next_look:
+            return
+        self._writer.refresh()
+        while len(self._todo) < self._plan.makers:
+            known = set(self._writer.remaining())
+            shard = self._writer.claim_next()
+            if shard is None:
+                self._next_look = time.monotonic() + _LOOK_SECONDS
+                break
+            for split, index in self._writer.remaining():
+                if (split, index) not in known:
+                    self._put_back(self._writer.task(split, index))
+        found, self._counted = self._writer.done - self._counted, self._writer.done
+        if found > 0:
+            self._progress.found(found)
+        if not self._writer.holds and not self._writer.complete and not self._said_waiting:
+            self._said_waiting = True
+            self._progress.message("other generators make the rest; waiting for them")
+
+    def _publish(self) -> bool:
+        shard = self._writer.publish_next(wait=False)  # more episodes are staged while it is packed
+        if shard is not None:
+            self._progress.shard(shard.name, len(shard.episodes), self._writer.manifest.revision)
+        return shard is not None
+
+    def _hand_out(self) -> None:
+        # a GPU's solver asks for more as soon as it has some: first those that have none, also while they start
+        for solver in sorted(self._solvers, key=lambda solver: (bool(solver.tasks), solver.given)):
+            others_first = solver.tasks and any(other.idle and not other.tasks for other in self._solvers)
+            if solver.idle and not others_first and (batch := self._next_batch(solver)):
+                solver.tasks.update((made.task.key, made) for made in batch)
+                solver.given += len(batch)
+                solver.give(batch)
+        for maker in self._makers:
+            if maker.idle and (task := self._next_task()):
+                maker.tasks[_task(task).key] = task
+                maker.give(task)
+
+    def _next_task(self) -> SceneTask | GridTask | None:
+        """For a maker: a scene while the next launch lacks some, then what a launch must have at its end."""
+        coming = len(self._ready) + len(self._being_made())
+        short = coming < self._launch_size
+        if self._todo and short:
+            return self._todo.pop(0)
+        ahead = coming < 2 * self._plan.scenes_per_launch * self._plan.solvers
+        simulated = bool(self._gridless) and any(self._gridless[0].task.key in solver.tasks for solver in self._solvers)
+        if self._todo and ahead and not simulated:
+            return self._todo.pop(0)
+        if self._gridless:
+            made = self._gridless.pop(0)
+            return GridTask(made.task, made.scene)
+        return None
+
+    def _being_made(self) -> list[SceneTask]:
+        return [task for maker in self._makers for task in maker.tasks.values() if isinstance(task, SceneTask)]
+
+    def _next_batch(self, solver: Worker) -> list[MadeScene]:
+        """The next scenes to simulate; empty when it is better to wait for more of them."""
+        self._ready.sort(key=lambda made: self._place(made.task))
+        for made in self._ready:
+            group = self._group.get(made.task.key)
+            if group is not None:
+                if solver.tasks:  # still being staged: no other can be to blame
+                    return []
+                batch = [other for other in self._ready if self._group.get(other.task.key) == group]
+                self._ready = [other for other in self._ready if self._group.get(other.task.key) != group]
+                return batch
+        size = self._launch_size
+        unmade = [*self._todo, *self._being_made()]
+        if not self._ready or (unmade and len(self._ready) < size):
+            return []
+        # training waits for the first shards in order, so small launches must not overtake a scene still being made
+        growing = self._largest_launch < self._plan.scenes_per_launch
+        if growing and any(self._place(task) < self._place(self._ready[size - 1].task) for task in unmade):
+            return []
+        batch, self._ready = self._ready[:size], self._ready[size:]
+        self._launches += 1
+        if self._launches % len(self._solvers) == 0:  # each has had one of this size
+            self._largest_launch = min(_LAUNCH_GROWTH * self._largest_launch, self._plan.scenes_per_launch)
+            self._launch_size = min(self._largest_launch, self._share(len(batch)))
+        return batch
+
+    def _receive(self, timeout: float) -> None:
+        for worker, message in self._crew.receive((*self._makers, *self._solvers), timeout):
+            if message is not None:
+                self._handle(worker, *message)
+            elif self._should_stop():  # a signal to the whole process group ends workers too
+                raise Stopped
+            else:
+                self._replace(worker)
+
+    def _handle(self, worker: Worker, kind: str, *values: Any) -> None:
+        if kind == "idle":
+            worker.idle = True
+            if worker in self._solvers:
+                self._progress.frame(self._solvers.index(worker), 0, 0)
+        elif kind == "frame":
+            self._progress.frame(self._solvers.index(worker), *values)
+        elif kind == "made":
+            (made,) = values
+            del worker.tasks[made.task.key]
+            self._ready.append(made)
+            if made.obstacle_grid is None:
+                self._gridless.append(made)
+        elif kind == "grid":
+            (built,) = values
+            del worker.tasks[built.task.key]
+            self._grid_built(built)
+        elif kind == "staged":
+            self._accept(_task(worker.tasks.pop(values[0])))
+        elif kind == "failed":
+            key, cause = values
+            self._quarantine(_task(worker.tasks.pop(key)), cause)
+        elif kind == "config_error":
+            raise ConfigError(values[0])
+        elif kind == "os_error":
+            raise OSError(*values)
+        else:
+            raise RuntimeError(f"a worker failed:\n{values[0]}")
+
+    def _grid_built(self, built: BuiltGrid) -> None:
+        """Gives a scene its grid, wherever it is by now: among those to be simulated, or with a solver."""
+        key, grid = built.task.key, built.grid
+        for place, made in enumerate(self._ready):
+            if made.task == built.task:
+                if isinstance(grid, str):
+                    self._quarantine(self._ready.pop(place).task, grid)
+                else:
+                    self._ready[place] = replace(made, obstacle_grid=grid)
+                return
+        for solver in self._solvers:
+            held = solver.tasks.get(key)
+            if isinstance(held, MadeScene) and held.task == built.task:
+                if not isinstance(grid, str):
+                    solver.tasks[key] = replace(held, obstacle_grid=grid)
+                solver.tell(built)
+                return
+
+    def _accept(self, task: SceneTask) -> None:
+        self._deaths_in_a_row = 0
+        self._writer.add_staged(task.split, task.index)
+        self._counted += 1
+        self._progress.episode(task.key)
+
+    def _quarantine(self, task: SceneTask, cause: str) -> None:
+        self._progress.message(f"{task.key} (seed {task.seed}) could not be simulated: {cause}; trying another seed")
+        self._alone.pop(task.key, None)
+        self._group.pop(task.key, None)
+        self._put_back(self._writer.quarantine(task, cause))
+
+    def _put_back(self, task: SceneTask) -> None:
+        self._todo.append(task)
+        self._todo.sort(key=self._place)
+
+    def _replace(self, worker: Worker) -> None:
+        cause, blamable = worker.cause_of_death(), worker.blamable()
+        self._deaths_in_a_row += blamable
+        attempts = self._config.dataset.maximum_attempts
+        halvings = self._plan.scenes_per_launch.bit_length()
+        if self._deaths_in_a_row > 3 * attempts + self._plan.solvers + halvings:
+            raise RuntimeError(f"workers keep dying before they finish any scene, the last because {cause}")
+        self._progress.message(f"a worker died ({cause}); it is replaced and its scenes are tried again")
+        lost = list(worker.tasks.values())
+        worker.kill()
+        if worker in self._solvers:
+            number = self._solvers.index(worker)
+            self._progress.frame(number, 0, 0)
+            self._solvers[number] = self._crew.start_solver(number)
+        else:
+            self._makers[self._makers.index(worker)] = self._crew.start_maker()
+        groups = max(self._group.values(), default=0) + 1
+        for place, item in enumerate(lost):
+            task = _task(item)
+            if isinstance(item, GridTask):
+                self._grid_lost(item, cause, blamable)
+                continue
+            if isinstance(item, MadeScene) and self._writer.is_staged(task.split, task.index):
+                self._accept(task)
+                continue
+            # of several scenes any may be to blame: each half is tried without the other, down to a scene alone, and
+            # only then is it counted against it
+            if blamable:
+                self._alone[task.key] = self._alone.get(task.key, 0) + (len(lost) == 1)
+                self._group[task.key] = groups + (2 * place >= len(lost))
+            if self._alone.get(task.key, 0) >= attempts:
+                self._quarantine(task, cause)
+            elif isinstance(item, MadeScene):
+                self._ready.append(item)
+            else:
+                self._put_back(task)
+
+    def _grid_lost(self, item: GridTask, cause: str, blamable: bool) -> None:
+        deaths = self._grid_deaths[item.task] = self._grid_deaths.get(item.task, 0) + blamable
+        if deaths >= self._config.dataset.maximum_attempts:
+            self._grid_built(BuiltGrid(item.task, cause))
+        else:
+            self._gridless.insert(0, MadeScene(item.task, item.scene, None))
+
+    def _place(self, task: SceneTask) -> int:
+        return self._order[task.split, task.index]
+
+
+def _task(item: SceneTask | MadeScene | GridTask) -> SceneTask:
+    return item if isinstance(item, SceneTask) else item.task

@@ -1,0 +1,206 @@
+"""Workers on a Ray cluster: `ray start --head` on one machine, `ray start --address=...` on others, then `pool=ray`.
+
+Makers and solvers are Ray actors; the pool schedules, retries and publishes as it does with processes of its own.
+Finished episodes travel through Ray's object store, so only the machine of the pool needs the data set's folder, and
+all need this project installed in the same Python. An actor that finds no place waits for a machine with room for
+it: machines may leave while the pool runs, and others may take their place.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import pkgutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from datagen.pool.plan import SceneTask
+from datagen.pool.pool import MAXIMUM_MAKERS, WorkerPlan, gpu_first_launch, gpu_scenes_per_launch
+from datagen.pool.shard import pack_episode, stage_parts
+from datagen.pool.worker import Backend, MadeScene, Worker, error_message, failure_of, make_episode, make_scene
+from hgn.config import DatagenConfig
+from hgn.data.identity import dataset_identity, identity_hash
+from hgn.schema import ConfigError
+
+_SOLVER_THREADS = 2
+_CONNECT_REMEDY = (
+    "start one with `ray start --head` on one machine and `ray start --address=...` on the others, and name it with "
+    "dataset.ray_address=... or RAY_ADDRESS"
+)
+
+
+def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]]) -> WorkerPlan:
+    """One solver for each GPU of the cluster; without one, for each two cores of a node."""
+    workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
+    gpus = int(sum(node.get("GPU", 0) for node in nodes))
+    if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
+        memory = min((node["memory"] for node in nodes if "memory" in node), default=math.inf)
+        launch = launch or gpu_scenes_per_launch(config, memory)
+        solvers, threads, first = workers or max(1, gpus), None, gpu_first_launch(config, launch)
+    else:
+        cores = [int(node["CPU"]) for node in nodes if node.get("CPU", 0) >= 1]
+        threads = min(_SOLVER_THREADS, *cores) if cores else 1
+        solvers, launch = workers or max(1, sum(count // threads for count in cores)), launch or 1
+        first = launch
+    return WorkerPlan(solvers, threads, min(MAXIMUM_MAKERS, solvers), launch, first)
+
+
+class RayWorkerFactory:
+    """Actors of a cluster; a context manager that holds the connection to it."""
+
+    def __init__(self, config: DatagenConfig, backend: Backend) -> None:
+        """Raises: ConfigError when Ray is not installed."""
+        try:
+            import ray
+        except ImportError:
+            raise ConfigError(
+                "pool=ray needs Ray, which is not installed; pip install 'hgn[ray]' on every machine"
+            ) from None
+        self._ray, self._config, self._backend = ray, config, backend
+
+    def __enter__(self) -> RayWorkerFactory:
+        """Raises: ConfigError when no cluster answers."""
+        address = self._config.dataset.ray_address or os.environ.get("RAY_ADDRESS") or "auto"
+        try:
+            self._ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise ConfigError(
+                f"pool=ray needs a Ray cluster at {address}, got {type(error).__name__}; {_CONNECT_REMEDY}"
+            ) from None
+        self.plan = plan_cluster(self._config, [node["Resources"] for node in self._ray.nodes() if node["Alive"]])
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ray.shutdown()
+
+    def start_maker(self) -> Worker:
+        return self._start(_Maker, self._config, self._backend, num_cpus=0, scheduling_strategy="SPREAD")
+
+    def start_solver(self, number: int) -> Worker:
+        threads = self.plan.threads
+        room = {"num_gpus": 1, "num_cpus": 0} if threads is None else {"num_cpus": threads}
+        return self._start(_Solver, self._config, self._backend, threads, **room)
+
+    def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
+        waiting = {ref: worker for worker in workers if isinstance(worker, RayWorker) for ref in worker.answers}
+        if not waiting:
+            time.sleep(timeout)
+            return
+        ready, _ = self._ray.wait(list(waiting), num_returns=1, timeout=timeout)
+        for ref in ready:
+            worker = waiting[ref]
+            worker.answers.remove(ref)
+            try:
+                kind, *values = self._ray.get(ref)
+            except self._ray.exceptions.RayError as error:
+                worker.cause = f"{type(error).__name__} on node {worker.node or 'not yet known'}"
+                # a node that falls silent is at first only unavailable; an actor that its scene killed is known dead
+                worker.silent = isinstance(error, self._ray.exceptions.ActorUnavailableError)
+                yield worker, None
+                continue
+            if kind == "ready":
+                (worker.node,) = values
+            elif kind == "packed":
+                key, packed = values
+                stage_parts(Path(self._config.dataset.folder), key, [packed])
+                yield worker, ("staged", key)
+            else:
+                yield worker, (kind, *values)
+            if not worker.answers:
+                yield worker, ("idle",)
+
+    def _start(self, kind: type, *arguments: object, **options: Any) -> RayWorker:
+        # neither restarted nor retried by Ray: the pool counts a scene's deaths, and replaces workers itself
+        actor: Any = self._ray.remote(kind).options(max_restarts=0, max_task_retries=0, **options).remote(*arguments)
+        return RayWorker(self._ray, actor)
+
+
+class RayWorker(Worker):
+    """The pool's end of an actor. It is idle once the cluster has found a place for it."""
+
+    def __init__(self, ray: Any, actor: Any) -> None:
+        super().__init__()
+        self._ray, self._actor = ray, actor
+        self.answers = [actor.ready.remote()]
+        self.node: str | None = None
+        self.cause, self.silent = "", False
+
+    def give(self, message: object) -> None:
+        self.idle = False
+        count = len(message) if isinstance(message, list) else 1
+        answers = self._actor.work.options(num_returns=count).remote(message)
+        self.answers = answers if count > 1 else [answers]
+
+    def kill(self) -> None:
+        self.answers = []
+        self._ray.kill(self._actor)
+
+    def cause_of_death(self) -> str:
+        return self.cause
+
+    def blamable(self) -> bool:
+        alive = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
+        return not self.silent and (self.node is None or self.node in alive)
+
+
+class _Maker:
+    """The actor that builds scenes."""
+
+    def __init__(self, config: DatagenConfig, backend: Backend) -> None:
+        self._config, self._backend = config, backend
+
+    def ready(self) -> tuple[str, str]:
+        return "ready", _node()
+
+    def work(self, task: SceneTask) -> tuple[Any, ...]:
+        try:
+            return make_scene(task, self._config, self._backend)
+        except Exception as error:  # noqa: BLE001 - not swallowed: the pool stops with this text
+            return error_message(error)
+
+
+class _Solver:
+    """The actor that simulates scenes: one answer for each."""
+
+    def __init__(self, config: DatagenConfig, backend: Backend, threads: int | None) -> None:
+        self._config, self._backend, self._threads = config, backend, threads
+
+    def ready(self) -> tuple[str, str]:
+        return "ready", _node()
+
+    def work(self, batch: list[MadeScene]) -> Any:
+        try:
+            answers = self._simulate(batch)
+        except Exception as error:  # noqa: BLE001 - not swallowed: the pool stops with this text
+            answers = [error_message(error)] * len(batch)
+        return answers if len(answers) > 1 else answers[0]
+
+    def _simulate(self, batch: list[MadeScene]) -> list[tuple[Any, ...]]:
+        dataset = self._config.dataset
+        config_hash = identity_hash(dataset_identity(self._config))
+        results = pkgutil.resolve_name(self._backend.simulate)(
+            [made.scene for made in batch],
+            self._config.mpm,
+            dataset.frames,
+            dataset.frame_rate_hz,
+            cpu_threads=self._threads,
+            colliders=[made.collider for made in batch],
+        )
+        answers: list[tuple[Any, ...]] = []
+        for made, result in zip(batch, results, strict=True):
+            cause = failure_of(result)
+            if cause is not None:
+                answers.append(("failed", made.task.key, cause))
+            else:
+                packed = pack_episode(make_episode(made, result, self._config, config_hash))
+                answers.append(("packed", made.task.key, packed))
+        return answers
+
+
+def _node() -> str:
+    import ray
+
+    return ray.get_runtime_context().get_node_id()

@@ -1,0 +1,163 @@
+"""Tar files of episodes: staged one by one, and read back whole before anything relies on them."""
+
+from __future__ import annotations
+
+import os
+import tarfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from datagen.pool.plan import ShardRange, episode_key, scene_seed
+from hgn.config import DatagenConfig
+from hgn.data.identity import dataset_identity, identity_hash
+from hgn.data.manifest import EpisodeEntry, ShardEntry
+from hgn.data.reader import read_episode
+from hgn.data.statistics import episode_statistics, merge_statistics
+from hgn.data.storage import file_sha256
+from hgn.scene.episode import Episode, encode_episode
+from hgn.schema import ConfigError
+from hgn.system.files import temporary_file
+
+STAGING_NAME = ".staging"
+_COPY_BYTES = 1 << 22
+
+
+def staged_path(folder: Path, split: str, index: int) -> Path:
+    """Where the tar file of a finished episode waits for the rest of its shard."""
+    return folder / STAGING_NAME / f"{episode_key(split, index)}.tar"
+
+
+def stage_episode(folder: Path, episode: Episode) -> None:
+    """Writes `<folder>/.staging/<key>.tar`. Safe to call from worker processes.
+
+    `episode.solver["dataset"]` holds `config_hash` and `attempt`, by which a later run knows the episode.
+    Raises: OSError (a full disk), ConfigError (positions that are not finite).
+    """
+    stage_parts(folder, episode.key, _tar_of(episode))
+
+
+def pack_episode(episode: Episode) -> bytes:
+    """The tar file of one episode. Raises: ConfigError (positions that are not finite)."""
+    return b"".join(_tar_of(episode))
+
+
+def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
+    """Writes the parts of an episode's tar file, whole or not at all, if the machine does not lose its power: what
+    waits here is read back before it is used, and soon stands in a shard, so it need not reach the disk.
+
+    Raises: OSError (a full disk).
+    """
+    target = folder / STAGING_NAME / f"{key}.tar"
+    with temporary_file(target) as temporary:
+        with temporary.open("wb", buffering=0) as file:
+            for part in parts:
+                rest = memoryview(part)
+                while rest:  # a write takes 2 GB at most
+                    rest = rest[file.write(rest) :]
+        temporary.replace(target)
+
+
+def _tar_of(episode: Episode) -> Iterator[bytes]:
+    """The parts of its tar: the same episode gives the same bytes, for there are no times, no owners, a fixed mode."""
+    written = 0
+    for name, data in encode_episode(episode).items():
+        info = tarfile.TarInfo(f"{episode.key}.{name}")
+        info.size, info.mtime, info.mode = len(data), 0, 0o644
+        header, rest = info.tobuf(tarfile.GNU_FORMAT), bytes(-len(data) % tarfile.BLOCKSIZE)
+        written += len(header) + len(data) + len(rest)
+        yield from (header, data, rest)
+    yield _tar_end(written)
+
+
+def _tar_end(written: int) -> bytes:
+    """What follows the last member: two empty blocks, and as many as fill a record."""
+    end = 2 * tarfile.BLOCKSIZE
+    return bytes(end + -(written + end) % tarfile.RECORDSIZE)
+
+
+def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
+    """Writes the members of several tars as one."""
+    written = 0
+    for source in sources:
+        members = (place for named in locate_members(source).values() for place in named.values())
+        length = max((offset + size for offset, size in members), default=0)
+        length += -length % tarfile.BLOCKSIZE
+        with source.open("rb", buffering=0) as staged:
+            for start in range(0, length, _COPY_BYTES):
+                file.write(staged.read(min(_COPY_BYTES, length - start)))
+        written += length
+    file.write(_tar_end(written))
+
+
+def sync_file(file: BinaryIO) -> None:
+    """Brings what was written to the disk itself."""
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
+    """Where each member's data lies in a tar: key -> name after `<key>.` -> (offset, bytes).
+
+    Raises: ConfigError when the file is not a whole tar.
+    """
+    located: dict[str, dict[str, tuple[int, int]]] = {}
+    try:
+        with tarfile.open(path, mode="r:") as tar:
+            for info in tar:
+                key, _, name = info.name.partition(".")
+                located.setdefault(key, {})[name] = (info.offset_data, info.size)
+    except tarfile.TarError as error:
+        raise ConfigError(f"{path} must be a whole tar, got {error}; delete it and run the generator again") from None
+    return located
+
+
+def inspect_shard(path: Path, shard: ShardRange, config: DatagenConfig) -> ShardEntry:
+    """Reads a tar back whole: every member, value and seed, and that it holds just this range of this data set.
+
+    Raises: ConfigError naming what does not fit, and the remedy.
+    """
+    located = locate_members(path)
+    expected = [episode_key(shard.split, index) for index in shard.indices]
+    if list(located) != expected:
+        raise ConfigError(
+            f"{path} must hold {', '.join(expected)}, got {', '.join(located) or 'nothing'}; delete it and run the "
+            "generator again"
+        )
+    content = np.memmap(path, dtype=np.uint8, mode="r")
+    entries, statistics = [], []
+    for index, (key, members) in zip(shard.indices, located.items(), strict=True):
+        episode, attempt = _read_own_episode(path, content, key, members, config)
+        seed = scene_seed(config.dataset.seed, shard.split, index, attempt)
+        if episode.seed != seed or episode.frame_count != config.dataset.frames:
+            raise ConfigError(
+                f"{path}: {key} must have seed {seed} and {config.dataset.frames} frames, got {episode.seed} "
+                f"and {episode.frame_count}; delete it and run the generator again"
+            )
+        entries.append(EpisodeEntry(key, index, seed, attempt, episode.particle_count, episode.frame_count, members))
+        statistics.append(episode_statistics(episode.position_TN3))
+    return ShardEntry(
+        name=shard.name,
+        split=shard.split,
+        first=shard.first,
+        stop=shard.stop,
+        sha256=file_sha256(path),
+        bytes=path.stat().st_size,
+        episodes=tuple(entries),
+        statistics=merge_statistics(statistics),
+    )
+
+
+def _read_own_episode(
+    path: Path, content: np.ndarray, key: str, members: dict[str, tuple[int, int]], config: DatagenConfig
+) -> tuple[Episode, int]:
+    episode = read_episode(content, path.name, key, members, scan_positions=True)
+    origin = episode.solver.get("dataset")
+    if not isinstance(origin, dict) or origin.get("config_hash") != identity_hash(dataset_identity(config)):
+        raise ConfigError(f"{path}: {key} belongs to another data set; move the file out of the folder")
+    attempt = origin.get("attempt")
+    if not isinstance(attempt, int):
+        raise ConfigError(f"{path}: {key} must name its attempt, got {attempt!r}; delete it and run again")
+    return episode, attempt

@@ -1,0 +1,386 @@
+"""Episodes to shards: each finished episode is staged at once, a shard is published when its range is complete.
+
+Every file appears whole or not at all, in this order: `.staging/<key>.tar`, the shard, the manifest; staged files
+go last. So after a crash at any point the state of the folder alone says what is left to do, and no finished
+episode is simulated again. Several generators may write to one folder: each claims the shards that it makes, the
+first to publish an episode wins, and the manifest is only changed under its lock, on top of what the others wrote.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import shutil
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+
+from datagen.pool.locks import ShardLocks
+from datagen.pool.plan import (
+    SceneTask,
+    ShardRange,
+    episode_key,
+    generation_order,
+    missing_ranges,
+    parse_episode_key,
+    parse_shard_name,
+    scene_seed,
+    work_order,
+)
+from datagen.pool.shard import STAGING_NAME, inspect_shard, join_tars, staged_path, sync_file
+from hgn.config import DatagenConfig
+from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
+from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest, QuarantinedScene, ShardEntry
+from hgn.schema import ConfigError
+from hgn.system.files import TEMPORARY_SUFFIX, sync_folder, temporary_file, temporary_target
+from hgn.system.machine import available_cpus
+
+# seeds tried for one episode before the scene distribution itself is held to be at fault
+MAXIMUM_REPLACEMENTS = 20
+PACKED_AT_ONCE = max(4, min(12, available_cpus() - 1))  # shards, where so many are ready; 0.1 GB each
+
+
+_Packed = tuple[ExitStack, Path, ShardEntry]
+
+
+class DatasetWriter:
+    """One generator's hold on a data set folder; a context manager.
+
+    Entering recovers what earlier runs left: shards that are not yet in the manifest are checked and listed, and
+    partial files that nobody is writing are removed. Raises: ConfigError when the folder holds another data set, or
+    a file that was altered.
+
+    Of `dataset.array_tasks` writers each makes its own shards alone: its share. Without it the share is everything.
+    """
+
+    def __init__(self, config: DatagenConfig, report: Callable[[str], None] = lambda message: None) -> None:
+        self.config = config
+        self.folder = Path(config.dataset.folder)
+        self.identity = dataset_identity(config)
+        self.config_hash = identity_hash(self.identity)
+        self.requested = {split: config.dataset.scenes(split) for split in SPLITS}
+        self.manifest = Manifest(config_hash=self.config_hash, config=self.identity, requested=self.requested)
+        self._report = report
+        tasks, task = config.dataset.array_tasks or 1, config.dataset.array_task or 0
+        self._share = work_order(self.requested, config.dataset.episodes_per_shard)[task::tasks]
+        self._pending = self._share  # what of it is not published
+        self._claimed: list[ShardRange] = []  # what of that this writer makes
+        self._staged: set[tuple[str, int]] = set()  # and what of these waits in .staging
+        self._packers = ThreadPoolExecutor(PACKED_AT_ONCE, "packer")
+        self._packing: dict[ShardRange, Future[_Packed]] = {}  # of the shards to be published next
+        self._stamp: tuple[int, ...] | None = None  # of the manifest file that `manifest` was read from or written to
+
+    def __enter__(self) -> DatasetWriter:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._locks = ShardLocks(self.folder)
+        try:
+            (self.folder / STAGING_NAME).mkdir(exist_ok=True)
+            with self._locks.manifest():
+                self._recover()
+                self._sweep()
+        except BaseException:
+            self._locks.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._packers.shutdown(cancel_futures=True)
+            for packing in self._packing.values():
+                if not packing.cancelled() and packing.exception() is None:
+                    packing.result()[0].close()
+            with self._locks.manifest():
+                self._sweep()
+            staging = self.folder / STAGING_NAME
+            with self._locks.alone() as alone:
+                if alone and staging.is_dir() and not any(staging.iterdir()):
+                    staging.rmdir()
+        finally:
+            self._locks.close()
+
+    def claim_next(self) -> ShardRange | None:
+        """Takes the next shard of the share that is neither published nor being made by another generator.
+
+        Its staged episodes are checked and kept. None when there is no such shard, or not yet: another generator may
+        end without publishing what it has claimed.
+        """
+        for shard in self._pending:
+            if shard in self._claimed or not self._locks.take(shard):
+                continue
+            # whoever had it may have published it, or ended before it could list it
+            with self._locks.manifest():
+                self._reload()
+                self._list_unlisted()
+            self._plan()
+            if shard not in self._pending:
+                self._locks.free(shard)
+                return self.claim_next()
+            self._claimed.append(shard)
+            self._find_staged(shard)
+            return shard
+        return None
+
+    def remaining(self) -> list[tuple[str, int]]:
+        """The episodes (split, index) of the claimed shards that are not staged, in the order to simulate them."""
+        wanted = {(shard.split, index) for shard in self._claimed for index in shard.indices} - self._staged
+        return [item for item in generation_order(self.requested) if item in wanted]
+
+    def refresh(self) -> None:
+        """Takes notice of what other generators have published."""
+        self._reload()
+        self._plan()
+
+    @property
+    def holds(self) -> bool:
+        """Whether there are claimed shards that are not published yet."""
+        return bool(self._claimed)
+
+    @property
+    def total(self) -> int:
+        """How many episodes the share has."""
+        return sum(len(shard.indices) for shard in self._share)
+
+    @property
+    def done(self) -> int:
+        """How many of them are published, or staged in claimed shards."""
+        return self.total - sum(len(shard.indices) for shard in self._pending) + len(self._staged)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the share is published, by whomever."""
+        return not self._pending
+
+    def task(self, split: str, index: int) -> SceneTask:
+        """The scene to simulate for an episode: the first seed that is not quarantined.
+
+        Raises: ConfigError when too many seeds in a row could not be simulated.
+        """
+        key = episode_key(split, index)
+        failures = [scene for scene in self.manifest.quarantined if scene.key == key]
+        attempt = 1 + max((scene.attempt for scene in failures), default=-1)
+        if attempt >= MAXIMUM_REPLACEMENTS:
+            raise ConfigError(
+                f"{key} could not be simulated with {attempt} seeds, the last because: {failures[-1].cause}; change "
+                "the scene or mpm settings, with another out=..."
+            )
+        return SceneTask(split, index, attempt, scene_seed(self.config.dataset.seed, split, index, attempt))
+
+    def quarantine(self, task: SceneTask, cause: str) -> SceneTask:
+        """Records that a scene could not be simulated and returns the one that takes its place."""
+        failure = QuarantinedScene(task.key, task.attempt, task.seed, cause)
+        with self._locks.manifest():
+            self._reload()
+            self._save(dataclasses.replace(self.manifest, quarantined=(*self.manifest.quarantined, failure)))
+        return self.task(task.split, task.index)
+
+    def add_staged(self, split: str, index: int) -> None:
+        """Tells the writer that an episode was staged."""
+        self._staged.add((split, index))
+
+    def is_staged(self, split: str, index: int) -> bool:
+        """Whether a staged file is there, told or not: a worker may die between the two."""
+        return staged_path(self.folder, split, index).is_file()
+
+    @property
+    def packing(self) -> bool:
+        """Whether shards are being packed, for `publish_next` to publish."""
+        return bool(self._packing)
+
+    def publish_next(self, wait: bool = True) -> ShardEntry | None:
+        """Publishes one claimed shard whose episodes are all staged; None when there is no such shard, or, unless it
+        is to `wait`, while they are being packed.
+
+        Raises: OSError (a full disk): nothing half-written is left and what was published stays untouched.
+        """
+        ready = [
+            shard for shard in self._claimed if all((shard.split, index) in self._staged for index in shard.indices)
+        ]
+        if not ready:
+            return None
+        # two rounds, so that no packer waits while this thread lists what is packed
+        for shard in ready[: 2 * PACKED_AT_ONCE] if len(ready) > 1 or not wait else []:
+            if shard not in self._packing:
+                self._packing[shard] = self._packers.submit(self._pack, shard)
+        if not wait:
+            ready = [shard for shard in ready if shard in self._packing and self._packing[shard].done()]
+            if not ready:
+                return None
+        entry = self._publish(ready[0])
+        self._forget(ready[0])
+        self._plan()
+        return entry
+
+    def _pack(self, shard: ShardRange) -> _Packed:
+        """A shard's file under a temporary name, which is gone when the stack is closed, and its checked entry."""
+        with ExitStack() as stack:
+            temporary = stack.enter_context(temporary_file(self.folder / shard.name))
+            with temporary.open("wb") as file:
+                join_tars(file, (staged_path(self.folder, shard.split, index) for index in shard.indices))
+                sync_file(file)
+            entry = inspect_shard(temporary, shard, self.config)
+            return stack.pop_all(), temporary, entry
+
+    def _publish(self, shard: ShardRange) -> ShardEntry:
+        packing = self._packing.pop(shard, None)
+        if winner := self._winner(shard):
+            if packing is not None:
+                packing.result()[0].close()
+            return winner
+        target = self.folder / shard.name
+        stack, temporary, entry = self._pack(shard) if packing is None else packing.result()
+        with stack, self._locks.manifest():
+            if winner := self._winner(shard):
+                return winner
+            if not _link(temporary, target):
+                entry = inspect_shard(target, shard, self.config)
+            sync_folder(self.folder)
+            self._publish_list((*self.manifest.shards, entry))
+        return entry
+
+    def _winner(self, shard: ShardRange) -> ShardEntry | None:
+        """What another generator has published of a claimed shard: only where a file system's locks do not hold."""
+        self._reload()
+        for other in self.manifest.shards:
+            if _overlap(shard, other):
+                self._report(f"{other.name} was published by another generator; this copy is dropped")
+                return other
+        return None
+
+    def _recover(self) -> None:
+        if (self.folder / MANIFEST_NAME).exists():
+            self._reload()
+            require_same_dataset(self.manifest.config, self.config, self.folder)
+        present = tuple(shard for shard in self.manifest.shards if self._is_present(shard))
+        if present != self.manifest.shards:
+            self._publish_list(present)
+        self._list_unlisted()
+        self._plan()
+        # a complete folder that is asked for less, or for the same again, stays as it is
+        asks_anew = self.requested != self.manifest.requested and (self._pending or not self.manifest.complete)
+        if asks_anew or not (self.folder / MANIFEST_NAME).exists():
+            self._save(dataclasses.replace(self.manifest, requested=self.requested))
+        published = self._published_episodes()
+        for path in (self.folder / STAGING_NAME).glob("*.tar"):
+            episode = parse_episode_key(path.stem)
+            if episode is None or (episode.split, episode.first) in published:
+                path.unlink(missing_ok=True)  # its publisher may be about to do the same
+
+    def _is_present(self, shard: ShardEntry) -> bool:
+        path = self.folder / shard.name
+        if not path.exists():
+            self._report(f"{path} is listed in the manifest but missing; its episodes are made again")
+            return False
+        size = path.stat().st_size
+        if size != shard.bytes:
+            raise ConfigError(
+                f"{path} must have {shard.bytes} bytes, got {size}; delete it and run the generator again"
+            )
+        return True
+
+    def _list_unlisted(self) -> None:
+        """Lists the shards that were published by a generator that ended before it could say so."""
+        shards = list(self.manifest.shards)
+        listed = {shard.name for shard in shards}
+        for path in sorted(self.folder.glob("*.tar")):
+            shard = parse_shard_name(path.name)
+            if shard is None or path.name in listed:
+                continue
+            for other in shards:
+                if _overlap(shard, other):
+                    raise ConfigError(f"{path} overlaps {other.name}; move it out of the folder")
+            shards.append(inspect_shard(path, shard, self.config))
+            self._report(f"{path.name} was published but not yet listed; checked and listed")
+        if len(shards) > len(self.manifest.shards):
+            self._publish_list(tuple(shards))
+
+    def _find_staged(self, shard: ShardRange) -> None:
+        """Checks what earlier runs left of a shard that was just claimed, and removes what they were writing."""
+        for index in shard.indices:
+            path = staged_path(self.folder, shard.split, index)
+            for partial in path.parent.glob(f".{path.name}.*{TEMPORARY_SUFFIX}"):
+                partial.unlink(missing_ok=True)
+            if not path.exists():
+                continue
+            try:
+                inspect_shard(path, ShardRange(shard.split, index, index + 1), self.config)
+            except ConfigError as error:
+                self._report(f"{error}; the episode is made again")
+                path.unlink()
+            else:
+                self._staged.add((shard.split, index))
+
+    def _sweep(self) -> None:
+        """Removes partial files of writers that are gone: nobody else has claimed what they were to be."""
+        for folder in (self.folder, self.folder / STAGING_NAME):
+            for path in folder.glob(f".*{TEMPORARY_SUFFIX}"):
+                name = temporary_target(path)
+                shard = parse_shard_name(name) or parse_episode_key(name.removesuffix(".tar"))
+                if shard is None:  # the manifest, which is locked
+                    path.unlink(missing_ok=True)
+                elif self._locks.take(shard):
+                    path.unlink(missing_ok=True)
+                    if not any(_overlap(shard, claimed) for claimed in self._claimed):
+                        self._locks.free(shard)
+
+    def _plan(self) -> None:
+        present = [ShardRange(shard.split, shard.first, shard.stop) for shard in self.manifest.shards]
+        self._pending = missing_ranges(self._share, present)
+
+    def _published_episodes(self) -> set[tuple[str, int]]:
+        return {(shard.split, entry.index) for shard in self.manifest.shards for entry in shard.episodes}
+
+    def _reload(self) -> None:
+        with contextlib.suppress(FileNotFoundError):  # removed by hand: it is written anew with the next shard
+            stamp = _stamp(self.folder / MANIFEST_NAME)
+            if stamp != self._stamp:
+                manifest = Manifest.load(self.folder)
+                if self._stamp is not None:
+                    require_same_dataset(manifest.config, self.config, self.folder)
+                self.manifest, self._stamp = manifest, stamp
+
+    def _publish_list(self, shards: tuple[ShardEntry, ...]) -> None:
+        self._save(
+            dataclasses.replace(
+                self.manifest, shards=shards, revision=self.manifest.revision + 1, requested=self.requested
+            )
+        )
+
+    def _save(self, manifest: Manifest) -> None:
+        manifest.save(self.folder)
+        self.manifest, self._stamp = manifest, _stamp(self.folder / MANIFEST_NAME)
+
+    def _forget(self, shard: ShardRange) -> None:
+        for index in shard.indices:
+            self._staged.discard((shard.split, index))
+            staged_path(self.folder, shard.split, index).unlink(missing_ok=True)
+        self._claimed.remove(shard)
+        self._locks.free(shard)
+
+
+def _overlap(one: ShardRange | ShardEntry, other: ShardRange | ShardEntry) -> bool:
+    return one.split == other.split and one.first < other.stop and other.first < one.stop
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns, status.st_size
+
+
+def _link(temporary: Path, target: Path) -> bool:
+    """Gives a finished file its name; False when the name is taken: a file that is there is never replaced."""
+    try:
+        target.hardlink_to(temporary)
+    except FileExistsError:
+        return False
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.EMLINK):
+            raise
+        if target.exists():
+            return False
+        shutil.move(temporary, target)  # a file system without hard links; the manifest's lock keeps others away
+    return True

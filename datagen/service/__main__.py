@@ -1,0 +1,91 @@
+"""`python -m datagen.service +experiment=obstacles out=data/obstacles`: generates a data set and serves it over HTTP.
+
+Training reads it from anywhere with `dataset.folder=http://HOST:PORT`, while it grows. Ctrl-C or SIGTERM leaves a
+folder that can be gone on with. Started again on a complete data set, it only serves.
+"""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import socket
+from pathlib import Path
+from typing import Any
+
+from datagen.generate import KEYS, StopRequest, datagen_config, require_local_folder
+from datagen.pool.progress import PROGRESS_KINDS, make_progress
+from datagen.pool.worker import Backend
+from datagen.service.supervisor import Supervisor
+from hgn.command import run_command
+from hgn.config import ServiceConfig
+from hgn.data.identity import require_same_dataset
+from hgn.data.manifest import MANIFEST_NAME, Manifest
+from hgn.data.storage import TOKEN_VARIABLE, dataset_token
+from hgn.schema import ConfigError, from_mapping, require
+
+_SERVICE_KEYS = ("host", "port", "connections")
+
+
+def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
+    """Serves until it is stopped; the exit code is 128 + the signal."""
+    kind = mapping.get("progress", "bar")
+    require(kind in PROGRESS_KINDS, "progress", f"one of {', '.join(PROGRESS_KINDS)}", kind)
+    config = datagen_config(mapping, KEYS | dict.fromkeys(_SERVICE_KEYS))
+    service = from_mapping(ServiceConfig, {key: mapping[key] for key in _SERVICE_KEYS if key in mapping})
+    require_local_folder(config)
+    folder = Path(config.dataset.folder)
+    if (folder / MANIFEST_NAME).exists():
+        require_same_dataset(Manifest.load(folder).config, config, folder)
+    token = dataset_token()
+    with _listen(service, token) as listener, StopRequest() as stop:
+        # this loads for a second, and the pool's processes, which import this file, do not need it
+        from datagen.service.server import make_app, make_server
+
+        progress = make_progress(kind)
+        with Supervisor(config.awaited, progress, backend) as supervisor:
+            app = make_app(folder, token, lambda: supervisor.state)
+            server = make_server(app, service.connections)
+
+            def end() -> None:
+                server.should_exit = True
+
+            supervisor.on_unusable = end
+            if supervisor.unusable is None:
+                host, port, *_ = listener.getsockname()
+                host = f"[{host}]" if ":" in host else host
+                progress.message(
+                    f"serving {folder} at http://{host}:{port}" + ("" if token is None else ", with a token")
+                )
+                server.run(sockets=[listener])
+        if supervisor.unusable is not None:
+            raise ConfigError(supervisor.unusable)
+    return 128 + (stop.signal or 0)
+
+
+def _listen(service: ServiceConfig, token: str | None) -> socket.socket:
+    """The socket to serve on.
+
+    Raises: ConfigError when the port is taken, the host is none of this machine's, or anybody could read.
+    """
+    host, port = service.host, service.port
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        if token is None and not ipaddress.ip_address(address[0]).is_loopback:
+            raise ConfigError(
+                f"host must be a loopback address without a token, got {host!r}; set {TOKEN_VARIABLE} in the "
+                "environment of the service and of its readers"
+            )
+        return socket.create_server(address[:2], family=family, backlog=1024)
+    except OSError as error:
+        remedies = {
+            errno.EADDRINUSE: "stop what uses it or choose another port=... (0: any free one)",
+            errno.EACCES: "choose a port of 1024 or more",
+        }
+        remedy = remedies.get(error.errno or 0, "choose host=127.0.0.1, or an address of this machine")
+        raise ConfigError(
+            f"host and port must be free to serve on, got {host}:{port} ({error.strerror}); {remedy}"
+        ) from None
+
+
+if __name__ == "__main__":
+    run_command(main, "service")

@@ -1,0 +1,247 @@
+"""The data set over HTTP, read-only: the manifest, the shards it lists, and how far the generator is.
+
+| path | what | |
+|---|---|---|
+| /manifest.json | the manifest | ETag: sha256 of its bytes |
+| /<shard>.tar | a published shard | ETag: its sha256; Range, If-Range |
+| /progress | counts and the pool's state, JSON | |
+| /metrics | the same for Prometheus | |
+| /healthz | 200 while the service serves; needs no token | |
+
+Nothing else of the folder can be reached, and no shard whose bytes are not those that the manifest promises. With a
+token each request must carry `Authorization: Bearer <token>`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import uvicorn
+from anyio import to_thread
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from datagen.service.sendfile import FileRange, SendfileProtocol
+from datagen.service.supervisor import PoolState
+from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
+from hgn.data.storage import verify_file
+from hgn.schema import ConfigError
+
+_OPEN_PATHS = ("/healthz",)
+_GRACE_S = 5  # for answers that are being sent when the service is stopped; readers go on where they were cut
+_REMEDY = "delete it and run the generator again"
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A manifest as it was read."""
+
+    content: bytes
+    etag: str
+    manifest: Manifest
+    shards: dict[str, ShardEntry]
+
+
+class Published:
+    """The manifest of a folder, read again when the file has changed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._stamp: tuple[int, ...] | None = None
+        self._snapshot: Snapshot | None = None
+
+    async def snapshot(self) -> Snapshot:
+        """Raises: ConfigError when there is no manifest that this version can read."""
+        return await to_thread.run_sync(self._read)
+
+    def _read(self) -> Snapshot:
+        path = self.folder / MANIFEST_NAME
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            raise ConfigError("the data set has no manifest yet; ask again in a moment") from None
+        stamp = (status.st_ino, status.st_mtime_ns, status.st_size)
+        if self._snapshot is None or stamp != self._stamp:
+            content = path.read_bytes()
+            manifest = Manifest.parse(content, MANIFEST_NAME)
+            etag = f'"{hashlib.sha256(content).hexdigest()}"'
+            self._snapshot = Snapshot(content, etag, manifest, {shard.name: shard for shard in manifest.shards})
+            self._stamp = stamp
+        return self._snapshot
+
+
+class Guard:
+    """Asks each request for the token, and counts what is answered."""
+
+    def __init__(self, app: ASGIApp, token: str | None, counters: Counter[str]) -> None:
+        self._app, self._counters = app, counters
+        self._expected = None if token is None else f"Bearer {token}".encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def counted(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                self._counters[f"code {message['status']}"] += 1
+            await send(message)
+            self._counters["bytes"] += len(message.get("body", b"")) + message.get("count", 0)
+
+        if scope["type"] != "http":
+            return
+        if not self._allowed(scope):
+            refusal = PlainTextResponse(
+                "a valid token is needed: Authorization: Bearer <token>\n", 401, {"WWW-Authenticate": "Bearer"}
+            )
+            await refusal(scope, receive, counted)
+            return
+        await self._app(scope, receive, counted)
+
+    def _allowed(self, scope: Scope) -> bool:
+        if self._expected is None or scope["path"] in _OPEN_PATHS:
+            return True
+        given = [value for name, value in scope["headers"] if name == b"authorization"]
+        # in constant time, so that the answer's delay tells nothing of the token
+        return len(given) == 1 and hmac.compare_digest(given[0], self._expected)
+
+
+def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> ASGIApp:
+    """The service as an ASGI application."""
+    published, counters = Published(folder), Counter[str]()
+
+    async def manifest(request: Request) -> Response:
+        snapshot = await published.snapshot()
+        headers = {"etag": snapshot.etag, "cache-control": "no-cache"}
+        if _unchanged(request, snapshot.etag):
+            return Response(status_code=304, headers=headers)
+        return Response(snapshot.content, headers=headers, media_type="application/json")
+
+    async def shard(request: Request) -> Response:
+        entry = (await published.snapshot()).shards.get(request.path_params["name"])
+        if entry is None:
+            return PlainTextResponse("the manifest lists no such shard\n", 404)
+        path, etag = folder / entry.name, f'"{entry.sha256}"'
+        try:
+            await to_thread.run_sync(verify_file, path, entry.sha256, entry.bytes, _REMEDY)
+        except FileNotFoundError:
+            return PlainTextResponse(f"{entry.name} is missing here; it must be generated again\n", 404)
+        except ConfigError:
+            return PlainTextResponse(f"{entry.name} is damaged here; {_REMEDY}\n", 410)
+        # another data set may have a shard of this name, at this address, later
+        headers = {"etag": etag, "cache-control": "private, no-cache"}
+        if _unchanged(request, etag):
+            return Response(status_code=304, headers=headers)
+        return FileRange(path, entry.bytes, headers, "application/x-tar")
+
+    async def progress(request: Request) -> Response:
+        return JSONResponse(
+            _progress((await published.snapshot()).manifest, pool()), headers={"cache-control": "no-store"}
+        )
+
+    async def metrics(request: Request) -> Response:
+        text = _metrics((await published.snapshot()).manifest, pool(), counters)
+        return PlainTextResponse(text, media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    async def healthz(request: Request) -> Response:
+        await published.snapshot()
+        return JSONResponse({"status": "ok", "generator": pool().status})
+
+    async def unreadable(request: Request, error: Exception) -> Response:
+        return PlainTextResponse(f"{error}\n", 503, {"retry-after": "1"})
+
+    app = Starlette(
+        routes=[
+            Route(f"/{MANIFEST_NAME}", manifest),
+            Route("/progress", progress),
+            Route("/metrics", metrics),
+            Route("/healthz", healthz),
+            Route("/{name}", shard),
+        ],
+        middleware=[Middleware(Guard, token=token, counters=counters)],
+        exception_handlers={ConfigError: unreadable},
+    )
+    app.router.redirect_slashes = False
+    return app
+
+
+def make_server(app: ASGIApp, connections: int) -> uvicorn.Server:
+    """Serves `app` to as many connections at once; more are told to come back."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http=SendfileProtocol,
+            loop="asyncio",  # uvloop, which Uvicorn takes where it is installed, cannot send files
+            lifespan="off",
+            ws="none",
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            limit_concurrency=connections,
+            timeout_graceful_shutdown=_GRACE_S,
+        )
+    )
+
+
+def _unchanged(request: Request, etag: str) -> bool:
+    asked = request.headers.get("if-none-match", "")
+    return asked.strip() == "*" or etag in [tag.strip().removeprefix("W/") for tag in asked.split(",")]
+
+
+def _progress(manifest: Manifest, pool: PoolState) -> dict[str, object]:
+    return {
+        "config_hash": manifest.config_hash,
+        "revision": manifest.revision,
+        "complete": manifest.complete,
+        "episodes": {
+            split: {"requested": count, "published": manifest.published(split)}
+            for split, count in manifest.requested.items()
+        },
+        "shards": len(manifest.shards),
+        "bytes": sum(shard.bytes for shard in manifest.shards),
+        "quarantined": len(manifest.quarantined),
+        "generator": {
+            "status": pool.status,
+            "starts": pool.starts,
+            "done": pool.done,
+            "total": pool.total,
+            "frames": pool.frames,
+            "running": [{"frame": frame, "scenes": scenes} for frame, scenes in pool.running.values()],
+            "error": pool.error,
+        },
+    }
+
+
+def _metrics(manifest: Manifest, pool: PoolState, counters: Counter[str]) -> str:
+    splits = [(split, f'{{split="{split}"}}') for split in manifest.requested]
+    codes = sorted(key.removeprefix("code ") for key in counters if key.startswith("code "))
+    families: list[tuple[str, str, str, list[tuple[str, float]]]] = [
+        ("hgn_episodes_requested", "gauge", "Episodes the data set is to have.",
+         [(label, manifest.requested[split]) for split, label in splits]),
+        ("hgn_episodes_published", "gauge", "Episodes that can be read.",
+         [(label, manifest.published(split)) for split, label in splits]),
+        ("hgn_shards_published", "gauge", "Shards that can be read.", [("", len(manifest.shards))]),
+        ("hgn_shard_bytes_published", "gauge", "Bytes of these.", [("", sum(s.bytes for s in manifest.shards))]),
+        ("hgn_manifest_revision", "counter", "Revision of the manifest.", [("", manifest.revision)]),
+        ("hgn_scenes_quarantined", "gauge", "Scenes that could not be simulated.", [("", len(manifest.quarantined))]),
+        ("hgn_generator_running", "gauge", "1 while the pool runs.", [("", int(pool.status == "running"))]),
+        ("hgn_generator_failed", "gauge", "1 when it ended for good with an error.",
+         [("", int(pool.status == "failed"))]),
+        ("hgn_generator_starts_total", "counter", "Starts of the pool.", [("", pool.starts)]),
+        ("hgn_generator_episodes_done", "gauge", "Episodes published or staged.", [("", pool.done)]),
+        ("hgn_generator_scenes_running", "gauge", "Scenes being simulated.",
+         [("", sum(scenes for _, scenes in pool.running.values()))]),
+        ("hgn_http_responses_total", "counter", "Answers by status code.",
+         [(f'{{code="{code}"}}', counters[f"code {code}"]) for code in codes]),
+        ("hgn_http_sent_bytes_total", "counter", "Bytes of all answers' bodies.", [("", counters["bytes"])]),
+    ]  # fmt: skip
+    lines = []
+    for name, kind, text, samples in families:
+        lines += [f"# HELP {name} {text}", f"# TYPE {name} {kind}"]
+        lines += [f"{name}{label} {value}" for label, value in samples]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,163 @@
+"""The pool as a process of its own, kept alive by the service: whatever becomes of it, what is published is served.
+
+A pool that dies, or ends for want of disk space, is started again after a pause that grows while no episode gets
+finished. One whose configuration is at fault is not: the service says so and goes on serving.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+from datagen.generate import StopRequest, generate
+from datagen.pool.progress import Progress
+from datagen.pool.worker import Backend, error_message
+from hgn.config import DatagenConfig
+from hgn.schema import ConfigError
+from hgn.system.processes import die_with_parent
+
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
+_STOP_PATIENCE_S = 60.0
+_EVENTS = ("start", "frame", "episode", "found", "shard", "message", "close")
+
+
+@dataclass(frozen=True)
+class PoolState:
+    """What is known of the pool. `status` is starting, running, complete, waiting (to start again), failed, stopped."""
+
+    status: str = "starting"
+    starts: int = 0
+    done: int = 0  # episodes published or staged
+    total: int = 0
+    frames: int = 0  # of an episode
+    running: dict[int, tuple[int, int]] = field(default_factory=dict)  # worker -> frame reached, scenes at once
+    error: str = ""  # the last one
+
+
+class Supervisor:
+    """Runs the pool until it is left; a context manager."""
+
+    def __init__(self, config: DatagenConfig, progress: Progress, backend: Backend | None = None) -> None:
+        self._config, self._progress, self._backend = config, progress, backend
+        self.state = PoolState()  # replaced as a whole, so that other threads may read it at any time
+        self.unusable: str | None = None  # why the generator could not even begin
+        self.on_unusable = lambda: None
+        self._stopping = threading.Event()
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._thread = threading.Thread(target=self._run, name="pool supervisor")
+
+    def __enter__(self) -> Supervisor:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Ends the pool as Ctrl-C does: it keeps what it has finished."""
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        pause = _FIRST_PAUSE_S
+        while not self._stopping.is_set():
+            before = self.state.done
+            outcome, text = self._run_once()
+            if outcome == "complete":
+                self._set(status="complete", error="", running={})
+                return
+            if self._stopping.is_set():
+                break
+            self._set(status="waiting", error=text, running={})
+            if outcome == "config_error":
+                self._set(status="failed")
+                self._progress.message(f"error: {text}")
+                if not self.state.total:
+                    self.unusable = text
+                    self.on_unusable()
+                return
+            pause = _FIRST_PAUSE_S if self.state.done != before else min(2 * pause, _LONGEST_PAUSE_S)
+            self._progress.message(f"the pool ended ({text}); it is started again in {pause:.0f} s")
+            self._stopping.wait(pause)
+        self._set(status="stopped", running={})
+
+    def _run_once(self) -> tuple[str, str]:
+        """Runs a pool to its end: complete, stopped, config_error, os_error, error or died, and in words why."""
+        context = multiprocessing.get_context("spawn")
+        connection, child = context.Pipe(duplex=False)
+        process = context.Process(target=_generate, args=(child, self._config, self._backend), name="pool")
+        process.start()
+        child.close()
+        self._set(status="running", starts=self.state.starts + 1)
+        outcome, text = "died", ""
+        asked, patience = False, _STOP_PATIENCE_S
+        try:
+            while True:
+                if self._stopping.is_set() and not asked:
+                    process.terminate()
+                    asked = True
+                if not connection.poll(0.2):
+                    patience -= 0.2 * asked
+                    if patience < 0:
+                        process.kill()
+                    continue
+                kind, *values = connection.recv()
+                if kind in _EVENTS:
+                    self._note(kind, *values)
+                else:
+                    outcome, text = kind, " ".join(str(value) for value in values if value is not None)
+        except (EOFError, ConnectionResetError):
+            process.join()
+        finally:
+            connection.close()
+        if outcome == "died":
+            code = process.exitcode or 0
+            text = f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        return outcome, text
+
+    def _note(self, kind: str, *values: Any) -> None:
+        state = self.state
+        if kind == "start":
+            self._set(done=values[0], total=values[1], frames=values[2], error="")
+        elif kind == "frame":
+            worker, frame, scenes = values
+            running = {key: value for key, value in state.running.items() if key != worker}
+            self._set(running=running | ({worker: (frame, scenes)} if scenes else {}))
+        elif kind == "episode":
+            self._set(done=state.done + 1)
+        elif kind == "found":
+            self._set(done=state.done + values[0])
+        getattr(self._progress, kind)(*values)
+
+    def _set(self, **values: Any) -> None:
+        self.state = replace(self.state, **values)
+
+
+class _PipeProgress(Progress):
+    """Tells the service everything, as (event, *values)."""
+
+    def __init__(self, connection: Connection) -> None:
+        for event in _EVENTS:
+            setattr(self, event, lambda *values, event=event: connection.send((event, *values)))
+
+
+def _generate(connection: Connection, config: DatagenConfig, backend: Backend | None) -> None:
+    with StopRequest() as stop:
+        die_with_parent(signal.SIGTERM)  # should the service be killed, the pool ends as it would at Ctrl-C
+        parent = multiprocessing.parent_process()
+        if parent is None or os.getppid() != parent.pid:
+            return
+        try:
+            finished = generate(config, _PipeProgress(connection), stop.requested, backend)
+            connection.send(("complete",) if finished else ("stopped",))
+        except (BrokenPipeError, ConnectionResetError):
+            return  # the service is gone; what is finished is kept
+        except (ConfigError, OSError) as error:
+            connection.send(error_message(error))
+        except Exception as error:  # noqa: BLE001 - not swallowed: the service reports it
+            connection.send(("error", str(error)))

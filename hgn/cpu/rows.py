@@ -1,0 +1,146 @@
+"""Rows through an MLP whose parts lie elsewhere: gathered, multiplied, normed and summed by segments, in PyTorch.
+
+The reference of hgn.cpu.compiled. There are no gradients.
+Norms of rows commute with sums of them as far as gain and shift go, so those are left to the sums where nothing else
+is wanted. Shape legend: R rows, K rows of a table, S segments, W width.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from hgn.network.mlp import MINIMUM_ROWS, MLP, linear
+
+
+class Hidden(NamedTuple):
+    """A hidden layer before its activation: the sum of `each` rows of a table, plus the product with a part's value."""
+
+    table_KW: torch.Tensor
+    chosen: torch.Tensor | None  # [R * each], int64; none: the table's rows in their order, which may be overwritten
+    each: int
+    part: int = 0
+    value_RW: torch.Tensor | None = None  # none: no product
+
+
+class Segments(NamedTuple):
+    """Runs of rows that are summed, each row times its weight."""
+
+    rows: int
+    offset: torch.Tensor  # [S + 1], int64: where they begin, and the number of rows
+    weight_R: torch.Tensor | None  # none: ones
+
+
+class Rows:
+    """An MLP of rows [R, W], its matrices taken once a frame: attributes of modules cost as much as a small product."""
+
+    def __init__(self, network: nn.Module) -> None:
+        assert isinstance(network, MLP)
+        first, second = network.first, network.second
+        self.parts = first.weight.T.split_with_sizes(network.parts)  # [in, out]
+        self.first_bias, self.slope = first.bias, network.slope
+        self.second: torch.Tensor = second.weight.T
+        self.second_bias: torch.Tensor = second.bias
+        self.norm = None if network.norm is None else (network.norm.weight, network.norm.bias, network.norm.eps)
+
+    def project(self, part: int, value: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
+        return _product(value, self.parts[part], bias)
+
+    def project_into(self, out: torch.Tensor, part: int, value: torch.Tensor, bias: torch.Tensor | None = None) -> None:
+        if len(value) < MINIMUM_ROWS:
+            out.copy_(_product(value, self.parts[part], bias))
+        elif bias is None:
+            torch.mm(value, self.parts[part], out=out)
+        else:
+            torch.addmm(bias, value, self.parts[part], out=out)
+
+    def add_projection(self, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
+        if len(value) < MINIMUM_ROWS:
+            return hidden.add_(_product(value, self.parts[part]))
+        return hidden.addmm_(value, self.parts[part])
+
+    def finish(self, hidden: torch.Tensor) -> torch.Tensor:
+        """Overwrites `hidden`."""
+        out = _product(nn.functional.leaky_relu_(hidden, self.slope), self.second, self.second_bias)
+        if self.norm is None:
+            return out
+        gain, shift, epsilon = self.norm
+        return torch.layer_norm(out, gain.shape, gain, shift, epsilon)
+
+    def output(self, out_RW: torch.Tensor, hidden: Hidden, residual_RW: torch.Tensor | None = None) -> None:
+        """Into `out_RW`, which may be the residual."""
+        rows_RW = self.finish(self._hidden(hidden))
+        if residual_RW is None:
+            out_RW.copy_(rows_RW)
+        else:
+            torch.add(rows_RW, residual_RW, out=out_RW)
+
+    def add_sums(self, sum_SW: torch.Tensor, hidden: Hidden, segments: Segments) -> None:
+        """Adds those of the outputs."""
+        assert self.norm is not None
+        gain, shift, epsilon = self.norm
+        matrix, bias = self._centred
+        rows_RW = _product(nn.functional.leaky_relu_(self._hidden(hidden), self.slope), matrix, bias)
+        scale_R = torch.linalg.vector_norm(rows_RW, dim=1).square_()
+        scale_R.mul_(1 / rows_RW.shape[1]).add_(epsilon).rsqrt_()
+        if segments.weight_R is None:
+            total_S1 = segments.offset.diff()[:, None]
+        else:
+            total_S1 = _summed(segments.weight_R[:, None], segments.offset)
+            scale_R.mul_(segments.weight_R)
+        sum_SW.add_(_summed(rows_RW, segments.offset, scale_R).mul_(gain).addcmul_(total_S1, shift))
+
+    def output_and_add_sums(
+        self, sum_SW: torch.Tensor, hidden: Hidden, segments: Segments, residual_RW: torch.Tensor | None
+    ) -> torch.Tensor:
+        """The outputs plus the residual, which may be overwritten; adds sums of the outputs."""
+        assert segments.weight_R is None
+        rows_RW = self.finish(self._hidden(hidden))
+        sum_SW.add_(_summed(rows_RW, segments.offset))
+        return rows_RW if residual_RW is None else residual_RW.add_(rows_RW)
+
+    def _hidden(self, hidden: Hidden) -> torch.Tensor:
+        table_KW, chosen, each, part, value_RW = hidden
+        if chosen is None:
+            rows_RW = table_KW
+        elif each == 1:
+            rows_RW = table_KW.index_select(0, chosen)
+        else:
+            rows_RW = _summed(table_KW, _steps(len(chosen) + 1, each), chosen=chosen)
+        return rows_RW if value_RW is None else self.add_projection(rows_RW, part, value_RW)
+
+    @cached_property
+    def _centred(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The second layer less its mean over the outputs: what the norm divides."""
+        return self.second - self.second.mean(1, keepdim=True), self.second_bias - self.second_bias.mean()
+
+
+def _product(value: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
+    """Rows times a matrix plus bias, each row computed alike however few there are, as hgn.network.mlp.linear."""
+    if len(value) < MINIMUM_ROWS:
+        return linear(value, matrix.T, bias)
+    return torch.mm(value, matrix) if bias is None else torch.addmm(bias, value, matrix)
+
+
+def _summed(
+    table_KW: torch.Tensor,
+    offset: torch.Tensor,
+    weight_R: torch.Tensor | None = None,
+    chosen: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Sums of runs of rows, or of those that are chosen, in one pass [S, W]."""
+    chosen = _steps(len(table_KW)) if chosen is None else chosen
+    result: torch.Tensor = torch.embedding_bag(
+        table_KW, chosen, offset, per_sample_weights=weight_R, include_last_offset=True
+    )[0]
+    return result
+
+
+@lru_cache(64)
+def _steps(end: int, step: int = 1) -> torch.Tensor:
+    """0 to `end`, excluded; the same blocks come again and again."""
+    with torch.inference_mode(False):
+        return torch.arange(0, end, step)

@@ -1,0 +1,54 @@
+"""What the fast training path reads: the samples of many updates, and whole episodes instead of windows.
+
+Shape legend: H velocity history, T frames, N particles, K obstacle cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.data.sampler import Sample, SamplerState
+from hgn.network.features import material_rows
+from hgn.scene.episode import Episode
+from hgn.scene.history import frames_before
+from hgn.scene.symmetry import Symmetry, scene_symmetries
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeTensors:
+    """An episode in memory. The first H of the H + T frames are the ballistic past."""
+
+    position_TN3: torch.Tensor  # float32, domain units
+    material_N: torch.Tensor  # int32, index into the network's materials
+    obstacle_cell_K3: torch.Tensor  # int32; empty where the network sees none
+    obstacle_normal_K3: torch.Tensor
+    domain_size: tuple[float, float, float]
+    symmetries: tuple[Symmetry, ...] = ()  # what training may show instead of the scene
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateChunk:
+    """The samples of successive updates, and the episodes among them that no chunk had before."""
+
+    samples: tuple[tuple[Sample, ...], ...]
+    episodes: dict[int, EpisodeTensors]
+    cursor: SamplerState  # the order's state once these are trained on
+    starts: tuple[tuple[int, int], ...] = ()  # episodes and frames that the network is to simulate from before it
+
+
+def whole_episode(episode: Episode, network: NetworkConfig) -> EpisodeTensors:
+    """Reads an episode; its windows are those of `hgn.scene.history.window`."""
+    past = frames_before(episode, -network.velocity_history)
+    grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
+    return EpisodeTensors(
+        torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),
+        material_rows(episode.material_N, network.materials).int(),
+        torch.from_numpy(np.array(grid.cell_K3[:seen], np.int32)),
+        torch.from_numpy(np.array(grid.normal_K3[:seen], np.float32)),
+        episode.domain_size,
+        scene_symmetries(episode.gravity, episode.domain_size, grid.cell_size),
+    )

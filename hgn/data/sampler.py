@@ -1,0 +1,104 @@
+"""The order in which samples are trained on: a pure function of seed, epoch, episodes, batch and world size.
+
+A sample is one frame of one episode. An epoch is a permutation of all samples of the episodes that were
+published when it began; epochs follow each other without a gap, so that every sample comes exactly once an
+epoch on any number of ranks, batches are all of one size, and the whole state of the order is a `SamplerState`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hgn.schema import ConfigError
+from hgn.system.splitmix import splitmix64
+
+
+@dataclass(frozen=True)
+class SamplerState:
+    """How far the order has been consumed, over all ranks together."""
+
+    epoch: int = 0
+    position: int = 0  # samples of this epoch already taken
+    episodes: int = 0  # episodes in this epoch; 0: not decided yet
+
+
+class Sample(NamedTuple):  # which Python makes faster than other classes: a thousand in a second are drawn
+    """Frame n of an episode: the network sees frames up to n and predicts n + 1."""
+
+    episode: int
+    frame: int
+    seed: int  # of its noise, grid jitter and symmetry
+    weight: float = 1.0  # of its loss
+    noise: float = 1.0  # in units of training.noise_std, see hgn.data.rest_noise
+
+
+def epoch_permutation(seed: int, epoch: int, sample_count: int) -> np.ndarray:
+    """The order of an epoch, int64 [sample_count]."""
+    return np.random.Generator(np.random.PCG64([seed, epoch])).permutation(sample_count)
+
+
+class EpisodeSampler:
+    """Walks through epochs in batches and tells each rank its share.
+
+    `published(epoch)` is asked once when an epoch begins and returns the number of frames of each published
+    episode, oldest publication first; it must return the same on every rank, and a list that continues the
+    one of the epoch before. After a resume it may return more than the cursor's epoch knew: the surplus waits
+    for the next epoch.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        batch_scenes: int,
+        published: Callable[[int], Sequence[int]],
+        cursor: SamplerState | None = None,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        assert 0 <= rank < world_size and batch_scenes >= 1
+        self.seed, self.batch_scenes, self.rank, self.world_size = seed, batch_scenes, rank, world_size
+        self.cursor = cursor or SamplerState()
+        self._published = published
+        self._order = np.zeros(0, np.int64)
+        self._first_sample = np.zeros(1, np.int64)
+        self._first_seed = 0  # of an epoch's samples, which have one after the other
+        self._begin_epoch(self.cursor.epoch, self.cursor.position, self.cursor.episodes)
+
+    def next_batch(self) -> list[Sample]:
+        """This rank's `batch_scenes` samples of the next global batch; advances the cursor."""
+        total, mine = self.batch_scenes * self.world_size, self.batch_scenes * self.rank
+        samples: list[Sample] = []
+        taken = 0  # of the global batch, which may run over the end of an epoch
+        while taken < total:
+            if self.cursor.position == len(self._order):
+                self._begin_epoch(self.cursor.epoch + 1, 0, 0)
+            rest = self._order[self.cursor.position :][: total - taken]
+            samples += self._samples(rest[max(mine - taken, 0) : max(mine + self.batch_scenes - taken, 0)])
+            self.cursor = replace(self.cursor, position=self.cursor.position + len(rest))
+            taken += len(rest)
+        return samples
+
+    def _begin_epoch(self, epoch: int, position: int, episodes: int) -> None:
+        frame_counts = list(self._published(epoch))
+        if episodes > len(frame_counts):
+            raise ConfigError(
+                f"data set must still hold the {episodes} training episodes that epoch {epoch} began with, "
+                f"got {len(frame_counts)}; restore the missing shards or start another run"
+            )
+        frame_counts = frame_counts[: episodes or len(frame_counts)]
+        if not frame_counts:
+            raise ConfigError("data set must hold at least one training episode, got none; generate some first")
+        self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
+        self._order = epoch_permutation(self.seed, epoch, int(self._first_sample[-1]))
+        self._first_seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0])
+        self.cursor = SamplerState(epoch, position, len(frame_counts))
+
+    def _samples(self, index_K: np.ndarray) -> list[Sample]:
+        episode_K = self._first_sample.searchsorted(index_K, side="right") - 1
+        frame_K = index_K - self._first_sample[episode_K]
+        seeds = [splitmix64(self._first_seed + index) >> 1 for index in index_K.tolist()]
+        return list(map(Sample, episode_K.tolist(), frame_K.tolist(), seeds))

@@ -1,0 +1,530 @@
+"""The network on fixed-capacity buffers: its forward pass as a fixed list of launches, fit for one CUDA graph.
+
+Nothing here reads a value back to the host. What each launch computes is in its kernel's file; the order is the
+paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+import triton
+
+from hgn.config import NetworkConfig
+from hgn.kernels.buffers import Block, Buffers
+from hgn.kernels.cell_mlp.kernel import cell_forward
+from hgn.kernels.edges.kernel import edge_forward
+from hgn.kernels.grid.op import DeviceGrid
+from hgn.kernels.mlp.kernel import clear_rows, gather_project, gather_sums, rows_forward
+from hgn.kernels.packing import PackedFCN, PackedNetwork, rounded_to_tf32
+from hgn.kernels.particle_cell.kernel import pairs_forward
+
+PRECISIONS = ("ieee", "tf32x3", "tf32", "half")
+PROCESSORS = 132  # an H100's
+RESIDENT_PROGRAMS = 2 * PROCESSORS
+FEW_ROWS = 64 * PROCESSORS
+CLEAR_ROWS = 64
+LIGHT_BLOCK = (64, 4)  # rows and warps of a program that keeps two weights, of which two fit on a processor
+NONE = -1  # where a product has no bias
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Rows and warps of a program. They change how fast, never what."""
+
+    cell_block: int  # cells of a tile of edges, eight rows each
+    cell_warps: int
+    few_cell_block: int  # the same on a level of few cells
+    few_cell_warps: int
+    row_block: int
+    row_warps: int
+    row_backward_warps: int
+    pair_particles: int  # eight rows each, at most 13
+    pair_warps: int
+    few_cells: int = 0  # up to which a level's cells are few
+    small_block: int = 16  # where there are few rows
+    small_warps: int = 8
+    dense: bool = False  # six rows a cell in the tiles of edges, not eight
+    overlap: bool = False  # kernels of a message step read their weights before their turn
+    prefetch: bool = False  # where there are many rows, the next tile's are brought to the L2 cache on the way forward
+    loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
+    gather_block: int = 0  # of a kernel for the sums of many rows' neighbours; 0: whoever needs them makes them
+    cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
+    cell_backward_warps: int = 8
+    half_cells: bool = False  # cells too are rounded between kernels, as edges are
+    # And particles are added to them rounded, half the traffic of the L2 cache: in training only the pairs' gradients.
+    half_sums: bool = False
+    light_programs: int = 2  # on a processor, of kernels with one weight: pairs forward, edges of a first iteration
+    light_registers: int | None = None  # of a thread, so that as many fit
+    weight_registers: int | None = None  # of a thread of the weights' products: 128 for two programs on a processor
+
+    @staticmethod
+    def of(precision: str) -> Tuning:
+        """What was fastest on an H100 at width 128."""
+        if precision == "ieee":
+            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
+        if precision == "tf32x3":
+            return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8, 528)
+        if precision == "tf32":  # operands of twice the size
+            return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8, 528)
+        half = Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, 1056, dense=True, overlap=True, loops=True)
+        return replace(
+            half,
+            light_programs=3,
+            light_registers=168,
+            gather_block=16,
+            cell_backward_block=64,
+            cell_backward_warps=4,
+            weight_registers=128,
+            prefetch=True,
+            half_cells=True,
+            half_sums=True,
+        )
+
+
+def feature_columns(config: NetworkConfig) -> int:
+    """Columns of the encoder's input: features, one-hot material, padding to a power of two that matrix units take."""
+    used = config.feature_width - config.material_embedding + len(config.materials)
+    return max(16, triton.next_power_of_2(used))
+
+
+class FusedNetwork(Buffers):
+    """Runs a packed network on a DeviceGrid.
+
+    `values` float32 [packed.size] are the parameters. In half precision and TF32 the products read `weights`, their
+    rounded copy; call `refresh` after every change of `values`. With `training` everything that a backward pass reads
+    is kept.
+    """
+
+    def __init__(
+        self,
+        config: NetworkConfig,
+        packed: PackedNetwork,
+        values: torch.Tensor,
+        grid: DeviceGrid,
+        particle_count: torch.Tensor,
+        precision: str,
+        training: bool = False,
+        tuning: Tuning | None = None,
+    ) -> None:
+        assert precision in PRECISIONS
+        # elements are addressed in int32: 2 million particles, 2.7 million cells at width 128
+        assert max(8 * grid.particles, 6 * grid.capacities[0]) * config.width < 2**31, "too large for one launch"
+        self.config, self.packed, self.grid, self.precision = config, packed, grid, precision
+        self.values, self.training, self.width = values, training, config.width
+        self.particle_count = particle_count
+        self.operand = torch.float16 if precision == "half" else torch.float32
+        self.device = values.device
+        rounded = precision in ("half", "tf32")
+        self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
+        # Falling particles show the encoder the same features frame by frame: its rounding pulls all of them one way.
+        self.fine = rounded and not training
+        self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
+        self.tuning = tuning or Tuning.of(precision)
+        self._allocate(self.keeps_pair_hidden())
+        self.refresh()
+
+    # parameters
+
+    def refresh(self) -> None:
+        """Copies what the kernels read in another form: all weights rounded, and the encoder's first layer."""
+        if self.weights is not self.values:
+            self.weights.copy_(self._rounded(self.values))
+        self.refresh_encoder()
+
+    def refresh_encoder(self) -> None:
+        """The encoder's first layer on features and one-hot materials: embedding and bias are multiplied out."""
+        first, embedding, bias = self._encode_views(self.values)
+        used = self.config.feature_width - self.config.material_embedding
+        materials = len(self.config.materials)
+        self.encode_weights[:, :used].copy_(first[:, :used])
+        torch.addmm(bias[:, None], first[:, used:], embedding.T, out=self.encode_weights[:, used : used + materials])
+        if self.precision == "tf32" and not self.fine:
+            self.encode_weights.copy_(self._rounded(self.encode_weights))
+
+    def _rounded(self, weights: torch.Tensor) -> torch.Tensor:
+        """To the nearest that TF32 can hold, as hgn.kernels.blocks.nearest_tf32; as they are at other precisions."""
+        if self.precision != "tf32":
+            return weights
+        return rounded_to_tf32(weights)
+
+    def _encode_views(self, flat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        config, packed, width = self.config, self.packed, self.width
+        at, columns = packed.encode.parts[0], config.feature_width
+        first = flat[at : at + width * columns].view(width, columns)
+        rows, embedding = len(config.materials), config.material_embedding
+        table = flat[packed.embedding : packed.embedding + rows * embedding].view(rows, embedding)
+        return first, table, flat[packed.encode.first_bias : packed.encode.first_bias + width]
+
+    # forward
+
+    def forward(self) -> None:
+        """From the grid's features and tables to `output` [N, OUT]: normalised accelerations in columns 0 to 2."""
+        packed, grid, levels = self.packed, self.grid, self.config.levels
+        self._rows(
+            packed.encode,
+            grid.feature_NF,
+            self.particle_count,
+            self.latent,
+            self.encode_hidden,
+            first=(self.encode_weights, 0),
+            bias=False,
+            following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
+            following_bias=(packed.particle_to_cell.first_bias, packed.cell_to_particle.first_bias),
+            products=(self.by_particle_down, self.by_particle_up),
+            fractions=(packed.particle_to_cell.parts[-1], packed.cell_to_particle.parts[-1]),
+            fine=self.fine,
+        )
+        self._clear(self.down[0].cell[0])
+        self._pairs(
+            packed.particle_to_cell,
+            self.by_particle_down,
+            self.by_particle_down,
+            self.kept_down,
+            self.down[0].cell[0],
+            True,
+        )
+        for i, block in enumerate(self.down):
+            self._begin(block, i > 0)
+            self._passing(block)
+            if i < levels - 1:
+                self._rows(
+                    packed.fine_to_coarse[i],
+                    block.cell[-1],
+                    grid.count(i),
+                    self.message[i],
+                    self.transfer_hidden_down[i],
+                    offset=(packed.fine_to_coarse[i].parts[1], 1),
+                    octant=grid.octant(i),
+                )
+        coarse = self.down[-1]
+        for i in reversed(range(levels - 1)):
+            block = self.up[i]
+            edge = block.packed.edge[0]
+            assert coarse.product is not None
+            self._rows(
+                packed.coarse_to_fine[i],
+                self.down[i].cell[-1],
+                grid.count(i),
+                block.cell[0],
+                self.transfer_hidden_up[i],
+                first=(self.weights, packed.coarse_to_fine[i].parts[1]),
+                gathered=coarse.product,
+                index=grid.parent(i),
+                offset=(packed.coarse_to_fine[i].parts[2], -1),
+                octant=grid.octant(i),
+                residual=True,
+                following=(edge.parts[0], edge.parts[1]),
+                following_bias=(NONE, edge.first_bias),
+                products=(block.send[0], block.receive[0]),
+            )
+            self._passing(block)
+            coarse = block
+        assert coarse.product is not None
+        self._pairs(
+            packed.cell_to_particle, self.by_particle_up, coarse.product, self.kept_up, self.decoder_input, False
+        )
+        self._rows(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
+
+    def _clear(self, x: torch.Tensor) -> None:
+        """Zeros into the finest cells' rows of x."""
+        clear_rows[self._blocks(len(x), CLEAR_ROWS)](
+            x, self.grid.count(0), WIDTH=self.width, BLOCK=CLEAR_ROWS, num_warps=4
+        )
+
+    def _blocks(self, rows: int, block: int) -> tuple[int]:
+        return (triton.cdiv(rows, block),)
+
+    def _many(self, rows: int) -> bool:
+        return rows >= FEW_ROWS
+
+    def _row_block(self, rows: int, backward: bool = False) -> tuple[int, int]:
+        """Rows and warps of a program over so many rows."""
+        tuning = self.tuning
+        if not self._many(rows):
+            return tuning.small_block, tuning.small_warps
+        return tuning.row_block, tuning.row_backward_warps if backward else tuning.row_warps
+
+    def _edge_block(self, cells: int) -> tuple[int, int]:
+        """Cells and warps of a tile of edges: small tiles where there would be few."""
+        tuning = self.tuning
+        few = cells <= tuning.few_cells
+        return (tuning.few_cell_block, tuning.few_cell_warps) if few else (tuning.cell_block, tuning.cell_warps)
+
+    def _loops(self, rows: int, block: int, least: int = 1) -> bool:
+        """Whether a program keeps all its weights and takes one block after the other, where each has `least`."""
+        return self.tuning.loops and self._many(rows) and rows >= (least - 1) * PROCESSORS * block
+
+    def _row_programs(self, rows: int, block: int, loops: bool, at_once: int = 1) -> tuple[int]:
+        """Those that keep their weights fill a processor's shared memory each, or an `at_once`-th of it."""
+        programs = triton.cdiv(rows, block)
+        return (min(programs, PROCESSORS * at_once) if loops else programs,)
+
+    def overlaps(self) -> bool:
+        """Whether the kernels of a message step start before the one before has ended."""
+        if not self.tuning.overlap or triton.knobs.runtime.interpret:
+            return False
+        target = triton.runtime.driver.active.get_current_target()
+        return target.backend == "cuda" and target.arch >= 90
+
+    def keeps_pair_hidden(self) -> bool:
+        """Whether the pairs' hidden layer is kept for the backward pass, and not computed again: see pairs_forward."""
+        return self.precision in ("tf32", "tf32x3")
+
+    def _edge_cells(self, block: int) -> int:
+        """Cells that a tile of edges takes where it has rows for `block` of eight each."""
+        return 8 * block // 6 if self.tuning.dense else block
+
+    def prefetches(self, rows: int) -> bool:
+        """Whether the kernels on so many rows bring the next tile's to the L2 cache: an instruction of the GPU's."""
+        return self.tuning.prefetch and self._many(rows) and not triton.knobs.runtime.interpret
+
+    def _programs(self, rows: int, block: int, at_once: int = 2) -> tuple[int]:
+        """Programs that take one block after the other: as many as run at once, `at_once` on a processor."""
+        return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS * at_once // 2),)
+
+    def _rows(
+        self,
+        fcn: PackedFCN,
+        x: torch.Tensor,
+        count: torch.Tensor,
+        y: torch.Tensor,
+        hidden: torch.Tensor,
+        first: tuple[torch.Tensor, int] | None = None,
+        gathered: torch.Tensor | None = None,
+        index: torch.Tensor | None = None,
+        offset: tuple[int, int] = (0, 0),
+        octant: torch.Tensor | None = None,
+        bias: bool = True,
+        norm: bool = True,
+        residual: bool = False,
+        following: tuple[int, ...] = (),
+        following_bias: tuple[int, ...] = (),
+        products: tuple[torch.Tensor, ...] = (),
+        fractions: tuple[int, int] = (0, 0),
+        fine: bool = False,
+    ) -> None:
+        first = first or (self.weights, fcn.parts[0])
+        block, warps = self._row_block(len(x))
+        at, bias_at = (*following, 0, 0), (*following_bias, NONE, NONE)
+        into = (*products, hidden, hidden)
+        loops = self._loops(len(x), block, 4)
+        rows_forward[self._row_programs(len(x), block, loops, 1 if norm else 2)](
+            x,
+            count,
+            self.weights,
+            self.values,
+            first[0],
+            first[1],
+            offset[0],
+            fcn.first_bias,
+            fcn.second,
+            fcn.second_bias,
+            fcn.gain,
+            fcn.shift,
+            gathered if gathered is not None else x,
+            index if index is not None else count,
+            octant if octant is not None else count,
+            at[0],
+            at[1],
+            bias_at[0],
+            bias_at[1],
+            self.grid.fraction_N3,
+            fractions[0],
+            fractions[1],
+            y,
+            hidden,
+            into[0],
+            into[1],
+            INPUT=x.shape[-1],
+            WIDTH=self.width,
+            OUT=fcn.out,
+            GATHER=gathered is not None,
+            OFFSET=offset[1],
+            BIAS=bias,
+            NORM=norm,
+            RESIDUAL=residual,
+            NEXT=len(following),
+            FRACTION=fractions != (0, 0),
+            SAVE=self.training,
+            FINE=fine,
+            BLOCK=block,
+            PRECISION=self.precision,
+            LOOP=loops,
+            num_warps=warps,
+        )
+
+    def _pairs(
+        self,
+        fcn: PackedFCN,
+        by_particle: torch.Tensor,
+        by_cell: torch.Tensor,
+        kept: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+        out: torch.Tensor,
+        to_cell: bool,
+    ) -> None:
+        grid, tuning = self.grid, self.tuning
+        at_once, registers = tuning.light_programs, tuning.light_registers
+        pairs_forward[self._programs(grid.particles, tuning.pair_particles, at_once)](
+            by_particle,
+            by_cell,
+            self.latent,
+            grid.cell_N8,
+            grid.weight_N8,
+            self.particle_count,
+            self.weights,
+            self.values,
+            fcn.parts[-1],
+            fcn.second,
+            fcn.second_bias,
+            fcn.gain,
+            fcn.shift,
+            *kept,
+            out,
+            TO_CELL=to_cell,
+            SAVE=self.training,
+            WIDTH=self.width,
+            PARTICLES=self.tuning.pair_particles,
+            PRECISION=self.precision,
+            num_warps=self.tuning.pair_warps,
+            maxnreg=registers,
+        )
+
+    def _gathers(self, rows: int) -> bool:
+        """Whether sums of so many rows' neighbours have a kernel of their own."""
+        return self.tuning.gather_block > 0 and self._many(rows)
+
+    def _gather(self, level: int, x: torch.Tensor, table: torch.Tensor, y: torch.Tensor, edges: bool = False) -> None:
+        """y = the sums of x's rows that the table lists."""
+        rows, size = self.grid.capacities[level], self.tuning.gather_block
+        gather_sums[self._blocks(rows, size)](
+            x,
+            table,
+            self.grid.count(level),
+            y,
+            rows,
+            SUM=len(table),
+            EDGES=edges,
+            WIDTH=self.width,
+            BLOCK=size,
+            num_warps=4,
+        )
+
+    def _begin(self, block: Block, from_children: bool) -> None:
+        """The block's input and its products for the first iteration."""
+        grid, level, edge = self.grid, block.level, block.packed.edge[0]
+        rows = grid.capacities[level]
+        size, warps = self._row_block(rows)
+        if from_children and self._gathers(rows):
+            self._gather(level, self.message[level - 1], grid.children(level), block.cell[0])
+            from_children = False
+        loops = not from_children and self._loops(rows, size)
+        if loops:
+            size, warps = LIGHT_BLOCK
+        gather_project[self._row_programs(rows, size, loops, 2)](
+            self.message[level - 1] if from_children else block.cell[0],
+            grid.children(level),
+            grid.count(level),
+            self.weights,
+            self.values,
+            edge.parts[0],
+            edge.parts[1],
+            edge.first_bias,
+            block.cell[0],
+            block.send[0],
+            block.receive[0],
+            rows,
+            SUM=8 if from_children else 0,
+            WIDTH=self.width,
+            BLOCK=size,
+            PRECISION=self.precision,
+            LOOP=loops,
+            num_warps=warps,
+        )
+
+    def _passing(self, block: Block) -> None:
+        grid, level, steps = self.grid, block.level, self.config.message_passing_steps
+        rows = grid.capacities[level]
+        size, warps = self._row_block(rows)
+        edge_size, edge_warps = self._edge_block(rows)
+        overlap, loops = self.overlaps(), self._loops(rows, size)
+        for m in range(steps):
+            edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
+            if not last:
+                following = block.packed.edge[m + 1].parts
+                next_at, into = (following[0], following[1]), (block.send[(m + 1) % 2], block.receive[(m + 1) % 2])
+                next_bias, products = block.packed.edge[m + 1].first_bias, 2
+            else:
+                product = block.product if block.product is not None else block.send[(m + 1) % 2]
+                next_at, into, products = (block.next_at, 0), (product, product), int(block.product is not None)
+                next_bias = 0
+            light = m == 0 and self._many(rows)
+            at_once = self.tuning.light_programs if light else 2
+            edge_forward[self._programs(rows, self._edge_cells(edge_size), at_once)](
+                block.send[m % 2],
+                block.receive[m % 2],
+                block.edge[m - 1] if m > 0 else block.cell[m],
+                grid.neighbour(level),
+                grid.count(level),
+                self.weights,
+                self.values,
+                edge.parts[2],
+                edge.second,
+                edge.second_bias,
+                edge.gain,
+                edge.shift,
+                block.edge[m] if not last else block.cell[m],
+                block.sum[m],
+                block.edge_hidden[m],
+                block.edge_normalised[m],
+                block.edge_deviation[m],
+                rows,
+                FIRST=m == 0,
+                STORE_EDGE=not last,
+                SAVE=self.training,
+                WIDTH=self.width,
+                ROWS=8 * edge_size,
+                DENSE=self.tuning.dense,
+                PRECISION=self.precision,
+                OVERLAP=overlap,
+                PREFETCH=self.prefetches(rows),
+                AHEAD=self.tuning.dense and self._many(rows),
+                num_warps=edge_warps,
+                maxnreg=self.tuning.light_registers if light else None,
+                launch_pdl=overlap,
+            )
+            cell_forward[self._row_programs(rows, size, loops)](
+                block.cell[m],
+                block.sum[m],
+                grid.count(level),
+                self.weights,
+                self.values,
+                cell.parts[0],
+                cell.parts[1],
+                cell.first_bias,
+                cell.second,
+                cell.second_bias,
+                cell.gain,
+                cell.shift,
+                next_at[0],
+                next_at[1],
+                next_bias,
+                block.cell[m + 1],
+                block.cell_hidden[m],
+                block.cell_normalised[m],
+                block.cell_deviation[m],
+                into[0],
+                into[1],
+                NEXT=products,
+                SAVE=self.training,
+                WIDTH=self.width,
+                BLOCK=size,
+                PRECISION=self.precision,
+                RESIDENT=overlap or loops,
+                LOOP=loops,
+                OVERLAP=overlap,
+                PREFETCH=self.prefetches(rows),
+                num_warps=warps,
+                launch_pdl=overlap,
+            )

@@ -1,0 +1,437 @@
+"""An MLP on rows, forward and backward: encoder, decoder, and the steps between levels.
+
+Forward of row r: h = x W + gathered[index_r] + offset_octant + b; a = leaky(h); y = norm(a W2 + b2) (+ x).
+Up to two products of y follow, with biases or without, for whoever reads it next. Shape legend: R rows, W width.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from hgn.kernels.blocks import (
+    LAST_TILE,
+    finer_product,
+    gathered_sum,
+    inside,
+    leaky,
+    leaky_backward,
+    listed,
+    matrix,
+    next_tile,
+    normalise,
+    normalise_backward,
+    optional_vector,
+    product,
+    transposed,
+    vector,
+    vectors,
+    weighted_sums,
+)
+from hgn.kernels.triton_compat import settle_keys
+
+
+@triton.jit
+def _shift(values, offset_at, octant, SIGN: tl.constexpr, WIDTH: tl.constexpr):
+    """Sum over axes of (1/2 - bit) times the offset weights [3, W]: towards the parent's centre for SIGN = 1."""
+    column = tl.arange(0, WIDTH)
+    result = tl.zeros((octant.shape[0], WIDTH), tl.float32)
+    for axis in tl.static_range(3):
+        bit = (octant >> (2 - axis)) & 1
+        weight = tl.load(values + offset_at + axis * WIDTH + column)
+        result += (SIGN * (0.5 - bit.to(tl.float32)))[:, None] * weight[None, :]
+    return result
+
+
+@triton.jit
+def _rows_of(x, tile, count, INPUT: tl.constexpr, BLOCK: tl.constexpr):
+    """A tile's rows of x [R, INPUT]."""
+    row = tile * BLOCK + tl.arange(0, BLOCK)
+    return tl.load(x + row[:, None] * INPUT + tl.arange(0, INPUT)[None, :], mask=(row < count)[:, None], other=0.0)
+
+
+@triton.jit
+def _three_rows(pointer, WIDTH: tl.constexpr):
+    """The matrix [3, W] at `pointer`, filled up to the 16 rows that a product takes."""
+    row = tl.arange(0, 16)
+    return tl.load(pointer + row[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=(row < 3)[:, None], other=0.0)
+
+
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
+def rows_forward(
+    x,
+    count_ptr,
+    weights,
+    values,
+    first_weights,
+    first_at,
+    offset_at,
+    bias_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
+    gathered,
+    index,
+    octant,
+    next_at_0,
+    next_at_1,
+    next_bias_at_0,
+    next_bias_at_1,
+    fraction,
+    fraction_at_0,
+    fraction_at_1,
+    y,
+    hidden,
+    next_0,
+    next_1,
+    INPUT: tl.constexpr,
+    WIDTH: tl.constexpr,
+    OUT: tl.constexpr,
+    GATHER: tl.constexpr,
+    OFFSET: tl.constexpr,
+    BIAS: tl.constexpr,
+    NORM: tl.constexpr,
+    RESIDUAL: tl.constexpr,
+    NEXT: tl.constexpr,
+    FRACTION: tl.constexpr,
+    SAVE: tl.constexpr,
+    FINE: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+    LOOP: tl.constexpr,
+):
+    """With FINE the MLP's own products are finer than PRECISION, and read the weights themselves.
+
+    FRACTION: the products that follow are a particle's part of its pairs: the first less what its fraction [R, 3] makes
+    of the offsets' weights [3, W], the second with it.
+
+    LOOP: a program takes one tile after the other, and reads its weights once.
+    """
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    column, outs = tl.arange(0, WIDTH), tl.arange(0, OUT)
+    if FRACTION:
+        offsets_0 = _three_rows(values + fraction_at_0, WIDTH)
+        offsets_1 = _three_rows(values + fraction_at_1, WIDTH)
+    IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # where many vectors would not fit into registers
+    if LOOP:
+        lines = vectors(values, bias_at, next_bias_at_0, next_bias_at_1, bias_at, bias_at, WIDTH)
+        bias, next_bias_0, next_bias_1 = vector(lines, 0), vector(lines, 1), vector(lines, 2)
+        lines = vectors(values, second_bias_at, gain_at, shift_at, shift_at, shift_at, OUT)
+        second_bias, gain, shift = vector(lines, 0), vector(lines, 1), vector(lines, 2)
+        first = transposed(first_weights + first_at, WIDTH, INPUT)
+        second = transposed((values if FINE else weights) + second_at, OUT, WIDTH)
+        if NEXT > 0:
+            following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
+        if NEXT > 1:
+            following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
+    elif not IN_PLACE:
+        bias = tl.load(values + bias_at + column)
+        next_bias_0 = optional_vector(values, next_bias_at_0, WIDTH)
+        next_bias_1 = optional_vector(values, next_bias_at_1, WIDTH)
+        second_bias = tl.load(values + second_bias_at + outs)
+        gain, shift = tl.load(values + gain_at + outs), tl.load(values + shift_at + outs)
+    tile = tl.program_id(0)
+    if LOOP:
+        x_rows = _rows_of(x, tile, count, INPUT, BLOCK)
+    while (tile * BLOCK < count) & (tile < LAST_TILE):
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = (row < count)[:, None]
+        at = row[:, None] * WIDTH + column[None, :]
+        if not LOOP:
+            x_rows = _rows_of(x, tile, count, INPUT, BLOCK)
+        x_tile = x_rows.to(tl.float32)
+        if FRACTION:
+            part = tl.arange(0, 16)
+            fractions = tl.load(fraction + row[:, None] * 3 + part[None, :], mask=live & (part < 3)[None, :], other=0.0)
+        if not LOOP:
+            first = transposed(first_weights + first_at, WIDTH, INPUT)
+        h = finer_product(x_tile, first, PRECISION) if FINE else product(x_tile, first, PRECISION)
+        if GATHER:
+            # a parent past the capacity is none (-1): the pass is void, and reads nothing in its place
+            where = tl.load(index + row, mask=row < count, other=-1)
+            there = (where >= 0)[:, None]
+            h += tl.load(gathered + where[:, None] * WIDTH + column[None, :], mask=there, other=0.0).to(tl.float32)
+        if OFFSET != 0:
+            h += _shift(values, offset_at, tl.load(octant + row, mask=row < count, other=0), OFFSET, WIDTH)
+        if BIAS:
+            if IN_PLACE:
+                bias = tl.load(values + bias_at + column)
+            h += inside(bias, tile)[None, :]
+        a = leaky(h)
+        if SAVE:
+            tl.store(hidden + at, a, mask=live)
+        if not LOOP:
+            second = transposed((values if FINE else weights) + second_at, OUT, WIDTH)
+        z = finer_product(a, second, PRECISION) if FINE else product(a, second, PRECISION)
+        if IN_PLACE:
+            second_bias = tl.load(values + second_bias_at + outs)
+        z += inside(second_bias, tile)[None, :]
+        if NORM:
+            z, _scale = normalise(z, OUT)
+            if IN_PLACE:
+                gain, shift = tl.load(values + gain_at + outs), tl.load(values + shift_at + outs)
+            z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
+        if RESIDUAL:
+            z += x_tile
+        tl.store(y + row[:, None] * OUT + outs[None, :], z, mask=live)
+        if LOOP:
+            # the next tile's, where there are registers for them
+            x_rows = _rows_of(x, tile + tl.num_programs(0), count, INPUT, BLOCK)
+        if NEXT > 0:
+            if not LOOP:
+                following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
+            if IN_PLACE:
+                next_bias_0 = optional_vector(values, next_bias_at_0, WIDTH)
+            if FRACTION:
+                later = finer_product(-fractions, offsets_0, PRECISION)
+                later = product(z, following_0, PRECISION, later) + inside(next_bias_0, tile)[None, :]
+            else:
+                later = product(z, following_0, PRECISION) + inside(next_bias_0, tile)[None, :]
+            tl.store(next_0 + at, later, mask=live)
+        if NEXT > 1:
+            if not LOOP:
+                following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
+            if IN_PLACE:
+                next_bias_1 = optional_vector(values, next_bias_at_1, WIDTH)
+            if FRACTION:
+                later = finer_product(fractions, offsets_1, PRECISION)
+                later = product(z, following_1, PRECISION, later) + inside(next_bias_1, tile)[None, :]
+            else:
+                later = product(z, following_1, PRECISION) + inside(next_bias_1, tile)[None, :]
+            tl.store(next_1 + at, later, mask=live)
+        tile = next_tile(tile, not LOOP)
+
+
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
+def rows_backward(
+    gradient,
+    gradient_index,
+    from_0,
+    from_1,
+    x_gradient,
+    count_ptr,
+    weights,
+    values,
+    totals,
+    first_at,
+    offset_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
+    octant,
+    next_at_0,
+    next_at_1,
+    hidden,
+    hidden_gradient,
+    second_gradient,
+    unscale,
+    WIDTH: tl.constexpr,
+    OUT: tl.constexpr,
+    GATHER: tl.constexpr,
+    OFFSET: tl.constexpr,
+    NORM: tl.constexpr,
+    RESIDUAL: tl.constexpr,
+    NEXT: tl.constexpr,
+    INTO: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """Gradients of all inputs of rows_forward.
+
+    The gradient of y is `gradient` (row gradient_index_r if GATHER) plus from_0, from_1 times their products' weights
+    (NEXT). INTO: 0 no gradient of x, 1 write it, 2 add it to what is there. Gains, shifts and offset weights are summed
+    into `totals`, divided by the loss scale (`unscale`); hidden_gradient and second_gradient are left for the others.
+    """
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = (row < count)[:, None]
+    column = tl.arange(0, WIDTH)
+    outs = tl.arange(0, OUT)
+    at = row[:, None] * WIDTH + column[None, :]
+    out_at = row[:, None] * OUT + outs[None, :]
+    if GATHER:
+        where = tl.load(gradient_index + row, mask=row < count, other=-1)
+        there = (where >= 0)[:, None]
+        dy = tl.load(gradient + where[:, None] * OUT + outs[None, :], mask=there, other=0.0).to(tl.float32)
+    else:
+        dy = tl.load(gradient + out_at, mask=live, other=0.0).to(tl.float32)
+    if NEXT > 0:
+        tile = tl.load(from_0 + at, mask=live, other=0.0).to(tl.float32)
+        dy += product(tile, matrix(weights + next_at_0, WIDTH, WIDTH), PRECISION)
+    if NEXT > 1:
+        tile = tl.load(from_1 + at, mask=live, other=0.0).to(tl.float32)
+        dy += product(tile, matrix(weights + next_at_1, WIDTH, WIDTH), PRECISION)
+    a = tl.load(hidden + at, mask=live, other=0.0).to(tl.float32)
+    if NORM:
+        z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
+        z += tl.load(values + second_bias_at + outs)[None, :]
+        normalised, scale = normalise(z, OUT)
+        summand = tl.arange(0, 16)[:, None]  # the least that the matrix units take
+        whole = tl.where((summand == 0) & live.trans(), 1.0, 0.0)
+        at_gain = totals + gain_at + summand * OUT + outs[None, :]
+        at_shift = totals + shift_at + summand * OUT + outs[None, :]
+        tl.atomic_add(at_gain, weighted_sums(whole, dy * normalised, PRECISION) * unscale, mask=summand < 1)
+        tl.atomic_add(at_shift, weighted_sums(whole, dy, PRECISION) * unscale, mask=summand < 1)
+        dz = normalise_backward(dy, normalised, scale, tl.load(values + gain_at + outs), OUT)
+    else:
+        dz = dy
+    dz = tl.where(live, dz, 0.0)
+    tl.store(second_gradient + out_at, dz, mask=live)
+    dh = leaky_backward(product(dz, matrix(weights + second_at, OUT, WIDTH), PRECISION), a)
+    tl.store(hidden_gradient + at, dh, mask=live)
+    if OFFSET != 0:
+        code = tl.load(octant + row, mask=row < count, other=0)[None, :]
+        axis = tl.arange(0, 16)[:, None]
+        side = OFFSET * (0.5 - ((code >> tl.maximum(2 - axis, 0)) & 1).to(tl.float32))
+        sides = weighted_sums(side, dh, PRECISION) * unscale
+        tl.atomic_add(totals + offset_at + axis * WIDTH + column[None, :], sides, mask=axis < 3)
+    if INTO > 0:
+        dx = product(dh, matrix(weights + first_at, WIDTH, WIDTH), PRECISION)
+        if RESIDUAL:
+            dx += dy
+        if INTO > 1:
+            dx += tl.load(x_gradient + at, mask=live, other=0.0)
+        tl.store(x_gradient + at, dx, mask=live)
+
+
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
+def clear_rows(x, count_ptr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+    """Zeros into the rows of x [.., W] that are in use: capacities have room for twice as many."""
+    count = tl.load(count_ptr)
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    zeros = tl.zeros((BLOCK, WIDTH), x.dtype.element_ty)
+    tl.store(x + row[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], zeros, mask=(row < count)[:, None])
+
+
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
+def gather_sums(
+    x,
+    table,
+    count_ptr,
+    y,
+    capacity,
+    SUM: tl.constexpr,
+    EDGES: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """y = the sum of x's rows listed in the table [SUM, capacity] (-1: none), as gathered_sum takes them.
+
+    In a kernel of its own where there are many rows: its programs are small enough that many wait at once, while a
+    kernel with products has registers for two rows at a time.
+    """
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = tl.arange(0, WIDTH)
+    found = listed(table, row, count, capacity, SUM, EDGES)
+    tile = gathered_sum(x, found, SUM, WIDTH, BLOCK)
+    tl.store(y + row[:, None] * WIDTH + column[None, :], tile, mask=(row < count)[:, None])
+
+
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
+def gather_project(
+    x,
+    table,
+    count_ptr,
+    weights,
+    values,
+    at_0,
+    at_1,
+    bias_at,
+    y,
+    next_0,
+    next_1,
+    capacity,
+    SUM: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+    LOOP: tl.constexpr,
+):
+    """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products of y, the
+    second with a bias. LOOP as in rows_forward."""
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    column = tl.arange(0, WIDTH)
+    bias = tl.load(values + bias_at + column)
+    if LOOP:
+        first = transposed(weights + at_0, WIDTH, WIDTH)
+        second = transposed(weights + at_1, WIDTH, WIDTH)
+    tile = tl.program_id(0)
+    if SUM == 0:
+        rows = _rows_of(x, tile, count, WIDTH, BLOCK)
+    while (tile * BLOCK < count) & (tile < LAST_TILE):
+        row = tile * BLOCK + tl.arange(0, BLOCK)
+        live = (row < count)[:, None]
+        at = row[:, None] * WIDTH + column[None, :]
+        if SUM > 0:
+            rows = gathered_sum(x, listed(table, row, count, capacity, SUM, False), SUM, WIDTH, BLOCK)
+            tl.store(y + at, rows, mask=live)
+        if not LOOP:
+            first = transposed(weights + at_0, WIDTH, WIDTH)
+        tl.store(next_0 + at, product(rows, first, PRECISION), mask=live)
+        if not LOOP:
+            second = transposed(weights + at_1, WIDTH, WIDTH)
+        result = product(rows, second, PRECISION)
+        if LOOP:
+            # the next tile's, where there are registers for them
+            rows = _rows_of(x, tile + tl.num_programs(0), count, WIDTH, BLOCK)
+        tl.store(next_1 + at, result + inside(bias, tile)[None, :], mask=live)
+        tile = next_tile(tile, not LOOP)
+
+
+@triton.jit(do_not_specialize_on_alignment=["count_ptr"])
+def gather_project_backward(
+    x,
+    table,
+    count_ptr,
+    weights,
+    at_0,
+    summed,
+    other,
+    other_at,
+    gradient,
+    capacity,
+    SUM: tl.constexpr,
+    EDGES: tl.constexpr,
+    ADD: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """summed = x, or the sum of x's rows listed in the table [SUM, capacity]; gradient (+)= summed W.
+
+    With EDGES, x is [capacity, SUM, W], of the row listed for a direction the opposite direction's part is taken, and
+    the product of `other` [capacity, W] with its own weights is added to the gradient.
+    """
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = (row < count)[:, None]
+    column = tl.arange(0, WIDTH)
+    at = row[:, None] * WIDTH + column[None, :]
+    if SUM == 0:
+        tile = tl.load(x + at, mask=live, other=0.0).to(tl.float32)
+    else:
+        tile = gathered_sum(x, listed(table, row, count, capacity, SUM, EDGES), SUM, WIDTH, BLOCK)
+    tl.store(summed + at, tile, mask=live)
+    result = product(tile, matrix(weights + at_0, WIDTH, WIDTH), PRECISION)
+    if EDGES:
+        tile = tl.load(other + at, mask=live, other=0.0).to(tl.float32)
+        result += product(tile, matrix(weights + other_at, WIDTH, WIDTH), PRECISION)
+    if ADD:
+        result += tl.load(gradient + at, mask=live, other=0.0)
+    tl.store(gradient + at, result, mask=live)
+
+
+settle_keys(globals())

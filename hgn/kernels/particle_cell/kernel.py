@@ -1,0 +1,436 @@
+"""Particle-cell pairs (paper steps 1 and 11), forward and backward: pair MLP, norm, weight and sum in one launch.
+
+Row r of a tile is corner r % 8 of particle r // 8. Sums to cells are atomic additions, whose order, and with it the
+last bits, may differ from run to run. Shape legend: N particles, W width.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from hgn.kernels.blocks import (
+    added,
+    chosen_rows,
+    column_sums,
+    high_and_low,
+    inside,
+    leaky_backward,
+    leaky_operand,
+    matrix,
+    members,
+    normalise_backward,
+    normalise_once,
+    product,
+    transposed,
+    weighted_sums,
+)
+from hgn.kernels.triton_compat import settle_keys
+
+
+@triton.jit
+def _offset(fraction, particle, corner, live, axis: tl.constexpr):
+    """Cell centre minus particle, in cells."""
+    bit = (corner >> (2 - axis)) & 1
+    return bit.to(tl.float32) - tl.load(fraction + particle * 3 + axis, mask=live, other=0.0)
+
+
+@triton.jit
+def _cell_of(tile, count, cell_of, ROWS: tl.constexpr):
+    """For each row of a tile its cell; there may be no such tile."""
+    pair = tile * ROWS + tl.arange(0, ROWS)
+    return tl.load(cell_of + pair, mask=(pair >= 0) & (pair < count * 8), other=0)
+
+
+@triton.jit
+def _cells_of(tile, count, cell_of, weight_of, ROWS: tl.constexpr):
+    """For each row of a tile its cell and its weight."""
+    pair = tile * ROWS + tl.arange(0, ROWS)
+    live = pair < count * 8
+    return tl.load(cell_of + pair, mask=live, other=0), tl.load(weight_of + pair, mask=live, other=0.0)
+
+
+@triton.jit
+def _particles(by_particle, tile, count, PARTICLES: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.constexpr):
+    """A tile's particles' rows [SUMS, W]."""
+    mine = tile * PARTICLES + tl.arange(0, SUMS)
+    there = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
+    return tl.load(by_particle + mine[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=there, other=0.0)
+
+
+@triton.jit
+def _choice(PARTICLES: tl.constexpr, SUMS: tl.constexpr, SIGN: tl.constexpr):
+    """[8 PARTICLES, SUMS]: a pair's particle, and in the spare places the bits of its corner, for the high parts of the
+    offsets' weights and for the low ones (high_and_low)."""
+    ROWS: tl.constexpr = PARTICLES * 8
+    spare = tl.arange(0, SUMS) - PARTICLES
+    bit = ((tl.arange(0, ROWS) % 8)[:, None] >> (2 - spare % 3)[None, :]) & 1
+    sides = tl.where((spare < 6)[None, :], SIGN * bit.to(tl.float32), 0.0)
+    return tl.where((spare >= 0)[None, :], sides, chosen_rows(ROWS, 8, SUMS))
+
+
+@triton.jit
+def _first_layer(choice, rows, of_cells, TO_CELL: tl.constexpr, PRECISION: tl.constexpr):
+    """The first layer of a tile's pairs [ROWS, W] before its activation: of its particles' rows and the offsets', and
+    unless TO_CELL of its cells' [ROWS, W]."""
+    if TO_CELL:
+        h = product(choice, rows, PRECISION)
+    else:
+        h = product(choice, rows, PRECISION, of_cells.to(tl.float32))
+    return h
+
+
+@triton.jit
+def pairs_forward(
+    by_particle,
+    by_cell,
+    particle,
+    cell_of,
+    weight_of,
+    count_ptr,
+    weights,
+    values,
+    offset_at,
+    second_at,
+    second_bias_at,
+    gain_at,
+    shift_at,
+    hidden,
+    normalised,
+    deviation,
+    out,
+    TO_CELL: tl.constexpr,
+    SAVE: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PARTICLES: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """TO_CELL: out [C, W] += weight * MLP(by_particle_n + offset). Otherwise out [N, W] = particle + sum over the
+    corners of weight * MLP(by_cell_c + by_particle_n - offset). The by_… are products with first-layer weights,
+    by_particle with the particle's part of the offset: what is left of it are the corner's three bits.
+
+    SAVE keeps what pairs_backward reads: the normalised output [8 N, W], one over its deviation, and the hidden layer
+    unless BY_PRODUCT: then it is cheaper to compute again.
+    """
+    ROWS: tl.constexpr = PARTICLES * 8
+    SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * PARTICLES >= count:
+        return
+    column = tl.arange(0, WIDTH)
+    # vectors once: in the loop each would be waited for again
+    second_bias = tl.load(values + second_bias_at + column)
+    gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
+    # Where it is exact, a particle's row comes to its pairs by a product, with the bits' rows in its spare places.
+    BY_PRODUCT: tl.constexpr = PRECISION == "half" or PRECISION == "ieee"
+    SIGN: tl.constexpr = 1 if TO_CELL else -1
+    if BY_PRODUCT:
+        choice = _choice(PARTICLES, SUMS, SIGN)
+        offsets = high_and_low(values + offset_at, PARTICLES, SUMS, WIDTH, PRECISION)
+    else:
+        offset_0 = tl.load(values + offset_at + column)
+        offset_1 = tl.load(values + offset_at + WIDTH + column)
+        offset_2 = tl.load(values + offset_at + 2 * WIDTH + column)
+    second = transposed(weights + second_at, WIDTH, WIDTH)
+    tile = tl.program_id(0)
+    # read a tile ahead: they say where other things are, or are few
+    cell, weight = _cells_of(tile, count, cell_of, weight_of, ROWS)
+    if BY_PRODUCT:
+        rows = _particles(by_particle, tile, count, PARTICLES, SUMS, WIDTH)
+    while tile * PARTICLES < count:
+        row = tl.arange(0, ROWS)
+        owner = tile * PARTICLES + row // 8
+        corner = row % 8
+        live = owner < count
+        here = live[:, None]
+        later = tile + tl.num_programs(0)
+        later_cell, later_weight = _cells_of(later, count, cell_of, weight_of, ROWS)
+        if BY_PRODUCT:
+            mine = tile * PARTICLES + tl.arange(0, SUMS)
+            of_cells = rows
+            if not TO_CELL:
+                of_cells = tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+            h = _first_layer(choice, rows.to(tl.float32) + offsets, of_cells, TO_CELL, PRECISION)
+            rows = _particles(by_particle, later, count, PARTICLES, SUMS, WIDTH)
+        else:
+            h = tl.load(by_particle + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+            if not TO_CELL:
+                h = added(h, tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0))
+            h = h.to(tl.float32)
+            h += (SIGN * (corner >> 2)).to(tl.float32)[:, None] * inside(offset_0, tile)[None, :]
+            h += (SIGN * (corner >> 1 & 1)).to(tl.float32)[:, None] * inside(offset_1, tile)[None, :]
+            h += (SIGN * (corner & 1)).to(tl.float32)[:, None] * inside(offset_2, tile)[None, :]
+        a = leaky_operand(h, PRECISION)
+        pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
+        if SAVE and not BY_PRODUCT:
+            tl.store(hidden + pair_at, a, mask=here)
+        z = product(a, second, PRECISION)
+        z, scale = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
+        if SAVE:
+            tl.store(normalised + pair_at, z, mask=here)
+            tl.store(deviation + owner * 8 + corner, scale, mask=live)
+        z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
+        if TO_CELL:
+            z = z * weight[:, None]
+            # a weight of zero points at a cell that may be another's: it adds nothing
+            touched = (live & (weight != 0))[:, None]
+            tl.atomic_add(out + cell[:, None] * WIDTH + column[None, :], z, mask=touched, sem="relaxed")
+        else:
+            if PRECISION == "tf32" and not SAVE:
+                # as a reduction: rounding the product's operands would cost more
+                mine = tile * PARTICLES + tl.arange(0, PARTICLES)
+                ends = (mine < count)[:, None]
+                summed = tl.sum(tl.reshape(z * weight[:, None], (PARTICLES, 8, WIDTH)), 1)
+            else:
+                mine = tile * PARTICLES + tl.arange(0, SUMS)
+                ends = ((tl.arange(0, SUMS) < PARTICLES) & (mine < count))[:, None]
+                summed = weighted_sums(members(SUMS, ROWS, 8) * weight[None, :], z, PRECISION)
+            at = mine[:, None] * WIDTH + column[None, :]
+            tl.store(out + at, summed + tl.load(particle + at, mask=ends, other=0.0), mask=ends)
+        tile, cell, weight = later, later_cell, later_weight
+
+
+@triton.jit
+def _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS: tl.constexpr):
+    """For each row of a tile its cell, its weight, and its offset's three parts."""
+    row = tl.arange(0, ROWS)
+    owner = tile * (ROWS // 8) + row // 8
+    corner = row % 8
+    live = owner < count
+    cell, weight = _cells_of(tile, count, cell_of, weight_of, ROWS)
+    side_0 = _offset(fraction, owner, corner, live, 0)
+    side_1 = _offset(fraction, owner, corner, live, 1)
+    side_2 = _offset(fraction, owner, corner, live, 2)
+    return cell, weight, side_0, side_1, side_2
+
+
+@triton.jit
+def pairs_backward(
+    gradient,
+    by_particle,
+    by_cell,
+    cell_of,
+    weight_of,
+    fraction,
+    count_ptr,
+    weights,
+    values,
+    totals,
+    offset_at,
+    second_at,
+    gain_at,
+    shift_at,
+    hidden,
+    normalised,
+    deviation,
+    second_gradient,
+    by_particle_gradient,
+    by_cell_gradient,
+    unscale,
+    TO_CELL: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PARTICLES: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """From the gradient of `out` ([C, W] if TO_CELL, else [N, W]) to those of by_particle, and of by_cell by atomics.
+
+    second_gradient [8 N, W] is left for the weight product. Where the hidden layer was not kept it is computed again,
+    to the same bits.
+    """
+    ROWS: tl.constexpr = PARTICLES * 8
+    SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * PARTICLES >= count:
+        return
+    column = tl.arange(0, WIDTH)
+    second = matrix(weights + second_at, WIDTH, WIDTH)
+    gain = tl.load(values + gain_at + column)
+    sums = tl.arange(0, SUMS)
+    gain_total, shift_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
+    side_total = tl.zeros((SUMS, WIDTH), tl.float32)
+    BY_PRODUCT: tl.constexpr = PRECISION == "half" or PRECISION == "ieee"  # as in pairs_forward
+    if BY_PRODUCT:
+        SIGN: tl.constexpr = 1 if TO_CELL else -1
+        choice = _choice(PARTICLES, SUMS, SIGN)
+    tile = tl.program_id(0)
+    # read a tile ahead: they say where other things are, and in a loop each thread keeps but one of them
+    cell, weight, side_0, side_1, side_2 = _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS)
+    while tile * PARTICLES < count:
+        row = tl.arange(0, ROWS)
+        owner = tile * PARTICLES + row // 8
+        corner = row % 8
+        live = owner < count
+        here = live[:, None]
+        pair_at = (owner * 8 + corner)[:, None] * WIDTH + column[None, :]
+        # all loads before the first use: the compiler keeps their order, and waits at the first
+        z = tl.load(normalised + pair_at, mask=here, other=0.0)
+        if BY_PRODUCT:
+            rows = _particles(by_particle, tile, count, PARTICLES, SUMS, WIDTH)
+        else:
+            a = tl.load(hidden + pair_at, mask=here, other=0.0)
+        scale = tl.load(deviation + owner * 8 + corner, mask=live, other=0.0)
+        if TO_CELL:
+            dy = tl.load(gradient + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+        else:
+            dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+        dy, z = dy * weight[:, None], z.to(tl.float32)
+        if tile >= 0:  # always, and the compiler does not know: else it puts these sums off, and keeps what they are of
+            gain_total += column_sums(dy * z, ROWS, WIDTH, 8)
+            shift_total += column_sums(dy, ROWS, WIDTH, 8)
+        dz = normalise_backward(dy, z, scale, inside(gain, tile), WIDTH)
+        tl.store(second_gradient + pair_at, dz, mask=here)
+        later = _pairs_of(tile + tl.num_programs(0), count, cell_of, weight_of, fraction, ROWS)
+        if BY_PRODUCT:
+            of_cells = rows
+            if not TO_CELL:
+                of_cells = tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+        dh = product(dz, second, PRECISION)
+        if BY_PRODUCT:
+            rows = rows.to(tl.float32) + high_and_low(values + offset_at, PARTICLES, SUMS, WIDTH, PRECISION)
+            a = leaky_operand(_first_layer(choice, rows, of_cells, TO_CELL, PRECISION), PRECISION)
+        dh = leaky_backward(dh, a.to(tl.float32))
+        if not TO_CELL:
+            touched = (live & (weight != 0))[:, None]
+            tl.atomic_add(by_cell_gradient + cell[:, None] * WIDTH + column[None, :], dh, mask=touched, sem="relaxed")
+        # the sums over a particle's pairs, and in the last rows those of the offsets' weights
+        chosen = members(SUMS, ROWS, 8)
+        chosen = tl.where((sums == SUMS - 3)[:, None], side_0[None, :], chosen)
+        chosen = tl.where((sums == SUMS - 2)[:, None], side_1[None, :], chosen)
+        chosen = tl.where((sums == SUMS - 1)[:, None], side_2[None, :], chosen)
+        summed = weighted_sums(chosen, dh, PRECISION)
+        mine = tile * PARTICLES + sums
+        ends = ((sums < PARTICLES) & (mine < count))[:, None]
+        tl.store(by_particle_gradient + mine[:, None] * WIDTH + column[None, :], summed, mask=ends)
+        side_total += summed
+        tile += tl.num_programs(0)
+        cell, weight, side_0, side_1, side_2 = later
+    tl.atomic_add(totals + gain_at + column, tl.sum(gain_total, 0) * unscale, sem="relaxed")
+    tl.atomic_add(totals + shift_at + column, tl.sum(shift_total, 0) * unscale, sem="relaxed")
+    axis = sums[:, None] - (SUMS - 3)
+    sign = unscale if TO_CELL else -unscale
+    at = totals + offset_at + axis * WIDTH + column[None, :]
+    tl.atomic_add(at, side_total * sign, mask=axis >= 0, sem="relaxed")
+
+
+@triton.jit
+def _weight_tile(
+    total,
+    lines,
+    cell,
+    tile,
+    count,
+    second_gradient,
+    by_particle,
+    by_cell,
+    cell_of,
+    choice,
+    offsets,
+    TO_CELL: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PARTICLES: tl.constexpr,
+    SUMS: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """`total` and `lines` with a tile's part of the gradients added, and the cells of the program's next tile."""
+    ROWS: tl.constexpr = PARTICLES * 8
+    column = tl.arange(0, WIDTH)
+    pair = tile * ROWS + tl.arange(0, ROWS)
+    here = (pair < count * 8)[:, None]
+    dz = tl.load(second_gradient + pair[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+    rows = _particles(by_particle, tile, count, PARTICLES, SUMS, WIDTH)
+    of_cells = rows
+    if not TO_CELL:
+        of_cells = tl.load(by_cell + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
+        # read a tile ahead: they say where other things are
+        cell = _cell_of(tile - tl.num_programs(0), count, cell_of, ROWS)
+    a = leaky_operand(_first_layer(choice, rows.to(tl.float32) + offsets, of_cells, TO_CELL, PRECISION), PRECISION)
+    lines += column_sums(dz.to(tl.float32), ROWS, WIDTH, 8)
+    return product(tl.trans(dz), a, PRECISION, total), lines, cell
+
+
+@triton.jit
+def pairs_weight_gradient(
+    second_gradient,
+    by_particle,
+    by_cell,
+    cell_of,
+    count_ptr,
+    values,
+    totals,
+    offset_at,
+    second_at,
+    second_bias_at,
+    unscale,
+    TO_CELL: tl.constexpr,
+    WIDTH: tl.constexpr,
+    PARTICLES: tl.constexpr,
+    PRECISION: tl.constexpr,
+    PIPELINED: tl.constexpr,
+):
+    """Gradients of the second layer and its bias, as weight_gradient makes them, where the hidden layer was not kept:
+    it is computed again, to the same bits, from an eighth of the bytes. Tiles come from behind: what pairs_backward
+    wrote last is still in the L2 cache.
+
+    PIPELINED: the compiler has a counted loop's tiles copied to shared memory two ahead. The interpreter of Triton 3.6
+    counts to no number that was loaded.
+    """
+    SUMS: tl.constexpr = 16
+    count = tl.load(count_ptr)
+    if tl.program_id(0) * PARTICLES >= count:
+        return
+    column = tl.arange(0, WIDTH)
+    SIGN: tl.constexpr = 1 if TO_CELL else -1
+    choice = _choice(PARTICLES, SUMS, SIGN)
+    offsets = high_and_low(values + offset_at, PARTICLES, SUMS, WIDTH, PRECISION)
+    total = tl.zeros((WIDTH, WIDTH), tl.float32)
+    lines = tl.zeros((8, WIDTH), tl.float32)
+    last = tl.cdiv(count, PARTICLES) - 1
+    cell = _cell_of(last - tl.program_id(0), count, cell_of, PARTICLES * 8)
+    if PIPELINED:
+        for number in tl.range(tl.program_id(0), last + 1, tl.num_programs(0), num_stages=3):
+            total, lines, cell = _weight_tile(
+                total,
+                lines,
+                cell,
+                last - number,
+                count,
+                second_gradient,
+                by_particle,
+                by_cell,
+                cell_of,
+                choice,
+                offsets,
+                TO_CELL,
+                WIDTH,
+                PARTICLES,
+                SUMS,
+                PRECISION,
+            )
+    else:
+        tile = last - tl.program_id(0)
+        while tile >= 0:
+            total, lines, cell = _weight_tile(
+                total,
+                lines,
+                cell,
+                tile,
+                count,
+                second_gradient,
+                by_particle,
+                by_cell,
+                cell_of,
+                choice,
+                offsets,
+                TO_CELL,
+                WIDTH,
+                PARTICLES,
+                SUMS,
+                PRECISION,
+            )
+            tile -= tl.num_programs(0)
+    tl.atomic_add(totals + second_bias_at + column, tl.sum(lines, 0) * unscale, sem="relaxed")
+    at = totals + second_at + column[:, None] * WIDTH + column[None, :]
+    tl.atomic_add(at, total * unscale, sem="relaxed")
+
+
+settle_keys(globals())

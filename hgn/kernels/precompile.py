@@ -1,0 +1,194 @@
+"""python -m hgn.kernels.precompile: compiles a part of the kernels of a training or of simulations, launching none.
+
+What it compiles goes into Triton's cache on disk.
+
+The launches are those of Updates and TritonRollout on tensors without memory, so that no kernel and no specialisation
+is named twice; only sizes are guessed (they choose between few variants), and what is guessed wrong is compiled when it
+is first used.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+import triton
+from triton.backends.compiler import GPUTarget
+
+from hgn.config import NetworkConfig
+from hgn.kernels.gns.update import GnsUpdates
+from hgn.kernels.grid.op import ObstacleTable, Window
+from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.network.build import build_network
+from hgn.network.features import ParticleState
+from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.backend import KERNEL_PRECISION
+from hgn.runtime.triton_rollout import TritonRollout, first_capacities
+from hgn.schema import from_mapping
+
+NICENESS = 10
+
+
+@dataclass(frozen=True)
+class PrecompileJob:
+    """What is trained, and on what."""
+
+    network: NetworkConfig
+    settings: UpdateSettings
+    precision: str  # as the kernels call it
+    several_ranks: bool
+    averages: bool  # the weights over the updates
+    particles: int  # of an update, about
+    cells: tuple[int, ...]  # of each level, about; of a GNS its edges
+    capability: int  # of the GPU: 90 for an H100
+    rollout_scenes: tuple[int, ...] = ()  # that the network simulates at once, to train on them and to measure
+
+
+@dataclass(frozen=True)
+class FrameJob:
+    """What simulates, how precisely, and at which sizes: particles, and cells of the finest level."""
+
+    networks: tuple[tuple[NetworkConfig, str], ...]  # with the precision that the runtime knows: highest, high, half
+    sizes: tuple[tuple[int, int], ...]
+    capability: int  # of the GPU: 90 for an H100
+
+
+Launches = dict[str, tuple[Any, str]]
+
+
+def launches_of(job: PrecompileJob | FrameJob, device: str = "meta") -> Launches:
+    """Every kernel of a job with what it is specialised for, by a key of both; Triton's driver needs a target."""
+    with _noted() as found:
+        if isinstance(job, PrecompileJob):
+            _update_launches(job, device)
+        else:
+            for config, precision in job.networks:
+                _frame_launches(config, precision, job.sizes, device)
+    return found
+
+
+@contextmanager
+def _noted() -> Iterator[Launches]:
+    found: Launches = {}
+
+    def note(*, fn: Any, compile: dict[str, Any], **_: Any) -> bool:
+        data = compile["specialization_data"]
+        found.setdefault(data, (fn.jit_function, data))
+        return True  # neither compiled nor launched
+
+    triton.knobs.runtime.jit_cache_hook = note
+    try:
+        yield found
+    finally:
+        triton.knobs.runtime.jit_cache_hook = None
+
+
+def _update_launches(job: PrecompileJob, device: str) -> None:
+    with torch.device(device):
+        network = build_network(job.network)
+    nothing = torch.zeros(5, device=device)
+    reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if job.several_ranks else None
+    kind = GnsUpdates if isinstance(network, GraphNetworkSimulator) else Updates
+    updates = kind(network, job.settings, job.precision, nothing[:2], nothing, reduce)
+    updates.average = torch.zeros_like(updates.values) if job.averages else None
+    updates.allocate(job.particles, job.cells)
+    updates.launches()
+    for scenes in job.rollout_scenes:
+        assert isinstance(network, HierarchicalGraphNetwork)
+        _rollout_launches(job, scenes, network, device)
+
+
+def _frame_launches(config: NetworkConfig, precision: str, sizes: tuple[tuple[int, int], ...], device: str) -> None:
+    """Those of a frame of hgn.runtime.simulator; a level has a quarter of the cells of the one below."""
+    with torch.device(device):
+        network = HierarchicalGraphNetwork(config)
+    obstacles = ObstacleTable([None], 1.0, torch.device(device)) if config.obstacle_features else None
+    for particles, cells in sizes:
+        capacities = tuple(max(1, cells >> 2 * level) for level in range(config.levels))
+        state = _nowhere(config, particles, 1, device)
+        _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
+
+
+class _Unplaced(TritonRollout):
+    """A simulation of particles that are nowhere."""
+
+    def _window(self) -> Window:
+        return Window.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
+
+
+def _nowhere(config: NetworkConfig, particles: int, scenes: int, device: str) -> ParticleState:
+    return ParticleState(
+        torch.zeros(particles, 3, device=device),
+        torch.zeros(particles, config.velocity_history, 3, device=device),
+        torch.zeros(particles, dtype=torch.int32, device=device),
+        torch.zeros(particles, dtype=torch.int64, device=device),
+        torch.zeros(scenes, 3, device=device),
+        None,
+    )
+
+
+def _rollout_launches(job: PrecompileJob, scenes: int, network: HierarchicalGraphNetwork, device: str) -> None:
+    """Those of a frame of hgn.training.graph_pushforward, or of a monitored rollout."""
+    config = job.network
+    share = scenes / job.settings.scenes
+    particles = round(share * job.particles)
+    obstacles = None
+    if config.obstacle_features:
+        obstacles = ObstacleTable([None] * scenes, job.settings.obstacle_cell_size, torch.device(device))
+    precision = next(name for name, kernels in KERNEL_PRECISION.items() if kernels == job.precision)
+    capacities = first_capacities([round(share * cells) for cells in job.cells], particles)
+    state = _nowhere(config, particles, scenes, device)
+    _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
+
+
+def compile_share(job: PrecompileJob | FrameJob, share: int, shares: int) -> int:
+    """Compiles every `shares`-th kernel from number `share` on; how many those are."""
+    mine = list(launches_of(job).values())[share::shares]
+    for function, data in mine:
+        kernel = function.preload(data)
+        triton.runtime.driver.active.launcher_cls(kernel.src, kernel.metadata)  # C, compiled as well
+    return len(mine)
+
+
+def job_text(job: PrecompileJob | FrameJob) -> str:
+    return json.dumps(asdict(job))
+
+
+def job_of(text: str) -> PrecompileJob | FrameJob:
+    mapping = json.loads(text)
+    if "networks" in mapping:
+        networks = tuple(
+            (from_mapping(NetworkConfig, network), precision) for network, precision in mapping["networks"]
+        )
+        return FrameJob(networks, tuple((n, cells) for n, cells in mapping["sizes"]), mapping["capability"])
+    network = from_mapping(NetworkConfig, mapping.pop("network"))
+    settings = UpdateSettings(**mapping.pop("settings"))
+    tuples = {name: tuple(mapping[name]) for name in ("cells", "rollout_scenes")}
+    return PrecompileJob(network, settings, **{**mapping, **tuples})
+
+
+def use_target(capability: int) -> None:
+    """Lets Triton compile for a GPU without a context on it, which would take memory from those who train."""
+    driver = triton.runtime.driver.active
+    driver.get_current_device = lambda: 0
+    driver.get_current_stream = lambda device: 0
+    driver.get_current_target = lambda: GPUTarget("cuda", capability, 32)
+
+
+def main() -> None:
+    os.nice(NICENESS)
+    share, shares = map(int, sys.argv[1:])
+    job = job_of(sys.stdin.read())
+    use_target(job.capability)
+    print(compile_share(job, share, shares))
+
+
+if __name__ == "__main__":
+    main()

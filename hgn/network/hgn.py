@@ -1,0 +1,145 @@
+"""The hierarchical graph network (paper sec. 3.2, fig. 2): plain torch, the reference for every faster path.
+
+On a CPU, where no gradients are wanted, hgn.cpu.network computes the same function, if it can by compiled C.
+
+Steps: encode particles (0), particles to cells (1), message passing on each level down (2, 4, …) with fine to
+coarse (3, 5, …) between, message passing on each level up (8, 10, …) after coarse to fine (7, 9, …), cells to
+particles (11), decode to the acceleration (12). With L levels there are 2 L - 1 message-passing blocks.
+Shape legend: N particles, C cells, E directed edges, W width, S scenes.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from hgn.config import NetworkConfig
+from hgn.cpu import network as cpu_network
+from hgn.network.base import ParticleNetwork
+from hgn.network.features import ParticleState
+from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
+from hgn.network.mlp import MLP
+
+
+class MessagePassing(nn.Module):
+    """Steps 2, 4, …: M iterations on the cells of one level (paper fig. 5), weights unshared."""
+
+    def __init__(self, steps: int, width: int) -> None:
+        super().__init__()
+        self.edge = nn.ModuleList(MLP((width, width, 3 if m == 0 else width), width, width) for m in range(steps))
+        self.cell = nn.ModuleList(MLP((width, width), width, width) for _ in range(steps))
+
+    def forward(self, cell_CW: torch.Tensor, level: Level) -> torch.Tensor:
+        """Returns the updated cell features [C, W]."""
+        edge_EW: torch.Tensor | None = None
+        # Receiver minus sender in cells: the opposite of where the sender lies.
+        offset_63 = -DIRECTION_63.to(cell_CW)
+        for edge_network, cell_network in zip(self.edge, self.cell, strict=True):
+            assert isinstance(edge_network, MLP) and isinstance(cell_network, MLP)
+            sender_CH = edge_network.project(0, cell_CW)
+            receiver_CH = edge_network.project(1, cell_CW) + edge_network.first.bias
+            hidden_EH = sender_CH.index_select(0, level.sender_E).add_(receiver_CH.index_select(0, level.receiver_E))
+            if edge_EW is None:
+                hidden_EH += edge_network.project(2, offset_63).index_select(0, level.direction_E)
+                edge_EW = edge_network.finish(hidden_EH)
+            else:
+                edge_network.add_projection(hidden_EH, 2, edge_EW)
+                edge_EW = edge_network.finish(hidden_EH).add_(edge_EW)
+            sum_CW = _scatter(edge_EW, level.receiver_E, level.cell_count)
+            hidden_CH = cell_network.project(0, cell_CW) + cell_network.first.bias
+            cell_network.add_projection(hidden_CH, 1, sum_CW)
+            cell_CW = cell_network.finish(hidden_CH).add_(cell_CW)
+        return cell_CW
+
+
+class HierarchicalGraphNetwork(ParticleNetwork):
+    """Predicts the acceleration of every particle, in frame units.
+
+    Without obstacle features the input lacks the normals (the paper's second data set); with them, a scene
+    without obstacles leaves their columns out, which is exact since the normals are zero.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        width = config.width
+        self.particle_to_cell = MLP((width, 3), width, width)
+        self.passing_down = nn.ModuleList(
+            MessagePassing(config.message_passing_steps, width) for _ in range(config.levels)
+        )
+        self.fine_to_coarse = nn.ModuleList(MLP((width, 3), width, width) for _ in range(config.levels - 1))
+        self.coarse_to_fine = nn.ModuleList(MLP((width, width, 3), width, width) for _ in range(config.levels - 1))
+        self.passing_up = nn.ModuleList(
+            MessagePassing(config.message_passing_steps, width) for _ in range(config.levels - 1)
+        )
+        self.cell_to_particle = MLP((width, width, 3), width, width)
+        self.decode = MLP((width,), width, 3, layer_norm=False)
+
+    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+        """The network's raw output [N, 3], which the loss compares with the normalised target.
+
+        The finest grid's origin in each scene is 0 unless given.
+        """
+        if origin_S3 is None:
+            origin_S3 = torch.zeros_like(state.domain_S3)
+        config = self.config
+        grid = build_hierarchy(state.position_N3, state.scene_N, origin_S3, config.cell_size, config.levels)
+        return self.propagate(self.encode_particles(state), grid)
+
+    def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
+        """Steps 1 to 12: latent particles and their grids to normalised accelerations [N, 3]."""
+        if particle_NW.device.type == "cpu" and not torch.is_grad_enabled():
+            return cpu_network.propagate(self, particle_NW, grid)
+        corner_83 = CORNER_83.to(particle_NW)
+        # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
+        parent_offset_83 = 0.5 - corner_83
+
+        network = self.particle_to_cell
+        corner_8H = network.project(1, corner_83) + network.first.bias
+        hidden_NH = network.project(0, particle_NW)
+        network.add_projection(hidden_NH, 1, -grid.fraction_N3)
+        message_N8W = network.finish(hidden_NH[:, None] + corner_8H).mul_(grid.weight_N8[..., None])
+        cell_CW = _scatter(message_N8W, grid.cell_N8, grid.levels[0].cell_count)
+
+        kept: list[torch.Tensor] = []
+        for i, level in enumerate(grid.levels):
+            cell_CW = self.passing_down[i](cell_CW, level)
+            if level.parent_C is None or level.octant_C is None:
+                break
+            kept.append(cell_CW)
+            network = _fcn(self.fine_to_coarse[i])
+            offset_8H = network.project(1, parent_offset_83) + network.first.bias
+            message_CW = network.finish(network.project(0, cell_CW).add_(offset_8H.index_select(0, level.octant_C)))
+            cell_CW = _scatter(message_CW, level.parent_C, grid.levels[i + 1].cell_count)
+
+        for i in reversed(range(len(kept))):
+            level = grid.levels[i]
+            assert level.parent_C is not None and level.octant_C is not None
+            network = _fcn(self.coarse_to_fine[i])
+            offset_8H = network.project(2, -parent_offset_83) + network.first.bias
+            hidden_CH = network.project(0, cell_CW).index_select(0, level.parent_C)
+            network.add_projection(hidden_CH, 1, kept[i])
+            hidden_CH += offset_8H.index_select(0, level.octant_C)
+            cell_CW = self.passing_up[i](network.finish(hidden_CH).add_(kept[i]), level)
+
+        network = self.cell_to_particle
+        cell_CH = network.project(0, cell_CW)
+        corner_8H = network.project(2, corner_83) - network.first.bias
+        hidden_NH = network.project(1, particle_NW)
+        network.add_projection(hidden_NH, 2, grid.fraction_N3)
+        cell_N8H = cell_CH.index_select(0, grid.cell_N8.flatten()).unflatten(0, (-1, 8))
+        hidden_N8H = cell_N8H + hidden_NH[:, None]
+        hidden_N8H -= corner_8H
+        change_NW = network.finish(hidden_N8H).mul_(grid.weight_N8[..., None]).sum(1)
+        output_N3: torch.Tensor = self.decode(particle_NW + change_NW)
+        return output_N3
+
+
+def _scatter(value: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tensor:
+    """Sums rows [..., W] by index [...] into [count, W]."""
+    width = value.shape[-1]
+    return value.new_zeros(count, width).index_add_(0, index.flatten(), value.reshape(-1, width))
+
+
+def _fcn(module: nn.Module) -> MLP:
+    assert isinstance(module, MLP)
+    return module

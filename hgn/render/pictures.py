@@ -1,0 +1,448 @@
+"""Pictures of rollouts: a grid of frames, an animation beside the ground truth, and the error over time.
+
+Shape legend: T frames, N particles.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
+from scipy.spatial import KDTree
+
+from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, Stage, to_bytes
+from hgn.scene.episode import Episode
+from hgn.scene.material import MATERIALS
+from hgn.scene.rollout_file import Rollout, obstacles_of_episode
+from hgn.scene.scene import Obstacle
+from hgn.schema import ConfigError
+from hgn.system.files import write_atomically
+
+RADIUS_IN_SPACINGS = 0.72  # spheres that overlap a little look like a body, not like a cloud
+TEXT_COLOR = (45, 50, 60)
+PALETTE_SAMPLES = 40_000
+WEBP_QUALITY = 70  # at 50 small particles smear, and at 90 the file is as large as a GIF
+Color = tuple[int, int, int]
+NO_OTHERS: Mapping[str, np.ndarray] = MappingProxyType({})
+
+
+def draw_frame(
+    position_N3: np.ndarray,
+    material_N: np.ndarray,
+    obstacles: Sequence[Obstacle],
+    domain_size: tuple[float, float, float],
+    title: str = "",
+    size: int = 640,
+    particle_radius: float | None = None,
+) -> Image.Image:
+    """One frame as an RGB picture, `size` pixels wide; lengths in domain units.
+
+    particle_radius: none takes it from the particles' spacing. Particles that are not finite are left out.
+    """
+    radius = particle_spacing(position_N3) * RADIUS_IN_SPACINGS if particle_radius is None else particle_radius
+    panel = Stage(domain_size, obstacles, radius, size).draw(position_N3, material_N)
+    header = _header_height(size) if title else 0
+    picture = Image.new("RGB", (panel.width, panel.height + header), _background())
+    picture.paste(panel, (0, header))
+    if title:
+        _write(picture, (panel.width / 2, header / 2), title, _text_size(size))
+    return picture
+
+
+def compare_picture(
+    rollout: Rollout,
+    frames: Sequence[int],
+    size: int = 360,
+    label: str = "prediction",
+    others: Mapping[str, np.ndarray] = NO_OTHERS,
+) -> Image.Image:
+    """A grid: a column each frame, the prediction above, the ground truth below where there is one.
+
+    size: width of one panel in pixels. label: what stands beside the first row. others: positions
+    float32 [T, N, 3] of the same particles as simulated otherwise, by name: rows between these two.
+
+    Raises: ConfigError when a frame lies outside the rollout, or others hold other particles.
+    """
+    check_frames(frames, rollout.frame_count)
+    stage = _stage(rollout, size)
+    rows = _versions(rollout, label, others)
+    width, height = stage.size
+    gap, header, footer = size // 30, _header_height(size), _header_height(size)
+    left = header if rows[0][0] else 0
+    picture = Image.new(
+        "RGB",
+        (left + len(frames) * (width + gap), header + len(rows) * (height + gap) + footer),
+        _background(),
+    )
+    for column, frame in enumerate(frames):
+        x = left + column * (width + gap)
+        seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
+        _write(picture, (x + width / 2, header / 2), seconds, _text_size(size))
+        for row, (_, position_TN3) in enumerate(rows):
+            panel = _panel(stage, position_TN3, frame, rollout.material_N)
+            picture.paste(panel, (x, header + row * (height + gap)))
+    for row, (name, _) in enumerate(rows):
+        if name:
+            strip = Image.new("RGB", (height, left), _background())
+            _write(strip, (height / 2, left / 2), name, _text_size(size))
+            picture.paste(strip.rotate(90, expand=True), (0, header + row * (height + gap)))
+    _legend(picture, picture.height - footer / 2, rollout, _text_size(size))
+    return picture
+
+
+def stacked(pictures: Sequence[Image.Image]) -> Image.Image:
+    """Pictures below each other."""
+    size = max(picture.width for picture in pictures), sum(picture.height for picture in pictures)
+    whole, y = Image.new("RGB", size, _background()), 0
+    for picture in pictures:
+        whole.paste(picture, (0, y))
+        y += picture.height
+    return whole
+
+
+def animate(
+    rollout: Rollout,
+    path: str | Path,
+    fps: float | None = None,
+    every: int = 3,
+    size: int = 360,
+    progress: Callable[[int, int], None] | None = None,
+    label: str = "prediction",
+    others: Mapping[str, np.ndarray] = NO_OTHERS,
+) -> None:
+    """Writes every `every`-th frame, the prediction beside the ground truth where there is one.
+
+    path: ends in .gif, or in .webp, which takes half the space and keeps all colours. fps: pictures per second, none
+    for real time; GIF counts in hundredths of a second, WebP in thousandths. size: width of one panel in pixels.
+    progress: called with (pictures drawn, pictures in all). label, others: as in compare_picture.
+
+    Raises: ConfigError when fps is beyond what viewers keep (50, WebP 60), every is below 1, or others hold other
+    particles.
+    """
+    webp = Path(path).suffix == ".webp"
+    fastest = 60 if webp else 50
+    if not every >= 1:
+        raise ConfigError(f"every must be at least 1, got {every}")
+    rate = rollout.frame_rate_hz / every if fps is None else fps
+    if not 0 < rate <= fastest:
+        remedy = f"take every >= {math.ceil(rollout.frame_rate_hz / fastest)}" if fps is None else "choose another fps"
+        kind = "WebP" if webp else "GIF"
+        raise ConfigError(f"fps must be in (0, {fastest}], which {kind} viewers keep, got {rate:g}; {remedy}")
+    frames = range(0, rollout.frame_count, every)
+    stage = _stage(rollout, size)
+    versions = _versions(rollout, label, others)
+
+    def drawn() -> Iterator[Image.Image]:
+        for done, frame in enumerate(frames, start=1):
+            yield _animation_picture(stage, rollout, versions, frame, size)
+            if progress is not None:
+                progress(done, len(frames))
+
+    buffer = io.BytesIO()
+    if webp:
+        first, *later = drawn()
+        duration = round(1000 / rate)
+        first.save(
+            buffer,
+            "WEBP",
+            save_all=True,
+            append_images=later,
+            duration=duration,
+            loop=0,
+            quality=WEBP_QUALITY,
+            method=3,
+        )
+    else:
+        some = [_animation_picture(stage, rollout, versions, frames[i], size) for i in spread(len(frames), 6)]
+        pictures = map(_Palette(some).apply, drawn())
+        duration = 10 * round(100 / rate)
+        next(pictures).save(
+            buffer,
+            "GIF",
+            save_all=True,
+            append_images=pictures,
+            duration=duration,
+            loop=0,
+            disposal=1,
+            optimize=False,
+        )
+    write_picture(path, buffer.getvalue())
+
+
+def error_curve(
+    error_T: Mapping[str, np.ndarray], frame_rate_hz: float, size: tuple[int, int] = (720, 400)
+) -> Image.Image:
+    """Position error over time, one line an entry of `error_T` (as `position_error` gives it), log scale.
+
+    size in pixels.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    shown = False
+    for name, error in error_T.items():
+        seconds = np.arange(len(error)) / frame_rate_hz
+        positive = np.where(error > 0, error, np.nan)  # frame 0 agrees exactly; a log scale has no zero
+        shown |= bool(np.isfinite(positive).any())
+        if name in MATERIALS:
+            color = tuple(MATERIAL_COLORS[MATERIALS.index(name)] * (0.85 if name == "snow" else 1.0))
+            axes.plot(seconds, positive, label=name, color=color, linewidth=1.8)
+        else:
+            axes.plot(seconds, positive, label=name, color="0.2" if name == "all" else None, linewidth=2.2)
+    if shown:
+        axes.set_yscale("log")
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("position MSE (squared domain units)")
+    axes.set_title("summed over axes, mean over particles", fontsize=9, color="0.4")
+    axes.grid(True, which="major", color="0.9")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, ncols=max(1, len(error_T)), loc="lower right")
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy(), "RGB")
+
+
+def position_error(rollout: Rollout) -> dict[str, np.ndarray]:
+    """Position MSE against the ground truth at each frame, float64 [T] in squared domain units.
+
+    Keys: `all`, and each material of the scene where there is more than one. Squares are summed over axes and
+    averaged over particles, up to the shorter of the two.
+
+    Raises: ConfigError when the rollout has no ground truth.
+    """
+    if rollout.reference_TN3 is None:
+        raise ConfigError("reference must be there to measure an error, got a rollout without ground truth")
+    frames = min(len(rollout.position_TN3), len(rollout.reference_TN3))
+    difference = rollout.position_TN3[:frames].astype(np.float64) - rollout.reference_TN3[:frames]
+    square_TN = (difference**2).sum(axis=2)
+    error = {"all": square_TN.mean(axis=1)}
+    present = np.unique(rollout.material_N)
+    if len(present) > 1:
+        error |= {MATERIALS[i]: square_TN[:, rollout.material_N == i].mean(axis=1) for i in present}
+    return error
+
+
+def write_picture(path: str | Path, picture: Image.Image | bytes, source: Mapping[str, object] | None = None) -> None:
+    """Writes a PNG (or the given bytes) whole or not at all; `source` goes into the PNG's Description."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(picture, Image.Image):
+        buffer = io.BytesIO()
+        text = PngImagePlugin.PngInfo()
+        if source is not None:
+            text.add_text("Description", json.dumps(source))
+        picture.save(buffer, format="PNG", pnginfo=text, optimize=True)
+        picture = buffer.getvalue()
+    write_atomically(path, picture)
+
+
+def particle_spacing(position_N3: np.ndarray) -> float:
+    """The distance between neighbours in the bulk, in the unit of the positions.
+
+    The median distance to the third neighbour: exact on a cubic lattice, up to its corners; 11 % low for
+    random points.
+    """
+    position_N3 = position_N3[np.isfinite(position_N3).all(axis=1)]
+    if len(position_N3) < 4:
+        return 1 / 128  # the usual eight particles in a cell of 1/64
+    some = position_N3[:: max(1, len(position_N3) // 2000)]
+    return max(float(np.median(KDTree(position_N3).query(some, k=4)[0][:, 3])), 1e-6)
+
+
+def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None) -> Rollout:
+    """An episode of a data set as a rollout: alone, or as the ground truth of a prediction float32 [T, N, 3].
+
+    The episode's positions stay memory-mapped.
+    """
+    return Rollout(
+        position_TN3=episode.position_TN3 if predicted_TN3 is None else predicted_TN3,
+        material_N=np.asarray(episode.material_N),
+        obstacles=obstacles_of_episode(episode),
+        domain_size=episode.domain_size,
+        frame_rate_hz=episode.frame_rate_hz,
+        gravity=episode.gravity,
+        cell_size=episode.obstacle_grid.cell_size,
+        source={"episode": episode.key, "seed": episode.seed, "specification": episode.specification},
+        reference_TN3=None if predicted_TN3 is None else episode.position_TN3,
+    )
+
+
+def check_frames(frames: Sequence[int], frame_count: int) -> None:
+    """Raises ConfigError unless there is a frame and all lie in [0, frame_count)."""
+    if not len(frames):
+        raise ConfigError("frames must name at least one frame, got []")
+    for i, frame in enumerate(frames):
+        if not 0 <= frame < frame_count:
+            raise ConfigError(f"frames[{i}] must be in [0, {frame_count}), the frames of the rollout, got {frame}")
+
+
+def _stage(rollout: Rollout, size: int) -> Stage:
+    radius = particle_spacing(rollout.position_TN3[0]) * RADIUS_IN_SPACINGS
+    radius = min(radius, 0.03 * min(rollout.domain_size))
+    return Stage(rollout.domain_size, rollout.obstacles, radius, size)
+
+
+def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, material_N: np.ndarray) -> Image.Image:
+    if frame < len(position_TN3):
+        position_N3 = position_TN3[frame]
+        panel = stage.draw(position_N3, material_N)
+        lost = int((~np.isfinite(position_N3)).any(axis=1).sum())
+        note = f"{lost} of {len(position_N3)} particles not finite" if lost else ""
+    else:
+        panel = stage.draw(np.empty((0, 3)), material_N[:0])
+        note = f"ends after {len(position_TN3)} frames"
+    if note:
+        _write(panel, (panel.width / 2, panel.height * 0.42), note, _text_size(panel.width), halo=3)
+    return panel
+
+
+def _versions(rollout: Rollout, label: str, others: Mapping[str, np.ndarray]) -> list[tuple[str, np.ndarray]]:
+    """Names and positions of what is drawn side by side; an episode that stands alone needs no name."""
+    for name, position_TN3 in others.items():
+        if position_TN3.shape[1:] != rollout.position_TN3.shape[1:]:
+            raise ConfigError(
+                f"{name} must hold the same {rollout.position_TN3.shape[1]} particles, got {position_TN3.shape[1]}"
+            )
+    predicted = "weights" in rollout.source or rollout.reference_TN3 is not None or len(others) > 0
+    truth = [] if rollout.reference_TN3 is None else [("ground truth", rollout.reference_TN3)]
+    return [(label if predicted else "", rollout.position_TN3), *others.items(), *truth]
+
+
+def _animation_picture(
+    stage: Stage, rollout: Rollout, versions: Sequence[tuple[str, np.ndarray]], frame: int, size: int
+) -> Image.Image:
+    width, height = stage.size
+    gap, header, text = size // 30, _header_height(size), _text_size(size)
+    picture = Image.new("RGB", (len(versions) * (width + gap) - gap, height + 2 * header), _background())
+    for column, (label, position_TN3) in enumerate(versions):
+        x = column * (width + gap)
+        picture.paste(_panel(stage, position_TN3, frame, rollout.material_N), (x, header))
+        _write(picture, (x + width / 2, header / 2), label, 6 * text // 5, bold=True)
+    seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
+    if len(versions) == 1:  # whose legend is as wide as the picture
+        _write(picture, (width - gap, header / 2), seconds, text, anchor="rm")
+    else:
+        _write(picture, (gap, picture.height - header / 2), seconds, text, anchor="lm")
+    _legend(picture, picture.height - header / 2, rollout, text)
+    return picture
+
+
+class _Palette:
+    """The 256 colours of an animation.
+
+    Flat colours and ramps of the materials are taken exactly; the rest is chosen by median cut, half of the
+    samples from where the pictures differ, so that few particles on a large floor still get their share.
+    """
+
+    def __init__(self, pictures: Sequence[Image.Image]) -> None:
+        stack = np.stack([np.asarray(picture) for picture in pictures])
+        moving = stack[:, (stack != stack[0]).any(axis=(0, 3))].reshape(-1, 3)
+        samples = [
+            pixels[np.linspace(0, len(pixels) - 1, PALETTE_SAMPLES).astype(np.int64)]
+            for pixels in (stack[0].reshape(-1, 3), moving)
+            if len(pixels)
+        ]
+        ramp = np.linspace(0.3, 1.0, 12)[:, None, None] * MATERIAL_COLORS
+        flat = to_bytes(np.concatenate((BACKGROUND_COLOR[None], OBSTACLE_COLOR[None], ramp.reshape(-1, 3))))
+        room = 255 - len(flat)
+        chosen = Image.fromarray(np.concatenate(samples)[None], "RGB").quantize(room).getpalette() or []
+        exact = np.concatenate((flat, [TEXT_COLOR])).astype(np.uint8)
+        self.colors = np.concatenate((exact, np.reshape(chosen, (-1, 3))[:room].astype(np.uint8)))
+        # nearest colour for the upper six bits of each channel; Pillow's own search is coarser
+        center = np.stack(np.meshgrid(*[np.arange(64) * 4 + 1.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        self.nearest = KDTree(self.colors.astype(np.float64)).query(center)[1].astype(np.uint8)
+        self.nearest[_upper_bits(exact)] = np.arange(len(exact))
+
+    def apply(self, picture: Image.Image) -> Image.Image:
+        """The picture in these colours, mode P."""
+        result = Image.fromarray(self.nearest[_upper_bits(np.asarray(picture))], "P")
+        result.putpalette(self.colors.tobytes())
+        return result
+
+
+def _upper_bits(color: np.ndarray) -> np.ndarray:
+    """The upper six bits of the three channels, as one number."""
+    bits = color.astype(np.int32) >> 2
+    return (bits[..., 0] << 12) | (bits[..., 1] << 6) | bits[..., 2]
+
+
+def spread(count: int, wanted: int) -> list[int]:
+    """At most `wanted` of `count` indices, the first and the last among them, evenly spread."""
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, wanted))})
+
+
+def _legend(picture: Image.Image, y: float, rollout: Rollout, text_size: int) -> None:
+    """Swatches of what is in the scene, in the middle of the line at height y."""
+    entries: list[tuple[str, np.ndarray]] = [(MATERIALS[i], MATERIAL_COLORS[i]) for i in np.unique(rollout.material_N)]
+    if rollout.obstacles:
+        entries.append(("obstacle", OBSTACLE_COLOR))
+    font = _font(text_size)
+    dot, space = 0.8 * text_size, 1.6 * text_size
+    widths = [dot + 0.5 * text_size + font.getlength(name) for name, _ in entries]
+    x = (picture.width - sum(widths) - space * (len(entries) - 1)) / 2
+    for (name, color), width in zip(entries, widths, strict=True):
+        swatch = Image.new("L", (4 * math.ceil(dot),) * 2, 0)
+        box = (0, 0, swatch.width - 1, swatch.height - 1)
+        if name == "obstacle":
+            ImageDraw.Draw(swatch).rectangle(box, fill=255)
+        else:
+            ImageDraw.Draw(swatch).ellipse(box, fill=255)
+        swatch = swatch.reduce(4)
+        place = (round(x), round(y - swatch.height / 2))
+        picture.paste(
+            tuple(to_bytes(color).tolist()), (*place, place[0] + swatch.width, place[1] + swatch.height), swatch
+        )
+        _write(picture, (x + dot + 0.5 * text_size, y), name, text_size, anchor="lm")
+        x += width + space
+
+
+def _write(
+    picture: Image.Image,
+    place: tuple[float, float],
+    text: str,
+    size: int,
+    anchor: str = "mm",
+    bold: bool = False,
+    halo: int = 0,
+) -> None:
+    """halo: pixels of background around the letters, for text over obstacles."""
+    ImageDraw.Draw(picture).text(
+        place,
+        text,
+        font=_font(size, bold),
+        fill=TEXT_COLOR,
+        anchor=anchor,
+        stroke_width=halo,
+        stroke_fill=_background() if halo else None,
+    )
+
+
+@functools.cache
+def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which comes with matplotlib."""
+    import matplotlib
+
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
+
+
+def _text_size(panel_size: int) -> int:
+    return max(9, panel_size // 23)
+
+
+def _header_height(panel_size: int) -> int:
+    return 2 * _text_size(panel_size)
+
+
+def _background() -> Color:
+    red, green, blue = to_bytes(BACKGROUND_COLOR).tolist()
+    return red, green, blue

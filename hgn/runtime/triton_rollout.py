@@ -1,0 +1,375 @@
+"""The simulation loop as one CUDA graph a frame (paper algorithm 1): no host synchronisation between looks.
+
+The host looks every `look_frames` frames, while the device is at the next ones. Where the grid needed more room than it
+had, the frames before are kept, the buffers grow, and the simulation goes on from the last good frame: nothing is lost,
+and nothing is done twice.
+Shape legend: N particles of all scenes, S scenes, T frames.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hgn.kernels.buffers import OUT
+from hgn.kernels.capture import captured
+from hgn.kernels.forward import FusedNetwork, feature_columns
+from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
+from hgn.kernels.packing import pack_network
+from hgn.kernels.rollout.kernel import DIVERGED, advance, integrate
+from hgn.network.features import ParticleState
+from hgn.network.grid import build_hierarchy
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.backend import kernel_precision
+from hgn.runtime.divergence import lost
+from hgn.runtime.parity import OUTPUT_BOUND, relative_error
+from hgn.schema import ConfigError
+
+LOOK_FRAMES, FEWEST_FRAMES = 32, 4
+PATH_BYTES = 1 << 27  # of positions on their way to the host: fewer frames where there are many particles
+GROWTH = 2.0  # room for so many times the cells
+# The same where there are more than ROOMY_CELLS of them: at first, and for what was needed when there was too little.
+TIGHT_START, TIGHT_GROWTH = 1.25, 1.5
+HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie spread need up to six times as many,
+SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # so many a particle at most, on each level; coarser ones as the last
+ROOMY_CELLS = 65_536  # of the finest level, up to which there is such headroom: beyond, memory counts
+CHECKED_PARTICLES = 50_000  # at most; the plain network needs memory
+INTEGRATE_BLOCK = 64  # particles
+
+
+class LeftDomainError(RuntimeError):
+    """Particles are no longer finite, or farther from the domain than its own size."""
+
+    def __init__(self, frame: int, lost: int) -> None:
+        super().__init__(f"{lost} particles at frame {frame}")
+        self.frame, self.lost = frame, lost
+
+
+def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
+    """Room on each level for a scene that begins with so many cells: few simulations need more later."""
+    found = []
+    for level, count in enumerate(cells):
+        spread = SPREAD_CELLS[min(level, len(SPREAD_CELLS) - 1)] * particles
+        roomy = min(HEADROOM * count, spread, ROOMY_CELLS >> 2 * level)
+        found.append(max(256 >> level, _room(count, level, TIGHT_START), int(roomy)))
+    return tuple(found)
+
+
+def _room(count: int, level: int, tight: float) -> int:
+    """GROWTH times the count, and less where that is more than for ROOMY_CELLS: at least `tight` times."""
+    return max(int(tight * count), int(GROWTH * min(count, ROOMY_CELLS >> 2 * level)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Frames on their way: how many, where the first goes, and frame and status behind the last."""
+
+    frames: int
+    first: int
+    seen: torch.Tensor  # int32 [2], on the host once `end` has come
+    end: torch.cuda.Event | None
+
+
+@functools.cache
+def _copy_stream(device: int) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device)
+
+
+class TritonRollout:
+    """A simulation in progress on one device. Without CUDA the same launches run one by one (for tests)."""
+
+    def __init__(
+        self,
+        network: HierarchicalGraphNetwork,
+        state: ParticleState,
+        precision: str,
+        capacities: tuple[int, ...] | None = None,
+        room: int = 0,
+        obstacles: ObstacleTable | None = None,
+    ) -> None:
+        """`precision` is highest, high or half; `capacities` are cells of each level to begin with.
+
+        `room` is for particles of states that `begin` brings later. `obstacles` replace those of the state.
+        """
+        self.config, self.device = network.config, state.position_N3.device
+        self.precision = kernel_precision(precision, self.device)
+        self.packed = pack_network(network)
+        self.values = self.packed.gather(list(network.parameters()))
+        self.particles = max(room, len(state.position_N3))
+        self.scenes = state.scene_count
+
+        def integers(value: int) -> torch.Tensor:
+            return torch.full((1,), value, dtype=torch.int32, device=self.device)
+
+        self.count, self.lost, self.frame = integers(0), integers(0), integers(0)
+        self.position_N3 = torch.zeros(self.particles, 3, device=self.device)
+        self.velocity_NV = torch.zeros(self.particles, 3 * self.config.velocity_history, device=self.device)
+        self.scene_N = torch.zeros(self.particles, dtype=torch.int32, device=self.device)
+        self.material_N = torch.zeros(self.particles, dtype=torch.int32, device=self.device)
+        self.domain_S3 = torch.zeros(self.scenes, 3, device=self.device)
+        self.origin_S3 = torch.zeros_like(self.domain_S3)
+        self.obstacles = obstacles
+        if obstacles is None and state.obstacles is not None:
+            self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
+        affordable = PATH_BYTES // (2 * 3 * 4 * max(1, self.particles))
+        self.look_frames = max(FEWEST_FRAMES, min(LOOK_FRAMES, affordable))
+        self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
+        self.overlap = self.device.type == "cuda"  # frames are started before those before them are taken away
+        normaliser = network.normaliser
+        self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
+        self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
+        self.frames_done = 0
+        self.growths = 0
+        self._fill(state)
+        self._build(capacities or self._first_capacities())
+
+    def fits(self, state: ParticleState) -> bool:
+        """Whether `begin` can go on with a state: as many scenes, in such domains, and not too many particles."""
+        if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
+            return False
+        seen, known = state.obstacles, self.obstacles
+        same = seen is known is None or (seen is not None and known is not None and seen.cell_size == known.cell_size)
+        return same and torch.equal(state.domain_S3, self.domain_S3)
+
+    def begin(self, state: ParticleState, new_obstacles: bool = False) -> None:
+        """Goes on with another state that `fits`.
+
+        Obstacles are those of the rows of `self.obstacles`, which the caller may write, or those of the state.
+        """
+        if new_obstacles and state.obstacles is not None:
+            assert self.obstacles is not None
+            self.obstacles.take(ObstacleTable.of(state.obstacles, state.scene_count))
+        self._fill(state)
+        self.frames_done = 0
+        self.lost.zero_()
+        self.grid.status.zero_()
+
+    def _fill(self, state: ParticleState) -> None:
+        count = self.live = len(state.position_N3)
+        assert count <= self.particles and state.scene_count == self.scenes
+        self.count.fill_(count)
+        self.position_N3[:count].copy_(state.position_N3)
+        self.velocity_NV[:count].copy_(state.velocity_NM3.flatten(1))
+        self.scene_N[:count].copy_(state.scene_N)
+        self.material_N[:count].copy_(state.material_N)
+        self.domain_S3.copy_(state.domain_S3)
+
+    def use_values(self, values: torch.Tensor) -> None:
+        """Takes over parameters in the packed layout."""
+        self.values.copy_(values)
+        self.engine.refresh()
+
+    def _first_capacities(self) -> tuple[int, ...]:
+        position_N3, scene_N = self.position_N3[: self.live], self.scene_N[: self.live].long()
+        grid = build_hierarchy(position_N3, scene_N, self.origin_S3, self.config.cell_size, self.config.levels)
+        return first_capacities([level.cell_count for level in grid.levels], self.live)
+
+    def _window(self) -> Window:
+        position_N3 = self.position_N3[: self.live]
+        box = torch.stack([position_N3.amin(0), position_N3.amax(0)]).cpu()
+        size = self.domain_S3.amax(0).cpu()
+        lower, upper = torch.minimum(box[0], torch.zeros(3)), torch.maximum(box[1], size)
+        config = self.config
+        return Window.around(lower.tolist(), upper.tolist(), config.cell_size, config.levels)
+
+    def _build(self, capacities: tuple[int, ...]) -> None:
+        config, window = self.config, self._window()
+        self.graph = None
+        # never more than the window or the particles' corners can hold
+        limits = [self.scenes * math.prod(n >> i for n in window.cells) for i in range(config.levels)]
+        limits = [min(limit, 8 * self.particles) for limit in limits]
+        rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
+        self.grid = DeviceGrid(
+            window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size, self.device
+        )
+        self.engine = FusedNetwork(config, self.packed, self.values, self.grid, self.count, self.precision)
+        if self.device.type == "cuda":
+            self.graph = self._capture()
+
+    def _capture(self) -> torch.cuda.CUDAGraph:
+        return captured([self.frame_launches], self._warm_up)[0]
+
+    def _warm_up(self) -> None:
+        """Compiles the kernels without moving anything: a status that is not zero stops the integration."""
+        self._network_pass()
+        self.grid.status.fill_(OVERFLOW)
+        self._integrate()
+        self.grid.status.zero_()
+
+    def require_agreement(self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "path") -> None:
+        """Compares the first output with the plain network's, as all kernels still stand at the start: `state` is that
+        of the start, or its first scenes.
+
+        Both round; kernels that are wrong differ by far more. Raises: ConfigError.
+        """
+        if self.graph is None:
+            self._network_pass()
+        found_N3 = self.engine.output[: len(state.position_N3), :3]
+        with torch.no_grad():
+            error = relative_error(found_N3, network.normalised_acceleration(state))
+        if not error <= OUTPUT_BOUND:  # NaN fails
+            raise ConfigError(
+                f"{field} must be plain on this machine, got fast: its output differs by {error:.1e} "
+                f"from the plain network's (at most {OUTPUT_BOUND}); set {field}=plain, and report device and versions"
+            )
+
+    def frame_launches(self) -> None:
+        """All launches of one frame: what the graph holds."""
+        self._network_pass()
+        self._integrate()
+
+    def _network_pass(self) -> None:
+        config, grid = self.config, self.grid
+        grid.build(self.position_N3, self.scene_N, self.origin_S3, self.count)
+        grid.prepare(
+            self.position_N3,
+            self.velocity_NV,
+            self.scene_N,
+            self.material_N,
+            self.origin_S3,
+            self.domain_S3,
+            self.count,
+            self.velocity_mean,
+            self.velocity_std,
+            self.obstacles,
+            config.velocity_history,
+            config.obstacle_features,
+            config.wall_distance_cells * config.cell_size,
+        )
+        self.engine.forward()
+
+    def _integrate(self) -> None:
+        integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
+            self.engine.output,
+            self.position_N3,
+            self.velocity_NV,
+            self.scene_N,
+            self.domain_S3,
+            self.mean,
+            self.std,
+            self.count,
+            self.grid.status,
+            self.lost,
+            self.frame,
+            self.path_TN3,
+            OUT=OUT,
+            HISTORY=self.config.velocity_history,
+            COLUMNS=1 << (3 * self.config.velocity_history - 1).bit_length(),
+            BLOCK=INTEGRATE_BLOCK,
+        )
+        advance[(1,)](self.grid.status, self.lost, self.frame)
+
+    def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:
+        """Simulates `frames` more frames; their positions, float32 [frames, N, 3].
+
+        Raises: LeftDomainError, with the number of the frame.
+        """
+        kept = np.empty((frames, self.live, 3), np.float32)
+        done, half = 0, 0
+        ahead: _Look | None = None
+        while done < frames:
+            look = ahead or self._launch(min(self.look_frames, frames - done), half)
+            rest, half = frames - done - look.frames, 1 - half
+            # The device goes on while the host takes frames away; where something is amiss it stands still instead.
+            ahead = self._launch(min(self.look_frames, rest), half) if self.overlap and rest else None
+            path_TN3, status = self._settle(look)
+            taken = len(path_TN3)
+            kept[done : done + taken] = self._taken_away(path_TN3)
+            if on_frame is not None:
+                for frame in range(done, done + taken):
+                    on_frame(self.frames_done - taken + frame - done + 1)
+            done += taken
+            if status and ahead is not None:
+                self._settle(ahead)  # in vain, and over before its buffers go
+                ahead = None
+            if status & DIVERGED.value:
+                raise LeftDomainError(self.frames_done, self._lost())
+            self.make_room(status)
+        return kept
+
+    def frames(self) -> Iterator[np.ndarray]:
+        """Positions float32 [N, 3] of frame after frame, without an end, computed `look_frames` at a time.
+
+        Raises: LeftDomainError, behind the last frame before it.
+        """
+        while True:
+            path_TN3, status = self.look(self.look_frames)
+            diverged = bool(status & DIVERGED.value)  # in the last of them
+            yield from path_TN3[: len(path_TN3) - diverged].to("cpu", copy=True).numpy()
+            if diverged:
+                raise LeftDomainError(self.frames_done, self._lost())
+            self.make_room(status)
+
+    def look(self, frames: int) -> tuple[torch.Tensor, int]:
+        """Simulates up to `frames` more frames: those taken, at most `look_frames` of them, and the status after them.
+
+        They are a view of what the next call writes to. Where the status is not zero, it must be dealt with first.
+        """
+        return self._settle(self._launch(min(self.look_frames, frames), 0))
+
+    def _launch(self, frames: int, half: int) -> _Look:
+        """Starts some frames, whose positions go into one half of the path."""
+        first = half * self.look_frames
+        self.frame.fill_(first)
+        for _ in range(frames):
+            if self.graph is None:
+                self.frame_launches()
+            else:
+                self.graph.replay()
+        seen = torch.cat([self.frame, self.grid.status])
+        if self.device.type != "cuda":
+            return _Look(frames, first, seen, None)
+        seen = torch.empty(2, dtype=seen.dtype, pin_memory=True).copy_(seen, non_blocking=True)
+        end = torch.cuda.Event()
+        end.record()
+        return _Look(frames, first, seen, end)
+
+    def _settle(self, look: _Look) -> tuple[torch.Tensor, int]:
+        """Waits for frames that were started: those taken, and the status after them."""
+        if look.end is not None:
+            look.end.synchronize()
+        last, status = look.seen.tolist()
+        taken = last - look.first
+        self.frames_done += taken
+        start = 3 * look.first * self.live
+        return self.path_TN3.view(-1)[start : start + 3 * taken * self.live].view(taken, self.live, 3), status
+
+    def _taken_away(self, path_TN3: torch.Tensor) -> np.ndarray:
+        """Frames that are settled, on the host: copied beside whatever the device is at."""
+        if self.device.type != "cuda":
+            return path_TN3.numpy()
+        with torch.cuda.stream(_copy_stream(torch.cuda.current_device())):
+            host_TN3 = torch.empty(path_TN3.shape, pin_memory=True).copy_(path_TN3, non_blocking=True)
+            torch.cuda.current_stream().synchronize()
+        return host_TN3.numpy()
+
+    def make_room(self, status: int) -> None:
+        """Grows the buffers where the status says that they were too small."""
+        if status & (OVERFLOW | OUT_OF_WINDOW):
+            self._grow()
+
+    def _lost(self) -> int:
+        position_N3, domain_N3 = self.position_N3[: self.live], self.domain_S3[self.scene_N[: self.live].long()]
+        return int(lost(position_N3, domain_N3).sum())
+
+    def _grow(self) -> None:
+        # all levels: those that still had room are as full, and would have the same captured again soon
+        before, needed = self.grid.capacities, self.grid.needed_L.tolist()
+        pairs = zip(before, needed, strict=True)
+        capacities = tuple(max(c, _room(n, i, TIGHT_GROWTH)) for i, (c, n) in enumerate(pairs))
+        self.growths += 1
+        # Particles are kept elsewhere: what there is goes first, so that there is never room for both.
+        self.graph = None
+        del self.engine, self.grid
+        try:
+            self._build(capacities)
+            return
+        except torch.OutOfMemoryError as error:
+            reason = str(error)  # the error itself keeps what was allocated so far
+        self._build(before)
+        raise torch.OutOfMemoryError(reason)

@@ -1,0 +1,84 @@
+"""Where a file or a figure comes from: versions, commit, date, machine."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+PACKAGES = ("torch", "triton", "lightning", "taichi", "numpy")
+# /a/b/c, but no URL's path
+_ABSOLUTE_PATH = re.compile(r"(?<![\w.:/~-])/(?:[^/\s,='\"\[\](){}]+/)*([^/\s,='\"\[\](){}]+)/?")
+
+
+def commit() -> str:
+    """The checkout's commit, with `+changes` where files differ from it; HGN_COMMIT where it is set, for copies
+    without their history; else `unknown`.
+    """
+    return os.environ.get("HGN_COMMIT") or commit_of(Path(__file__).resolve().parents[2])
+
+
+def commit_of(folder: Path) -> str:
+    """The commit of the checkout in `folder`, with `+changes` where files differ from it; `unknown` if it is none."""
+    if not (folder / ".git").exists():
+        return "unknown"
+    try:
+        revision = _git(folder, "rev-parse", "--short=12", "HEAD")
+        changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return revision + ("+changes" if changed else "")
+
+
+def device_name(device: torch.device | str) -> str:
+    """The GPU's name, or the processor's kind and the number of threads."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU {platform.machine()}, {torch.get_num_threads()} threads"
+
+
+def provenance(device: torch.device | str = "cpu") -> dict[str, Any]:
+    """{"device", "versions", "commit", "date", "command"}, ready for JSON."""
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return {
+        "device": device_name(device),
+        "versions": versions,
+        "commit": commit(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": command_line(),
+    }
+
+
+def command_line() -> str:
+    """How this process was started, without the folders that are this machine's."""
+    return shlex.join(without_folders(sys.orig_argv))
+
+
+def without_folders(value: Any) -> Any:
+    """Plain containers with the last part alone of each absolute path in their texts: folders are a machine's own."""
+    if isinstance(value, str):
+        return _ABSOLUTE_PATH.sub(r"\1", value)
+    if isinstance(value, dict):
+        return {key: without_folders(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_folders(item) for item in value]
+    return value
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    result = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
+    return result.stdout.strip()

@@ -1,0 +1,111 @@
+"""Whether the fast path's kernels, as compiled for this machine, compute what the plain network computes.
+
+Compared on the first update's own batch, before anything is trained: outputs, and the gradients of a random weighting
+of them. Both paths round, and rounding turns the activations next to their kink, so the bounds are wide; kernels that
+are wrong miss them by far. Shape legend: N particles of all scenes, S scenes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+
+from hgn.data.episode_tensors import EpisodeTensors
+from hgn.kernels.update.op import Updates
+from hgn.network.base import ParticleNetwork
+from hgn.network.cell_keys import pack
+from hgn.network.features import ParticleState
+from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.gns_edges import PlainEdges
+from hgn.network.obstacles import ObstacleCells
+from hgn.runtime.parity import GRADIENT_BOUND, OUTPUT_BOUND, relative_error
+from hgn.scene.symmetry import Symmetry
+from hgn.schema import ConfigError
+from hgn.training.symmetry import obstacles_under
+
+CHECKED_PARTICLES = {"hgn": 200_000, "gns": 40_000}  # at most; the plain network needs memory
+
+
+def require_agreement(
+    updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None = None
+) -> tuple[float, float]:
+    """Relative errors of outputs and of all gradients on the batch that `updates` holds, of these episodes' images.
+
+    Too large a batch is not checked: NaN. Raises: ConfigError when one of them exceeds its bound.
+    """
+    network, engine, count = updates.network, updates.engine, int(updates.particle_count)
+    if count > CHECKED_PARTICLES.get(network.config.kind, 0):
+        return math.nan, math.nan
+    state, origin_S3 = _state(updates, episodes, symmetries, count)
+    generator = torch.Generator().manual_seed(0)
+    weight_N3 = torch.randn(count, 3, generator=generator).to(updates.device) * updates.share_N[:count, None]
+    parameters = list(network.parameters())
+    with _plain(network):
+        output_N3 = network.normalised_acceleration(state, origin_S3)
+        expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
+    output_error = relative_error(engine.output[:count, :3], output_N3.detach())
+    engine.output_gradient[:count].zero_()
+    engine.output_gradient[:count, :3] = weight_N3 / engine.unscale
+    engine.backward()
+    found = [torch.zeros_like(parameter) for parameter in parameters]
+    updates.packed.scatter(engine.totals[: updates.packed.size], found)
+    gradient_error = relative_error(
+        torch.cat([tensor.flatten() for tensor in found]),
+        torch.cat(
+            [(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, expected, strict=True)]
+        ),
+    )
+    if not (output_error <= OUTPUT_BOUND and gradient_error <= GRADIENT_BOUND):  # NaN fails
+        raise ConfigError(
+            f"training.path must be plain on this machine, got fast: its outputs differ by {output_error:.1e} from the "
+            f"plain network's (at most {OUTPUT_BOUND}), its gradients by {gradient_error:.1e} (at most "
+            f"{GRADIENT_BOUND}); set training.path=plain, and report device and versions"
+        )
+    if updates.device.type == "cuda":
+        del output_N3, expected
+        torch.cuda.empty_cache()  # what is free decides where episodes are kept
+    return output_error, gradient_error
+
+
+@contextmanager
+def _plain(network: ParticleNetwork) -> Iterator[None]:
+    """A GNS without kernels: in blocks of edges, for autograd keeps ten times as much."""
+    if not isinstance(network, GraphNetworkSimulator):
+        yield
+        return
+    before, network.edges = network.edges, PlainEdges()
+    try:
+        yield
+    finally:
+        network.edges = before
+
+
+def _state(
+    updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None, count: int
+) -> tuple[ParticleState, torch.Tensor]:
+    """The batch as the plain network reads it, noise and jitter included."""
+    config = updates.config
+    keys, normals = [], []
+    for scene, episode in enumerate(episodes):
+        cells = episode.obstacle_cell_K3.long()
+        keys.append(pack(torch.full((len(cells),), scene), cells))
+        normals.append(episode.obstacle_normal_K3)
+    obstacles = None
+    if config.obstacle_features and any(len(key) for key in keys):
+        cell_size = updates.settings.obstacle_cell_size
+        obstacles = ObstacleCells(torch.cat(keys), torch.cat(normals), cell_size)
+        if symmetries is not None:
+            obstacles = obstacles_under(obstacles, symmetries)
+        obstacles = obstacles.to(updates.device)
+    state = ParticleState(
+        updates.position_N3[:count],
+        updates.velocity_NV[:count].view(count, config.velocity_history, 3),
+        updates.material_N[:count].long(),
+        updates.scene_N[:count].long(),
+        updates.domain_S3,
+        obstacles,
+    )
+    return state, updates.origin_S3

@@ -1,0 +1,42 @@
+"""What a training's kernels are compiled for ahead, while the first episodes are made."""
+
+from __future__ import annotations
+
+from hgn.config import SceneConfig, TrainConfig
+from hgn.kernels.precompile import PrecompileJob
+from hgn.kernels.update.op import UpdateSettings
+from hgn.runtime.backend import KERNEL_PRECISION
+
+NEIGHBOURS = 100  # of a particle of GNS, about
+
+
+def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ranks: bool) -> PrecompileJob:
+    """What a training on such a GPU will compile; sizes follow from the scenes' distribution."""
+    training, network = config.training, config.network
+    particles, cells = _sizes(config.scene, network.levels)
+    if network.kind == "gns":
+        cells = [NEIGHBOURS * particles]
+    own = [training.rollout_scenes] if training.rollout_share > 0 else []
+    monitored = network.kind == "hgn" and training.monitor_rollout_frames >= 2
+    return PrecompileJob(
+        network,
+        UpdateSettings.of(training, config.scene.cell_size),
+        KERNEL_PRECISION[training.precision],
+        several_ranks,
+        training.ema_decay > 0,
+        training.batch_scenes * particles,
+        tuple(training.batch_scenes * count for count in cells),
+        10 * capability[0] + capability[1],
+        tuple(own + ([training.monitor_scenes] if monitored else [])),
+    )
+
+
+def _sizes(scene: SceneConfig, levels: int) -> tuple[int, list[int]]:
+    """Particles and cells of each level of a scene as it begins, its groups being cubes."""
+    edge = scene.group_size / scene.cell_size
+    particles = scene.group_count * scene.particles_per_cell * edge**3
+    cells, length = [], edge + 2  # cells beside a particle's are active too
+    for _ in range(levels):
+        cells.append(max(1, round(scene.group_count * length**3)))
+        length = (length + 1) / 2
+    return max(1, round(particles)), cells

@@ -1,0 +1,186 @@
+"""Training on the network's own states: it simulates, and learns to return from where that leads to the truth.
+
+The pushforward idea of Brandstetter et al. 2022, collected like DAgger (Ross et al. 2011). Every `rollout_every`
+updates the weights of now (their moving average where there is one) simulate `rollout_scenes` scenes, each from a
+random true frame on, and each simulated frame becomes a window; a share of the samples is taken from these until the
+next time. Noise shows a network errors that are drawn; its own are biased, and common to a body. Everything is drawn
+from seed, update and rank. The pool is not part of a checkpoint: a training that goes on makes a new one, which is the
+old one where the checkpoint lies at a multiple of `rollout_every`.
+Shape legend: H velocity history, F simulated frames, W = H + 2 frames of a window, N particles, S scenes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from hgn.config import TrainingConfig
+from hgn.data.batch import Batch, make_batch
+from hgn.data.rest_noise import asked_acceleration, noise_at_rest
+from hgn.network.base import ParticleNetwork
+from hgn.runtime.divergence import lost
+from hgn.runtime.simulator import Simulator
+from hgn.scene.episode import Episode
+from hgn.scene.history import window
+from hgn.schema import ConfigError
+
+START_STREAM, ENTRY_STREAM = 0x57A7, 0xE217
+# finest cells; farther from the truth (rms over a scene) its motion is no answer any more, and the loss would be made
+# of such frames alone: they are dropped, and with an untrained network most are
+DROPPED_BEYOND = 0.5
+PULLED_WITHIN = 1.0  # finest cells on an axis; no particle is pulled as if it were farther away
+
+
+def drawn_starts(
+    training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]
+) -> tuple[tuple[int, int], ...]:
+    """Episode and frame that each simulation before `update` starts from, of episodes of so many frames.
+
+    Every episode once before one comes twice; the truth is known for one frame longer than is simulated.
+    Raises: ConfigError when all episodes are too short.
+    """
+    last = {i: count - 2 - training.rollout_frames for i, count in enumerate(frame_counts)}
+    long_enough = [i for i, frame in last.items() if frame >= 0]
+    if not long_enough:
+        raise ConfigError(
+            f"training.rollout_frames must be at most the frames of an episode - 2, got {training.rollout_frames} "
+            f"where episodes have up to {max(frame_counts, default=0)} frames; set it lower"
+        )
+    generator = np.random.default_rng([training.seed, START_STREAM, update, rank])
+    drawn: list[int] = []
+    while len(drawn) < training.rollout_scenes:
+        drawn += generator.permutation(long_enough).tolist()
+    return tuple((i, int(generator.integers(last[i] + 1))) for i in drawn[: training.rollout_scenes])
+
+
+def drawn_entries(training: TrainingConfig, update: int, rank: int, pool: int) -> list[int]:
+    """Which of `pool` windows the first samples of an update are replaced by: `rollout_share` of them on average."""
+    if pool == 0:
+        return []
+    generator = np.random.default_rng([training.seed, ENTRY_STREAM, update, rank])
+    count = int(training.rollout_share * training.batch_scenes + generator.random())
+    return [int(place * pool) for place in generator.random(count)]
+
+
+def own_windows(true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, pull: float, cell_size: float) -> torch.Tensor:
+    """The windows of one scene's simulation, [F, W, N, 3].
+
+    true_TN3 holds the frames n - H to n + F + 1 of the truth, simulated_FN3 the frames n + 1 to n + F. The answer after
+    frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k): the network undoes its velocity error, and a share of
+    its position error, which brings back what has crossed a wall.
+    """
+    frames = len(simulated_FN3)
+    history = len(true_TN3) - frames - 2
+    positions_TN3 = torch.cat([true_TN3[: history + 1], simulated_FN3])
+    question = positions_TN3.unfold(0, history + 1, 1)[1:].permute(0, 3, 1, 2)
+    now_FN3, next_FN3 = true_TN3[history + 1 : -1], true_TN3[history + 2 :]
+    limit = PULLED_WITHIN * cell_size
+    answer = simulated_FN3 + (next_FN3 - now_FN3) + pull * (now_FN3 - simulated_FN3).clamp(-limit, limit)
+    return torch.cat([question, answer[:, None]], dim=1)
+
+
+def frames_kept(
+    true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, cell_size: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """How many frames from the first on can be trained on, and the mean squared distance from the truth in the last of
+    them, both [] on the device.
+    """
+    now_FN3 = true_TN3[len(true_TN3) - len(simulated_FN3) - 1 : -1]
+    square_F = (simulated_FN3 - now_FN3).square().sum(-1).mean(-1)
+    good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~lost(simulated_FN3, domain_3).any(-1)  # NaN is not
+    count = good_F.int().cumprod(0).sum()
+    return count, square_F[(count - 1).clamp(min=0)]
+
+
+def lost_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: torch.Tensor) -> torch.Tensor:
+    """Whether each particle belongs to a scene that has lost one, bool [N]."""
+    scene_N = scene_N.long()
+    lost_S = torch.zeros(len(domain_S3), device=position_N3.device)
+    lost_S.index_add_(0, scene_N, lost(position_N3, domain_S3[scene_N]).float())
+    return lost_S[scene_N] > 0
+
+
+class PushforwardPool:
+    """The pool on the plain path, which serves every network."""
+
+    def __init__(self, network: ParticleNetwork, training: TrainingConfig, frame_rate_hz: float, rank: int) -> None:
+        """`network` simulates."""
+        self.network, self.training, self.rank = network, training, rank
+        self._simulator = Simulator(network, frame_rate_hz)
+        self._entries: list[tuple[Episode, int, np.ndarray, float]] = []  # with the acceleration that is asked for
+        self.figures: dict[str, float] = {}
+
+    def refresh(self, starts: Sequence[tuple[Episode, int]]) -> None:
+        """Simulates from these frames, and makes the pool of that."""
+        begun = time.monotonic()
+        self._entries = []
+        squares = []
+        for group in self._groups(starts):
+            for (episode, frame), simulated_FN3 in zip(group, self._simulate(group), strict=True):
+                squares += self._take(episode, frame, simulated_FN3)
+        self.figures = figures_of(self.training, len(self._entries), squares, time.monotonic() - begun)
+
+    def mixed(self, batch: Batch, update: int) -> Batch:
+        """The batch with its share of samples replaced; seeds stay, and with them noise, jitter and symmetry."""
+        chosen = drawn_entries(self.training, update, self.rank, len(self._entries))
+        if not chosen:
+            return batch
+        samples, config = list(batch.samples_S), self.network.config
+        windows = [window(episode, frame, config.velocity_history) for episode, frame in samples]
+        weights, noise = (list(values or (1.0,) * len(samples)) for values in (batch.weight_S, batch.noise_S))
+        for slot, entry in enumerate(chosen):
+            episode, frame, windows[slot], acceleration = self._entries[entry]
+            samples[slot] = episode, frame
+            noise[slot], weights[slot] = noise_at_rest(self.training, acceleration, batch.seeds_S[slot])
+        made = make_batch(samples, config, batch.seeds_S, batch.cursor, weights, windows, noise)
+        return made.to(batch.window_WN3.device)
+
+    def _groups(self, starts: Sequence[tuple[Episode, int]]) -> list[list[tuple[Episode, int]]]:
+        """What fits into memory at once."""
+        groups: list[list[tuple[Episode, int]]] = []
+        room = 0
+        for start in starts:
+            if room <= 0:
+                groups.append([])
+                room = self.training.monitor_particles_per_batch
+            groups[-1].append(start)
+            room -= len(start[0].material_N)
+        return groups
+
+    def _simulate(self, starts: Sequence[tuple[Episode, int]]) -> list[torch.Tensor]:
+        """Positions [F, N, 3] of each scene; of a scene that was lost, whatever came after."""
+        batch = make_batch(starts, self.network.config).to(self._simulator.device)
+        begin = state = batch.state()
+        path = []
+        for _ in range(self.training.rollout_frames):
+            state = self._simulator.step(state)
+            path.append(state.position_N3.cpu().clone())
+            again_N = lost_scenes(state.position_N3, state.scene_N, state.domain_S3)
+            if bool(again_N.any()):
+                position_N3 = torch.where(again_N[:, None], begin.position_N3, state.position_N3)
+                velocity_NM3 = torch.where(again_N[:, None, None], 0.0, state.velocity_NM3)
+                state = replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
+        return list(torch.stack(path).split(list(batch.particles_S), dim=1))
+
+    def _take(self, episode: Episode, frame: int, simulated_FN3: torch.Tensor) -> list[float]:
+        """Adds a scene's windows; its mean squared distance at the end, where it is there until then."""
+        config, frames = self.network.config, len(simulated_FN3)
+        true_TN3 = torch.from_numpy(window(episode, frame, config.velocity_history, frames + 1))
+        kept, square = frames_kept(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), config.cell_size)
+        windows = own_windows(true_TN3, simulated_FN3, self.training.rollout_pull, config.cell_size)
+        accelerations = asked_acceleration(windows).tolist()
+        self._entries += [(episode, frame + k + 1, windows[k].numpy(), accelerations[k]) for k in range(int(kept))]
+        return [float(square)] if kept == frames else []
+
+
+def figures_of(training: TrainingConfig, windows: int, squares: Sequence[float], seconds: float) -> dict[str, float]:
+    """What is logged of a pool; `squares` are mean squared distances of whole simulations in their last frame."""
+    dropped = training.rollout_scenes * training.rollout_frames - windows
+    values = {"windows": float(windows), "dropped": float(dropped), "seconds": seconds}
+    if squares:
+        values["mse"] = float(np.mean(squares))
+    return {f"own_states/{name}": value for name, value in values.items()}

@@ -1,0 +1,80 @@
+"""The deterministic order of samples, and its exact resume."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hgn.data.sampler import EpisodeSampler, SamplerState
+from hgn.schema import ConfigError
+
+frame_counts = st.lists(st.integers(2, 9), min_size=1, max_size=6)
+
+
+def take(order, batches):
+    return [(s.episode, s.frame, s.seed) for _ in range(batches) for s in order.next_batch()]
+
+
+@settings(max_examples=60, deadline=None)
+@given(frame_counts, st.integers(1, 4), st.integers(1, 8), st.integers(0, 5))
+def test_each_sample_once_an_epoch(frames, batch, world_size, seed):
+    """On any world size and batch, the ranks together see every sample exactly once in each epoch."""
+    ranks = [EpisodeSampler(seed, batch, lambda _: frames, rank=r, world_size=world_size) for r in range(world_size)]
+    total = sum(frames) - len(frames)
+    epochs = 3
+    stream = []
+    while len(stream) < epochs * total:
+        for rank in ranks:
+            stream += [(s.episode, s.frame) for s in rank.next_batch()]
+    expected = sorted((e, n) for e, count in enumerate(frames) for n in range(count - 1))
+    for epoch in range(epochs):
+        assert sorted(stream[epoch * total : (epoch + 1) * total]) == expected
+
+
+@settings(max_examples=60, deadline=None)
+@given(frame_counts, st.integers(1, 4), st.integers(1, 3), st.integers(0, 20), st.integers(1, 20))
+def test_resume_equals_no_interruption(frames, batch, world_size, before, after):
+    """Starting again from the cursor gives the samples, and their seeds, that would have come."""
+    for rank in range(world_size):
+        order = EpisodeSampler(3, batch, lambda _: frames, rank=rank, world_size=world_size)
+        take(order, before)
+        again = EpisodeSampler(3, batch, lambda _: frames, order.cursor, rank, world_size)
+        assert take(again, after) == take(order, after)
+
+
+def test_growing_data_waits_for_the_next_epoch():
+    """Episodes published during an epoch join the next one, also when the run was interrupted between."""
+    published = [3]
+    order = EpisodeSampler(0, 1, lambda _: published)
+    first = take(order, 1)
+    published.append(4)
+    again = EpisodeSampler(0, 1, lambda _: published, order.cursor)
+    rest = take(again, 1)
+    assert sorted(s[:2] for s in first + rest) == [(0, 0), (0, 1)]
+    assert again.cursor.episodes == 1
+    assert sorted(s[:2] for s in take(again, 5)) == [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]
+    assert again.cursor == SamplerState(1, 5, 2)
+
+
+def test_epochs_and_seeds_differ():
+    """Another epoch and another seed shuffle differently; each sample's noise seed is its own."""
+    samples = take(EpisodeSampler(0, 1, lambda _: [101]), 200)
+    first, second = samples[:100], samples[100:]
+    assert [s[1] for s in first] != [s[1] for s in second]
+    assert [s[1] for s in first] != [s[1] for s in take(EpisodeSampler(1, 1, lambda _: [101]), 100)]
+    assert len({s[2] for s in samples}) == 200
+
+
+def test_lost_or_missing_episodes_are_refused():
+    """A data set that has shrunk, or is empty, ends in a message with the remedy."""
+    with pytest.raises(ConfigError, match="must still hold the 3 training episodes"):
+        EpisodeSampler(0, 1, lambda _: [5, 5], SamplerState(0, 2, 3))
+    with pytest.raises(ConfigError, match="at least one training episode"):
+        EpisodeSampler(0, 1, lambda _: [])
+
+
+def test_order_is_the_same_everywhere():
+    """The order is part of the contract: this is the start of seed 0, epoch 0, on three episodes of 5 frames."""
+    found = [s[:2] for s in take(EpisodeSampler(0, 2, lambda _: [5, 5, 5]), 3)]
+    assert found == [(2, 1), (0, 2), (1, 3), (1, 0), (1, 1), (2, 3)]

@@ -1,0 +1,157 @@
+"""The network's own states on the fast path against the plain one."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from kernels.engines import device
+from kernels.test_training import data as data
+from kernels.test_training import run_mapping
+from network.states import network_of
+from training.runs import metrics
+from training.test_noise import episode
+from training.test_own_states import falling, training_of, wild_network
+from training.test_symmetry import scene_with_obstacles
+
+from hgn import train
+from hgn.config import DatagenConfig
+from hgn.data.episode_tensors import whole_episode
+from hgn.data.rest_noise import noise_at_rest
+from hgn.data.statistics import Statistics
+from hgn.kernels.grid.op import ObstacleHash
+from hgn.kernels.packing import pack_network
+from hgn.kernels.update.op import DeviceEpisode, DeviceSample
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.scene.episode import Episode
+from hgn.schema import ConfigError
+from hgn.training.checkpoint import read_checkpoint
+from hgn.training.graph_pushforward import GraphPushforwardPool
+from hgn.training.module import TrainingModule
+from hgn.training.pushforward import PushforwardPool
+
+CELL_SIZE = 1 / 64
+
+
+def placed(made: Episode, network: HierarchicalGraphNetwork) -> DeviceEpisode:
+    whole, where = whole_episode(made, network.config), device()
+    cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3
+    obstacles = ObstacleHash.of(cells, normals).to(where) if len(cells) else None
+    return DeviceEpisode(whole.position_TN3.to(where), whole.material_N.to(where), obstacles, whole.domain_size)
+
+
+def values_of(network: HierarchicalGraphNetwork) -> torch.Tensor:
+    return pack_network(network).gather(list(network.parameters())).detach()
+
+
+def assert_same_pools(fast: GraphPushforwardPool, plain: PushforwardPool) -> None:
+    for name, value in plain.figures.items():
+        if name != "own_states/seconds":
+            assert fast.figures[name] == pytest.approx(value, rel=1e-3), name
+    for (found, asked), (made, _, expected, acceleration) in zip(fast._entries, plain._entries, strict=True):
+        np.testing.assert_allclose(found.position_TN3.cpu().numpy(), expected, rtol=0, atol=1e-6)
+        assert found.particles == made.particle_count and found.position_TN3.is_contiguous()
+        assert asked == pytest.approx(acceleration, abs=1e-6)
+
+
+def test_the_pool_is_that_of_the_plain_path() -> None:
+    """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and
+    other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
+    scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
+    training = training_of(precision="highest", rollout_frames=2, noise_std=0.5, noise_at_rest=0.1)
+    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 60.0, 0)
+    rollouts = []
+    for starts in ([(0, 0), (1, 4)], [(1, 0), (2, 6)], [(0, 5), (3, 2)]):
+        fast.refresh([(placed(scenes[i], network), frame) for i, frame in starts], values_of(network))
+        plain.refresh([(scenes[i], frame) for i, frame in starts])
+        assert_same_pools(fast, plain)
+        rollouts.append(fast._rollout)
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.mul_(1.05)
+    assert rollouts[0] is rollouts[1] is not rollouts[2]
+    samples = [DeviceSample(placed(scenes[0], network), 2, seed, 0.5) for seed in (5, 6, 7, 8)]
+    mixed = fast.mixed(samples, 11)
+    assert [sample.seed for sample in mixed] == [5, 6, 7, 8] and mixed[2:] == samples[2:]
+    asked = dict(fast._entries)
+    for sample in mixed[:2]:
+        weight, noise = sample.weight, sample.noise
+        assert (noise, weight) == noise_at_rest(training, asked[sample.episode], sample.seed) and sample.frame == 0
+    assert len({sample.noise for sample in mixed[:2]} | {1.0}) == 3
+
+
+def test_lost_scenes_are_dropped() -> None:
+    """A scene that leaves its domain, or is no longer made of numbers, ends alone: the other's frames are the plain
+    path's, and the next simulation is whole again."""
+    network = wild_network().to(device())
+    small, large = falling(episode(4, seed=1), 0.27), episode(4, seed=2)
+    starts = [(small, 2), (large, 2)]
+    training = training_of(precision="highest")
+    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 60.0, 0)
+    for mean, kept in ((0.02, 4), (float("nan"), 0), (0.01, 5)):
+        network.normaliser.acceleration_mean.fill_(mean)
+        fast.refresh([(placed(made, network), frame) for made, frame in starts], values_of(network))
+        plain.refresh(starts)
+        assert_same_pools(fast, plain)
+        assert len(fast._entries) == kept
+
+
+def test_wrong_kernels_are_refused() -> None:
+    """Before anything is trained on them, the simulation's kernels are compared with the plain network."""
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
+    fast = GraphPushforwardPool(network, training_of(precision="highest"), CELL_SIZE, 0)
+    starts = [(placed(scene_with_obstacles(i, 5), network), 2) for i in range(2)]
+    kept = GraphPushforwardPool._first_scenes
+
+    def another(self: GraphPushforwardPool, *arguments: object) -> object:
+        with torch.no_grad():
+            next(network.decode.parameters()).mul_(1.5)
+        return kept(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(GraphPushforwardPool, "_first_scenes", another)
+        with pytest.raises(ConfigError, match=r"training.path must be plain on this machine.*set training.path=plain"):
+            fast.refresh(starts, values_of(network))
+
+
+def test_fast_training_is_the_plain_one(
+    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both paths simulate the same scenes at the same updates and train on the same windows: weights, their average and
+    what is logged of the pool agree. The fast one tells where the time of its first updates went."""
+    monkeypatch.setattr("hgn.training.graph_trainer.REPORTED_UPDATES", 2)
+    if device().type == "cpu":
+        monkeypatch.setattr("hgn.runtime.backend.why_not_fast", lambda *_: None)  # kernels run in the interpreter
+    same = {"noise_std": 0.0, "grid_jitter": False, "ema_decay": 0.7, "symmetry": "gravity"}
+    own = {"rollout_share": 0.5, "rollout_every": 1, "rollout_scenes": 2, "rollout_frames": 2}
+    counts = {"maximum_updates": 2, "log_every": 2, "checkpoint_every": 2, "monitor_every": 2}
+    original = TrainingModule.set_statistics
+
+    def set_statistics(self: TrainingModule, statistics: Statistics) -> None:
+        original(self, statistics)
+        self.network.normaliser.acceleration_std.fill_(1e-3)  # free fall has none, and rounding would be all there is
+        self._begin_average()
+
+    monkeypatch.setattr(TrainingModule, "set_statistics", set_statistics)
+    ends, lines = {}, {}
+    for path in ("plain", "fast"):
+        assert train.main(run_mapping(data, tmp_path / path, path=path, **same, **own, **counts)) == 0
+        ends[path] = read_checkpoint(tmp_path / path / "checkpoints" / "last.ckpt")
+        lines[path] = next(line for line in metrics(tmp_path / path) if "loss" in line)
+    assert re.findall(r"the first 2 updates took .* s own states, .* capturing \d+ times", capsys.readouterr().err)
+    # Adam's first steps are signs of gradients: where those are next to nothing, rounding decides
+    for key, value in ends["plain"]["state_dict"].items():
+        assert float((ends["fast"]["state_dict"][key] - value).double().abs().mean()) < 1e-5, key
+    moments = [
+        torch.cat([s["exp_avg"].flatten() for s in end["optimizer_states"][0]["state"].values()])
+        for end in (ends["fast"], ends["plain"])
+    ]
+    assert float((moments[0] - moments[1]).norm() / moments[1].norm()) < 1e-4
+    assert ends["fast"]["hgn"] == ends["plain"]["hgn"]
+    assert lines["fast"]["own_states/windows"] == lines["plain"]["own_states/windows"] == 4
+    for name in ("loss", "own_states/mse"):
+        assert lines["fast"][name] == pytest.approx(lines["plain"][name], rel=1e-3)

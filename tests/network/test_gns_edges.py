@@ -1,0 +1,65 @@
+"""GNS's own gradients by its edges: exact in float64, near it in half precision, whatever the size of the gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from network.comparison import assert_same_function
+from network.naive_gns import naive_gns_acceleration
+from network.states import gns_of, random_state
+from network.test_gns import state_for
+
+from hgn.network.features import ParticleState
+from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.gns_edges import Edges, PlainEdges
+from hgn.runtime.parity import relative_error
+
+
+def output_and_gradients(
+    network: GraphNetworkSimulator, edges: Edges | None, state: ParticleState, weight: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The network's output, and the gradients of all parameters of a random weighting of it, divided by `weight`."""
+    network.edges = edges
+    output = network.normalised_acceleration(state)
+    factor = torch.randn(output.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(output)
+    parameters = list(network.parameters())
+    found = torch.autograd.grad((output * factor * weight).sum(), parameters, allow_unused=True)
+    flat = [torch.zeros_like(p).flatten() if g is None else g.flatten() for p, g in zip(parameters, found, strict=True)]
+    return output.detach().double(), torch.cat(flat).double() / weight
+
+
+@pytest.mark.parametrize("kind", ["gns", "gns_particles"])
+@pytest.mark.parametrize("counts", [(17, 6), (1,)])
+def test_blocks_with_gradients_of_their_own_are_exact(kind, counts, monkeypatch):
+    """Outputs and all parameter gradients equal the naive network's, in float64 and in many blocks of edges."""
+    monkeypatch.setattr("hgn.network.gns_edges.CPU_ROWS", 30)
+    network = gns_of(kind=kind)
+    network.edges = PlainEdges()
+    state = state_for(network, counts)
+    expected = naive_gns_acceleration(network, state)
+    assert_same_function(network, network.normalised_acceleration(state), expected)
+    with torch.no_grad():
+        torch.testing.assert_close(network.normalised_acceleration(state), expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("weight", [1e-9, 1.0, 1e5])
+def test_half_precision_is_near_whatever_the_gradients_size(weight):
+    """Outputs within 1e-3 and gradients within 1e-2 of float64's: far too small and too large ones for float16 too."""
+    state = random_state((80, 20), spread=0.15)
+    expected = output_and_gradients(gns_of(message_passing_steps=10), None, state, weight)
+    network = gns_of(torch.float32, message_passing_steps=10)
+    state = random_state((80, 20), dtype=torch.float32, spread=0.15)
+    found = output_and_gradients(network, PlainEdges(torch.float16), state, weight)
+    assert relative_error(found[0], expected[0]) < 1e-3 and relative_error(found[1], expected[1]) < 1e-2
+
+
+def test_a_gradient_of_zero_or_not_finite_stays_that():
+    """No error at the output gives zero gradients; a NaN there gives NaN, so that the update is skipped."""
+    network = gns_of(torch.float32)
+    state = random_state((12,), dtype=torch.float32, spread=0.1)
+    network.edges = PlainEdges(torch.float16)
+    weight = network.steps[0].edge.second.weight
+    for factor in (0.0, torch.nan):
+        network.zero_grad()
+        (network.normalised_acceleration(state) * factor).sum().backward()
+        assert weight.grad.isnan().all() if factor else weight.grad.eq(0).all()

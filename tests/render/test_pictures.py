@@ -1,0 +1,241 @@
+"""Pictures and animations of a small synthetic rollout."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image, ImageSequence
+
+from hgn.render.pictures import (
+    animate,
+    compare_picture,
+    draw_frame,
+    error_curve,
+    particle_spacing,
+    position_error,
+    rollout_of_episode,
+    write_picture,
+)
+from hgn.scene.episode import Episode
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
+from hgn.scene.scene import Obstacle
+from hgn.schema import ConfigError
+
+
+def falling_blobs(frames: int = 30, reference_frames: int | None = None) -> Rollout:
+    """One blob of each material falls and bounces once; the ground truth bounces less."""
+    lattice = np.stack(np.meshgrid(*[np.arange(5)] * 3), axis=-1).reshape(-1, 3) / 128
+    centers = np.array([[0.25, 0.6, 0.6], [0.5, 0.7, 0.3], [0.7, 0.65, 0.7]])
+    start = np.concatenate([center + lattice for center in centers])
+    seconds = np.arange(frames if reference_frames is None else max(frames, reference_frames)) / 60
+
+    def height(restitution: float) -> np.ndarray:
+        fall = 0.5 * 9.8 * seconds**2
+        return np.where(fall < 0.5, -fall, -0.5 + restitution * (fall - 0.5))
+
+    def motion(restitution: float) -> np.ndarray:
+        position = np.repeat(start[None], len(seconds), axis=0)
+        position[..., 1] += height(restitution)[:, None]
+        return position.astype(np.float32)
+
+    box = trimesh.creation.box((0.3, 0.1, 0.2))
+    obstacle = Obstacle("box", box.vertices + np.array((0.7, 0.2, 0.3)), box.faces.astype(np.int32), closed=True)
+    return Rollout(
+        position_TN3=motion(0.4)[:frames],
+        material_N=np.repeat(np.arange(3, dtype=np.uint8), len(lattice)),
+        obstacles=(obstacle,),
+        domain_size=(1.0, 1.0, 1.0),
+        frame_rate_hz=60.0,
+        source={"weights": "model.safetensors"},
+        reference_TN3=None if reference_frames is None else motion(0.1)[:reference_frames],
+    )
+
+
+def has_hue(picture: Image.Image, material: int) -> bool:
+    """Whether at least 20 pixels have the hue of the material: blue, ochre, pale blue."""
+    red, _, blue = np.moveaxis(np.asarray(picture).astype(np.int64), -1, 0)
+    found = (
+        (blue - red > 90) & (blue > 120),
+        (red - blue > 60) & (red > 110),
+        (blue - red > 18) & (blue - red < 75) & (red > 110),
+    )[material]
+    return int(found.sum()) >= 20
+
+
+@pytest.mark.parametrize("material", [0, 1, 2])
+def test_each_material_is_seen_in_its_colour(material: int) -> None:
+    """A frame shows a material's hue when that material is there, and not when it is not."""
+    rollout = falling_blobs()
+
+    def frame(kept: np.ndarray) -> Image.Image:
+        return draw_frame(
+            rollout.position_TN3[0, kept], rollout.material_N[kept], (), rollout.domain_size, "t = 0.00 s", 300
+        )
+
+    assert has_hue(frame(rollout.material_N == material), material)
+    assert not has_hue(frame(np.zeros(len(rollout.material_N), bool)), material)
+
+
+def test_grid_of_frames() -> None:
+    """The grid has a column a frame and a row for each of prediction and ground truth; panels differ."""
+    rollout = falling_blobs(30, 30)
+    both = compare_picture(rollout, [0, 10, 29], size=120)
+    alone = compare_picture(dataclasses.replace(rollout, reference_TN3=None), [0, 10, 29], size=120)
+    one = compare_picture(rollout, [0], size=120)
+    assert both.width > 2.7 * one.width and both.height == one.height
+    assert both.height > 1.7 * alone.height
+    middle = np.asarray(alone).astype(np.int64)
+    step = 124
+    assert (middle[:, 30:140] != middle[:, 30 + step : 140 + step]).any()
+
+
+def test_pictures_are_reproducible() -> None:
+    """The same rollout gives the same pixels."""
+    rollout = falling_blobs(12, 12)
+    first, second = (np.asarray(compare_picture(rollout, [5, 11], size=100)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_ended_ground_truth_and_lost_particles_are_said() -> None:
+    """A panel past the end of the ground truth says so, as does one with particles that are not finite."""
+    rollout = falling_blobs(20, 10)
+    whole = np.asarray(compare_picture(falling_blobs(20, 20), [15], size=150))
+    assert (np.asarray(compare_picture(rollout, [15], size=150)) != whole).any()
+    rollout.position_TN3[15, :5] = np.nan
+    compare_picture(rollout, [15], size=150)
+    rollout.position_TN3[0] = np.nan
+    compare_picture(rollout, [0], size=150)
+
+
+@pytest.mark.parametrize("frames", [[], [0, 30], [-1]])
+def test_frames_outside_the_rollout(frames: list[int]) -> None:
+    """Frames that are not there are refused by name and number."""
+    with pytest.raises(ConfigError, match="frames"):
+        compare_picture(falling_blobs(), frames)
+
+
+@pytest.mark.parametrize(("every", "fps", "pictures", "milliseconds"), [(3, None, 10, 50), (7, 12.5, 5, 80)])
+def test_animation(tmp_path: Path, every: int, fps: float | None, pictures: int, milliseconds: int) -> None:
+    """The GIF has the frames asked for, in real time or at the rate asked for, loops, and moves."""
+    seen: list[tuple[int, int]] = []
+    path = tmp_path / "new" / "rollout.gif"
+    animate(falling_blobs(30, 30), path, fps, every, size=120, progress=lambda *step: seen.append(step))
+    with Image.open(path) as gif:
+        assert gif.info["loop"] == 0
+        shown = [(frame.info["duration"], np.asarray(frame.convert("RGB"))) for frame in ImageSequence.Iterator(gif)]
+    assert [duration for duration, _ in shown] == [milliseconds] * pictures
+    assert all((a != b).any() for (_, a), (_, b) in itertools.pairwise(shown))
+    assert shown[0][1].shape[1] > 240
+    assert tuple(shown[-1][1][1, 1]) == (255, 255, 255)
+    assert seen == [(i + 1, pictures) for i in range(pictures)]
+    assert [entry.name for entry in path.parent.iterdir()] == ["rollout.gif"]
+    for material in range(3):
+        assert has_hue(Image.fromarray(shown[0][1]), material)
+
+
+def test_webp_animation(tmp_path: Path) -> None:
+    """A WebP holds the same pictures as the GIF in real time, loops, and is the smaller file."""
+    rollout, progress = falling_blobs(24, 24), []
+    animate(rollout, tmp_path / "a.webp", every=2, size=160, progress=lambda *step: progress.append(step))
+    animate(rollout, tmp_path / "a.gif", every=2, size=160)
+    with Image.open(tmp_path / "a.webp") as webp, Image.open(tmp_path / "a.gif") as gif:
+        assert (webp.format, webp.n_frames, webp.size, webp.info["loop"]) == ("WEBP", 12, gif.size, 0)
+        for frame in (0, 5, 11):
+            webp.seek(frame)
+            gif.seek(frame)
+            one, other = (np.asarray(picture.convert("RGB")).astype(np.float64) for picture in (webp, gif))
+            assert webp.info["duration"] == 33 and np.abs(one - other).mean() < 4
+    assert progress == [(i + 1, 12) for i in range(12)]
+    assert (tmp_path / "a.webp").stat().st_size < 0.8 * (tmp_path / "a.gif").stat().st_size
+
+
+@pytest.mark.parametrize("ending", ["gif", "webp"])
+def test_single_frame_animation(tmp_path: Path, ending: str) -> None:
+    """A rollout of one frame gives a still picture."""
+    animate(falling_blobs(1), tmp_path / f"still.{ending}", size=80)
+    with Image.open(tmp_path / f"still.{ending}") as picture:
+        assert picture.n_frames == 1
+
+
+def test_animation_rates_that_viewers_change(tmp_path: Path) -> None:
+    """Rates above 50 per second (WebP 60), which viewers slow down, are refused with the remedy; so is every=0."""
+    with pytest.raises(ConfigError, match="every >= 2"):
+        animate(falling_blobs(), tmp_path / "a.gif", every=1)
+    with pytest.raises(ConfigError, match="another fps"):
+        animate(falling_blobs(), tmp_path / "a.gif", fps=100)
+    with pytest.raises(ConfigError, match=r"fps must be in \(0, 60\], which WebP viewers keep, got 61"):
+        animate(falling_blobs(), tmp_path / "a.webp", fps=61)
+    with pytest.raises(ConfigError, match="every must be"):
+        animate(falling_blobs(), tmp_path / "a.gif", every=0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_position_error() -> None:
+    """Squares are summed over axes and averaged over particles, of each material too."""
+    rollout = falling_blobs(8, 6)
+    moved = rollout.reference_TN3 + np.array([0.1, 0.0, 0.2], np.float32)
+    error = position_error(dataclasses.replace(rollout, position_TN3=moved))
+    assert list(error) == ["all", "water", "sand", "snow"]
+    for values in error.values():
+        np.testing.assert_allclose(values, np.full(6, 0.05), rtol=1e-5)
+    with pytest.raises(ConfigError, match="without ground truth"):
+        position_error(falling_blobs(3))
+
+
+def test_error_curve() -> None:
+    """The plot has the size asked for and its lines; errors of zero or NaN throughout draw without a warning."""
+    picture = error_curve(position_error(falling_blobs(30, 30)), 60.0, (500, 300))
+    assert picture.size == (500, 300)
+    assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 20
+    error_curve({"all": np.zeros(5)}, 60.0)
+    error_curve({"all": np.full(5, np.nan)}, 60.0)
+
+
+def test_particle_spacing() -> None:
+    """A lattice gives its spacing, at any scale; too few particles give the usual one."""
+    lattice = np.stack(np.meshgrid(*[np.arange(9)] * 3), axis=-1).reshape(-1, 3) * 0.02
+    assert particle_spacing(lattice) == pytest.approx(0.02)
+    assert particle_spacing(lattice[:3]) == 1 / 128
+    assert particle_spacing(np.full((50, 3), np.nan)) == 1 / 128
+    assert particle_spacing(np.zeros((50, 3))) > 0
+
+
+def test_episode_as_rollout(tmp_path: Path) -> None:
+    """An episode alone is no prediction and is not labelled as one; beside a prediction it is the ground truth."""
+    blobs = falling_blobs(4, 6)
+    assert blobs.reference_TN3 is not None
+    episode = Episode(
+        key="validation-000000",
+        position_TN3=blobs.reference_TN3,
+        initial_velocity_N3=np.zeros((blobs.particle_count, 3), np.float32),
+        material_N=blobs.material_N,
+        obstacle_grid=ObstacleGrid(1 / 64, np.full((1, 3), 30, np.int32), np.array([[0, 1, 0]], np.float32)),
+        domain_size=(1.0, 1.0, 1.0),
+        gravity=(0.0, -9.8, 0.0),
+        frame_rate_hz=60.0,
+        seed=5,
+        specification={"kind": "user"},
+        solver={},
+    )
+    alone = rollout_of_episode(episode)
+    assert alone.reference_TN3 is None and alone.source["episode"] == "validation-000000"
+    np.testing.assert_array_equal(alone.position_TN3, episode.position_TN3)
+    predicted = rollout_of_episode(episode, blobs.position_TN3)
+    np.testing.assert_array_equal(predicted.position_TN3, blobs.position_TN3)
+    np.testing.assert_array_equal(predicted.reference_TN3, episode.position_TN3)
+    write_rollout(tmp_path / "episode.h5", alone)
+    assert read_rollout(tmp_path / "episode.h5").source == alone.source
+    assert compare_picture(alone, [0, 3], 100).width < compare_picture(predicted, [0, 3], 100).width
+
+
+def test_png_keeps_its_source(tmp_path: Path) -> None:
+    """The PNG says how the rollout was made."""
+    write_picture(tmp_path / "a.png", Image.new("RGB", (4, 4)), {"weights": "model.safetensors"})
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.text["Description"] == '{"weights": "model.safetensors"}'

@@ -1,0 +1,141 @@
+"""hgn.system.machine: the cores and the memory that a process may use, as Linux tells them, and folders."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from hgn.system import device, machine
+from hgn.system.machine import available_cpus, available_memory, writable_folder
+
+GIB = 2**30
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file system of its own, of a machine of 16 cores and 64 GiB."""
+    monkeypatch.setattr(machine, "ROOT", tmp_path)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(16)), raising=False)
+    values = {"SC_PHYS_PAGES": 16 * 2**20, "SC_PAGE_SIZE": 4096}
+    monkeypatch.setattr(os, "sysconf", values.__getitem__)
+    return tmp_path
+
+
+def write(root: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(f"{text}\n")
+
+
+def test_where_nothing_limits(root: Path) -> None:
+    """Another system, a machine without control groups, and groups without limits: all cores and all memory."""
+    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
+    write(root, {"proc/self/cgroup": "0::/", "sys/fs/cgroup/cgroup.procs": "1"})
+    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
+    write(root, {"sys/fs/cgroup/cpu.max": "max 100000", "sys/fs/cgroup/memory.max": "max"})
+    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
+    (root / "sys/fs/cgroup/memory.max").unlink()
+    (root / "sys/fs/cgroup/memory.max").mkdir()  # cannot be read
+    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
+
+
+@pytest.mark.parametrize(("quota", "cpus"), [("150000", 2), ("200000", 2), ("10000", 1), ("9900000", 16)])
+def test_a_container(root: Path, quota: str, cpus: int) -> None:
+    """Version 2: its own group is the outermost that it sees. Parts of a core count as one."""
+    write(root, {"proc/self/cgroup": "0::/", "sys/fs/cgroup/cpu.max": f"{quota} 100000"})
+    write(root, {"sys/fs/cgroup/memory.max": str(8 * GIB)})
+    assert (available_cpus(), available_memory()) == (cpus, 8 * GIB)
+
+
+def test_the_least_of_all_groups_around(root: Path) -> None:
+    """A limit of any of them holds for what is within."""
+    write(root, {"proc/self/cgroup": "0::/a/b/c"})
+    folder = "sys/fs/cgroup/a"
+    write(root, {f"{folder}/cpu.max": "400000 100000", f"{folder}/memory.max": str(32 * GIB)})
+    write(root, {f"{folder}/b/cpu.max": "300000 100000", f"{folder}/b/memory.max": "max"})
+    write(root, {f"{folder}/b/c/cpu.max": "max 100000", f"{folder}/b/c/memory.max": str(48 * GIB)})
+    assert (available_cpus(), available_memory()) == (3, 32 * GIB)
+
+
+def test_version_1(root: Path) -> None:
+    """A tree for each controller, or for several; -1 and a number that no memory has are no limits."""
+    groups = "9:name=systemd:/x\n4:memory:/pod/one\n2:cpu,cpuacct:/pod/one\n1:cpuset:/\n0::/"
+    write(root, {"proc/self/cgroup": groups})
+    cpu, memory = "sys/fs/cgroup/cpu,cpuacct", "sys/fs/cgroup/memory"
+    write(root, {f"{cpu}/cpu.cfs_quota_us": "-1", f"{cpu}/cpu.cfs_period_us": "100000"})
+    write(root, {f"{memory}/memory.limit_in_bytes": "9223372036854771712"})
+    assert (available_cpus(), available_memory()) == (16, 64 * GIB)
+    write(root, {f"{cpu}/pod/one/cpu.cfs_quota_us": "250000", f"{cpu}/pod/one/cpu.cfs_period_us": "50000"})
+    write(root, {f"{memory}/pod/one/memory.limit_in_bytes": str(4 * GIB)})
+    assert (available_cpus(), available_memory()) == (5, 4 * GIB)
+
+
+@pytest.mark.parametrize("own", ["/docker/0a1b", "/../../machine.slice"])
+def test_groups_that_cannot_be_seen(root: Path, own: str) -> None:
+    """A container is told of groups outside of it, and sees its own as the outermost."""
+    write(root, {"proc/self/cgroup": f"0::{own}", "sys/fs/cgroup/cpu.max": "400000 100000"})
+    write(root, {"sys/machine.slice/cpu.max": "100000 100000"})
+    assert available_cpus() == 4
+
+
+def test_this_machine() -> None:
+    """What it tells is at least one core, and no more than it has."""
+    assert 1 <= available_cpus() <= (os.cpu_count() or 1)
+    assert 0 < available_memory() <= os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_threads_keep_to_a_quota(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyTorch's are as many as there are cores to keep busy, never more than they were, unless somebody chose."""
+    before = torch.get_num_threads()
+    try:
+        for cpus, chosen, threads in ((3, None, 3), (9, None, 6), (3, "6", 6)):
+            torch.set_num_threads(6)
+            monkeypatch.setattr(device, "available_cpus", lambda cpus=cpus: cpus)
+            monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+            if chosen is not None:
+                monkeypatch.setenv("OMP_NUM_THREADS", chosen)
+            assert device.choose_device("cpu") == torch.device("cpu")
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_folders_that_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The usual one, there or not yet, and nothing is made. Else this user's own, the same one each time, which nobody
+    else reads; and not a link that stands in its place."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    (tmp_path / "file").touch()
+    for usual in (tmp_path, tmp_path / "a" / "b"):
+        assert writable_folder(usual, "x") == usual
+    assert not (tmp_path / "a").exists()
+    own = tmp_path / "temporary" / f"x-{os.getuid()}"
+    for usual in (tmp_path / "file", tmp_path / "file" / "a", Path("~") / "a"):
+        assert writable_folder(usual, "x") == own and own.stat().st_mode & 0o777 == 0o700
+    own.rmdir()
+    own.symlink_to(tmp_path)
+    other = writable_folder(tmp_path / "file", "x")
+    assert other.parent == own.parent and other != own and other.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("named", [None, "TRITON_HOME", "TRITON_CACHE_DIR"])
+def test_where_triton_keeps_what_it_compiles(tmp_path: Path, named: str | None) -> None:
+    """A home that cannot be written to is in nobody's way, unless somebody named a folder; how sums and products are
+    rounded is said, which Triton's next version would do otherwise."""
+    (tmp_path / "file").touch()
+    program = (
+        "import os, hgn.kernels; print(os.environ.get('TRITON_CACHE_DIR'), os.environ['TRITON_DEFAULT_FP_FUSION'])"
+    )
+    names = {"TRITON_HOME", "TRITON_CACHE_DIR", "TRITON_DEFAULT_FP_FUSION"}
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    environment |= {"HOME": str(tmp_path / "file"), "TMPDIR": str(tmp_path)}
+    environment |= {"PYTHONPATH": str(Path(__file__).parents[2])} | ({named: "/mine"} if named else {})
+    ended = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    folder = {None: str(tmp_path / f"triton-{os.getuid()}"), "TRITON_HOME": "None", "TRITON_CACHE_DIR": "/mine"}[named]
+    assert ended.stdout == f"{folder} 1\n"

@@ -1,0 +1,79 @@
+"""However the samples come to the trainer, whole or in windows, from a folder or a URL, the numbers are the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import fsspec
+import pytest
+import torch
+from training.runs import NETWORK, TRAINING
+
+from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
+from hgn.data.batch import Batch
+from hgn.data.episode_tensors import EpisodeTensors
+from hgn.data.reader import EpisodeStore
+from hgn.data.storage import CACHE_VARIABLE
+from hgn.training.data_module import EpisodeDataModule
+
+UPDATES = 40  # of 2 samples, where an epoch has 25
+SETTINGS = (NetworkConfig(**NETWORK), TrainingConfig(**TRAINING))
+
+
+@pytest.fixture
+def folder(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> Path:
+    return make_dataset(make_config())
+
+
+def streamed(folder: Path | str, training: TrainingConfig = SETTINGS[1]) -> list[Batch]:
+    return list(islice(EpisodeDataModule(EpisodeStore(folder, "train"), SETTINGS[0], training).batches(), UPDATES))
+
+
+@pytest.mark.parametrize(("importance", "at_rest"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.01), (0.0, 0.01)])
+def test_resident_feeding_equals_streaming(folder: Path, importance: float, at_rest: float) -> None:
+    """Whole episodes, which stay in a GPU's memory, hold the windows that streaming reads, bitwise, for samples of the
+    same order, seeds, weights and noise; each episode comes once, and the cursors agree wherever a chunk ends."""
+    changes = {"frame_importance": importance, "noise_at_rest": at_rest, "noise_std": 1.0}  # nothing moves as much
+    network, training = SETTINGS[0], replace(SETTINGS[1], **changes)
+    expected = streamed(folder, training)
+    resident: dict[int, EpisodeTensors] = {}
+    update = 0
+    for chunk in EpisodeDataModule(EpisodeStore(folder, "train"), network, training, chunks=True).chunks():
+        assert not resident.keys() & chunk.episodes.keys()
+        resident |= chunk.episodes
+        for samples in chunk.samples[: UPDATES - update]:
+            batch = expected[update]
+            windows = [
+                resident[sample.episode].position_TN3[sample.frame : sample.frame + network.velocity_history + 2]
+                for sample in samples
+            ]
+            assert torch.equal(torch.cat(windows, dim=1), batch.window_WN3)
+            assert torch.equal(torch.cat([resident[s.episode].material_N for s in samples]).long(), batch.material_N)
+            assert tuple(sample.seed for sample in samples) == batch.seeds_S
+            assert tuple(sample.weight for sample in samples) == batch.weight_S
+            assert tuple(sample.noise for sample in samples) == batch.noise_S
+            assert (batch.weight_S == (1.0, 1.0)) == (importance == 0 and at_rest == 1)
+            assert all(noise == 1 if at_rest == 1 else at_rest < noise < 1 for noise in batch.noise_S)
+            if importance == 0:
+                assert batch.weight_S == pytest.approx([1 / noise**2 for noise in batch.noise_S])
+            update += 1
+        if update == UPDATES:
+            break
+        assert chunk.cursor == expected[update - 1].cursor
+    assert len(resident) == 5
+
+
+def test_feeding_from_a_url_equals_feeding_from_a_folder(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same batches come through the cache of a remote data set, bitwise."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    files = fsspec.filesystem("memory")
+    for path in (*folder.glob("*.tar"), folder / "manifest.json"):
+        files.pipe(f"/feeding/{path.name}", path.read_bytes())
+    for here, there in zip(streamed(folder), streamed("memory://feeding"), strict=True):
+        assert torch.equal(here.window_WN3, there.window_WN3)
+        assert (here.seeds_S, here.cursor) == (there.seeds_S, there.cursor)

@@ -1,0 +1,127 @@
+"""Kernels compiled ahead: processes that compile, what the user hears of them, and that the cache then has it all."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
+from hgn.kernels.precompile import FrameJob, PrecompileJob, job_of, job_text
+from hgn.runtime.precompile import Precompilation, frame_sizes
+from hgn.training.precompile import job_of_training
+
+CHECKOUT = Path(__file__).parents[2]
+
+
+def job(batch_scenes: int = 8) -> PrecompileJob:
+    training = TrainingConfig(batch_scenes=batch_scenes, precision="half")
+    config = TrainConfig(SceneConfig(), network=NetworkConfig(width=16, levels=2), training=training)
+    return job_of_training(config, (9, 0), False)
+
+
+@pytest.fixture
+def started() -> Iterator[list[Precompilation]]:
+    all_started: list[Precompilation] = []
+    yield all_started
+    for ahead in all_started:
+        ahead.stop()
+
+
+def start(started: list[Precompilation], program: str) -> Precompilation:
+    started.append(Precompilation(job(), 2, (sys.executable, "-c", f"import sys; {program}")))
+    return started[0]
+
+
+def test_the_job_follows_from_the_configuration() -> None:
+    """Sizes are those of the scenes' distribution as it begins, to a few per cent, and the job survives its text."""
+    made = job()
+    assert made.precision == "half" and made.capability == 90 and made.settings.scenes == 8
+    assert made.particles == pytest.approx(8 * 4296, rel=0.05)
+    assert made.cells == pytest.approx((8 * 1419, 8 * 231), rel=0.2)  # of a measured batch
+    assert job_of(job_text(made)) == made
+
+
+def test_jobs_of_simulations() -> None:
+    """Networks keep their precisions through the job's text; few and many particles, dense and spread, are among the
+    sizes, and as many as there are cases change little."""
+    networks = ((NetworkConfig(width=16), "half"), (NetworkConfig(width=16, levels=2), "high"))
+    made = FrameJob(networks, frame_sizes([2_763, 30_000, 1, 30_000]), 90)
+    assert job_of(job_text(made)) == made
+    assert {particles for particles, _ in made.sizes} == {1, 2_763, 30_000} and len(made.sizes) == 9
+    assert min(made.sizes) == (1, 1) and max(made.sizes) == (30_000, 36_000)
+    assert len(frame_sizes(range(1, 1000))) == 9
+
+
+def test_what_was_compiled_is_counted(started: list[Precompilation]) -> None:
+    """Each process gets its share and the job; the counts of all are told together."""
+    ahead = start(started, "assert 'half' in sys.stdin.read(); print(10 + int(sys.argv[1]) + int(sys.argv[2]))")
+    assert "fast path: 25 kernels ready" in ahead.wait(lambda: False)
+
+
+def test_a_failure_is_told(started: list[Precompilation]) -> None:
+    """When a process fails, its exit code and last line are told, and that nothing is lost."""
+    text = start(started, "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)").wait(lambda: False)
+    assert "1 of 2 processes" in text and "exit code 1: no ptxas" in text and "when it is first used" in text
+
+
+def test_an_interruption_ends_them(started: list[Precompilation]) -> None:
+    """Whoever is interrupted waits no longer, and no process is left."""
+    ahead = start(started, "import time; time.sleep(60)")
+    begin = time.monotonic()
+    assert "interrupted" in ahead.wait(lambda: True)
+    assert time.monotonic() - begin < 30
+    assert all(process.poll() is not None for process in ahead._processes)
+
+
+def test_the_launches_are_those_of_an_update(tmp_path: Path) -> None:
+    """Without memory and without a GPU the same kernels with the same specialisations are found as on tensors that
+    exist, and one of them is compiled into Triton's cache."""
+    run_compiled(tmp_path, "ahead_program.py")
+    assert list(tmp_path.glob("*/*.cubin"))
+
+
+def test_every_process_looks_under_the_same_keys(tmp_path: Path) -> None:
+    """A kernel's key in the cache on disk does not depend on which kernels the process saw before: those that a share
+    compiles are found by a training, which begins with others."""
+    with ThreadPoolExecutor() as pool:
+        texts = pool.map(lambda order: run_compiled(tmp_path, "ahead_keys.py", order), ("launch", "behind"))
+    keys = [text.split("\n") for text in texts]
+    assert len(keys[0]) > 30 and keys[0] == keys[1][::-1]
+
+
+def test_no_tile_is_copied_over_one_that_is_being_multiplied(tmp_path: Path) -> None:
+    """Of the weights' products tiles are copied to shared memory ahead, and each product is over before the next copy:
+    the compiler keeps too few buffers for one that is under way meanwhile."""
+    lines = [line.split() for line in run_compiled(tmp_path, "ahead_pipelines.py").split("\n")]
+    assert {kernel for kernel, _, _ in lines} == {"weight_gradient", "pairs_weight_gradient"}
+    assert all(int(ahead) >= 2 and int(pending) == 0 for _, ahead, pending in lines), lines
+
+
+def test_an_update_of_gns_never_asks_the_device(tmp_path: Path) -> None:
+    """From the samples to new weights it runs on tensors without memory, which have no value to wait for; neighbours,
+    edges, both passes and the optimiser are among its kernels, which can be compiled ahead."""
+    names = {line.split()[0] for line in run_compiled(tmp_path, "ahead_keys.py", "launch", "gns").split("\n")}
+    assert names >= {
+        "walk_neighbours",
+        "step_forward",
+        "norm_backward",
+        "encode_layers_backward",
+        "momentum_directions",
+    }
+
+
+def run_compiled(folder: Path, program: str, *arguments: str) -> str:
+    """Runs a program of this folder with Triton compiling into `folder`, not interpreting; what it printed."""
+    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
+    environment |= {"TRITON_CACHE_DIR": str(folder), "PYTHONPATH": str(CHECKOUT)}
+    command = [sys.executable, str(Path(__file__).with_name(program)), *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()

@@ -1,0 +1,207 @@
+"""Training on the network's own states, on the plain path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from network.states import gns_of, network_of
+from training.runs import metrics, train_mapping
+from training.test_noise import episode
+from training.test_resume import assert_same
+from training.test_resume import data as data
+from training.test_resume import stop_at as stop_at
+from training.test_symmetry import scene_with_obstacles
+
+from hgn import train
+from hgn.config import DatagenConfig, DatasetConfig, NetworkConfig, TrainConfig, TrainingConfig
+from hgn.data.batch import make_batch
+from hgn.network.base import ParticleNetwork
+from hgn.runtime.simulator import Simulator
+from hgn.scene.episode import Episode
+from hgn.scene.history import window
+from hgn.schema import ConfigError
+from hgn.training.checkpoint import read_checkpoint
+from hgn.training.pushforward import PushforwardPool, drawn_entries, drawn_starts, own_windows
+
+HISTORY, CELL = 5, 0.1
+
+
+def training_of(**changes: Any) -> TrainingConfig:
+    values = {"batch_scenes": 4, "rollout_share": 0.5, "rollout_frames": 3, "rollout_scenes": 2, "rollout_pull": 0.25}
+    return TrainingConfig(**values | changes)
+
+
+def test_windows_are_those_of_the_simulation() -> None:
+    """Each simulated frame k gives the positions of the six frames up to it, the first of them true, and as the answer
+    its own place moved as the truth moves, plus a share of its distance from the truth: none of it with pull 0, all of
+    it with pull 1, where the answer is the truth; farther than a cell no particle is pulled harder."""
+    generator = torch.Generator().manual_seed(0)
+    true = torch.rand(HISTORY + 4 + 2, 7, 3, generator=generator, dtype=torch.float64)
+    simulated = true[HISTORY + 1 : -1] + 0.05 * torch.randn(4, 7, 3, generator=generator, dtype=torch.float64)
+    simulated[:, 0] += 3 * CELL
+    places = [*true[: HISTORY + 1], *simulated]
+    for pull in (0.0, 0.25, 1.0):
+        windows = own_windows(true, simulated, pull, CELL)
+        assert windows.shape == (4, HISTORY + 2, 7, 3)
+        for k, found in enumerate(windows):
+            for i in range(HISTORY + 1):
+                assert torch.equal(found[i], places[k + 1 + i])
+            now = HISTORY + 1 + k
+            distance = (true[now] - simulated[k]).clamp(-CELL, CELL)
+            torch.testing.assert_close(found[-1], simulated[k] + true[now + 1] - true[now] + pull * distance)
+            near = (true[now] - simulated[k]).abs() < CELL
+            if pull == 1.0:
+                torch.testing.assert_close(found[-1][near], true[now + 1][near])
+
+
+def test_what_is_simulated_is_drawn_from_seed_and_update() -> None:
+    """Every episode long enough comes once before one comes twice, from any frame whose truth is known long enough, the
+    first included; the same for the same update and rank, another for another. Without any it is refused."""
+    training = training_of(rollout_scenes=5)
+    frames = [10, 4, 12, 6]  # 4: no frame 5 ahead of any start
+    drawn = [drawn_starts(training, update, 0, frames) for update in range(200)]
+    for starts in drawn:
+        assert len(starts) == 5 and {index for index, _ in starts[:3]} == {0, 2, 3}
+    for index in (0, 2, 3):
+        assert {frame for starts in drawn for i, frame in starts if i == index} == set(range(frames[index] - 4))
+    assert drawn_starts(training, 7, 0, frames) == drawn[7] != drawn[8]
+    assert drawn_starts(training, 7, 1, frames) != drawn[7]
+    with pytest.raises(ConfigError, match="rollout_frames must be at most the frames of an episode - 2, got 3 where"):
+        drawn_starts(training, 0, 0, [4, 4])
+
+
+@pytest.mark.parametrize(("share", "scenes"), [(0.3, 4), (0.25, 8), (0.1, 1), (0.0, 4)])
+def test_the_share_is_kept(share: float, scenes: int) -> None:
+    """On average this share of the samples is replaced, at most one sample more or less in an update, by windows of the
+    whole pool; with an empty pool none is."""
+    training = training_of(rollout_share=share, batch_scenes=scenes)
+    drawn = [drawn_entries(training, update, 0, 10) for update in range(2000)]
+    counts = [len(entries) for entries in drawn]
+    assert np.mean(counts) == pytest.approx(share * scenes, abs=0.03)
+    assert all(abs(count - share * scenes) < 1 for count in counts)
+    if share:
+        assert {entry for entries in drawn for entry in entries} == set(range(10))
+    assert drawn_entries(training, 3, 0, 0) == []
+
+
+def own_states(network: ParticleNetwork, training: TrainingConfig | None = None) -> PushforwardPool:
+    return PushforwardPool(network, training or training_of(), 60.0, 0)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        network_of(torch.float32, levels=2, message_passing_steps=1),
+        gns_of(torch.float32, message_passing_steps=1, cell_size=0.05),
+        gns_of(torch.float32, kind="gns_particles", message_passing_steps=1, cell_size=0.05),
+    ],
+    ids=["hgn", "gns", "gns_particles"],
+)
+def test_the_pool_is_what_the_network_does(network: ParticleNetwork) -> None:
+    """From frame 0, whose past is ballistic, and from a later one, the pool holds the windows of each scene simulated
+    by itself; a batch gets them in place of its first samples, with its seeds, and the others stay."""
+    episodes = [scene_with_obstacles(i, 5 + i, cells=200) for i in range(2)]
+    starts = [(episodes[0], 0), (episodes[1], 6)]
+    own = own_states(network)
+    own.refresh(starts)
+    assert own.figures["own_states/windows"] == 6 and own.figures["own_states/dropped"] == 0
+    expected = []
+    for made, frame in starts:
+        state = make_batch([(made, frame)], network.config).state()
+        path = []
+        for _ in range(3):
+            state = Simulator(network, 60.0).step(state)
+            path.append(state.position_N3)
+        true = torch.from_numpy(window(made, frame, HISTORY, 4))
+        expected += list(own_windows(true, torch.stack(path), 0.25, network.config.cell_size))
+    for (made, _, found, _), wanted, origin in zip(own._entries, expected, [0, 0, 0, 1, 1, 1], strict=True):
+        assert made is episodes[origin]
+        np.testing.assert_allclose(found, wanted.numpy(), rtol=0, atol=1e-7)
+    batch = make_batch([(e, 3) for e in [*episodes, *episodes]], network.config, (5, 6, 7, 8))
+    mixed = own.mixed(batch, 11)
+    chosen = drawn_entries(own.training, 11, 0, 6)
+    assert len(chosen) == 2 and mixed.seeds_S == batch.seeds_S
+    by_scene = mixed.window_WN3.split(list(mixed.particles_S), dim=1)
+    for slot, entry in enumerate(chosen):
+        np.testing.assert_array_equal(by_scene[slot].numpy(), own._entries[entry][2])
+    kept = batch.window_WN3.split(list(batch.particles_S), dim=1)
+    assert torch.equal(by_scene[2], kept[2]) and torch.equal(by_scene[3], kept[3])
+
+
+def falling(episode: Episode, domain: float) -> Episode:
+    return replace(episode, domain_size=(domain, domain, domain))
+
+
+def wild_network() -> ParticleNetwork:
+    """One that accelerates everything by 0.02 a frame, along each axis."""
+    network = network_of(torch.float32, levels=1, message_passing_steps=1, cell_size=0.5)
+    with torch.no_grad():
+        network.normaliser.acceleration_mean.fill_(0.02)
+        network.normaliser.acceleration_std.fill_(0.0)
+    return network
+
+
+def test_lost_scenes_are_dropped() -> None:
+    """A scene whose particles leave its domain by more than its size, or are no longer numbers, gives the windows
+    before that and none after; the others give all, and one too far from the truth none from there on."""
+    network = wild_network()
+    small, large = falling(episode(4, seed=1), 0.27), episode(4, seed=2)  # both around 0.5: 0.02, 0.06, 0.12 on
+    own = own_states(network)
+    own.refresh([(small, 2), (large, 2)])
+    assert [made is small for made, *_ in own._entries] == [True, False, False, False]
+    assert own.figures["own_states/dropped"] == 2
+    network.config = replace(network.config, cell_size=0.1)  # 0.02 sqrt(3) < 0.05 < 0.06 sqrt(3)
+    own.refresh([(small, 2), (large, 2)])
+    assert [made is small for made, *_ in own._entries] == [True, False]
+    with torch.no_grad():
+        network.normaliser.acceleration_mean.fill_(torch.nan)
+    own.refresh([(small, 2), (large, 2)])
+    assert own._entries == [] and own.figures["own_states/windows"] == 0 and "own_states/mse" not in own.figures
+    batch = make_batch([(small, 2)] * 4, network.config)
+    assert own.mixed(batch, 0) is batch
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rollout_share": 1.0}, "rollout_share must be 0 or more and below 1, got 1.0"),
+        ({"rollout_pull": 1.5}, "rollout_pull must be 0 to 1, got 1.5"),
+        ({"rollout_every": 0}, "rollout_every must be .*got 0"),
+        ({"rollout_share": 0.5, "rollout_frames": 5}, "rollout_frames must be at most dataset.frames - 2 = 4 .*got 5"),
+    ],
+)
+def test_wrong_values_are_refused(changes: dict[str, Any], message: str) -> None:
+    """Each key names its rule, the value and what follows from the data set."""
+    with pytest.raises(ConfigError, match=message):
+        TrainConfig(dataset=DatasetConfig(frames=6), network=NetworkConfig(), training=TrainingConfig(**changes))
+
+
+def test_a_resume_where_the_pool_is_made_anew_changes_nothing(
+    data: DatagenConfig, tmp_path: Path, stop_at: Callable[[int | None], None]
+) -> None:
+    """Interrupted at a multiple of rollout_every, a training ends where an uninterrupted one does, bit by bit, and it
+    tells how many windows it has; interrupted elsewhere it goes on with a pool of its own."""
+    own = {"rollout_share": 0.5, "rollout_every": 4, "rollout_scenes": 3, "rollout_frames": 2, "ema_decay": 0.8}
+
+    def trained(name: str, stops: list[int], **changes: Any) -> dict[str, Any]:
+        for stop in (*stops, None):
+            stop_at(stop)
+            train.main(train_mapping(data, tmp_path / name, path="plain", **own | changes))
+        return read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
+
+    whole, again, elsewhere = trained("whole", []), trained("again", [4, 8]), trained("elsewhere", [6])
+    for part in ("state_dict", "optimizer_states", "lr_schedulers", "hgn"):
+        assert_same(again[part], whole[part], part)
+    without = trained("without", [], rollout_share=0.0)
+    for other in (elsewhere, without):
+        assert other["hgn"] == whole["hgn"]
+        assert any(not torch.equal(other["state_dict"][name], value) for name, value in whole["state_dict"].items())
+    lines = [line for line in metrics(tmp_path / "whole") if "loss" in line]
+    assert all(line["own_states/windows"] == 6 and line["own_states/dropped"] == 0 for line in lines)
+    assert not any("own_states/windows" in line for line in metrics(tmp_path / "without"))

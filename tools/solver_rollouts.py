@@ -1,0 +1,89 @@
+"""Simulating test scenes with the solver, to the end or to its failure, and how long a frame takes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hgn.config import MpmConfig
+from hgn.runtime.rollouts import RolloutResult
+from hgn.scene.episode import Episode
+from hgn.scene.rollout_file import obstacles_of_episode
+from hgn.scene.scene import Scene
+
+TOGETHER_S = 20e-6  # frames that are reported less than this apart were computed together
+
+
+class FrameClock:
+    """Notes when frames are done; a simulator may report several at once."""
+
+    def __init__(self) -> None:
+        self.ends: list[float] = []
+
+    def __call__(self, frame: int) -> None:
+        self.ends.append(time.perf_counter())
+
+    def milliseconds(self) -> float | None:
+        """Mean time of a frame behind the first ones, which start things up; none where there are too few."""
+        gaps = np.diff(self.ends)
+        later = np.flatnonzero(gaps > TOGETHER_S)
+        if not len(later):
+            return None
+        first = int(later[0])
+        return 1e3 * float(gaps[first:].sum()) / (len(self.ends) - 1 - first)
+
+
+def solver_scene(episode: Episode, cell_size: float | None = None) -> Scene:
+    """An episode's initial state for the solver, on its own grid or another."""
+    return Scene(
+        position_N3=np.array(episode.position_TN3[0]),
+        velocity_N3=episode.initial_velocity_N3,
+        material_N=episode.material_N,
+        obstacles=obstacles_of_episode(episode),
+        domain_size=episode.domain_size,
+        cell_size=episode.obstacle_grid.cell_size if cell_size is None else cell_size,
+        gravity=episode.gravity,
+        seed=episode.seed,
+    )
+
+
+def solver_trials(
+    scenes: Sequence[Scene],
+    config: MpmConfig,
+    frames: int,
+    frame_rate_hz: float,
+    on_frame: Callable[[int], None] | None = None,
+    colliders: Sequence[Any] | None = None,
+    stability_fractions: Sequence[float] | None = None,
+) -> list[RolloutResult]:
+    """The solver's trajectories; of a scene that it stops only the initial state is left."""
+    from datagen.mpm.solver import SceneFailure, simulate
+
+    results = simulate(
+        scenes,
+        config,
+        frames,
+        frame_rate_hz,
+        on_frame,
+        colliders=colliders,
+        stability_fractions=stability_fractions,
+    )
+    trials = []
+    for scene, result in zip(scenes, results, strict=True):
+        if isinstance(result, SceneFailure):
+            trials.append(RolloutResult(scene.position_N3[None], result.cause))
+        else:
+            finite_T = np.isfinite(result.position_TN3).all(axis=(1, 2))
+            good = frames if finite_T.all() else int(finite_T.argmin())
+            cause = None if good == frames else f"positions are not finite at frame {good}"
+            trials.append(RolloutResult(result.position_TN3[:good], cause))
+    return trials
+
+
+def other_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
+    """The solver's settings for cells of another size: walls as thick as they were, to the nearest node."""
+    return replace(config, wall_cells=max(2, round(config.wall_cells * own_cell_size / cell_size)))
