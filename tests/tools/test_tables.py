@@ -1,0 +1,180 @@
+"""python -m tools.tables: pages say what the JSON beside them says, and a page or a file that was changed is named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import tools.tables
+from hgn.schema import ConfigError
+from tools.tables import ROOT, formatted, main, pages, specifications
+
+SPECIFICATION = """
+files: {bench: bench.json, weights: weights.safetensors}
+values:
+  frame: "{bench.rows(case='frame', particles=4296).ms:.3f} ms"
+tables:
+  frames:
+    rows: every(bench.rows, case='frame')
+    columns: {particles: "{row.particles:,}", ms: "{row.ms:.2g}", MSE: "{row.mse['10']:?.2g}", check: "{row.check:?}"}
+  chosen:
+    rows:
+      - {label: one, particles: 4296, must: 0.35}
+      - {label: two, particles: 400000}
+    let: {row: "bench.rows(case='frame', particles=particles)", first: "bench.rows[0]"}
+    columns: {"": "{label}", must: "{must:?}", ratio: "{row.ms / first.ms:.1f}", outside: "{row.outside:.2g%}"}
+"""
+PAGE = """A frame takes <!--=frame-->0.302 ms<!--/-->.
+
+<!-- table: frames -->
+
+| particles | ms | MSE | check |
+| --: | --: | --: | --- |
+| 4,296 | 0.30 | 8.4e-6 | yes |
+| 400,000 | 4.6 | | |
+
+<!-- end -->
+<!-- table: chosen -->
+
+| | must | ratio | outside |
+| --- | --: | --: | --: |
+| one | 0.35 | 1.0 | 0, 12 % |
+| two | | 15.4 | 0.072, 1.4 % |
+
+<!-- end -->
+"""
+BENCH = {
+    "rows": [
+        {"case": "frame", "particles": 4296, "ms": 0.30213, "mse": {"10": 8.4e-6}, "check": True, "outside": [0, 0.12]},
+        {"case": "frame", "particles": 400000, "ms": 4.641, "mse": {}, "check": None, "outside": [0.00072, 0.014]},
+        {"case": "update", "particles": 4296, "ms": 1.06},
+    ]
+}
+
+
+def folder(path: Path, specification: str = SPECIFICATION, page: str = PAGE) -> Path:
+    """A repository with one folder of a page, its JSON and its specification; returns the last."""
+    results = path / "results" / "bench"
+    results.mkdir(parents=True)
+    (results / "bench.json").write_text(json.dumps(BENCH))
+    (results / "README.md").write_text(page)
+    (results / "tables.yaml").write_text(specification)
+    return results / "tables.yaml"
+
+
+@pytest.mark.parametrize("specification", specifications(ROOT), ids=lambda path: str(path.parent.relative_to(ROOT)))
+def test_pages_and_their_json_agree(specification: Path) -> None:
+    """Every page of the repository is what `python -m tools.tables` makes of the files beside it."""
+    assert [page.differences for page in pages(specification) if page.differences] == []
+
+
+def test_an_edited_figure_of_the_repository_is_found(tmp_path: Path) -> None:
+    """One digit changed in a copy of a results page, or in its JSON: the page, the table and the file are named."""
+    copy = tmp_path / "results"
+    shutil.copytree(ROOT / "results" / "public_gns", copy)
+    page, specification = copy / "README.md", copy / "tables.yaml"
+    text = page.read_text()
+    changed = text.replace("| 0.352 |", "| 0.353 |")
+    assert changed != text
+    page.write_text(changed)
+    expected = "table h100 is not what public_gns_h100.json says; run python -m tools.tables"
+    assert [page.differences for page in pages(specification)] == [(expected,)]
+    page.write_text(text)
+    report = json.loads((copy / "public_gns_h100.json").read_text())
+    report["rows"][0]["ms"] *= 1.01
+    (copy / "public_gns_h100.json").write_text(json.dumps(report))
+    assert [page.differences for page in pages(specification)] == [(expected,)]
+
+
+def test_writes_tables_and_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What stands between markers is replaced, and nothing else; check=true names it and changes nothing."""
+    monkeypatch.setattr(tools.tables, "ROOT", tmp_path)
+    page = folder(tmp_path).with_name("README.md")
+    assert main({}) == 0 and page.read_text() == PAGE and capsys.readouterr().out == ""
+    edited = PAGE.replace("0.302", "0.058").replace("| 15.4 |", "| 15 |")
+    page.write_text(edited)
+    assert main({"check": True}) == 1 and page.read_text() == edited
+    assert capsys.readouterr().out.splitlines() == [
+        "results/bench/README.md: table chosen is not what bench.json says; run python -m tools.tables",
+        "results/bench/README.md: figure frame is not what bench.json says; run python -m tools.tables",
+    ]
+    assert main({}) == 0 and page.read_text() == PAGE
+    assert capsys.readouterr().out == "results/bench/README.md\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("particles=4296).ms", "particles=1).ms"), "figure frame: LookupError: 0 items of 3 have"),
+        (("rows(case='frame', particles=4296)", "rows(case='frame')"), "figure frame: LookupError: 2 items of 3 have"),
+        (("row.particles:,", "row.particle:,"), "table frames: LookupError: no 'particle' among case, particles"),
+        (("row.mse['10']:?", "row.mse['10']:"), "table frames: LookupError: no '10' among"),
+        (("row.ms:.2g", "row.mse:.2g"), "table frames: TypeError"),
+        (("  chosen:", "  other:"), "has no table chosen; define it there or take the marker away"),
+        (("values:", "values:\n  more: '1'"), "no page has a marker for more"),
+    ],
+)
+def test_faulty_specifications(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+    """An expression that finds nothing, or too much, and names without a counterpart are answered by name."""
+    assert change[0] in SPECIFICATION
+    with pytest.raises(ConfigError) as error:
+        pages(folder(tmp_path, SPECIFICATION.replace(*change)))
+    assert message in str(error.value) and "tables.yaml" in str(error.value)
+
+
+@pytest.mark.parametrize("marker", ["<!--/-->", "<!-- end -->\n<!-- table: chosen"])
+def test_a_marker_without_an_end(tmp_path: Path, marker: str) -> None:
+    """An end that was deleted is not searched for in the next table."""
+    broken = PAGE.replace(marker, marker.removeprefix("<!--/-->").removeprefix("<!-- end -->\n"))
+    with pytest.raises(ConfigError, match=r"README.md: a marker has no end"):
+        pages(folder(tmp_path, page=broken))
+
+
+def test_outside_of_a_checkout(tmp_path: Path) -> None:
+    """Without pages there is nothing to write, which is said."""
+    with pytest.raises(ConfigError, match="run it from a checkout"):
+        specifications(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("value", "form", "text"),
+    [
+        (0.00064, ".2g", "6.4e-4"),
+        (0.0489, ".2g", "0.049"),
+        (0.1, ".2g", "0.10"),
+        (38.7, ".2g", "39"),
+        (1.65e-7, ".3g", "1.65e-7"),
+        (-3e-5, ".1g", "-3e-5"),
+        (4296, ",", "4,296"),
+        (0.8882, ".0%", "89 %"),
+        ([0.8882, 0.968], ".0%", "89, 97 %"),
+        ((0.0270, 0.0597), ".3f", "0.027, 0.060"),
+        (0.0, ".3f", "0"),
+        (1.5e-3, ".1e", "1.5e-3"),
+        (True, "", "yes"),
+        ("pass", "", "pass"),
+    ],
+)
+def test_formats(value: object, form: str, text: str) -> None:
+    """Figures are shown as pages write them."""
+    assert formatted(value, form) == text
+
+
+def test_safetensors_header(tmp_path: Path) -> None:
+    """Size, tensors and metadata of a weights file are a source like any other."""
+    header = json.dumps({"__metadata__": {"hgn": '{"updates": 7}'}, "a": {"dtype": "F16", "shape": [2, 3]}}).encode()
+    specification = folder(
+        tmp_path,
+        SPECIFICATION + "  files:\n    rows: weights.tensors.values()\n"
+        "    columns: {updates: '{weights.metadata.updates}', bytes: '{weights.bytes}', size: '{prod(row.shape)}'}\n",
+        PAGE + "<!-- table: files -->\n<!-- end -->\n",
+    )
+    specification.with_name("weights.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
+    (page,) = pages(specification)
+    assert f"| 7 | {len(header) + 8} | 6 |" in page.text
+    assert page.differences == ("table files is not what weights.safetensors says; run python -m tools.tables",)

@@ -1,0 +1,281 @@
+"""python -m tools.tables [check=true]: writes the tables and figures of Markdown pages from the JSON beside them.
+
+A folder of pages has a `tables.yaml`; its pages hold `<!-- table: NAME -->` … `<!-- end -->` for a table and
+`<!--=NAME-->0.302<!--/-->` for a figure within a sentence, and what stands between is written by this command:
+
+    files: {bench: bench_h100.json}     # sources by name, relative to the folder: .json, or .safetensors (the header)
+    values:
+      frame: "{bench.rows(case='frame').ms:.3f} ms"
+    tables:
+      frames:
+        rows: bench.rows                # an expression: each item is `row`; or a list of mappings, one for each row
+        columns:
+          particles: "{row.particles:,}"
+          ms: "{row.ms:.3f}"
+
+In braces stands an expression of Python over the sources, the names of the row and the functions of `FUNCTIONS`, then
+a format. `rows(case='frame')` is the one item of a list whose fields are these; `every(rows, case='frame')` are all.
+`let: {NAME: EXPRESSION}` in a table gives each row further names. A format that begins with `?` leaves the cell empty
+where there is nothing. Lists are joined by commas, and `%` multiplies by 100.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import statistics
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hgn.command import run_command
+from hgn.files import write_atomically
+from hgn.schema import ConfigError, from_mapping
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("results", "hgn/weights", "jobs", "docs")  # of the repository, searched for SPECIFICATION
+SPECIFICATION = "tables.yaml"
+REMEDY = "run python -m tools.tables"
+
+EXPRESSION_ERRORS = (ArithmeticError, AttributeError, LookupError, NameError, SyntaxError, TypeError, ValueError)
+
+TABLE = re.compile(r"(?P<begin><!-- table: (?P<name>[\w-]+) -->\n)(?P<text>.*?)(?P<end><!-- end -->)", re.DOTALL)
+VALUE = re.compile(r"(?P<begin><!--=(?P<name>[\w-]+)-->)(?P<text>[^<]*)(?P<end><!--/-->)")
+OPENING = re.compile(r"<!-- table: |<!--=")
+FIELD = re.compile(r"\{([^{}]+)\}")
+NUMERIC = re.compile(r"\W*(\d|$)")
+WITH_FORMAT = re.compile(r"(.*):([^:'\"()\[\]]*)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class TablesConfig:
+    """`python -m tools.tables`: what is done with pages that differ from their JSON."""
+
+    check: bool = False
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page as its sources say it has to be, and what differs from that, a line each."""
+
+    path: Path
+    text: str
+    differences: tuple[str, ...]
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Writes the pages that differ, or with check=true names what differs; exit code 1 then."""
+    config = from_mapping(TablesConfig, mapping)
+    differing = [page for path in specifications(ROOT) for page in pages(path) if page.differences]
+    for page in differing:
+        name = page.path.relative_to(ROOT)
+        print("\n".join(f"{name}: {difference}" for difference in page.differences) if config.check else name)
+        if not config.check:
+            write_atomically(page.path, page.text.encode())
+    return int(config.check and bool(differing))
+
+
+def specifications(root: Path) -> list[Path]:
+    """All `tables.yaml` of the repository. Raises ConfigError where there is none."""
+    paths = sorted(path for folder in FOLDERS for path in (root / folder).rglob(SPECIFICATION))
+    if not paths:
+        raise ConfigError(
+            f"no {SPECIFICATION} in {root}/{{{','.join(FOLDERS)}}}; run it from a checkout of the repository"
+        )
+    return paths
+
+
+def pages(specification: Path) -> list[Page]:
+    """The Markdown pages beside a specification.
+
+    Raises: ConfigError for a marker without a definition or an end, a definition without a marker, and an expression
+    that finds nothing; it names file and definition.
+    """
+    definitions = yaml.safe_load(specification.read_text())
+    folder = specification.parent
+    read: set[str] = set()  # sources that the current definition has asked
+    sources = {name: Source(folder / file, read) for name, file in (definitions.get("files") or {}).items()}
+    kinds = {"table": definitions.get("tables") or {}, "figure": definitions.get("values") or {}}
+    used: set[str] = set()
+
+    def page(path: Path) -> Page:
+        differences = []
+
+        def filled(match: re.Match[str], kind: str) -> str:
+            name = match["name"]
+            if name not in kinds[kind]:
+                raise ConfigError(
+                    f"{path}: {specification} has no {kind} {name}; define it there or take the marker away"
+                )
+            used.add(name)
+            read.clear()
+            try:
+                text = (_table if kind == "table" else _fill)(kinds[kind][name], sources)
+            except EXPRESSION_ERRORS as error:
+                raise ConfigError(f"{specification}: {kind} {name}: {type(error).__name__}: {error}") from error
+            if text != match["text"]:
+                differences.append(f"{kind} {name} is not what {' and '.join(sorted(read))} says; {REMEDY}")
+            return match["begin"] + text + match["end"]
+
+        text = path.read_text()
+        if len(OPENING.findall(text)) != len(TABLE.findall(text)) + len(VALUE.findall(text)):
+            raise ConfigError(f"{path}: a marker has no end; tables end with <!-- end -->, figures with <!--/-->")
+        text = TABLE.sub(lambda match: filled(match, "table"), text)
+        text = VALUE.sub(lambda match: filled(match, "figure"), text)
+        return Page(path, text, tuple(differences))
+
+    written = [page(path) for path in sorted(folder.glob("*.md"))]
+    unused = (kinds["table"].keys() | kinds["figure"].keys()) - used
+    if unused:
+        raise ConfigError(f"{specification}: no page has a marker for {', '.join(sorted(unused))}")
+    return written
+
+
+class Source:
+    """A file of `files`, read when an expression asks for it; its name is then added to `read`."""
+
+    def __init__(self, path: Path, read: set[str]) -> None:
+        self._path = path
+        self._read = read
+        self._node: Any = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loaded(), name)
+
+    def __getitem__(self, key: Any) -> Any:
+        return self._loaded()[key]
+
+    def _loaded(self) -> Any:
+        self._read.add(self._path.name)
+        if self._node is None:
+            read = _safetensors_header if self._path.suffix == ".safetensors" else _json
+            self._node = _node(read(self._path))
+        return self._node
+
+
+class Record(dict):
+    """A JSON object whose fields are attributes too."""
+
+    def __getattr__(self, name: str) -> Any:
+        return self[name]
+
+    def __missing__(self, key: Any) -> Any:
+        raise LookupError(f"no {key!r} among {', '.join(map(str, self))}")
+
+
+class Records(list):
+    """A JSON list. Called with fields it is the one item that has them."""
+
+    def __call__(self, **fields: Any) -> Any:
+        chosen = every(self, **fields)
+        if len(chosen) != 1:
+            raise LookupError(f"{len(chosen)} items of {len(self)} have {fields}")
+        return chosen[0]
+
+
+def every(records: Iterable[Record], **fields: Any) -> Records:
+    """All items of a list that have these fields."""
+    return Records(item for item in records if all(item.get(name) == value for name, value in fields.items()))
+
+
+def _node(value: Any) -> Any:
+    if isinstance(value, dict):
+        return Record({key: _node(item) for key, item in value.items()})
+    return Records(map(_node, value)) if isinstance(value, list) else value
+
+
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
+def _safetensors_header(path: Path) -> dict[str, Any]:
+    with path.open("rb") as file:
+        (length,) = struct.unpack("<Q", file.read(8))
+        header = json.loads(file.read(length))
+    metadata = json.loads(header.pop("__metadata__")["hgn"])
+    return {"bytes": path.stat().st_size, "tensors": header, "metadata": metadata}
+
+
+def _rms(values: Any) -> float:
+    return math.sqrt(statistics.fmean(value**2 for value in values))
+
+
+FUNCTIONS: dict[str, Any] = {
+    **{function.__name__: function for function in (abs, every, len, list, max, min, sorted, sum, zip)},
+    **{
+        "mean": statistics.fmean,
+        "median": statistics.median,
+        "rms": _rms,
+        "prod": math.prod,
+        "stdev": statistics.stdev,
+    },
+}
+
+
+def _table(definition: Mapping[str, Any], sources: Mapping[str, Any]) -> str:
+    rows, columns = definition["rows"], definition["columns"]
+    scopes: list[dict[str, Any]] = []
+    for row in _evaluate(rows, sources) if isinstance(rows, str) else rows:
+        scope = dict(sources) | ({"row": row} if isinstance(rows, str) else row)
+        for name, expression in definition.get("let", {}).items():
+            scope[name] = _evaluate(expression, scope)
+        scopes.append(scope)
+    cells = [[_fill(template, scope) for template in columns.values()] for scope in scopes]
+    rules = ["--:" if all(NUMERIC.match(text) for text in column) else "---" for column in zip(*cells, strict=True)]
+    lines = ["|" + "".join(f" {text} |" if text else " |" for text in line) for line in (columns, rules, *cells)]
+    return "\n" + "\n".join(lines) + "\n\n"
+
+
+def _fill(template: Any, names: Mapping[str, Any]) -> str:
+    return FIELD.sub(lambda match: _field(match[1], names), str(template))
+
+
+def _field(field: str, names: Mapping[str, Any]) -> str:
+    match = WITH_FORMAT.fullmatch(field)
+    expression, form = (match[1], match[2]) if match else (field, "")
+    optional = form.startswith("?")
+    try:
+        value = _evaluate(expression, names)
+    except (LookupError, NameError, TypeError) as error:
+        if optional and (not isinstance(error, TypeError) or "NoneType" in str(error)):
+            return ""
+        raise
+    if value is None and optional:
+        return ""
+    return formatted(value, form.removeprefix("?"))
+
+
+def _evaluate(expression: str, names: Mapping[str, Any]) -> Any:
+    return eval(expression.strip(), {"__builtins__": {}} | FUNCTIONS | dict(names))
+
+
+def formatted(value: Any, form: str) -> str:
+    """A value as a page shows it: 8.4e-6 for 8.4e-06, 12 % for 0.12, 0 for zero; lists joined by commas."""
+    if isinstance(value, (list, tuple)):
+        texts = [formatted(item, form) for item in value]
+        unit = " %" if form.endswith("%") else ""
+        return ", ".join(text.removesuffix(unit) for text in texts) + unit
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        raise ValueError("there is no value")
+    if isinstance(value, str) or value == 0:
+        return str(value) if isinstance(value, str) else "0"
+    percent = form.endswith("g%")  # significant digits of a percentage
+    if percent:
+        value, form = value * 100, form[:-1]
+    if form.endswith("g"):
+        small = abs(value) < 1e-3
+        form = f".{int(form[1:-1]) - 1}e" if small else f"#{form}"
+    text = format(value, form) + ("%" if percent else "")
+    text = re.sub(r"e([+-])0*(\d+)", lambda match: f"e{match[1].strip('+')}{match[2]}", text)
+    return re.sub(r"\.(?=$|%)", "", text).replace("%", " %")
+
+
+if __name__ == "__main__":
+    run_command(main, "tables")
