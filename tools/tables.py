@@ -34,8 +34,8 @@ from typing import Any
 import yaml
 
 from hgn.command import run_command
-from hgn.files import write_atomically
 from hgn.schema import ConfigError, from_mapping
+from hgn.system.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("results", "hgn/weights", "jobs", "docs")  # of the repository, searched for SPECIFICATION
