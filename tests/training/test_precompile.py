@@ -83,7 +83,7 @@ def test_an_interruption_ends_them(started: list[Precompilation]) -> None:
 def test_the_launches_are_those_of_an_update(tmp_path: Path) -> None:
     """Without memory and without a GPU the same kernels with the same specialisations are found as on tensors that
     exist, and one of them is compiled into Triton's cache."""
-    run_compiled(tmp_path, "ahead_program.py")
+    run_compiled(tmp_path, "precompile_program.py")
     assert list(tmp_path.glob("*/*.cubin"))
 
 
@@ -91,7 +91,7 @@ def test_every_process_looks_under_the_same_keys(tmp_path: Path) -> None:
     """A kernel's key in the cache on disk does not depend on which kernels the process saw before: those that a share
     compiles are found by a training, which begins with others."""
     with ThreadPoolExecutor() as pool:
-        texts = pool.map(lambda order: run_compiled(tmp_path, "ahead_keys.py", order), ("launch", "behind"))
+        texts = pool.map(lambda order: run_compiled(tmp_path, "precompile_keys.py", order), ("launch", "behind"))
     keys = [text.split("\n") for text in texts]
     assert len(keys[0]) > 30 and keys[0] == keys[1][::-1]
 
@@ -99,7 +99,7 @@ def test_every_process_looks_under_the_same_keys(tmp_path: Path) -> None:
 def test_no_tile_is_copied_over_one_that_is_being_multiplied(tmp_path: Path) -> None:
     """Of the weights' products tiles are copied to shared memory ahead, and each product is over before the next copy:
     the compiler keeps too few buffers for one that is under way meanwhile."""
-    lines = [line.split() for line in run_compiled(tmp_path, "ahead_pipelines.py").split("\n")]
+    lines = [line.split() for line in run_compiled(tmp_path, "precompile_pipelines.py").split("\n")]
     assert {kernel for kernel, _, _ in lines} == {"weight_gradient", "pairs_weight_gradient"}
     assert all(int(ahead) >= 2 and int(pending) == 0 for _, ahead, pending in lines), lines
 
@@ -107,7 +107,7 @@ def test_no_tile_is_copied_over_one_that_is_being_multiplied(tmp_path: Path) -> 
 def test_an_update_of_gns_never_asks_the_device(tmp_path: Path) -> None:
     """From the samples to new weights it runs on tensors without memory, which have no value to wait for; neighbours,
     edges, both passes and the optimiser are among its kernels, which can be compiled ahead."""
-    names = {line.split()[0] for line in run_compiled(tmp_path, "ahead_keys.py", "launch", "gns").split("\n")}
+    names = {line.split()[0] for line in run_compiled(tmp_path, "precompile_keys.py", "launch", "gns").split("\n")}
     assert names >= {
         "walk_neighbours",
         "step_forward",
