@@ -8,7 +8,7 @@ import pytest
 import torch
 from kernels.engines import device
 from network.states import gns_of, random_state
-from network.test_edges import output_and_gradients
+from network.test_gns_edges import output_and_gradients
 
 from hgn.kernels.gns.op import FusedEdges, Tuning, fits
 from hgn.network.features import ParticleState

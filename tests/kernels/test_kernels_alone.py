@@ -21,7 +21,7 @@ from kernels.references import ELSEWHERE, REFERENCES
 from kernels.test_gns import on_device
 from kernels.test_network import drawn, float32_state
 from network.states import gns_of, network_of, random_state
-from network.test_edges import output_and_gradients
+from network.test_gns_edges import output_and_gradients
 from triton.runtime.jit import KernelInterface
 
 import hgn.kernels
@@ -147,7 +147,7 @@ def test_several_scenes(precision: str, table: Table) -> None:
     judged(judge, engine, network, state)
     assert not judge.wrong and (engine.grid.weight_N8[:5] == 0).any()  # cells on whose borders particles are
     if precision in ("half", "ieee"):
-        assert judge.kernels == kernels_of("engine", "backward")
+        assert judge.kernels == kernels_of("forward", "backward")
 
 
 @pytest.mark.parametrize("precision", ["tf32", "half", FLOAT32])

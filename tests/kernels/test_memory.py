@@ -9,11 +9,11 @@ import pytest
 import torch
 from kernels.engines import device, engine_of, inference_of, run_forward
 from kernels.memory import Alive, checked_memory
-from kernels.test_own_states import CELL_SIZE, placed, values_of
+from kernels.test_pushforward import CELL_SIZE, placed, values_of
 from kernels.test_update import HISTORY, episode, updates_of
 from network.states import network_of, random_state
 from training.test_noise import episode as falling_episode
-from training.test_own_states import training_of
+from training.test_pushforward import training_of
 from training.test_symmetry import scene_with_obstacles
 from triton.runtime.errors import InterpreterError
 

@@ -14,7 +14,7 @@ from kernels.test_training import run_mapping
 from network.states import network_of
 from training.runs import metrics
 from training.test_noise import episode
-from training.test_own_states import falling, training_of, wild_network
+from training.test_pushforward import falling, training_of, wild_network
 from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
