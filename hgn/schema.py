@@ -15,6 +15,8 @@ import typing
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
+from hgn.renamed import KEYS, current_names, key_remedy, value_remedy
+
 T = TypeVar("T")
 
 
@@ -36,7 +38,10 @@ def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}  # type: ignore[arg-type]
     for key in mapping:
         if key not in fields:
-            raise ConfigError(f"{_join(path, str(key))} is not a known key; {known_keys(str(key), fields)}")
+            name = _join(path, str(key))
+            renamed = KEYS.get(name, "").rpartition(".")[2] in fields
+            remedy = key_remedy(name, mapping[key]) if renamed else known_keys(str(key), fields)
+            raise ConfigError(f"{name} is not a known key; {remedy}")
     values: dict[str, Any] = {}
     for name, field in fields.items():
         if name in mapping:
@@ -49,6 +54,11 @@ def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
         if path:
             raise ConfigError(f"{path}.{error}") from None
         raise
+
+
+def from_stored(cls: type[T], mapping: Mapping[str, Any], section: str) -> T:
+    """The same for a section of a file of ours, which may have been written with the names of an earlier release."""
+    return from_mapping(cls, current_names(mapping, section), section)
 
 
 def known_keys(key: str, known: Iterable[str]) -> str:
@@ -72,6 +82,7 @@ def to_mapping(value: Any) -> Any:
 def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str = "") -> None:
     """Raises ConfigError `<field> must be <rule>, got <value>; <remedy>` unless the rule holds."""
     if not rule_holds:
+        remedy = remedy or value_remedy(field, value)
         raise ConfigError(f"{field} must be {rule}, got {value!r}" + (f"; {remedy}" if remedy else ""))
 
 

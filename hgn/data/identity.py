@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hgn.config import DatagenConfig, is_mesh_file
+from hgn.renamed import stored_names
 from hgn.scene.episode import SCHEMA_VERSION
 from hgn.scene.shapes import mesh_sha256
 from hgn.schema import ConfigError, to_mapping
@@ -24,13 +25,15 @@ _NOT_PHYSICS = ("device", "scenes_per_launch")
 def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
     """The plain mapping that defines the episodes: scene distribution, physics, frames, rate, seed, schema.
 
+    Keys are those of the first release, whatever they are called since: a data set stays the same.
+
     Mesh files count by their content. Raises: ConfigError for one that cannot be read.
     """
     shapes = config.scene.obstacle_shapes
     named = [f"{Path(shape).name} {mesh_sha256(shape)}" if is_mesh_file(shape) else shape for shape in shapes]
     return {
         "schema_version": SCHEMA_VERSION,
-        "scene": to_mapping(config.scene) | {"obstacle_shapes": named},
+        "scene": stored_names(to_mapping(config.scene), "scene") | {"obstacle_shapes": named},
         "mpm": physics_settings(config),
         "frames": config.dataset.frames,
         "frame_rate_hz": config.dataset.frame_rate_hz,
@@ -40,7 +43,8 @@ def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
 
 def physics_settings(config: DatagenConfig) -> dict[str, Any]:
     """The solver's settings that trajectories depend on, as stored with each episode."""
-    return {key: value for key, value in to_mapping(config.mpm).items() if key not in _NOT_PHYSICS}
+    settings = stored_names(to_mapping(config.mpm), "mpm")
+    return {key: value for key, value in settings.items() if key not in _NOT_PHYSICS}
 
 
 def identity_hash(identity: Mapping[str, Any]) -> str:

@@ -17,6 +17,7 @@ from safetensors.torch import save
 from hgn.config import NetworkConfig
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
+from hgn.renamed import current_names
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import write_atomically
 
@@ -94,7 +95,7 @@ def load_weights(
     version = mapping.get("format_version") if isinstance(mapping, dict) else None
     if version != FORMAT_VERSION:
         raise ConfigError(f"{field} format_version must be {FORMAT_VERSION}, got {version!r} in {path}; export again")
-    info = from_mapping(WeightsInfo, mapping, "weights")
+    info = from_mapping(WeightsInfo, current_names(mapping), "weights")
     network = build_network(info.network)
     expected = {name: tensor.shape for name, tensor in network.state_dict().items()}
     found = {name: tensor.shape for name, tensor in tensors.items()}

@@ -17,7 +17,7 @@ from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.runtime.weights import find_weights, load_weights
-from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.schema import ConfigError, from_stored, to_mapping
 
 SECTION = "hgn"  # the checkpoint's key for what is ours
 NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the tensors: as trained, and their moving average
@@ -57,7 +57,7 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     """
     remedy = "set it so, or choose another run=FOLDER"
     # Through the dataclass: a key that is younger than the checkpoint has its default in it.
-    stored = to_mapping(from_mapping(NetworkConfig, checkpoint[SECTION]["network"], "network"))
+    stored = to_mapping(from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network"))
     wanted = to_mapping(config.network)
     for key in sorted(stored.keys() | wanted.keys()):
         if stored.get(key) != wanted.get(key):
@@ -99,7 +99,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
 
 def network_of_checkpoint(checkpoint: dict[str, Any]) -> ParticleNetwork:
     """The network of a checkpoint, normaliser included, in evaluation mode: the moving average where there is one."""
-    network = build_network(from_mapping(NetworkConfig, checkpoint[SECTION]["network"], "network"))
+    network = build_network(from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network"))
     state = checkpoint["state_dict"]
     prefix = AVERAGED if any(name.startswith(AVERAGED) for name in state) else NETWORK
     network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
@@ -109,12 +109,12 @@ def network_of_checkpoint(checkpoint: dict[str, Any]) -> ParticleNetwork:
 
 def cursor_of_checkpoint(checkpoint: dict[str, Any]) -> SamplerState:
     """Where in the order of samples the run stood."""
-    return from_mapping(SamplerState, checkpoint[SECTION]["cursor"], "cursor")
+    return from_stored(SamplerState, checkpoint[SECTION]["cursor"], "cursor")
 
 
 def data_of_checkpoint(checkpoint: dict[str, Any]) -> DataInfo:
     """The data set that the network was trained on."""
-    return from_mapping(DataInfo, checkpoint[SECTION]["data"], "data")
+    return from_stored(DataInfo, checkpoint[SECTION]["data"], "data")
 
 
 def updates_of_checkpoint(checkpoint: dict[str, Any]) -> int:

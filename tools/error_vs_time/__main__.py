@@ -26,7 +26,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, shipped_weights
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
-from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.schema import ConfigError, from_mapping, from_stored, require, to_mapping
 from hgn.system.device import choose_device
 from hgn.system.files import write_json
 from hgn.system.progress import bar
@@ -72,7 +72,7 @@ def main(mapping: dict[str, Any]) -> int:
     for report in earlier:
         report.require_same([episode.key for episode in episodes], frames, _reference_name(config))
     known = [row for report in earlier for row in report.rows]
-    mpm = replace(from_mapping(MpmConfig, store.manifest.config["mpm"], "mpm"), device=_solver_device(device))
+    mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=_solver_device(device))
     networks = [c for c in network_contenders(config, device, episodes) if not is_among(c.row, known)]
     own_cell, rate = episodes[0].obstacle_grid.cell_size, episodes[0].frame_rate_hz
     own_grid = round(1 / own_cell)

@@ -26,7 +26,7 @@ from hgn.runtime.rollouts import RolloutResult, network_trials
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import require_frame_rate
 from hgn.scene.episode import Episode
-from hgn.schema import from_mapping, require, require_one_of, require_positive, to_mapping
+from hgn.schema import from_mapping, from_stored, require, require_one_of, require_positive, to_mapping
 from hgn.system.device import choose_device
 from hgn.system.files import write_atomically, write_json
 from hgn.system.progress import bar
@@ -99,7 +99,7 @@ def main(mapping: dict[str, Any]) -> int:
         report.add("network", run.name, simulated(simulator, run, episodes, report.frames), plain)
     if config.solver:
         simulator.release()
-        mpm = from_mapping(MpmConfig, store.manifest.config["mpm"], "mpm")
+        mpm = from_stored(MpmConfig, store.manifest.config["mpm"], "mpm")
         mpm = replace(mpm, device="gpu" if device.type == "cuda" else "cpu")
         for name, (trials, reference) in solver_floors(mpm, episodes, report.frames, config.displacements).items():
             report.add("solver", name, trials, reference)

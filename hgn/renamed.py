@@ -1,0 +1,69 @@
+"""Names of earlier releases: the one table by which they are answered with today's, and by which old files load.
+
+A command line or YAML file with an old name is refused, and the message gives the new one. Checkpoints, weights and
+manifests keep the names that they were written with, and load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# Old key to new key, as on a command line; a key stays in its section.
+KEYS = {
+    "half": "stored_precision",
+    "path": "backend",
+    "paths": "backends",
+    "training.path": "training.backend",
+}
+# Old value to new value, by the new key's last name.
+_BACKENDS = {"plain": "torch", "fast": "triton"}
+_PRECISIONS = {"highest": "fp32", "high": "tf32", "half": "fp16"}
+VALUES: dict[str, dict[Any, str]] = {
+    "backend": _BACKENDS,
+    "backends": _BACKENDS,
+    "precision": _PRECISIONS,
+    "precisions": _PRECISIONS,
+    "stored_precision": {True: "fp16", False: "fp32"},
+}
+
+
+def current_value(key: str, value: Any) -> Any:
+    """A value as it is called today; `key` may be dotted, and of an item of a list."""
+    values = VALUES.get(key.rpartition(".")[2].partition("[")[0], {})
+    return values.get(value, value) if isinstance(value, (str, bool)) else value
+
+
+def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+    """A stored mapping with today's keys and values; `section` is its dotted name in the configuration."""
+    result = {}
+    for old, value in mapping.items():
+        key = KEYS.get(_join(section, old), _join(section, old))
+        inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)
+        result[key.rpartition(".")[2]] = inner
+    return result
+
+
+def stored_names(mapping: Mapping[str, Any], section: str) -> dict[str, Any]:
+    """A section of today's configuration with the keys that data sets are identified by: those they began with."""
+    old_keys = {new: old.rpartition(".")[2] for old, new in KEYS.items()}
+    return {old_keys.get(_join(section, key), key): value for key, value in mapping.items()}
+
+
+def key_remedy(key: str, value: Any) -> str | None:
+    """What to write instead of an old key, which is dotted; none for a key that was not renamed."""
+    if key not in KEYS:
+        return None
+    value = current_value(KEYS[key], value)
+    example = f"={value}" if isinstance(value, (str, int, float)) else ""
+    return f"it is called {KEYS[key]} now; write {KEYS[key]}{example}"
+
+
+def value_remedy(key: str, value: Any) -> str:
+    """What to write instead of an old value; empty for a value that was not renamed."""
+    new = current_value(key, value)
+    return "" if new is value else f"{value} is called {new} now"
+
+
+def _join(section: str, key: str) -> str:
+    return f"{section}.{key}" if section else key

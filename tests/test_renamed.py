@@ -1,0 +1,62 @@
+"""hgn.renamed: old names are answered with today's, and files of before load."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hgn.config import DatagenConfig, NetworkConfig, RolloutConfig, SceneConfig, TrainConfig
+from hgn.data.identity import dataset_identity
+from hgn.network.build import build_network
+from hgn.renamed import KEYS, VALUES, current_names, stored_names
+from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
+from hgn.schema import ConfigError, from_mapping, from_stored, to_mapping
+
+
+def test_old_names_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An old key or value is refused in one line that says what it is called now."""
+    monkeypatch.setitem(KEYS, "training.rate", "training.learning_rate")
+    monkeypatch.setitem(VALUES, "symmetry", {"upright": "gravity"})
+    for training, remedy in (
+        (
+            {"rate": 0.1},
+            "training.rate is not a known key; it is called training.learning_rate now; write ",
+        ),
+        ({"symmetry": "upright"}, "training.symmetry must be one of .*, got 'upright'; upright is called gravity now"),
+        ({"raet": 0.1}, "training.raet is not a known key; known keys: "),
+    ):
+        with pytest.raises(ConfigError, match=remedy):
+            from_mapping(TrainConfig, {"training": training})
+    with pytest.raises(ConfigError, match=r"training\.rate is not a known key; known keys: "):  # of another command
+        from_mapping(RolloutConfig, {"training.rate": 0.1})
+
+
+def test_files_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stored section is read with the names that it was written with; of weights, too."""
+    monkeypatch.setitem(KEYS, "network.breadth", "network.width")
+    config = NetworkConfig(width=8, levels=2)
+    stored = to_mapping(config)
+    stored["breadth"] = stored.pop("width")
+    assert from_stored(NetworkConfig, stored, "network") == config
+    network = build_network(config)
+    info = WeightsInfo(config, 60.0, 1 / 64)
+    save_weights(tmp_path / "new.safetensors", network, info)
+    monkeypatch.setattr("hgn.runtime.weights.to_mapping", lambda info: to_mapping(info) | {"network": stored})
+    save_weights(tmp_path / "old.safetensors", network, info)
+    assert b"breadth" in (tmp_path / "old.safetensors").read_bytes()
+    for name in ("new", "old"):
+        assert load_weights(tmp_path / f"{name}.safetensors")[1] == info
+
+
+def test_identity_keeps_its_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A data set is identified by the keys that it was generated with, whatever they are called today."""
+    config = replace(DatagenConfig(), scene=SceneConfig(obstacle_count=3))
+    before = dataset_identity(config)
+    monkeypatch.setitem(KEYS, "scene.obstacles", "scene.obstacle_count")
+    scene = dataset_identity(config)["scene"]
+    assert scene["obstacles"] == 3 and "obstacle_count" not in scene
+    assert current_names(scene, "scene") == before["scene"]
+    assert from_stored(SceneConfig, scene, "scene") == config.scene
+    assert stored_names(to_mapping(config.mpm), "mpm") == to_mapping(config.mpm)
