@@ -231,8 +231,11 @@ def _table(definition: Mapping[str, Any], sources: Mapping[str, Any]) -> str:
     return "\n" + "\n".join(lines) + "\n\n"
 
 
-def _fill(template: Any, names: Mapping[str, Any]) -> str:
-    return FIELD.sub(lambda match: _field(match[1], names), str(template))
+def _fill(template: str, names: Mapping[str, Any]) -> str:
+    fields = [_field(field, names) for field in FIELD.findall(template)]
+    if fields and not any(fields):
+        return ""
+    return FIELD.sub(lambda _: fields.pop(0), template)
 
 
 def _field(field: str, names: Mapping[str, Any]) -> str:
@@ -241,8 +244,8 @@ def _field(field: str, names: Mapping[str, Any]) -> str:
     optional = form.startswith("?")
     try:
         value = _evaluate(expression, names)
-    except (LookupError, NameError, TypeError) as error:
-        if optional and (not isinstance(error, TypeError) or "NoneType" in str(error)):
+    except (AttributeError, LookupError, NameError, TypeError) as error:
+        if optional and (isinstance(error, (LookupError, NameError)) or "NoneType" in str(error)):
             return ""
         raise
     if value is None and optional:
