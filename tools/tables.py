@@ -206,7 +206,7 @@ def _rms(values: Any) -> float:
 
 
 FUNCTIONS: dict[str, Any] = {
-    **{function.__name__: function for function in (abs, every, len, list, max, min, sorted, sum, zip)},
+    **{function.__name__: function for function in (abs, any, dict, every, len, list, max, min, sorted, str, sum, zip)},
     **{
         "mean": statistics.fmean,
         "median": statistics.median,
@@ -273,8 +273,8 @@ def formatted(value: Any, form: str) -> str:
     if percent:
         value, form = value * 100, form[:-1]
     if form.endswith("g"):
-        small = abs(value) < 1e-3
-        form = f".{int(form[1:-1]) - 1}e" if small else f"#{form}"
+        digits = int(form[1:-1])
+        form = f".{digits - 1}e" if abs(value) < 1e-3 else f"#{form}" if abs(value) < 10**digits else ",.0f"
     text = format(value, form) + ("%" if percent else "")
     text = re.sub(r"e([+-])0*(\d+)", lambda match: f"e{match[1].strip('+')}{match[2]}", text)
     return re.sub(r"\.(?=$|%)", "", text).replace("%", " %")
