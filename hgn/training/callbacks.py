@@ -1,4 +1,4 @@
-"""What happens beside the updates: checkpoints, monitoring, log lines, stopping.
+"""What happens beside the updates: one start on all ranks, checkpoints, monitoring, log lines, stopping.
 
 Files of a run: checkpoints/last.ckpt, checkpoints/best.ckpt (lowest one-step validation error), metrics.jsonl,
 tensorboard/, pictures/.
@@ -26,8 +26,10 @@ from hgn.render.pictures import rollout_of_episode
 from hgn.runtime.rollouts import network_trials
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.episode import Episode
+from hgn.schema import ConfigError, to_mapping
 from hgn.system.files import TEMPORARY_SUFFIX
 from hgn.system.progress import bar
+from hgn.training import lightning_compat
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.data_module import EpisodeDataModule, agreed_count
 from hgn.training.errors import (
@@ -43,6 +45,32 @@ from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 from hgn.training.tensorboard import show_rollout
+
+
+class SameStart(Callback):
+    """All ranks begin at one place: the same update, the same samples next, the same weights and normaliser.
+
+    From then on nothing but gradients travels at an update, but for those where ranks log, save, measure or agree.
+    """
+
+    def __init__(self, feed: EpisodeDataModule) -> None:
+        self.feed = feed
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Raises: ConfigError on every rank when one of them resumes from another checkpoint."""
+        if trainer.world_size == 1:
+            return
+        lightning_compat.skip_sigterm_broadcast(trainer)
+        mine: dict[str, Any] = {"update": trainer.global_step} | to_mapping(self.feed.cursor)
+        first = trainer.strategy.broadcast(mine)
+        if not trainer.strategy.reduce_boolean_decision(mine == first, all=True):
+            raise ConfigError(
+                f"run must be a folder that all machines share, got another checkpoint on some of them (rank "
+                f"{trainer.global_rank}: {mine}, rank 0: {first}); give them one run=FOLDER"
+            )
+        # A data set that grows may have shown other statistics to a rank that looked later.
+        for tensor in (*pl_module.parameters(), *pl_module.buffers()):
+            torch.distributed.broadcast(tensor.detach(), 0)
 
 
 class Checkpoints(Callback):

@@ -23,6 +23,7 @@ from hgn.data.sampler import EpisodeSampler, Sample, SamplerState
 from hgn.data.storage import without_patience
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
+from hgn.training import lightning_compat
 from hgn.training.pushforward import drawn_starts
 
 T = TypeVar("T")
@@ -191,8 +192,7 @@ class EpisodeDataModule(LightningDataModule):
         trainer = self.trainer
         if trainer is None:
             return self.interrupted()
-        # Lightning's own handler is in place until the first update begins
-        if trainer.world_size > 1 or not (self.interrupted() or trainer.received_sigterm):
+        if trainer.world_size > 1 or not (self.interrupted() or lightning_compat.received_sigterm(trainer)):
             return False
         trainer.should_stop = True
         return True

@@ -1,19 +1,81 @@
-"""What the processes of a distributed training must have in common."""
+"""How many processes train, which of them this is, the run's folder, and how gradients are averaged over them.
+
+Launchers say so in environment variables: torchrun sets RANK, WORLD_SIZE and LOCAL_WORLD_SIZE, srun sets SLURM_PROCID,
+SLURM_NTASKS and SLURM_NNODES, Lightning's own launcher, which starts the other processes of a machine itself, sets
+LOCAL_RANK and NODE_RANK in them.
+"""
 
 from __future__ import annotations
 
 import inspect
+import os
+import re
+from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.strategies import DDPStrategy
-from torch.nn.parallel import DistributedDataParallel
 
-from hgn.schema import ConfigError, to_mapping
-from hgn.training.data_module import EpisodeDataModule
+from hgn.config import TrainingConfig
+from hgn.schema import ConfigError, require
 
+RUN_VARIABLE = "HGN_RUN"
 MESSAGE_MB = 4  # gradients of the network's last layers are on their way while those of its first are computed
+_RANDOM_ID = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+
+
+def first_rank() -> bool:
+    """Whether this process leads: it alone starts the generator and writes the run's files."""
+    if "RANK" in os.environ:
+        # torchrun's word counts: inside Slurm its rank 0 may be on any of the nodes
+        return os.environ["RANK"] == "0"
+    return all(os.environ.get(name, "0") == "0" for name in ("SLURM_PROCID", "NODE_RANK", "LOCAL_RANK"))
+
+
+def first_on_machine() -> bool:
+    """Whether this process leads those of its machine."""
+    if "RANK" in os.environ:
+        return os.environ.get("LOCAL_RANK", "0") == "0"
+    return all(os.environ.get(name, "0") == "0" for name in ("SLURM_LOCALID", "LOCAL_RANK"))
+
+
+def default_run(name: str) -> Path:
+    """The run's folder where the configuration names none; the same in all processes and after every restart.
+
+    In runs/, the first of these that there is: HGN_RUN (a path may be given too), torchrun's run id (--rdzv-id),
+    `name` with Slurm's job id (which a requeued job keeps), `name`. So two jobs do not meet in one folder by accident.
+    """
+    torchrun_id = os.environ.get("TORCHELASTIC_RUN_ID", "none")  # none: no id was given
+    if _RANDOM_ID.fullmatch(torchrun_id):
+        torchrun_id = "none"  # torchrun --standalone makes a new one at each start: nothing could go on from there
+    if os.environ.get(RUN_VARIABLE):
+        return Path("runs", os.environ[RUN_VARIABLE])
+    if torchrun_id != "none":
+        return Path("runs", re.sub(r"[^\w.-]+", "-", torchrun_id))
+    if "RANK" not in os.environ and _inside_slurm_step() and "SLURM_JOB_ID" in os.environ:
+        return Path("runs", f"{name}-{os.environ['SLURM_JOB_ID']}")
+    return Path("runs", name)
+
+
+def layout(training: TrainingConfig) -> tuple[int, int]:
+    """(processes on each machine, machines): as configured, else as launched, else all GPUs of one machine.
+
+    Raises: ConfigError when there are not as many GPUs, or the launcher started another number of processes.
+    """
+    _check_restarts()
+    launched = _launched()
+    devices, nodes = training.devices, training.nodes
+    if launched is not None:
+        devices, nodes = devices or launched[0], nodes or launched[1]
+    devices, nodes = _devices(training.accelerator, devices), nodes or 1
+    if launched is not None and devices * nodes != launched[0] * launched[1]:
+        # each process would train alone and write over the others' checkpoints, or wait for ever
+        raise ConfigError(
+            f"training.devices x training.nodes must be the {launched[0] * launched[1]} processes that the launcher "
+            f"started, got {devices} x {nodes}; leave both out, or set training.devices to the processes of one "
+            "machine and training.nodes to the number of machines, and under Slurm start one task for each device "
+            "with srun"
+        )
+    return devices, nodes
 
 
 def averaging_options() -> dict[str, Any]:
@@ -22,15 +84,12 @@ def averaging_options() -> dict[str, Any]:
     In buckets, while the backward pass still runs; nothing else travels. Buffers are not sent at each update: the
     normaliser is constant, and the sum of losses is each rank's own.
     """
+    from torch.nn.parallel import DistributedDataParallel
+
     # torch 2.13 has another name for it
     renamed = "forward_sync_buffers" in inspect.signature(DistributedDataParallel).parameters
     keep_buffers = "forward_sync_buffers" if renamed else "broadcast_buffers"
     return {"gradient_as_bucket_view": True, "bucket_cap_mb": MESSAGE_MB, keep_buffers: False}
-
-
-def gradient_averaging(path: str) -> DDPStrategy:
-    """The strategy of a training on several ranks; `path` is plain or fast."""
-    return DDPStrategy(**averaging_options()) if path == "plain" else _Unwrapped()
 
 
 def sum_over_ranks(tensor: torch.Tensor) -> None:
@@ -38,40 +97,39 @@ def sum_over_ranks(tensor: torch.Tensor) -> None:
     torch.distributed.all_reduce(tensor)
 
 
-class _Unwrapped(DDPStrategy):
-    """For updates that average their gradients themselves: no DistributedDataParallel, which would wait for them."""
-
-    def configure_ddp(self) -> None:
-        pass
-
-
-class SameStart(Callback):
-    """All ranks begin at one place: the same update, the same samples next, the same weights and normaliser.
-
-    From then on nothing but gradients travels at an update, but for those where ranks log, save, measure or agree.
-    """
-
-    def __init__(self, feed: EpisodeDataModule) -> None:
-        self.feed = feed
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Raises: ConfigError on every rank when one of them resumes from another checkpoint."""
-        if trainer.world_size == 1:
-            return
-        # Before each update Lightning asks rank 0 for a SIGTERM, and has the host wait for the device until it answers
-        # (its issue 21487). Ours goes another way: the ranks agree now and then, see Stopper.
-        trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
-        mine: dict[str, Any] = {"update": trainer.global_step} | to_mapping(self.feed.cursor)
-        first = trainer.strategy.broadcast(mine)
-        if not trainer.strategy.reduce_boolean_decision(mine == first, all=True):
-            raise ConfigError(
-                f"run must be a folder that all machines share, got another checkpoint on some of them (rank "
-                f"{trainer.global_rank}: {mine}, rank 0: {first}); give them one run=FOLDER"
-            )
-        # A data set that grows may have shown other statistics to a rank that looked later.
-        for tensor in (*pl_module.parameters(), *pl_module.buffers()):
-            torch.distributed.broadcast(tensor.detach(), 0)
+def _check_restarts() -> None:
+    shared = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    if shared and int(os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) > 0:
+        # Restarted processes would find the addresses of those that are gone, and wait for half an hour.
+        raise ConfigError(
+            "TORCH_DISABLE_SHARE_RDZV_TCP_STORE must be 1 in torchrun's environment where it may restart processes "
+            f"(--max-restarts {os.environ['TORCHELASTIC_MAX_RESTARTS']}), got "
+            f"{os.environ.get('TORCH_DISABLE_SHARE_RDZV_TCP_STORE', 'nothing')}; see pytorch issue 135712"
+        )
 
 
-def _nothing() -> None:
-    pass
+def _devices(accelerator: str, wanted: int | None) -> int:
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    require(accelerator != "gpu" or gpus > 0, "training.accelerator", "auto or cpu without a GPU", "gpu")
+    if accelerator == "cpu" or gpus == 0:
+        return wanted or 1
+    wanted = wanted or gpus
+    require(wanted <= gpus, "training.devices", f"at most the {gpus} GPUs of this machine", wanted)
+    return wanted
+
+
+def _launched() -> tuple[int, int] | None:
+    """(processes on each machine, machines) that a launcher started."""
+    if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
+        processes = int(os.environ["WORLD_SIZE"])
+        here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
+        return here, processes // here
+    if _inside_slurm_step():
+        processes, nodes = int(os.environ["SLURM_NTASKS"]), int(os.environ.get("SLURM_NNODES", "1"))
+        return processes // nodes, nodes
+    return None
+
+
+def _inside_slurm_step() -> bool:
+    interactive = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # Lightning's rule: a shell, no job
+    return "SLURM_PROCID" in os.environ and "SLURM_NTASKS" in os.environ and not interactive

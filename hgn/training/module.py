@@ -21,6 +21,7 @@ from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.gns_backend import require_agreement, use_edges
 from hgn.schema import to_mapping
+from hgn.training import lightning_compat
 from hgn.training.checkpoint import (
     AVERAGED,
     NETWORK,
@@ -178,17 +179,10 @@ class TrainingModule(LightningModule):
         if report and self.trainer.is_global_zero:
             print(report, file=sys.stderr)
         self.cursor = chunk.cursor
-        # what an optimiser's and a scheduler's step leave behind, `count` times
-        progress = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
-        for tracker in (progress.total, progress.current):
-            tracker.ready += count
-            tracker.completed += count
+        lightning_compat.count_updates(self.trainer, count)
         scheduler = self.lr_schedulers()
         assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
-        rate = self._rate(first + count)
-        scheduler.last_epoch, scheduler._step_count = first + count, first + count + 1
-        scheduler._last_lr = [rate]
-        scheduler.optimizer.param_groups[0]["lr"] = rate
+        lightning_compat.advance_scheduler(scheduler, first + count, self._rate(first + count))
 
     def _rate(self, update: int) -> float:
         """The learning rate of update number `update`, from 0."""
@@ -228,8 +222,4 @@ class TrainingModule(LightningModule):
         elif not any(name.startswith(AVERAGED) for name in state):  # the average begins here
             begun = {AVERAGED + k.removeprefix(NETWORK): v.clone() for k, v in state.items() if k.startswith(NETWORK)}
             state.update(begun)
-        # Lightning counts updates in one of two places, by the path that made them.
-        updates = {"ready": updates_of_checkpoint(checkpoint), "completed": updates_of_checkpoint(checkpoint)}
-        loops = checkpoint["loops"]["fit_loop"]
-        loops["epoch_loop.automatic_optimization.optim_progress"]["optimizer"]["step"]["total"] = dict(updates)
-        loops["epoch_loop.manual_optimization.optim_step_progress"]["total"] = dict(updates)
+        lightning_compat.set_stored_updates(checkpoint, updates_of_checkpoint(checkpoint))

@@ -42,7 +42,7 @@ def test_fast_training_is_the_plain_one(
     """Without noise and jitter both paths make the same updates: every count and log line is there, weights,
     their average and moments agree; a training may change path at any checkpoint, and ends where the others do."""
     if device().type == "cpu":
-        monkeypatch.setattr("hgn.runtime.backend.why_not_fast", lambda *_: None)  # kernels run in the interpreter
+        monkeypatch.setattr("hgn.runtime.backend.why_not_fast", lambda *_: None)  # interpreted
     same = {"noise_std": 0.0, "grid_jitter": False, "warmup_updates": 3, "ema_decay": 0.7}
     ends = {}
     for name, parts in {
@@ -88,7 +88,9 @@ def test_fast_training_of_gns_is_the_plain_one(
     plain one does, with the same counts and rates."""
     on_cpu = device().type == "cpu"
     if on_cpu:
-        monkeypatch.setattr("hgn.train.why_not_trained_fast", lambda *_: None)  # kernels run in the interpreter
+        monkeypatch.setattr(
+            "hgn.training.session.why_not_trained_fast", lambda *_: None
+        )  # kernels run in the interpreter
     same = {"noise_std": 0.0, "grid_jitter": False, "optimizer": "muon", "ema_decay": 0.7, "maximum_updates": 3}
     same |= {"log_every": 3, "checkpoint_every": 3, "monitor_every": 3, "precision": "highest" if on_cpu else "half"}
     ends = {}

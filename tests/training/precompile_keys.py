@@ -1,4 +1,4 @@
-"""precompile_keys.py launch|behind [gns]: the keys in Triton's cache on disk of every kernel of a small update, one a line.
+"""precompile_keys.py launch|behind [gns]: the keys in Triton's cache on disk of a small update's kernels, one a line.
 
 They are asked for in the order of the launches, as a training does, or from behind, as a process might that compiles a
 share of them.

@@ -23,7 +23,7 @@ from hgn.config import DatagenConfig, TrainingConfig
 from hgn.data.sampler import EpisodeSampler
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.launch import default_run, first_rank, layout
+from hgn.training.distributed import default_run, first_rank, layout
 from hgn.training.module import TrainingModule
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -17,11 +17,13 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from training.runs import metrics, train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig
+from hgn.config import DatagenConfig, TrainConfig
+from hgn.data.manifest import Manifest
 from hgn.runtime.rollouts import RolloutResult
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, from_mapping
 from hgn.training import callbacks
 from hgn.training.checkpoint import read_checkpoint
+from hgn.training.dataset import PublishedEpisodes
 from hgn.training.module import TrainingModule
 
 MakeConfig = Callable[..., DatagenConfig]
@@ -165,15 +167,14 @@ def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path,
     config = make_config(training_scenes=2)
     make_dataset(config)
     looks, now = [], [0.0]
-    load = train.Manifest.load
-    monkeypatch.setattr(train.Manifest, "load", lambda *a, **k: looks.append(now[0]) or load(*a, **k))
-    monkeypatch.setattr(train.time, "monotonic", lambda: now[0])
+    load = Manifest.load
+    monkeypatch.setattr(Manifest, "load", lambda *a, **k: looks.append(now[0]) or load(*a, **k))
+    monkeypatch.setattr("hgn.training.dataset.time.monotonic", lambda: now[0])
     for wanted, expected in ((3, [0.0, 12.0, 24.0]), (2, [0.0])):
         mapping = train_mapping(config, tmp_path)
         mapping["dataset"]["training_scenes"] = wanted
         del mapping["name"]
-        settings = train.from_mapping(train.TrainConfig, mapping)
-        text = train._published_text(settings, None)
+        text = PublishedEpisodes(from_mapping(TrainConfig, mapping), None)
         looks.clear()
         for now[0] in (0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 24.0, 28.0):
             assert text() == f"2/{wanted} episodes"

@@ -1,0 +1,94 @@
+"""The data set that a training needs: whether it is there, waiting for its episodes, and how far it has come."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+
+from hgn.config import TrainConfig
+from hgn.data.manifest import SPLITS, Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.data.storage import UnreachableError, is_remote
+from hgn.schema import ConfigError
+from hgn.system.progress import bar
+from hgn.training.distributed import first_rank
+from hgn.training.generator import Generator
+from hgn.training.stop import StopRequest
+
+BETWEEN_LOOKS_S = 10.0  # at the data set's manifest, for the progress line
+
+
+def is_complete(config: TrainConfig) -> bool:
+    """Whether every episode that the configuration asks for is published."""
+    folder = config.dataset.folder
+    if not EpisodeStore.available(folder):
+        return False
+    manifest = Manifest.load(folder)
+    return all(manifest.published(split) >= config.dataset.scenes(split) for split in SPLITS)
+
+
+def wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: StopRequest) -> EpisodeStore | None:
+    """Waits until enough training episodes are published, showing what is awaited; none when asked to stop.
+
+    Raises: ConfigError when they cannot come: the generator failed, or nobody makes them.
+    """
+    folder = config.dataset.folder
+    needed = min(config.training.minimum_episodes, config.dataset.training_scenes)
+    if generator is None and first_rank() and not EpisodeStore.available(folder):
+        raise ConfigError(
+            f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
+            f"out={folder}, or set training.generate=true"
+        )
+    progress = None
+    while not stop.requested:
+        store = EpisodeStore(folder, "train") if EpisodeStore.available(folder) else None
+        if store is not None and len(store) >= needed:
+            if progress is not None:
+                progress.close()
+            return store
+        if generator is not None:
+            generator.check()
+            if not generator.running:
+                raise ConfigError(
+                    f"training.minimum_episodes must be reachable, got {needed} where the data set has "
+                    f"{len(store) if store else 0}; ask for more scenes"
+                )
+        elif first_rank() and (not is_remote(folder) or (store is not None and store.manifest.complete)):
+            raise ConfigError(
+                f"dataset.folder must hold {needed} training episodes, got {len(store) if store else 0} in {folder}; "
+                "generate them, or set training.generate=true"
+            )
+        if progress is None and first_rank():
+            print(f"waiting for training episode {needed} in {folder}", file=sys.stderr)
+            progress = bar("generating", total=needed * config.dataset.frames, unit="frame")
+        if progress is not None and generator is not None:
+            frames = generator.frames_done()
+            progress.update(min(max(frames, progress.n), progress.total) - progress.n)
+        time.sleep(0.5)
+    return None
+
+
+class PublishedEpisodes:
+    """What the progress line says of the data set: `5/800 episodes`.
+
+    Hundreds of scenes take a tenth of a second to read: not with every line, and never again once all are there.
+    """
+
+    def __init__(self, config: TrainConfig, generator: Generator | None) -> None:
+        self.folder, self.total = config.dataset.folder, config.dataset.training_scenes
+        self.generator = generator
+        self._looked_at_s, self._text = -math.inf, ""
+
+    def __call__(self) -> str:
+        if time.monotonic() - self._looked_at_s < BETWEEN_LOOKS_S:
+            return self._text
+        try:
+            count = Manifest.load(self.folder, patience_s=0.0).published("train")
+        except UnreachableError:
+            count, self._text = 0, "the service does not answer"
+        else:
+            ended = self.generator is not None and not self.generator.running and count < self.total
+            self._text = f"{count}/{self.total} episodes{', generator stopped' if ended else ''}"
+        self._looked_at_s = math.inf if count >= self.total else time.monotonic()
+        return self._text

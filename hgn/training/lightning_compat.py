@@ -1,0 +1,77 @@
+"""All of Lightning's private and fragile parts that this project touches; pyproject.toml bounds its version.
+
+`tests/training/test_lightning_compat.py` fails when a new version has changed one of them.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from typing import Any
+
+import torch
+from lightning.pytorch import Trainer
+from lightning.pytorch.strategies import DDPStrategy
+
+from hgn.training.distributed import averaging_options
+
+
+def quieten() -> None:
+    """No news and no advice from Lightning: the commands say themselves what they do."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", ".*does not have many workers.*")
+    warnings.filterwarnings("ignore", ".*LeafSpec.*")
+    warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.accelerator=cpu says so
+
+
+def gradient_averaging(path: str) -> DDPStrategy:
+    """The strategy of a training on several ranks; `path` is plain or fast."""
+    return DDPStrategy(**averaging_options()) if path == "plain" else _Unwrapped()
+
+
+class _Unwrapped(DDPStrategy):
+    """For updates that average their gradients themselves: no DistributedDataParallel, which would wait for them."""
+
+    def configure_ddp(self) -> None:
+        pass
+
+
+def skip_sigterm_broadcast(trainer: Trainer) -> None:
+    """Before each update Lightning asks rank 0 for a SIGTERM, and has the host wait for the device until it answers
+    (its issue 21487). Ours goes another way: the ranks agree now and then, see hgn.training.callbacks.Stopper.
+    """
+    trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
+
+
+def received_sigterm(trainer: Trainer) -> bool:
+    """Whether a SIGTERM reached Lightning's own handler, which is in place until the first update begins."""
+    return trainer.received_sigterm
+
+
+def count_updates(trainer: Trainer, count: int) -> None:
+    """Leaves behind what `count` steps of an optimiser do, where kernels made them: `trainer.global_step` grows."""
+    progress = trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
+    for tracker in (progress.total, progress.current):
+        tracker.ready += count
+        tracker.completed += count
+
+
+def advance_scheduler(scheduler: torch.optim.lr_scheduler.LambdaLR, update: int, rate: float) -> None:
+    """Leaves behind what the scheduler's steps up to this update do, the last of which gave this learning rate."""
+    scheduler.last_epoch, scheduler._step_count = update, update + 1
+    scheduler._last_lr = [rate]
+    scheduler.optimizer.param_groups[0]["lr"] = rate
+
+
+def set_stored_updates(checkpoint: dict[str, Any], updates: int) -> None:
+    """Lightning counts updates in one of two places, by the backend that made them; a checkpoint gets both."""
+    loops = checkpoint["loops"]["fit_loop"]
+    for tracker in (
+        loops["epoch_loop.automatic_optimization.optim_progress"]["optimizer"]["step"],
+        loops["epoch_loop.manual_optimization.optim_step_progress"],
+    ):
+        tracker["total"] = {"ready": updates, "completed": updates}
+
+
+def _nothing() -> None:
+    pass

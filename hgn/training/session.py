@@ -1,0 +1,164 @@
+"""One training from its start or its last checkpoint to its end: network, data, callbacks and Lightning's trainer."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+import yaml
+
+from hgn.config import TrainConfig
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.data.sampler import SamplerState
+from hgn.network.base import ParticleNetwork
+from hgn.network.build import build_network
+from hgn.runtime.backend import choose_path, set_matmul_precision, why_not_trained_fast
+from hgn.schema import to_mapping
+from hgn.system.device import keep_to_quota
+from hgn.system.files import write_atomically
+from hgn.system.provenance import provenance
+from hgn.training.checkpoint import DataInfo
+from hgn.training.distributed import first_on_machine, first_rank, layout
+from hgn.training.errors import told_gain
+from hgn.training.stop import StopRequest
+
+if TYPE_CHECKING:
+    from hgn.runtime.precompile import Precompilation
+
+
+def train_network(
+    config: TrainConfig,
+    store: EpisodeStore,
+    checkpoint: tuple[Path, SamplerState] | None,
+    begin_with: ParticleNetwork | None,
+    stop: StopRequest,
+    published: Callable[[], str],
+    precompilation: Precompilation | None,
+) -> int:
+    """Trains until `training.maximum_updates` or a stop request; returns the exit code.
+
+    checkpoint: the file to resume from, and where in the data it stood. `published` tells how much of the data set is
+    there. Every rank calls this.
+    """
+    # Lightning loads for seconds: not before the waiting is over, and never for the other commands.
+    from lightning.pytorch import Trainer, seed_everything
+    from lightning.pytorch.loggers import TensorBoardLogger
+
+    from hgn.training import lightning_compat
+    from hgn.training.callbacks import Checkpoints, LogLines, Monitor, SameStart, Stopper
+    from hgn.training.checkpoint_writer import CheckpointWriter
+    from hgn.training.data_module import EpisodeDataModule
+    from hgn.training.gradients import GradientGuard
+    from hgn.training.module import TrainingModule
+    from hgn.training.tensorboard import FinalMetrics
+
+    training, run = config.training, Path(config.run)
+    data = DataInfo(
+        store.manifest.config_hash, config.dataset.frame_rate_hz, config.scene.cell_size, config.scene.gravity
+    )
+    lightning_compat.quieten()
+    devices, nodes = layout(training)
+    path, text = _path(config)
+    if first_rank():
+        print(text, file=sys.stderr)
+    keep_to_quota()
+    set_matmul_precision(training.precision)
+    seed_everything(training.seed, verbose=False)
+    module = TrainingModule(build_network(config.network), training, data, path)
+    if begin_with is None:
+        module.set_statistics(store.statistics())
+    else:
+        module.begin_with(begin_with)
+    feed = EpisodeDataModule(store, config.network, training, chunks=path == "fast", interrupted=lambda: stop.requested)
+    if checkpoint is not None:
+        feed.cursor = checkpoint[1]
+    _write_run_files(config, run)
+
+    writer = CheckpointWriter()
+    checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every, writer)
+    monitor = Monitor(run, store, stop, checkpoints)
+    guard = GradientGuard(training.maximum_skipped_updates)
+    lines = LogLines(run, monitor, guard, feed, published)
+    final = FinalMetrics(to_mapping(config), monitor.last, stop)
+    trainer = Trainer(
+        accelerator=training.accelerator,
+        devices=devices,
+        num_nodes=nodes,
+        strategy=lightning_compat.gradient_averaging(path) if devices * nodes > 1 else "auto",
+        max_steps=training.maximum_updates,
+        max_epochs=-1,
+        callbacks=[SameStart(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
+        plugins=[writer],
+        logger=TensorBoardLogger(run, name="", version="tensorboard"),
+        default_root_dir=run,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        log_every_n_steps=training.maximum_updates,
+    )
+    if precompilation is not None:
+        print(precompilation.wait(lambda: stop.requested), file=sys.stderr)
+    trainer.fit(module, feed, ckpt_path=checkpoint[0] if checkpoint else None, weights_only=True)
+    if trainer.is_global_zero:
+        _report(config, trainer.global_step, monitor.last, stop)
+    # a signal that came after the last update changed nothing
+    return 0 if trainer.global_step >= training.maximum_updates else stop.exit_code
+
+
+def _path(config: TrainConfig) -> tuple[str, str]:
+    """`plain` or `fast`, and a line that says so."""
+    training = config.training
+    on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
+    device = torch.device("cuda" if on_gpu else "cpu")
+    own_states = training.rollout_share > 0
+    reason = why_not_trained_fast(device, config.network, training.precision, own_states)
+    half_plainly = config.network.kind != "hgn"
+    return choose_path("training.path", training.path, training.precision, reason, half_plainly)
+
+
+def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation | None:
+    """Lets the kernels be compiled while others wait for data, where this process leads its machine's on GPUs."""
+    training = config.training
+    path, _ = _path(config)
+    on_gpu = training.accelerator != "cpu" and torch.cuda.is_available() and torch.version.hip is None
+    if path != "fast" or not on_gpu or not first_on_machine():
+        return None
+    # Triton, which the plain path does without, is loaded here.
+    from hgn.runtime.precompile import Precompilation
+    from hgn.training.precompile import job_of_training
+
+    devices, nodes = layout(training)
+    precompilation = Precompilation(job_of_training(config, torch.cuda.get_device_capability(), devices * nodes > 1))
+    stack.callback(precompilation.stop)
+    return precompilation
+
+
+def _write_run_files(config: TrainConfig, run: Path) -> None:
+    """The resolved configuration, with the commit and the machine that it ran on."""
+    run.mkdir(parents=True, exist_ok=True)
+    if not first_rank():
+        return
+    manifest = Manifest.load(config.dataset.folder)
+    record = to_mapping(config)
+    record["provenance"] = provenance("cuda" if torch.cuda.is_available() else "cpu") | {
+        "data_schema_version": manifest.schema_version,
+        "data_config_hash": manifest.config_hash,
+    }
+    write_atomically(run / "config.yaml", yaml.safe_dump(record, sort_keys=False).encode())
+
+
+def _report(config: TrainConfig, updates: int, last: dict[str, float], stop: StopRequest) -> None:
+    print(f"trained {updates} of {config.training.maximum_updates} updates in {config.run}")
+    if "one_step/validation" in last:
+        print(
+            f"one-step validation MSE {last['one_step/validation']:.3e}, "
+            f"{told_gain(last['one_step_gain/validation'])} the best trivial predictor's"
+        )
+    if stop.requested:
+        print("stopped; the same command goes on from here")
