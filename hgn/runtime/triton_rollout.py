@@ -245,24 +245,24 @@ class TritonRollout:
 
     def _integrate(self) -> None:
         integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
-            self.engine.output,
-            self.position_N3,
-            self.velocity_NV,
-            self.scene_N,
-            self.domain_S3,
-            self.mean,
-            self.std,
-            self.count,
-            self.grid.status,
-            self.lost,
-            self.frame,
-            self.path_TN3,
+            output=self.engine.output,
+            position=self.position_N3,
+            velocity=self.velocity_NV,
+            scene_of=self.scene_N,
+            domain=self.domain_S3,
+            mean=self.mean,
+            std=self.std,
+            particle_count=self.count,
+            status=self.grid.status,
+            lost=self.lost,
+            frame=self.frame,
+            path=self.path_TN3,
             OUT=OUT,
             HISTORY=self.config.velocity_history,
             COLUMNS=1 << (3 * self.config.velocity_history - 1).bit_length(),
             BLOCK=INTEGRATE_BLOCK,
         )
-        advance[(1,)](self.grid.status, self.lost, self.frame)
+        advance[(1,)](status=self.grid.status, lost=self.lost, frame=self.frame)
 
     def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:
         """Simulates `frames` more frames; their positions, float32 [frames, N, 3].

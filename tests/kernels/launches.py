@@ -70,13 +70,12 @@ def watched(
     begin = KernelInterface.__getitem__
 
     def watching(kernel: Any, grid: Any) -> Callable[..., None]:
-        def launch(*values: Any, **named: Any) -> None:
-            arguments = dict(zip(kernel.arg_names, values, strict=False)) | named
+        def launch(**arguments: Any) -> None:
             left = {name: value for name, value in arguments.items() if isinstance(value, torch.Tensor)}
             given = arguments | {
                 name: value.clone() for name, value in left.items() if value.data_ptr() not in parameters
             }
-            begin(kernel, grid)(*values, **named)
+            begin(kernel, grid)(**arguments)
             see(Launch(kernel.__name__, given, left, parameters, buffers or {}))
 
         return launch

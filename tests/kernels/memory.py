@@ -61,8 +61,8 @@ class Checked:
         old = [tensor for tensor in (reference() for reference in self._old) if tensor is not None]
         return Alive(old + living_tensors())
 
-    def begin(self, launch: str, arguments: tuple[Any, ...]) -> None:
-        pointers = tuple(a.data_ptr() for a in arguments if isinstance(a, torch.Tensor))
+    def begin(self, launch: str, arguments: dict[str, Any]) -> None:
+        pointers = tuple(a.data_ptr() for a in arguments.values() if isinstance(a, torch.Tensor))
         self.launches.append((launch, pointers))
         self._launch, self._alive = launch, self._now()
 
@@ -103,9 +103,9 @@ def checked_memory() -> Iterator[Checked]:
         return
     run = interpreter.GridExecutor.__call__
 
-    def launch(self: Any, *arguments: Any, **named: Any) -> None:
+    def launch(self: Any, **arguments: Any) -> None:
         checked.begin(self.fn.__name__, arguments)
-        run(self, *arguments, **named)
+        run(self, **arguments)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interpreter, "_interpreter", checked)

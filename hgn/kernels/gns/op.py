@@ -6,6 +6,7 @@ Shape legend: N particles, E directed edges, W width, P programs.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import triton
@@ -63,10 +64,9 @@ class FusedEdges(Edges):
         edge_EW = torch.empty(edges, width, dtype=self._dtype, device=weights.second.device)
         if edges:
             encode_forward[(triton.cdiv(edges, self.tuning.block),)](
-                *self._encoder(graph, first_bias_W, weights),
-                weights.gain,
-                weights.shift,
-                edge_EW,
+                **self._encoder(graph, first_bias_W, weights),
+                shift=weights.shift,
+                edge=edge_EW,
                 WIDTH=width,
                 BLOCK=self.tuning.block,
                 PRECISION=self.precision,
@@ -84,23 +84,21 @@ class FusedEdges(Edges):
         partial_P8W = weights.second.new_empty(programs, 8, width)
         encoder = self._encoder(graph, first_bias_W, weights)
         encode_norm_backward[(programs,)](
-            gradient_EW,
-            *encoder,
-            weights.gain,
-            activation_EW,
-            second_EW,
-            partial_P8W,
+            gradient=gradient_EW,
+            **encoder,
+            activation=activation_EW,
+            second_gradient=second_EW,
+            partial=partial_P8W,
             WIDTH=width,
             BLOCK=tuning.backward_block,
             PRECISION=self.precision,
             num_warps=tuning.backward_warps,
         )
         encode_layers_backward[(programs,)](
-            second_EW,
-            activation_EW,
-            *encoder[:5],
-            encoder[7],
-            partial_P8W,
+            second_gradient=second_EW,
+            activation=activation_EW,
+            **{name: encoder[name] for name in encoder.keys() - {"first", "first_bias", "second_bias", "gain"}},
+            partial=partial_P8W,
             WIDTH=width,
             BLOCK=tuning.backward_block,
             PRECISION=self.precision,
@@ -119,12 +117,11 @@ class FusedEdges(Edges):
         edges, width = edge_EW.shape
         programs = self._programs(self.tuning.programs, triton.cdiv(edges, self.tuning.block), edge_EW.device)
         step_forward[(programs,)](
-            edge_EW,
-            edge_EW if out_EW is None else out_EW,
-            message_EW,
-            *self._step(graph, ends, weights),
-            weights.gain,
-            weights.shift,
+            edge=edge_EW,
+            edge_out=edge_EW if out_EW is None else out_EW,
+            message_out=message_EW,
+            **self._step(graph, ends, weights),
+            shift=weights.shift,
             LAST=last,
             WIDTH=width,
             BLOCK=self.tuning.block,
@@ -152,14 +149,13 @@ class FusedEdges(Edges):
         gradient_EW = edge_EW if gradient_EW is None else gradient_EW.contiguous()
         step = self._step(graph, ends, weights)
         norm_backward[(programs,)](
-            self._stored(sum_gradient_NW * graph.scale),
-            gradient_EW,
-            edge_EW,
-            *step,
-            weights.gain,
-            activation_EW,
-            second_EW,
-            partial_P3W,
+            sum_gradient=self._stored(sum_gradient_NW * graph.scale),
+            gradient=gradient_EW,
+            edge=edge_EW,
+            **step,
+            activation=activation_EW,
+            second_gradient=second_EW,
+            partial=partial_P3W,
             LAST=last,
             WIDTH=width,
             BLOCK=tuning.backward_block,
@@ -167,15 +163,16 @@ class FusedEdges(Edges):
             num_warps=tuning.backward_warps,
         )
         layers_backward[(programs,)](
-            second_EW,
-            activation_EW,
-            gradient_EW,
-            graph.neighbours.receivers.offset_N1,
-            graph.neighbours.receivers.count,
-            *step[6:8],
-            hidden_EW,
-            result_EW,
-            partial_P3W,
+            second_gradient=second_EW,
+            activation=activation_EW,
+            gradient=gradient_EW,
+            offset=step["offset"],
+            particles=step["particles"],
+            own=step["own"],
+            second=step["second"],
+            hidden_gradient=hidden_EW,
+            edge_gradient=result_EW,
+            partial=partial_P3W,
             LAST=last,
             WIDTH=width,
             BLOCK=tuning.backward_block,
@@ -198,33 +195,35 @@ class FusedEdges(Edges):
     def _operand(self, weight: torch.Tensor) -> torch.Tensor:
         return rounded_to_tf32(weight) if self.precision == "tf32" else self._stored(weight)
 
-    def _encoder(self, graph: Graph, first_bias_W: torch.Tensor, weights: Weights) -> tuple[object, ...]:
-        receivers = graph.neighbours.receivers
-        return (
-            graph.position_N3.contiguous(),
-            graph.neighbours.sender_E,
-            receivers.segment_E,
-            receivers.offset_N1,
-            receivers.count,
-            weights.own.contiguous(),
-            first_bias_W,
-            self._operand(weights.second),
-            weights.bias,
-        )
+    def _encoder(self, graph: Graph, first_bias_W: torch.Tensor, weights: Weights) -> dict[str, Any]:
+        """What the encoder's kernels read, by their names."""
+        return {
+            "position": graph.position_N3.contiguous(),
+            "first": weights.own.contiguous(),
+            "first_bias": first_bias_W,
+            **self._edges(graph, weights),
+        }
 
-    def _step(self, graph: Graph, ends: Ends, weights: Weights) -> tuple[object, ...]:
+    def _step(self, graph: Graph, ends: Ends, weights: Weights) -> dict[str, Any]:
+        """What a message step's kernels read, by their names."""
+        return {
+            "send": self._stored(ends.send_NW),
+            "receive": self._stored(ends.receive_NW),
+            "own": self._operand(weights.own),
+            **self._edges(graph, weights),
+        }
+
+    def _edges(self, graph: Graph, weights: Weights) -> dict[str, Any]:
         receivers = graph.neighbours.receivers
-        return (
-            self._stored(ends.send_NW),
-            self._stored(ends.receive_NW),
-            graph.neighbours.sender_E,
-            receivers.segment_E,
-            receivers.offset_N1,
-            receivers.count,
-            self._operand(weights.own),
-            self._operand(weights.second),
-            weights.bias,
-        )
+        return {
+            "sender": graph.neighbours.sender_E,
+            "receiver": receivers.segment_E,
+            "offset": receivers.offset_N1,
+            "particles": receivers.count,
+            "second": self._operand(weights.second),
+            "second_bias": weights.bias,
+            "gain": weights.gain,
+        }
 
     def _sums(
         self,
@@ -239,11 +238,11 @@ class FusedEdges(Edges):
         order_E, offset_N1 = by_sender or (receivers.segment_E, receivers.offset_N1)
         total_NW = torch.empty_like(like_NW, memory_format=torch.contiguous_format)
         edge_sums[(receivers.count,)](
-            value_EW,
-            order_E,
-            offset_N1,
-            total_NW,
-            graph.scale if scaled else total_NW,
+            value=value_EW,
+            order=order_E,
+            offset=offset_N1,
+            total=total_NW,
+            scale_ptr=graph.scale if scaled else total_NW,
             ORDERED=by_sender is not None,
             SCALED=scaled,
             WIDTH=value_EW.shape[1],
@@ -265,12 +264,13 @@ class FusedEdges(Edges):
         shape = (programs, 1 if own is None else 2, width, width)
         partial_PCWW = torch.empty(shape, dtype=torch.float32, device=second_EW.device)
         weight_products[(programs,)](
-            second_EW,
-            activation_EW,
-            *(own or (second_EW, activation_EW)),
-            receivers.offset_N1,
-            receivers.count,
-            partial_PCWW,
+            second_gradient=second_EW,
+            activation=activation_EW,
+            hidden_gradient=second_EW if own is None else own[0],
+            edge=activation_EW if own is None else own[1],
+            offset=receivers.offset_N1,
+            particles=receivers.count,
+            partial=partial_PCWW,
             BOTH=own is not None,
             WIDTH=width,
             STEP=tuning.product_rows,

@@ -50,30 +50,36 @@ class DeviceNeighbours:
         """Of the first `count` particles, int32 [1]. There is no grid for an origin to move."""
         list_, receivers, capacity = self.neighbours, self.neighbours.receivers, self.capacity
         kernel.cell_keys[(triton.cdiv(self.particles, KEY_BLOCK),)](
-            position_N3,
-            scene_N,
-            count,
-            self._key_N,
-            self.status,
-            0.5 * SLACK * self.radius,
-            self.particles,
+            position=position_N3,
+            scene_of=scene_N,
+            particle_count=count,
+            key=self._key_N,
+            status=self.status,
+            size=0.5 * SLACK * self.radius,
+            particles=self.particles,
             BLOCK=KEY_BLOCK,
         )
         torch.sort(self._key_N, stable=True, out=(self._sorted_N, list_.order_N))
         torch.index_select(position_N3, 0, list_.order_N, out=self.position_N3)
         kernel.find_runs[(triton.cdiv(self.particles, RUN_BLOCK),)](
-            self._sorted_N,
-            count,
-            self._run_end,
-            self._run_shift,
-            self.particles,
+            key=self._sorted_N,
+            particle_count=count,
+            run_end=self._run_end,
+            run_shift=self._run_shift,
+            particles=self.particles,
             SIDE=SIDE,
             STEPS=max(LEAST_STEPS, self.particles.bit_length()),
             BLOCK=RUN_BLOCK,
         )
         self._walk(fill=False)
         torch.cumsum(self._counts_N, 0, out=receivers.offset_N1[1:])
-        kernel.check_room[(1,)](receivers.offset_N1, self.particles, capacity, self.needed_L, self.status)
+        kernel.check_room[(1,)](
+            offset=receivers.offset_N1,
+            particles=self.particles,
+            capacity=capacity,
+            needed=self.needed_L,
+            status=self.status,
+        )
         receivers.offset_N1.clamp_(max=capacity)
         list_.sender_E.fill_(self.particles)
         self._walk(fill=True)
@@ -81,16 +87,16 @@ class DeviceNeighbours:
     def _walk(self, fill: bool) -> None:
         list_, receivers = self.neighbours, self.neighbours.receivers
         kernel.walk_neighbours[(triton.cdiv(self.particles, WALK_BLOCK),)](
-            self.position_N3,
-            self._run_end,
-            self._run_shift,
-            self._counts_N,
-            receivers.offset_N1,
-            list_.sender_E,
-            receivers.segment_E,
-            self.particles,
-            self.capacity,
-            self.radius * self.radius,
+            position=self.position_N3,
+            run_end=self._run_end,
+            run_shift=self._run_shift,
+            counts=self._counts_N,
+            offset=receivers.offset_N1,
+            sender_of=list_.sender_E,
+            receiver_of=receivers.segment_E,
+            particles=self.particles,
+            capacity=self.capacity,
+            square_radius=self.radius * self.radius,
             FILL=fill,
             SIDE=SIDE,
             BLOCK=WALK_BLOCK,

@@ -329,42 +329,48 @@ class Updates:
         engine = self.engine
         engine.forward()
         kernel.loss_gradient[(triton.cdiv(self.particles, BLOCK),)](
-            engine.output,
-            self.target_N3,
-            self.share_N,
-            self.particle_count,
-            engine.output_gradient,
-            self.loss,
-            1.0 / engine.unscale,
-            self.settings.huber,
+            output=engine.output,
+            target=self.target_N3,
+            share_of=self.share_N,
+            particle_count=self.particle_count,
+            gradient=engine.output_gradient,
+            loss=self.loss,
+            scale=1.0 / engine.unscale,
+            huber=self.settings.huber,
             OUT=engine.output.shape[1],
             BLOCK=BLOCK,
         )
         engine.backward()
         if self.reduce is not None:
-            kernel.tell_overflow[(1,)](self.grid.status, engine.totals[-TAIL:])
+            kernel.tell_overflow[(1,)](status=self.grid.status, flag=engine.totals[-TAIL:])
 
     def launches_after_reduction(self) -> None:
         """From the gradients to new parameters."""
         engine, size, share = self.engine, self.packed.size, 1.0 / self.ranks
         blocks = (triton.cdiv(size, FLAT_BLOCK),)
         kernel.square_norm[blocks](
-            engine.totals, size, share, engine.totals[-TAIL:], self.grid.status, self.norm, BLOCK=FLAT_BLOCK
+            gradient=engine.totals,
+            size=size,
+            share=share,
+            flag=engine.totals[-TAIL:],
+            status=self.grid.status,
+            norm=self.norm,
+            BLOCK=FLAT_BLOCK,
         )
         kernel.adam[blocks](
-            self.values,
-            engine.weights,
-            engine.totals,
-            share,
-            self.first_moment,
-            self.second_moment,
-            self._rates,
-            self.update,
-            self.step,
-            self.grid.status,
-            self.norm,
-            size,
-            self.blocks.member if self.blocks else None,
+            value=self.values,
+            weight=engine.weights,
+            gradient=engine.totals,
+            share=share,
+            first_moment=self.first_moment,
+            second_moment=self.second_moment,
+            rates=self._rates,
+            update=self.update,
+            step=self.step,
+            status=self.grid.status,
+            norm=self.norm,
+            size=size,
+            others=self.blocks.member if self.blocks else None,
             PRECISION=engine.copy_precision,
             BLOCK=FLAT_BLOCK,
         )
@@ -383,11 +389,23 @@ class Updates:
             )
         if self.average is not None:
             kernel.average_values[blocks](
-                self.values, self.average, self._shares, self.update, self.grid.status, size, BLOCK=FLAT_BLOCK
+                value=self.values,
+                average=self.average,
+                shares=self._shares,
+                update=self.update,
+                status=self.grid.status,
+                size=size,
+                BLOCK=FLAT_BLOCK,
             )
         engine.refresh_encoder()
         kernel.finish_update[(1,)](
-            self.grid.status, self.update, self.step, self.loss, self.norm, self.loss_sum, self.counters
+            status=self.grid.status,
+            update=self.update,
+            step=self.step,
+            loss=self.loss,
+            norm=self.norm,
+            loss_sum=self.loss_sum,
+            counters=self.counters,
         )
 
     def _assemble(self) -> None:
@@ -397,37 +415,37 @@ class Updates:
         if smooth_step > 0:
             shortest, longest = (cells * config.cell_size for cells in SMOOTH_CELLS)
             kernel.draw_waves[(settings.scenes,)](
-                self._samples,
-                self.update,
-                self.waves_SKC,
-                smooth_step,
-                2 * math.pi / shortest,
-                math.log(longest / shortest),
-                settings.scenes,
+                samples=self._samples,
+                update=self.update,
+                waves=self.waves_SKC,
+                amplitude_step=smooth_step,
+                largest_number=2 * math.pi / shortest,
+                log_range=math.log(longest / shortest),
+                scenes=settings.scenes,
                 HISTORY=config.velocity_history,
                 WAVES=SMOOTH_WAVES,
             )
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
-            self._samples,
-            self._domains,
-            self.update,
-            self.position_N3,
-            self.velocity_NV,
-            self.scene_N,
-            self.material_N,
-            self.target_N3,
-            self.share_N,
-            self.origin_S3,
-            self.domain_S3,
-            self._obstacle_row,
-            self.particle_count,
-            self.mean,
-            self.std,
-            own_step,
-            self.waves_SKC,
-            config.cell_size if settings.grid_jitter else 0.0,
-            settings.scenes,
-            settings.obstacle_cell_size,
+            samples=self._samples,
+            sample_domain=self._domains,
+            update=self.update,
+            position=self.position_N3,
+            velocity=self.velocity_NV,
+            scene_of=self.scene_N,
+            material_of=self.material_N,
+            target=self.target_N3,
+            share_of=self.share_N,
+            origin=self.origin_S3,
+            domain=self.domain_S3,
+            obstacle_table=self._obstacle_row,
+            particle_count=self.particle_count,
+            mean=self.mean,
+            std=self.std,
+            noise_step=own_step,
+            waves=self.waves_SKC,
+            jitter=config.cell_size if settings.grid_jitter else 0.0,
+            scenes=settings.scenes,
+            obstacle_cell_size=settings.obstacle_cell_size,
             HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry,
             NOISE=own_step > 0,
