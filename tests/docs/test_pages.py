@@ -1,0 +1,152 @@
+"""What holds of every Markdown page: width, links, paths; and of README and CHANGELOG, whose form is fixed."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from docs.pages import ROOT, Block, blocks_of, markdown_files, prose_lines, shell_lines
+
+COLUMNS = 100
+README_LINES, README_COMMANDS, ENTRY_LINES = 130, 12, 2
+PAGES = markdown_files()
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+CODE = re.compile(r"`[^`]+`")
+LINK = re.compile(r"!?\[(?:[^\]\\]|\\.)*\]\(([^)\s]+)\)")
+ADDRESS = re.compile(r"\S*(?:https?://|s3://)\S*")
+# folders of the checkout whose names begin a path in prose
+PATH = re.compile(r"`((?:hgn|datagen|tools|tests|conf|jobs|docs|results)/[\w./-]*\w/?)`")
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and MyST make them."""
+    found: set[str] = set()
+    for _, line in prose_lines(page):
+        heading = re.match(r"#+ (.*)", line)
+        if heading:
+            text = re.sub(r"[^\w\- ]", "", heading[1].replace("`", "").lower())
+            found.add(text.strip().replace(" ", "-"))
+        found |= set(re.findall(r"^\(([\w-]+)\)=$", line))
+    return found
+
+
+def counted(line: str) -> str:
+    """A line without what may be long: addresses, and the targets of links."""
+    return ADDRESS.sub("", re.sub(r"\]\([^)]*\)", "]", line))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_no_line_is_wide(page: Path) -> None:
+    """No line of prose is wider than 100 columns; tables, addresses and blocks of code are left out."""
+    wide = [number for number, line in prose_lines(page) if not line.startswith("|") and len(counted(line)) > COLUMNS]
+    assert not wide, f"{page.relative_to(ROOT)}: lines {wide}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_links_lead_somewhere(page: Path) -> None:
+    """Each link to a file of the project, and each anchor in it, is there."""
+    for number, line in prose_lines(page):
+        for target in LINK.findall(CODE.sub("", line)):
+            if re.match(r"[a-z0-9+]+:", target):
+                continue
+            name, _, anchor = target.partition("#")
+            file = page if not name else (page.parent / name).resolve()
+            assert file.exists(), f"{page.relative_to(ROOT)}:{number}: {target}"
+            if anchor:
+                assert anchor in anchors(file), f"{page.relative_to(ROOT)}:{number}: {target}, of {anchors(file)}"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.is_relative_to(ROOT / "docs")] + [ROOT / "README.md"])
+def test_paths_exist(page: Path) -> None:
+    """Each path of the checkout that a page names in code is there."""
+    for number, line in prose_lines(page):
+        for path in PATH.findall(line):
+            assert (ROOT / path).exists(), f"{page.relative_to(ROOT)}:{number}: {path}"
+
+
+def commands() -> list[tuple[str, str]]:
+    """Each `python -m` line of README and docs/, in blocks and in code within lines, with its place."""
+    found = []
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        if {"log", "results"} & set(page.relative_to(ROOT).parts):
+            continue
+        for block in blocks_of(page):
+            found += [(str(block), line) for line in _commands_of(block)]
+        for number, line in prose_lines(page):
+            place = f"{page.relative_to(ROOT)}:{number}"
+            found += [(place, text) for text in re.findall(r"`(python -m [^`]+)`", line)]
+    return found
+
+
+def _commands_of(block: Block) -> list[str]:
+    return [line for line in shell_lines(block) if line.startswith("python -m ")] if block.language == "bash" else []
+
+
+def test_commands_compose() -> None:
+    """Each command that a page shows is there, and each setting that it is given exists."""
+    assert len(commands()) > 20
+    for place, line in commands():
+        _, _, module, *arguments = shlex.split(line.removesuffix("&").replace("…", "a"))
+        assert importlib.util.find_spec(module) is not None, f"{place}: {line}"
+        if module.split(".")[0] not in ("hgn", "datagen", "tools"):
+            continue
+        name = module.rpartition(".")[2]
+        if module == "tools.stability" and arguments:
+            name = f"stability_{arguments.pop(0)}"
+        if not arguments or "--help" in arguments:
+            continue
+        folder = ROOT / "conf" / ("command" if (ROOT / "conf" / "command" / f"{name}.yaml").is_file() else "")
+        if "--json" in arguments:
+            at = arguments.index("--json")
+            arguments[at : at + 2] = [f"json={arguments[at + 1]}"]
+        with initialize_config_dir(str(folder), version_base="1.3"):
+            compose(name, arguments)
+
+
+def test_readme_is_short() -> None:
+    """At most 130 lines, none over 100 columns (tables too), and at most twelve commands in its table."""
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= README_LINES
+    assert max(len(line) for line in lines) <= COLUMNS
+    assert sum(line.startswith("| `python -m ") for line in lines) <= README_COMMANDS
+
+
+def test_readme_figures() -> None:
+    """The README's table has the figures of the report's JSON, rounded to three digits."""
+    report = json.loads((ROOT / "results/error_vs_time/obstacles.json").read_text())
+    wanted = {
+        "HGN as shipped, fp16": {"weights": "obstacles.safetensors", "precision": "fp16"},
+        "GNS, fp16": {"weights": "gns.safetensors", "precision": "fp16"},
+        "solver, 48³ cells": {"system": "mpm", "grid": 48, "step": 1.0},
+        "solver, 64³ cells": {"system": "mpm", "grid": 64, "step": 1.0},
+    }
+    table = [line.strip("|").split("|") for line in (ROOT / "README.md").read_text().splitlines() if line[:2] == "| "]
+    cells = {row[0].strip(): [cell.strip() for cell in row[1:]] for row in table}
+    for name, keys in wanted.items():
+        (row,) = [row for row in report["rows"] if all(row.get(key) == value for key, value in keys.items())]
+        values = (row["ms"], row.get("one_step_mse"), row["position_mse"]["299"])
+        for text, value in zip(cells[name], values, strict=True):
+            assert (text == "") == (value is None), name
+            digits = len(re.sub(r"e.*|\.|^0+\.?0*", "", text))
+            assert value is None or float(text) == float(f"{value:.{max(digits, 1)}g}"), f"{name}: {text}, {value}"
+
+
+def test_changelog_form() -> None:
+    """Releases, in them Added, Changed and Fixed, in those entries of at most two lines."""
+    lines = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()
+    releases = [line for line in lines if line.startswith("## ")]
+    assert releases[0] == "## Unreleased"
+    assert all(re.fullmatch(r"## \d+\.\d+\.\d+ \(\d{4}-\d\d-\d\d\)", line) for line in releases[1:])
+    assert any(line.startswith("## 0.1.0 ") for line in releases)
+    entry = 0
+    for number, line in enumerate(lines, start=1):
+        assert len(line) <= COLUMNS, f"CHANGELOG.md:{number}"
+        entry = 1 if line.startswith("- ") else entry + 1 if entry and line.startswith("  ") else 0
+        assert entry <= ENTRY_LINES, f"CHANGELOG.md:{number}"
+        if line.startswith("### "):
+            assert re.match(r"### (Added|Changed|Fixed)", line), f"CHANGELOG.md:{number}"

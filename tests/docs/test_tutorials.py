@@ -1,0 +1,160 @@
+"""Every block of the README, of getting started and of the tutorials runs as it stands, with small settings."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from docs.pages import ROOT, Runner, blocks_of, run_module, shell_lines
+
+TUTORIALS = ROOT / "docs" / "tutorials"
+# a data set, made by the solver once for all pages, of which every training here is told
+SCENES = [
+    "scene.obstacle_count=1",
+    "scene.obstacle_shapes=[rock.obj]",
+    "scene.obstacle_size=[0.2,0.2]",
+    "scene.group_count=1",
+    "scene.group_size=0.04",
+    "scene.materials=[water]",
+    "scene.lone_particles=0",
+    "dataset.training_scenes=2",
+    "dataset.validation_scenes=1",
+    "dataset.test_scenes=0",
+    "dataset.frames=6",
+    "dataset.folder=data/mine",
+]
+TRAINING = [
+    "network.width=8",
+    "network.levels=2",
+    "network.message_passing_steps=1",
+    "training.maximum_updates=4",
+    "training.batch_scenes=1",
+    "training.precision=high",
+    "training.log_every=1",
+    "training.checkpoint_every=2",
+    "training.monitor_every=2",
+    "training.monitor_scenes=1",
+    "training.monitor_rollout_frames=0",
+    "training.accelerator=cpu",
+]
+SETTINGS = {
+    "datagen.solve": ["frames=2"],
+    "hgn.rollout": ["frames=2", "device=cpu", "render=false"],
+    "hgn.evaluate": ["rollout_frames=0", "device=cpu"],
+    "hgn.train": [*SCENES, *TRAINING],
+    "tools.render": ["size=64", "gif=false"],
+}
+INSTALLS = {
+    ". .venv/bin/activate": "tests/end_to_end/test_wheel.py",
+    "pip install PATH_OF_THE_CHECKOUT": "tests/end_to_end/test_wheel.py",
+    "pip install PATH_OF_THIS_FOLDER": "tests/end_to_end/test_wheel.py",
+}
+
+
+def lines_of(page: Path) -> list[str]:
+    """The commands of a page's shell blocks."""
+    return [line for block in blocks_of(page) if block.language == "bash" for line in shell_lines(block)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a mesh and a data set of three scenes, made as the command makes it."""
+    path = tmp_path_factory.mktemp("tutorials")
+    (mesh,) = [block for block in blocks_of(TUTORIALS / "train.md") if block.file == "rock.obj"]
+    (path / "rock.obj").write_text(mesh.content)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(path)
+        assert run_module("datagen", ["+experiment=obstacles", *SCENES, "dataset.workers=1", "progress=off"]) == 0
+    return path
+
+
+@pytest.fixture
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same folder, as the current one."""
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def test_readme(here: Path) -> None:
+    """README: a random scene, the main job, the program; what a tutorial runs word for word is not run twice."""
+    (here / "ramp.obj").write_text((ROOT / "conf/example/ramp.obj").read_text())
+    scene = {line: "tutorials/scene.md" for line in lines_of(TUTORIALS / "scene.md")}
+    runner = Runner(SETTINGS, {"frames=300": "frames=2"}, INSTALLS | scene)
+    runner.run(ROOT / "README.md")
+    assert len(runner.names["position_TN3"]) == 2
+    assert (here / "rollout/random_0.vtkhdf").is_file() and set(scene) <= set(runner.ran)
+
+
+def test_getting_started(here: Path) -> None:
+    """Getting started: what is installed, a first simulation, help."""
+    Runner(SETTINGS, elsewhere=INSTALLS).run(ROOT / "docs" / "getting_started.md")
+
+
+def test_scene(here: Path) -> None:
+    """A scene of one's own: network and solver simulate it, pictures and the distance between them."""
+    runner = Runner(SETTINGS)
+    runner.run(TUTORIALS / "scene.md")
+    assert runner.names["distance_T"].shape == (2,) and runner.names["distance_T"][0] == 0
+    assert list((here / "pictures").glob("*.png"))
+
+
+def test_train(here: Path) -> None:
+    """Training on scenes of one's own: an experiment file, a run that goes on, export, errors, other weights."""
+    Runner(SETTINGS | {"hgn.train": [*SETTINGS["hgn.train"], "training.maximum_updates=2"]}).run_first(
+        TUTORIALS / "train.md", "hgn.train"
+    )
+    Runner(SETTINGS).run(TUTORIALS / "train.md")
+    updates = [json.loads(line)["update"] for line in (here / "runs/mine/metrics.jsonl").read_text().splitlines()]
+    assert sorted(set(updates)) == [1, 2, 3, 4]
+    assert (here / "runs/mine_2/checkpoints/last.ckpt").is_file() and (here / "mine.safetensors").is_file()
+    files = {"config.yaml", "metrics.jsonl", "tensorboard", "checkpoints/last.ckpt", "checkpoints/best.ckpt"}
+    assert all((here / "runs/mine" / name).exists() for name in files)
+
+
+def test_program(here: Path) -> None:
+    """Weights in a program: a scene file as a whole, and frame by frame from particles and a mesh."""
+    runner = Runner(SETTINGS, {"frames=300": "frames=2", "frame == 300": "frame == 1"}, INSTALLS)
+    runner.run(TUTORIALS / "program.md")
+    assert runner.names["frame"] == 1 and (here / "my_scene.vtkhdf").is_file()
+
+
+@pytest.fixture
+def port(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A free one, at which the tutorial's program looks too."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        number = listener.getsockname()[1]
+    monkeypatch.setenv("DATASET", f"http://127.0.0.1:{number}")
+    monkeypatch.setenv("HGN_DATASET_TOKEN", "")
+    yield number
+
+
+def test_serve(here: Path, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A data set served over HTTP with a token, and two trainings that read it."""
+    monkeypatch.setenv("HGN_CACHE", str(here / "cache"))
+    settings = SETTINGS | {
+        "datagen.service": [*SCENES[:-1], "out=data/mine", "host=127.0.0.1", f"port={port}", "progress=json"],
+        "hgn.train": [*SETTINGS["hgn.train"], f"dataset.folder=http://127.0.0.1:{port}", "run=runs/served"],
+    }
+    runner = Runner(settings, setenv=monkeypatch.setenv)
+    try:
+        runner.run(TUTORIALS / "serve.md")
+    finally:
+        for process in runner.background:
+            process.send_signal(signal.SIGTERM)
+            process.communicate(timeout=60)
+    assert len(list((here / "cache").rglob("*.tar"))) == len(list((here / "data/mine").glob("*.tar")))
+
+
+def test_network(here: Path) -> None:
+    """The network: built, looked into, changed by settings and by a subclass with gradients."""
+    runner = Runner(SETTINGS)
+    runner.run(TUTORIALS / "network.md")
+    assert "`{parameter_count:,} parameters".format(parameter_count=runner.names["network"].parameter_count) in (
+        TUTORIALS / "network.md"
+    ).read_text()
+    assert (runner.names["changed"].speed.weight.grad != 0).any()
