@@ -10,7 +10,7 @@ TEST_PROCESSES ?= 2
 # the tests start a hundred processes, each of which would compile the package anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test check format lint types layers clean
+.PHONY: setup demo test check format lint types layers docs clean
 
 setup: $(VENV)/.installed
 
@@ -18,7 +18,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 13) and "Python 3.11 or 3.12 is needed (Taichi), got " + sys.version.split()[0] + "; name one with make PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
 	$(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off -c constraints.txt torch
-	$(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[dev]'
+	$(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[dev,docs]'
 	@touch $@
 
 demo: setup
@@ -40,7 +40,7 @@ demo: setup
 test: setup
 	$(RUN) -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
-check: setup format lint types layers test
+check: setup format lint types layers docs test
 
 format:
 	$(RUN) -m ruff format --check
@@ -54,5 +54,8 @@ types:
 layers:
 	$(VENV)/bin/lint-imports
 
+docs: setup
+	$(RUN) -m sphinx -W --keep-going -n -q -b html docs docs/_build
+
 clean:
-	rm -rf $(VENV) build dist
+	rm -rf $(VENV) build dist docs/_build docs/_generated

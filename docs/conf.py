@@ -12,7 +12,7 @@ project = "HGN"
 author = "the HGN maintainers"
 copyright = "the HGN maintainers, MIT licence"
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "configuration_pages"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "reference_pages"]
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build", "_generated", "_ext"]
 suppress_warnings = ["epub.unknown_project_files"]
@@ -22,6 +22,7 @@ myst_heading_anchors = 3
 
 html_theme = "furo"
 html_title = "HGN"
+html_css_files = ["custom.css"]
 html_static_path = ["_static"]
 html_show_sourcelink = False
 

@@ -1,16 +1,17 @@
-"""Writes the configuration reference from the dataclasses of hgn/config.py: fields, types, defaults, comments."""
+"""Writes the references from the sources: the dataclasses of hgn/config.py, and each command's docstring and settings."""
 
 from __future__ import annotations
 
 import ast
 import io
+import re
 import tokenize
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "hgn" / "config.py"
-TARGET = ROOT / "docs" / "_generated" / "configuration.md"
+GENERATED = ROOT / "docs" / "_generated"
 
 
 def configuration_page(source: str) -> str:
@@ -57,11 +58,41 @@ def _comment_of(item: ast.AnnAssign, lines: list[str], comments: dict[int, str])
     return "; ".join(([" ".join(above)] if above else []) + ([behind] if behind else []))
 
 
+def command_names() -> dict[str, tuple[Path, list[str]]]:
+    """By `python -m` name, the file of each command and the names of its configurations."""
+    found = {}
+    for folder in ("datagen", "hgn", "tools"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            names = re.findall(r"^ +run_command\(.*\"(\w+)\"\)", path.read_text(encoding="utf-8"), re.MULTILINE)
+            if names:
+                parts = path.relative_to(ROOT).with_suffix("").parts
+                found[".".join(parts[:-1] if parts[-1] == "__main__" else parts)] = (path, names)
+    return found
+
+
+def commands_page() -> str:
+    """Markdown: a section for each command, with its module's docstring and the file of its settings."""
+    parts = []
+    for name, (path, configurations) in command_names().items():
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        parts.append(f"## {name}\n\n```text\n{text}\n```\n")
+        for configuration in configurations:
+            file = ROOT / "conf" / "command" / f"{configuration}.yaml"
+            if file.is_file():
+                parts.append(f"```yaml\n{file.read_text(encoding='utf-8')}```\n")
+    return "\n".join(parts)
+
+
 def _write(_: Any) -> None:
-    TARGET.parent.mkdir(exist_ok=True)
-    page = configuration_page(SOURCE.read_text(encoding="utf-8"))
-    if not TARGET.is_file() or TARGET.read_text(encoding="utf-8") != page:
-        TARGET.write_text(page, encoding="utf-8")
+    GENERATED.mkdir(exist_ok=True)
+    pages = {
+        "configuration.md": configuration_page(SOURCE.read_text(encoding="utf-8")),
+        "commands.md": commands_page(),
+    }
+    for name, page in pages.items():
+        target = GENERATED / name
+        if not target.is_file() or target.read_text(encoding="utf-8") != page:
+            target.write_text(page, encoding="utf-8")
 
 
 def setup(app: Any) -> dict[str, bool]:
