@@ -82,7 +82,7 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_readme(here: Path) -> None:
     """README: a random scene, the main job, the program; what a tutorial runs word for word is not run twice."""
     (here / "ramp.obj").write_text((ROOT / "conf/example/ramp.obj").read_text())
-    scene = {line: "tutorials/scene.md" for line in lines_of(TUTORIALS / "scene.md")}
+    scene = dict.fromkeys(lines_of(TUTORIALS / "scene.md"), "tutorials/scene.md")
     runner = Runner(SETTINGS, {"frames=300": "frames=2"}, INSTALLS | scene)
     runner.run(ROOT / "README.md")
     assert len(runner.names["position_TN3"]) == 2
@@ -154,7 +154,8 @@ def test_network(here: Path) -> None:
     """The network: built, looked into, changed by settings and by a subclass with gradients."""
     runner = Runner(SETTINGS)
     runner.run(TUTORIALS / "network.md")
-    assert "`{parameter_count:,} parameters".format(parameter_count=runner.names["network"].parameter_count) in (
-        TUTORIALS / "network.md"
-    ).read_text()
+    assert (
+        "`{parameter_count:,} parameters".format(parameter_count=runner.names["network"].parameter_count)
+        in (TUTORIALS / "network.md").read_text()
+    )
     assert (runner.names["changed"].speed.weight.grad != 0).any()
