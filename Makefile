@@ -14,24 +14,32 @@ unexport PYTHONDONTWRITEBYTECODE
 
 setup: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+# modules are compiled as they are used: that of all at once takes longer than the tests of some
+INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off --no-compile -c constraints.txt
+
+$(VENV)/.created:
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 13) and "Python 3.11 or 3.12 is needed (Taichi), got " + sys.version.split()[0] + "; name one with make PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off -c constraints.txt torch
-	$(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[dev,docs]'
 	@touch $@
 
-demo: setup
-	@echo "== 1 of 5: generating MPM episodes"
-	$(RUN) -m datagen +experiment=demo
-	@echo "== 2 of 5: training"
+$(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/.created
+	$(INSTALL) -e '.[dev]'
+	@touch $@ $(VENV)/.demo
+
+# what the demo needs alone: the tests' packages are larger
+$(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/.created
+	$(INSTALL) -e '.[datagen,train]'
+	@touch $@
+
+demo: $(VENV)/.demo
+	@echo "== 1 of 4: generating MPM episodes and training on them"
 	$(RUN) -m hgn.train +experiment=demo
-	@echo "== 3 of 5: exporting inference weights"
+	@echo "== 2 of 4: exporting inference weights"
 	$(RUN) -m hgn.export checkpoint=$(DEMO)/checkpoints/best.ckpt out=$(DEMO)/weights.safetensors
-	@echo "== 4 of 5: simulating a validation scene beside its ground truth"
+	@echo "== 3 of 4: simulating a validation scene beside its ground truth"
 	$(RUN) -m hgn.rollout weights=$(DEMO)/weights.safetensors data=data/demo episode=validation-000000 out=$(DEMO)/rollout.vtkhdf
 	$(RUN) -m tools.render rollout=$(DEMO)/rollout.vtkhdf out=$(DEMO)/pictures every=2
-	@echo "== 5 of 5: errors"
+	@echo "== 4 of 4: errors"
 	$(RUN) -m hgn.evaluate weights=$(DEMO)/weights.safetensors data=data/demo json=$(DEMO)/errors.json
 	@echo "weights: $(DEMO)/weights.safetensors"
 	@echo "rollout: $(DEMO)/rollout.vtkhdf (HDF5; ParaView opens it)"

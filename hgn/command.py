@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 from hgn.config import config_directory
 from hgn.schema import ConfigError, known_keys, require
+from hgn.system.extras import missing_extra
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
 
@@ -91,6 +92,11 @@ def _exit_code(main: Callable[[dict[str, Any]], int | None], config_name: str) -
                 break
     except ConfigError as error:
         code = _fail(str(error), EXIT_INPUT)
+    except ModuleNotFoundError as error:
+        missing = missing_extra(error)
+        if missing is None:
+            raise
+        code = _fail(missing, EXIT_MACHINE)
     except OSError as error:
         if error.errno not in _MACHINE_ERRORS:
             raise

@@ -20,6 +20,7 @@ from hgn.data.sampler import SamplerState
 from hgn.data.storage import is_remote
 from hgn.network.base import ParticleNetwork
 from hgn.schema import from_mapping
+from hgn.system.extras import require_installed
 from hgn.training.checkpoint import check_checkpoint, cursor_of_checkpoint, network_of_weights, read_checkpoint
 from hgn.training.dataset import PublishedEpisodes, is_complete, wait_for_episodes
 from hgn.training.distributed import default_run, first_rank, layout
@@ -30,6 +31,7 @@ from hgn.training.stop import StopRequest
 
 def main(mapping: dict[str, Any]) -> int:
     """Trains as the resolved configuration says; returns the exit code."""
+    require_installed("lightning")
     name = mapping.pop("name", "unnamed")
     if mapping.get("run") is None:
         mapping["run"] = str(default_run(name))

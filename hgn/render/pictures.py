@@ -326,7 +326,7 @@ def _animation_picture(
     for column, (label, position_TN3) in enumerate(versions):
         x = column * (width + gap)
         picture.paste(_panel(stage, position_TN3, frame, rollout.material_N), (x, header))
-        _write(picture, (x + width / 2, header / 2), label, 6 * text // 5, bold=True)
+        _write(picture, (x + width / 2, header / 2), label, 6 * text // 5)
     seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
     if len(versions) == 1:  # whose legend is as wide as the picture
         _write(picture, (width - gap, header / 2), seconds, text, anchor="rm")
@@ -411,14 +411,13 @@ def _write(
     text: str,
     size: int,
     anchor: str = "mm",
-    bold: bool = False,
     halo: int = 0,
 ) -> None:
     """halo: pixels of background around the letters, for text over obstacles."""
     ImageDraw.Draw(picture).text(
         place,
         text,
-        font=_font(size, bold),
+        font=_font(size),
         fill=TEXT_COLOR,
         anchor=anchor,
         stroke_width=halo,
@@ -427,12 +426,11 @@ def _write(
 
 
 @functools.cache
-def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans, which comes with matplotlib."""
-    import matplotlib
-
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """The one that comes with Pillow."""
+    font = ImageFont.load_default(size)
+    assert isinstance(font, ImageFont.FreeTypeFont)
+    return font
 
 
 def _text_size(panel_size: int) -> int:

@@ -65,7 +65,7 @@ def test_configs_travel_inside(wheel: Path) -> None:
                 assert archive.read(f"hgn/conf/{path.relative_to(ROOT / 'conf')}") == path.read_bytes()
         for path in (ROOT / "hgn" / "weights").iterdir():
             assert archive.read(f"hgn/weights/{path.name}") == path.read_bytes()
-    assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"hgn", "datagen", "tools"}
+    assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"hgn", "datagen"}
     assert not [name for name in names if "__pycache__" in name or "test" in name]
 
 
@@ -83,8 +83,7 @@ def test_commands_compose_their_config(python: Path, tmp_path: Path, module: str
     assert composed["name"] == "small" and key in composed
 
 
-@pytest.mark.parametrize(("module", "key"), [("hgn.rollout", "weights: obstacles"), ("tools.render", "rollout: null")])
-def test_commands_help(python: Path, tmp_path: Path, module: str, key: str) -> None:
+def test_command_helps(python: Path, tmp_path: Path) -> None:
     """`--help` says what a command does and shows its keys with their comments, from an empty folder."""
-    text = run(python, tmp_path, "-m", module, "--help")
-    assert key in text and "# a f" in text and text.strip("`\n").startswith(f"python -m {module}")
+    text = run(python, tmp_path, "-m", "hgn.rollout", "--help")
+    assert "weights: obstacles" in text and "# a f" in text and text.strip("`\n").startswith("python -m hgn.rollout")

@@ -1,0 +1,58 @@
+"""Extras: a command that lacks a package says which extra brings it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from hgn.system.extras import EXTRA_OF, missing_extra
+
+ROOT = Path(__file__).resolve().parents[2]
+BROUGHT_ALONG = {"lightning_utilities": "lightning", "aiohttp": "fsspec"}  # by a package that an extra lists
+
+
+def test_each_package_is_in_the_extra_that_is_named() -> None:
+    """pyproject.toml and the errors agree."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for package, extra in EXTRA_OF.items():
+        listed = {re.split(r"[^\w-]", requirement)[0] for requirement in extras[extra]}
+        assert BROUGHT_ALONG.get(package, package) in listed, package
+
+
+def test_a_package_of_no_extra_is_no_such_error() -> None:
+    """A module that is missing for another reason is a fault, not a missing extra."""
+    assert missing_extra(ModuleNotFoundError(name="hgn.nothing")) is None
+
+
+HIDE = """
+import sys
+class Hide:
+    def find_spec(self, name, path=None, target=None):
+        if name == {package!r}:
+            raise ModuleNotFoundError(name=name)
+sys.meta_path.insert(0, Hide())
+"""
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments"),
+    [
+        ("taichi", ["datagen.solve", "scene=funnel", "frames=2", "out=solved.vtkhdf"]),
+        ("lightning", ["hgn.train", "+experiment=demo"]),
+        ("starlette", ["datagen.service", "+experiment=demo", "port=0", "progress=off"]),
+    ],
+)
+def test_missing_extra_is_named(tmp_path: Path, package: str, arguments: list[str]) -> None:
+    """One line, exit code 1, no traceback, and no hour of work before."""
+    (tmp_path / "sitecustomize.py").write_text(HIDE.format(package=package))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    command = [sys.executable, "-m", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    line = f"error: this needs {package}, which is not installed; pip install 'hgn[{EXTRA_OF[package]}]'"
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (1, line), done.stderr
