@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import re
@@ -11,6 +12,8 @@ from pathlib import Path
 import pytest
 from docs.pages import ROOT, Block, blocks_of, markdown_files, prose_lines, shell_lines
 from hydra import compose, initialize_config_dir
+
+from hgn import config
 
 COLUMNS = 100
 README_LINES, README_COMMANDS, ENTRY_LINES = 130, 12, 2
@@ -151,3 +154,21 @@ def test_changelog_form() -> None:
         assert entry <= ENTRY_LINES, f"CHANGELOG.md:{number}"
         if line.startswith("### "):
             assert re.match(r"### (Added|Changed|Fixed)", line), f"CHANGELOG.md:{number}"
+
+
+def test_every_command_is_listed() -> None:
+    """The reference of commands names each module that can be run, and no other."""
+    spec = importlib.util.spec_from_file_location("reference_pages", ROOT / "docs" / "_ext" / "reference_pages.py")
+    assert spec is not None and spec.loader is not None
+    reference_pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(reference_pages)
+    page = (ROOT / "docs" / "reference" / "commands.md").read_text()
+    listed = set(re.findall(r"^\| `python -m ([\w.]+)", page, re.MULTILINE))
+    parents = {name.removesuffix(".network") for name in reference_pages.command_names()}  # tools.stability network
+    assert listed == parents
+
+    text = reference_pages.configuration_page((ROOT / "hgn" / "config.py").read_text())
+    for cls in (config.SceneConfig, config.MpmConfig, config.TrainingConfig, config.EvaluateConfig):
+        section = text.split(f"## {cls.__name__}\n")[1].split("\n## ")[0]
+        assert re.findall(r"^\| `(\w+)`", section, re.MULTILINE) == [field.name for field in dataclasses.fields(cls)]
+    assert "| `seed` | `int` | `0` |" in text and "domain units per frame |" in text

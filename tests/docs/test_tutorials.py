@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import socket
 from collections.abc import Iterator
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pytest
 from docs.pages import ROOT, Runner, blocks_of, run_module, shell_lines
+
+from hgn.scene.scene_file import load_scene
 
 TUTORIALS = ROOT / "docs" / "tutorials"
 # a data set, made by the solver once for all pages, of which every training here is told
@@ -159,3 +162,20 @@ def test_network(here: Path) -> None:
         in (TUTORIALS / "network.md").read_text()
     )
     assert (runner.names["changed"].speed.weight.grad != 0).any()
+
+
+def test_how_to(here: Path) -> None:
+    """How-to pages: the check of a data set's shards, which sees a flipped bit, and the scene file's example."""
+    (check,) = [block for block in blocks_of(ROOT / "docs/how_to/verify_shards.md") if block.language == "python"]
+    code = check.content.replace("data/obstacles", "data/mine")
+    exec(code)
+    shutil.copytree("data/mine", "data/damaged")
+    shard = sorted(Path("data/damaged").glob("train-*.tar"))[0]
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    with pytest.raises(AssertionError, match=shard.name):
+        exec(code.replace("data/mine", "data/damaged"))
+    (example,) = [block for block in blocks_of(ROOT / "docs/how_to/scene_files.md") if block.language == "yaml"]
+    Path("funnel.yaml").write_text(example.content)
+    assert len(load_scene("funnel.yaml").obstacles) == 5
