@@ -1,0 +1,161 @@
+"""python -m tools.compare 'trees=[before,after]' out=FILE.json: source trees timed in turns by their own benches.
+
+A tree is a folder with this project's sources, or a commit or branch of the repository in the current folder. A round
+runs `python -m tools.bench` of each tree, in the other order every other time, so that a machine that slows down slows
+all of them. The bench checks before it times; no time is told of what fails. The JSON holds {"meta", "rows"}; the exit
+code is 1 where a check is red.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hgn.command import run_command
+from hgn.schema import ConfigError, from_mapping, require, require_positive, to_mapping
+from hgn.system.files import write_json
+from hgn.system.provenance import provenance, without_folders
+
+EXIT_RED = 1
+PASS = "pass"
+SOURCES = ("hgn", "tools", "conf", "datagen", "pyproject.toml")  # of a commit
+WORK = ("case", "particles", "scenes", "precision")  # what is the same work in two trees
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """`python -m tools.compare`: which trees are timed, and on what."""
+
+    trees: tuple[str, ...]
+    out: str
+    rounds: int = 3
+    bench: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        require(len(self.trees) > 0, "trees", "a list with at least one tree", [], "as in 'trees=[main,.]'")
+        require(len(set(self.trees)) == len(self.trees), "trees", "a list of different trees", list(self.trees))
+        require_positive(self, "rounds")
+        for i, option in enumerate(self.bench):
+            ours = option.startswith(("json=", "--json"))
+            require("=" in option and not ours, f"bench[{i}]", "KEY=VALUE other than json", option)
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints the table; returns the exit code."""
+    config = from_mapping(CompareConfig, mapping)
+    with tempfile.TemporaryDirectory(prefix="hgn_compare_") as scratch:
+        folders = [_sources(name, Path(scratch) / str(i), f"trees[{i}]") for i, name in enumerate(config.trees)]
+        runs: dict[str, list[dict[str, Any]]] = {name: [] for name in config.trees}
+        turn = list(zip(config.trees, folders, strict=True))
+        for number in range(config.rounds):
+            for name, folder in turn if number % 2 == 0 else turn[::-1]:
+                runs[name].append(_run_bench(folder, config.bench, Path(scratch) / "bench.json"))
+                rows = compared(runs)
+                meta = runs[name][-1].get("meta", {}) | provenance("cpu") | _device(runs)
+                write_json(config.out, {"meta": meta | {"config": without_folders(to_mapping(config))}, "rows": rows})
+    print(table(rows, config.trees))
+    return 0 if all(row["check"] == PASS for row in rows) else EXIT_RED
+
+
+def _device(runs: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """The device and versions that the benches name."""
+    named = [run["meta"] for reports in runs.values() for run in reports if "meta" in run]
+    return {key: named[0][key] for key in ("device", "versions")} if named else {}
+
+
+def _run_bench(folder: Path, options: Sequence[str], out: Path) -> dict[str, Any]:
+    """A tree's report; `failed` in it says why there is none."""
+    out.unlink(missing_ok=True)
+    paths = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    command = [sys.executable, "-m", "tools.bench", *options, f"json={out}"]
+    done = subprocess.run(
+        command, cwd=folder, env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    if not out.exists():
+        last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
+        return {"failed": f"the bench ended with exit code {done.returncode}: {last[0]}", "rows": []}
+    report: dict[str, Any] = json.loads(out.read_text())
+    return report
+
+
+def compared(runs: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """A row for each tree and work: median of the runs' medians, their range, and the ratio to the first tree's."""
+    rows: list[dict[str, Any]] = []
+    first: dict[tuple[Any, ...], float] = {}
+    for tree, reports in runs.items():
+        failures = [report["failed"] for report in reports if "failed" in report]
+        rows += [{"tree": tree, "case": "bench", "ms": None, "check": failures[0]}] if failures else []
+        works: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+        for report in reports:
+            for row in report["rows"]:
+                works.setdefault(tuple(row[key] for key in WORK), []).append(row)
+        for work, samples in works.items():
+            check = next((row["check"] for row in samples if row["check"] != PASS), PASS)
+            row = {"tree": tree, **dict(zip(WORK, work, strict=True)), "check": check, "runs": len(samples), "ms": None}
+            if check == PASS:
+                times = [sample["ms"] for sample in samples]
+                row |= {"ms": float(np.median(times)), "ms_range": [min(times), max(times)]}
+                row["memory_gb"] = samples[-1].get("memory_gb")
+                row["ratio"] = row["ms"] / first.setdefault(work, row["ms"])
+            rows.append(row)
+    return rows
+
+
+def table(rows: Sequence[dict[str, Any]], trees: Sequence[str]) -> str:
+    """The figures for people, as Markdown, one line a work."""
+    lines = [f"| ms (range, ratio) | {' | '.join(trees)} |", f"| :-- |{' --: |' * len(trees)}"]
+    works = dict.fromkeys(tuple(row.get(key) for key in WORK) for row in rows if row["case"] != "bench")
+    for work in works:
+        cells = []
+        for tree in trees:
+            row = next((r for r in rows if r["tree"] == tree and tuple(r.get(key) for key in WORK) == work), None)
+            if row is None or row["ms"] is None:
+                cells.append("-")
+            else:
+                low, high = row["ms_range"]
+                cells.append(f"{row['ms']:.3f} ({low:.3f} … {high:.3f}, {row['ratio']:.3f})")
+        lines.append(f"| {work[0]}, {work[1]} particles, {work[2]} scenes, {work[3]} | {' | '.join(cells)} |")
+    lines += [f"{row['case']} of {row['tree']}: {row['check']}" for row in rows if row["check"] != PASS]
+    return "\n".join(lines)
+
+
+def _sources(name: str, scratch: Path, field: str) -> Path:
+    """The tree's folder; a commit's files are taken out of the repository. Raises: ConfigError."""
+    folder = Path(name).expanduser()
+    if not folder.is_dir():
+        folder = scratch
+        try:
+            top = _git("rev-parse", "--show-toplevel").decode().strip()
+            commit = _git("rev-parse", "--verify", "--end-of-options", f"{name}^{{commit}}").decode().strip()
+            archive = _git("-C", top, "archive", commit, *SOURCES)
+        except (OSError, subprocess.CalledProcessError) as error:
+            answer = (getattr(error, "stderr", b"") or str(error).encode()).decode(errors="replace").strip()
+            raise ConfigError(
+                f"{field} must be a folder, or a commit or branch of the repository here, got {name!r}; git says: "
+                f"{answer}"
+            ) from None
+        with tarfile.open(fileobj=io.BytesIO(archive)) as file:
+            safely: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # Python 3.11.4 on
+            file.extractall(folder, **safely)
+    bench = folder / "tools" / "bench" / "__main__.py"
+    require(bench.is_file(), field, "a tree with tools/bench", name, "name the folder above hgn and tools")
+    return folder.resolve()
+
+
+def _git(*arguments: str) -> bytes:
+    return subprocess.run(["git", *arguments], capture_output=True, check=True).stdout
+
+
+if __name__ == "__main__":
+    run_command(main, "compare")
