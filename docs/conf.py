@@ -27,7 +27,17 @@ html_static_path = ["_static"]
 html_show_sourcelink = False
 
 nitpicky = True
-# types of other packages, whose documentation is not read while this one is built
-nitpick_ignore_regex = [(r"py:.*", r"(np|numpy|torch|Path|pathlib|collections|Iterator|Sequence|Callable)(\..*)?")]
+# types of other packages, whose documentation is not read while this one is built, and how autodoc names parts of types
+nitpick_ignore_regex = [(r"py:.*", r"(np|numpy|torch|pathlib|collections|dict\[|tuple\[).*")]
+# settings have a page of their own; the others are for those who read the code
+_INTERNAL = (
+    "config.NetworkConfig",
+    "config.SceneConfig",
+    "network.base.ParticleNetwork",
+    "network.features.ParticleState",
+)
+_INTERNAL += ("runtime.simulator.InitialState", "scene.episode.Episode")
+nitpick_ignore = [("py:class", f"hgn.{name}") for name in _INTERNAL]
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"

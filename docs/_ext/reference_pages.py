@@ -4,8 +4,11 @@ and makes files of the checkout that pages link to part of the site."""
 from __future__ import annotations
 
 import ast
+import dataclasses
+import inspect
 import io
 import re
+import textwrap
 import tokenize
 from pathlib import Path
 from typing import Any
@@ -96,6 +99,20 @@ def _write(_: Any) -> None:
             target.write_text(page, encoding="utf-8")
 
 
+def _document_fields(_: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Adds a dataclass's fields, with their types and the comments beside them, to its docstring."""
+    if what != "class" or not dataclasses.is_dataclass(obj):
+        return
+    source = textwrap.dedent(inspect.getsource(obj))
+    node, text, comments = ast.parse(source).body[0], source.splitlines(), _comments(source)
+    assert isinstance(node, ast.ClassDef)
+    lines.append("")
+    for item in node.body:
+        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name) and item.target.id[0] != "_":
+            comment = _comment_of(item, text, comments).replace("*", "\\*").replace("`", "")
+            lines.append(f":param {item.target.id}: ``{ast.unparse(item.annotation)}``; {comment}".rstrip("; "))
+
+
 _LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)(?:#[^)\s]*)?\)")
 
 
@@ -118,4 +135,5 @@ def setup(app: Any) -> dict[str, bool]:
     """Called by Sphinx."""
     app.connect("builder-inited", _write)
     app.connect("source-read", _read)
+    app.connect("autodoc-process-docstring", _document_fields)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
