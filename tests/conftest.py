@@ -43,7 +43,7 @@ LONGEST_FILES = (  # half a minute and more on one core; begun last, one of them
     *("kernels/test_rollout", "network/test_network", "training/test_resume", "training/test_precompile"),
     *("training/test_live_service", "training/test_train", "datagen/mpm/test_collider", "datagen/test_kills"),
     *("tools/test_error_vs_time", "tools/test_scaling", "tools/test_stability_solver", "datagen/test_command"),
-    *("datagen/test_service", "kernels/test_pushforward", "end_to_end/test_bad_input"),
+    *("datagen/test_service", "kernels/test_pushforward", "end_to_end/test_bad_input", "docs/test_tutorials"),
 )
 
 
