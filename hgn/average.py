@@ -51,7 +51,7 @@ def average(config: AverageConfig) -> None:
     ]
     updates = max(each.updates for _, each in loaded)
     made = replace(info, updates=updates, provenance=provenance() | {"average_of": parts})
-    save_weights(Path(config.out), network, made, config.half)
+    save_weights(Path(config.out), network, made, config.stored_precision)
 
 
 def _require_same(

@@ -17,8 +17,10 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 SYMMETRIES = ("none", "gravity")
-PATHS = ("auto", "plain", "fast")
-PRECISIONS = ("highest", "high", "half")
+BACKENDS = ("auto", "torch", "triton", "cpu")
+TRAINING_BACKENDS = ("auto", "torch", "triton")
+PRECISIONS = ("fp32", "tf32", "fp16")
+STORED_PRECISIONS = ("fp32", "fp16")
 
 
 def config_directory() -> Path:
@@ -356,8 +358,8 @@ class TrainingConfig:
     accelerator: str = "auto"  # or cpu, gpu
     devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
     nodes: int | None = None  # machines; none: as launched, without a launcher one
-    precision: str = "high"  # matrix products: highest (float32), high (TF32 on a GPU), half (fast path and GNS only)
-    path: str = "auto"  # plain (PyTorch), fast (kernels in CUDA graphs); auto: fast where it runs
+    precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+    backend: str = "auto"  # torch, triton (kernels in CUDA graphs); auto: triton where it runs
     minimum_episodes: int = 1  # training starts once that many training episodes are published
     generate: bool = True  # start the generator where the data set is missing or incomplete
     maximum_skipped_updates: int = 100  # in a row, for gradients that are not finite; then training ends
@@ -406,7 +408,7 @@ class TrainingConfig:
         )
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
         require_one_of(self, "precision", PRECISIONS)
-        require_one_of(self, "path", PATHS)
+        require_one_of(self, "backend", TRAINING_BACKENDS)
         require(
             self.final_learning_rate <= self.learning_rate,
             "final_learning_rate",
@@ -462,7 +464,10 @@ class ExportConfig:
 
     checkpoint: str
     out: str
-    half: bool = False  # learned tensors as float16
+    stored_precision: str = "fp32"  # of the learned tensors in the file; or fp16
+
+    def __post_init__(self) -> None:
+        require_one_of(self, "stored_precision", STORED_PRECISIONS)
 
 
 @dataclass(frozen=True)
@@ -472,9 +477,10 @@ class AverageConfig:
     weights: tuple[str, ...]
     out: str
     shares: tuple[float, ...] | None = None  # of each, together 1; none: equal ones
-    half: bool = False  # learned tensors as float16
+    stored_precision: str = "fp32"  # of the learned tensors in the file; or fp16
 
     def __post_init__(self) -> None:
+        require_one_of(self, "stored_precision", STORED_PRECISIONS)
         require(len(self.weights) >= 2, "weights", "at least two files", len(self.weights))
         if self.shares is not None:
             count = f"one for each of the {len(self.weights)} files"
@@ -495,12 +501,12 @@ class RolloutConfig:
     episode: str | None = None  # … and the key of one of its episodes
     frames: int = 300
     device: str = "auto"  # or cpu, cuda, cuda:1, …
-    path: str = "auto"  # plain (PyTorch), fast (kernels in CUDA graphs); auto: fast where it runs
-    precision: str = "high"  # matrix products: highest (float32), high (TF32 on a GPU), half (fast path and GNS only)
+    backend: str = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest that runs
+    precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
 
     def __post_init__(self) -> None:
         require(self.frames >= 2, "frames", "at least 2", self.frames)
-        require_one_of(self, "path", PATHS)
+        require_one_of(self, "backend", BACKENDS)
         require_one_of(self, "precision", PRECISIONS)
         require(
             (self.data is None) == (self.episode is None),
@@ -526,13 +532,13 @@ class EvaluateConfig:
     rollout_frames: int = 300  # 0: none
     particles_per_batch: int = 32_768
     device: str = "auto"
-    path: str = "auto"  # of the rollouts: plain, fast; auto: fast where it runs
-    precision: str = "high"  # matrix products: highest, high, half (rollouts on the fast path, and GNS)
+    backend: str = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
+    precision: str = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
     json: str | None = None  # also write the figures to this file
 
     def __post_init__(self) -> None:
         require_positive(self, "scenes", "frame_stride", "particles_per_batch")
         require_non_negative(self, "rollout_frames")
         require_one_of(self, "split", ("train", "validation", "test"))
-        require_one_of(self, "path", PATHS)
+        require_one_of(self, "backend", BACKENDS)
         require_one_of(self, "precision", PRECISIONS)

@@ -37,14 +37,14 @@ from hgn.training.errors import (
 def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; returns the exit code."""
     config = from_mapping(EvaluateConfig, mapping)
-    simulator = Simulator.load(config.weights, config.device, config.path, config.precision)
+    simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     info = simulator.info
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     require_frame_rate(info, episodes[0].frame_rate_hz)
     rows = one_step_rows(simulator.network, episodes, config)
     if config.rollout_frames >= 2:
-        print(simulator.path_said, file=sys.stderr)
+        print(simulator.backend_note, file=sys.stderr)
         rows.append(rollout_row(simulator, episodes, config.rollout_frames))
     print(table(rows, config, len(episodes)))
     if config.json is not None:

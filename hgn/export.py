@@ -16,12 +16,12 @@ from hgn.training.checkpoint import data_of_checkpoint, network_of_checkpoint, r
 def main(mapping: dict[str, Any]) -> int:
     """Writes the weights file; returns the exit code."""
     config = from_mapping(ExportConfig, mapping)
-    export(Path(config.checkpoint), Path(config.out), config.half)
+    export(Path(config.checkpoint), Path(config.out), config.stored_precision)
     print(config.out)
     return 0
 
 
-def export(checkpoint_path: Path, out: Path, half: bool = False) -> None:
+def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32") -> None:
     """Checkpoint to weights. Raises: ConfigError when the checkpoint is missing or not ours."""
     checkpoint = read_checkpoint(checkpoint_path)
     network = network_of_checkpoint(checkpoint)
@@ -34,7 +34,7 @@ def export(checkpoint_path: Path, out: Path, half: bool = False) -> None:
         updates=updates_of_checkpoint(checkpoint),
         provenance=provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.config_hash},
     )
-    save_weights(out, network, info, half)
+    save_weights(out, network, info, stored_precision)
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
 
     Raises: ConfigError for bad input, weights that let the simulation diverge among them; nothing is written then.
     """
-    simulator = Simulator.load(config.weights, config.device, config.path, config.precision)
+    simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     weights = find_weights(config.weights)
     source = {"weights": weights.name, "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
     frames = config.frames
@@ -78,7 +78,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": config.episode}
-    print(simulator.path_said, file=sys.stderr)
+    print(simulator.backend_note, file=sys.stderr)
     with bar("simulating", total=frames - 1, unit="frame") as progress:
         try:
             (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from hgn.config import DatagenConfig, NetworkConfig, RolloutConfig, SceneConfig, TrainConfig
+from hgn.config import (
+    DatagenConfig,
+    EvaluateConfig,
+    ExportConfig,
+    NetworkConfig,
+    RolloutConfig,
+    SceneConfig,
+    TrainConfig,
+)
 from hgn.data.identity import dataset_identity
 from hgn.network.build import build_network
 from hgn.renamed import KEYS, VALUES, current_names, stored_names
@@ -31,6 +40,30 @@ def test_old_names_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
             from_mapping(TrainConfig, {"training": training})
     with pytest.raises(ConfigError, match=r"training\.rate is not a known key; known keys: "):  # of another command
         from_mapping(RolloutConfig, {"training.rate": 0.1})
+
+
+@pytest.mark.parametrize(
+    ("config", "mapping", "message"),
+    [
+        (RolloutConfig, {"path": "fast"}, "path is not a known key; it is called backend now; write backend=triton"),
+        (
+            EvaluateConfig,
+            {"weights": "a", "data": "b"} | {"path": "plain"},
+            "it is called backend now; write backend=torch",
+        ),
+        (TrainConfig, {"training": {"path": "auto"}}, "it is called training.backend now; write training.backend=auto"),
+        (TrainConfig, {"path": "fast"}, "path is not a known key; known keys: scene, "),
+        (RolloutConfig, {"backend": "fast"}, "backend must be one of .*, got 'fast'; fast is called triton now"),
+        (RolloutConfig, {"precision": "half"}, "precision must be one of .*, got 'half'; half is called fp16 now"),
+        (TrainConfig, {"training": {"precision": "highest"}}, "training.precision must .*; highest is called fp32 now"),
+        (ExportConfig, {"checkpoint": "a", "out": "b", "half": True}, "write stored_precision=fp16"),
+    ],
+)
+def test_todays_table(config: type, mapping: dict[str, Any], message: str) -> None:
+    """An old key or value is refused in one line that says what it is called now."""
+    with pytest.raises(ConfigError, match=message) as caught:
+        from_mapping(config, mapping)
+    assert "\n" not in str(caught.value)
 
 
 def test_files_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

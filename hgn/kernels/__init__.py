@@ -1,4 +1,4 @@
-"""The fast path's kernels, in Triton, whose surroundings are settled here before any of them is defined."""
+"""Triton kernels, in Triton, whose surroundings are settled here before any of them is defined."""
 
 import os
 from pathlib import Path

@@ -275,7 +275,7 @@ class FusedTrainingNetwork(FusedNetwork):
         """Of a weight's product; in the interpreter, whose time goes by operations, more."""
         if triton.knobs.runtime.interpret:
             return 128
-        return 64 if self.precision == "half" else 32
+        return 64 if self.precision == "fp16" else 32
 
     def _gradient_of(self, block: Block) -> torch.Tensor:
         """Where the gradient of a block's output is collected, and left as that of its input."""

@@ -1,9 +1,8 @@
 """What the kernels share: matrix products at a chosen precision, layer normalisation and its gradient.
 
 Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range (weights come
-rounded, see nearest_tf32), "half" to 10 bits with float16's range, "tf32x3" makes float32 of three TF32 products
-(Triton's plain float32 product takes minutes to compile at this size), and "ieee" is what it is in the interpreter.
-Sums are float32 always.
+rounded, see nearest_tf32), "fp16" to 10 bits with float16's range, "fp32" makes float32 of three TF32 products, and in
+the interpreter multiplies as it is. Sums are float32 always.
 """
 
 from __future__ import annotations
@@ -13,6 +12,9 @@ import triton.language as tl
 
 from hgn.kernels.triton_compat import settle_keys
 
+EXACT_FP32 = tl.constexpr(triton.knobs.runtime.interpret)
+# Triton's own float32 product takes minutes to compile at this size.
+FP32_PRODUCT = tl.constexpr("ieee" if triton.knobs.runtime.interpret else "tf32x3")
 LEAKY = tl.constexpr(0.01)  # hgn.network.mlp.LEAKY_SLOPE
 LAST_TILE = tl.constexpr(1 << 20)  # beyond all: elements are addressed in int32
 EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
@@ -32,12 +34,12 @@ def nearest_tf32(x):
 @triton.jit
 def product(x, w, PRECISION: tl.constexpr, total=None):
     """x [R, K] @ w [K, N] in float32 accumulation, added to the float32 `total` if there is one."""
-    if PRECISION == "half":
+    if PRECISION == "fp16":
         result = tl.dot(x.to(tl.float16), w.to(tl.float16), total)
     elif PRECISION == "tf32":
         result = tl.dot(nearest_tf32(x.to(tl.float32)), w, total, input_precision="tf32")
     else:
-        result = tl.dot(x.to(tl.float32), w.to(tl.float32), total, input_precision=PRECISION)
+        result = tl.dot(x.to(tl.float32), w.to(tl.float32), total, input_precision=FP32_PRODUCT)
     return result
 
 
@@ -47,7 +49,7 @@ def finer_product(x, w, PRECISION: tl.constexpr):
 
     An operand is a float16 and the float16 of what that leaves.
     """
-    if PRECISION == "half" or PRECISION == "tf32":
+    if PRECISION == "fp16" or PRECISION == "tf32":
         x_high, w_high = x.to(tl.float16), w.to(tl.float16)
         x_low = (x - x_high.to(tl.float32)).to(tl.float16)
         w_low = (w - w_high.to(tl.float32)).to(tl.float16)
@@ -65,12 +67,12 @@ def weighted_sums(w, x, PRECISION: tl.constexpr):
 
     Sums inside a tile run on the matrix units: as reductions they pass the rows from thread to thread.
     """
-    if PRECISION == "half":
+    if PRECISION == "fp16":
         result = tl.dot(w.to(tl.float16), x.to(tl.float16))
     elif PRECISION == "tf32":
         result = tl.dot(nearest_tf32(w), nearest_tf32(x), input_precision="tf32")
     else:
-        result = tl.dot(w, x, input_precision=PRECISION)
+        result = tl.dot(w, x, input_precision=FP32_PRODUCT)
     return result
 
 
@@ -161,8 +163,8 @@ def leaky(h):
 
 @triton.jit
 def leaky_operand(h, PRECISION: tl.constexpr):
-    """leaky(h) for a product: in half precision of float16 numbers, two in an instruction."""
-    if PRECISION == "half":
+    """leaky(h) for a product: in fp16 of float16 numbers, two in an instruction."""
+    if PRECISION == "fp16":
         h = h.to(tl.float16)
         a = leaky(h)
     else:
@@ -188,7 +190,7 @@ def normalise(z, WIDTH: tl.constexpr):
 def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
     """The same, at the lower precisions with both sums at once: cancellation costs less than their operands' rounding
     as long as a row's mean is within some ten standard deviations."""
-    if PRECISION == "half":
+    if PRECISION == "fp16":
         mean = tl.sum(z, 1) / WIDTH
         variance = tl.maximum(tl.sum(z * z, 1) / WIDTH - mean * mean, 0.0)
         scale = 1.0 / tl.sqrt(variance + EPSILON)
@@ -217,7 +219,7 @@ def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.con
     rows = tl.load(
         pointer + (place % 3)[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], mask=inside[:, None], other=0.0
     )
-    if PRECISION == "half":
+    if PRECISION == "fp16":
         high = rows.to(tl.float16).to(tl.float32)
         rows = tl.where((place < 3)[:, None], high, rows - high)
     else:

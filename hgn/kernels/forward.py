@@ -20,7 +20,7 @@ from hgn.kernels.mlp.kernel import clear_rows, gather_project, gather_sums, rows
 from hgn.kernels.packing import PackedFCN, PackedNetwork, rounded_to_tf32
 from hgn.kernels.particle_cell.kernel import pairs_forward
 
-PRECISIONS = ("ieee", "tf32x3", "tf32", "half")
+PRECISIONS = ("fp32", "tf32", "fp16")
 PROCESSORS = 132  # an H100's
 RESIDENT_PROGRAMS = 2 * PROCESSORS
 FEW_ROWS = 64 * PROCESSORS
@@ -62,9 +62,9 @@ class Tuning:
     @staticmethod
     def of(precision: str) -> Tuning:
         """What was fastest on an H100 at width 128."""
-        if precision == "ieee":
+        if precision == "fp32" and triton.knobs.runtime.interpret:
             return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
-        if precision == "tf32x3":
+        if precision == "fp32":
             return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8, 528)
         if precision == "tf32":  # operands of twice the size
             return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8, 528)
@@ -92,7 +92,7 @@ def feature_columns(config: NetworkConfig) -> int:
 class FusedNetwork(Buffers):
     """Runs a packed network on a DeviceGrid.
 
-    `values` float32 [packed.size] are the parameters. In half precision and TF32 the products read `weights`, their
+    `values` float32 [packed.size] are the parameters. In fp16 and TF32 the products read `weights`, their
     rounded copy; call `refresh` after every change of `values`. With `training` everything that a backward pass reads
     is kept.
     """
@@ -114,9 +114,9 @@ class FusedNetwork(Buffers):
         self.config, self.packed, self.grid, self.precision = config, packed, grid, precision
         self.values, self.training, self.width = values, training, config.width
         self.particle_count = particle_count
-        self.operand = torch.float16 if precision == "half" else torch.float32
+        self.operand = torch.float16 if precision == "fp16" else torch.float32
         self.device = values.device
-        rounded = precision in ("half", "tf32")
+        rounded = precision in ("fp16", "tf32")
         self.weights = torch.empty_like(values, dtype=self.operand) if rounded else values
         # Falling particles show the encoder the same features frame by frame: its rounding pulls all of them one way.
         self.fine = rounded and not training
@@ -270,7 +270,7 @@ class FusedNetwork(Buffers):
 
     def keeps_pair_hidden(self) -> bool:
         """Whether the pairs' hidden layer is kept for the backward pass, and not computed again: see pairs_forward."""
-        return self.precision in ("tf32", "tf32x3")
+        return self.precision == "tf32" or (self.precision == "fp32" and not triton.knobs.runtime.interpret)
 
     def _edge_cells(self, block: int) -> int:
         """Cells that a tile of edges takes where it has rows for `block` of eight each."""

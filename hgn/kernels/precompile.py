@@ -29,7 +29,6 @@ from hgn.network.build import build_network
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import KERNEL_PRECISION
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
 from hgn.schema import from_mapping
 
@@ -42,7 +41,7 @@ class PrecompileJob:
 
     network: NetworkConfig
     settings: UpdateSettings
-    precision: str  # as the kernels call it
+    precision: str
     several_ranks: bool
     averages: bool  # the weights over the updates
     particles: int  # of an update, about
@@ -55,7 +54,7 @@ class PrecompileJob:
 class FrameJob:
     """What simulates, how precisely, and at which sizes: particles, and cells of the finest level."""
 
-    networks: tuple[tuple[NetworkConfig, str], ...]  # with the precision that the runtime knows: highest, high, half
+    networks: tuple[tuple[NetworkConfig, str], ...]  # with their precisions
     sizes: tuple[tuple[int, int], ...]
     capability: int  # of the GPU: 90 for an H100
 
@@ -142,10 +141,9 @@ def _rollout_launches(job: PrecompileJob, scenes: int, network: HierarchicalGrap
     obstacles = None
     if config.obstacle_features:
         obstacles = ObstacleTable([None] * scenes, job.settings.obstacle_cell_size, torch.device(device))
-    precision = next(name for name, kernels in KERNEL_PRECISION.items() if kernels == job.precision)
     capacities = first_capacities([round(share * cells) for cells in job.cells], particles)
     state = _nowhere(config, particles, scenes, device)
-    _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
+    _Unplaced(network, state, job.precision, capacities, obstacles=obstacles).frame_launches()
 
 
 def compile_share(job: PrecompileJob | FrameJob, share: int, shares: int) -> int:

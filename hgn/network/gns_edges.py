@@ -220,7 +220,7 @@ class PlainEdges(Edges):
         return (dz @ second).masked_fill_(a <= 0, 0.0)
 
     def _rounded(self, value: torch.Tensor) -> torch.Tensor:
-        """As the operand of a product: in half precision its sums are float32 still."""
+        """As the operand of a product: in fp16 its sums are float32 still."""
         return value if self.dtype is None else value.to(self.dtype).to(value.dtype)
 
     @staticmethod

@@ -11,21 +11,19 @@ from hgn.config import NetworkConfig
 from hgn.runtime.triton_host import why_no_triton
 from hgn.schema import ConfigError
 
-# what the configuration calls them, and what the kernels do; float32 in three TF32 products
-KERNEL_PRECISION = {"highest": "tf32x3", "high": "tf32", "half": "half"}
 FAST_WIDTHS = (16, 32, 64, 128)
 FAST_LEVELS = 8
-HIGHEST_WIDTH = 64  # wider matrices in three parts each do not fit into an H100's shared memory
+FP32_WIDTH = 64  # wider matrices in three parts each do not fit into an H100's shared memory
 
 
-def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "high") -> str | None:
-    """What keeps the fast path from running, in words; none if nothing does."""
+def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "tf32") -> str | None:
+    """What keeps backend triton from running, in words; none if nothing does."""
     if config.kind != "hgn":
         return f"it computes hgn networks, not {config.kind}"
     if reason := _why_no_kernels(device) or _why_not_wide_so(config):
         return reason
-    if precision == "highest" and config.width > HIGHEST_WIDTH:
-        return f"with precision highest it computes widths up to {HIGHEST_WIDTH}, not {config.width}"
+    if precision == "fp32" and config.width > FP32_WIDTH:
+        return f"with precision fp32 it computes widths up to {FP32_WIDTH}, not {config.width}"
     if config.levels > FAST_LEVELS:
         return f"network.levels must be at most {FAST_LEVELS} for it, not {config.levels}"
     return None
@@ -34,7 +32,7 @@ def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "
 def why_not_trained_fast(
     device: torch.device, config: NetworkConfig, precision: str, own_states: bool = False
 ) -> str | None:
-    """What keeps training from the fast path, which updates GNS too, in words; none if nothing does.
+    """What keeps training from backend triton, which updates GNS too, in words; none if nothing does.
 
     `own_states`: it is to train on the network's own states.
     """
@@ -44,8 +42,8 @@ def why_not_trained_fast(
         return f"it trains hgn and gns networks, not {config.kind}"
     if reason := _why_no_kernels(device):
         return reason
-    if precision != "half":
-        return f"it trains gns with precision half, not {precision}"
+    if precision != "fp16":
+        return f"it trains gns with precision fp16, not {precision}"
     if reason := _why_not_wide_so(config):
         return reason
     if config.maximum_neighbours is not None:
@@ -68,37 +66,36 @@ def _why_not_wide_so(config: NetworkConfig) -> str | None:
 
 
 def choose_path(
-    field: str, path: str, precision: str, reason: str | None, half_plainly: bool = False
+    field: str, backend: str, precision: str, reason: str | None, torch_has_fp16: bool = False
 ) -> tuple[str, str]:
-    """`plain` or `fast`, and a line that says so; `reason` is what keeps the fast one from running.
+    """`torch` or `triton`, and a line that says so; `reason` is what keeps the latter from running.
 
-    `half_plainly`: the plain path knows half precision too.
-    Raises: ConfigError when the fast path is asked for and cannot run, or half precision without it.
+    `torch_has_fp16`: of this network.
+    Raises: ConfigError when triton is asked for and cannot run, or fp16 without it.
     """
-    if path == "fast" and reason is not None:
-        raise ConfigError(f"{field} must be plain or auto here, got fast: {reason}")
-    chosen = "fast" if path != "plain" and reason is None else "plain"
-    if chosen == "plain" and precision == "half" and not half_plainly:
+    if backend == "triton" and reason is not None:
+        raise ConfigError(f"{field} must be torch or auto here, got triton: {reason}")
+    chosen = "triton" if backend != "torch" and reason is None else "torch"
+    if chosen == "torch" and precision == "fp16" and not torch_has_fp16:
         raise ConfigError(
-            f"precision must be high or highest on the plain path, got half; {reason or f'{field}=plain was asked for'}"
+            f"precision must be tf32 or fp32 on backend torch, got fp16; {reason or f'{field}=torch was asked for'}"
         )
-    because = f" ({reason})" if chosen == "plain" and path == "auto" else ""
-    return chosen, f"{field.rpartition('.')[0] or 'runtime'} path: {chosen}{because}, precision {precision}"
+    because = f" ({reason})" if chosen == "torch" and backend == "auto" else ""
+    return chosen, f"{field.rpartition('.')[0] or 'runtime'} backend: {chosen}{because}, precision {precision}"
 
 
 def path_on(
-    device: torch.device, network: NetworkConfig, path: str, precision: str, field: str = "path"
+    device: torch.device, network: NetworkConfig, backend: str, precision: str, field: str = "backend"
 ) -> tuple[str, str]:
-    """What choose_path answers for a network on a device; GNS has half precision of its own, see gns_edges."""
-    return choose_path(field, path, precision, why_not_fast(device, network, precision), network.kind != "hgn")
+    """What choose_path answers for a network on a device; GNS has fp16 of its own, see gns_edges."""
+    return choose_path(field, backend, precision, why_not_fast(device, network, precision), network.kind != "hgn")
 
 
 def set_matmul_precision(precision: str) -> None:
-    """PyTorch's own float32 products: full with `highest`, one TF32 product on a GPU with `high` and `half`."""
-    torch.set_float32_matmul_precision("highest" if precision == "highest" else "high")
+    """PyTorch's own float32 products: full with fp32, one TF32 product on a GPU with tf32 and fp16."""
+    torch.set_float32_matmul_precision("highest" if precision == "fp32" else "high")
 
 
 def kernel_precision(precision: str, device: torch.device) -> str:
-    """What the kernels call `highest`, `high` or `half`; without a GPU float32 needs no detour."""
-    name = KERNEL_PRECISION[precision]
-    return "ieee" if device.type == "cpu" and name != "half" else name
+    """What the kernels are given: without a GPU there is no TF32."""
+    return "fp32" if device.type == "cpu" and precision == "tf32" else precision

@@ -1,4 +1,4 @@
-"""What works on the edges of a GNS: fused kernels in half precision on a GPU, else PyTorch."""
+"""What works on the edges of a GNS: fused kernels in fp16 on a GPU, else PyTorch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHECKED_PARTICLES = 10_000  # of the first scene; autograd needs memory
 
 
 def use_edges(network: ParticleNetwork, precision: str) -> None:
-    """Chooses for a GNS, by the device that it is on and the precision highest, high or half; others are left alone."""
+    """Chooses for a GNS, by the device that it is on and the precision; others are left alone."""
     if isinstance(network, GraphNetworkSimulator):
         network.edges = edges_for(next(network.parameters()).device, network.config.width, precision)
 
@@ -28,13 +28,13 @@ def edges_for(device: torch.device, width: int, precision: str) -> Edges | None:
 
     On a CPU such blocks are twice as fast, for they stay in its caches.
     """
-    if precision == "half" and device.type == "cuda" and why_no_triton() is None:
+    if precision == "fp16" and device.type == "cuda" and why_no_triton() is None:
         # Triton, which nothing else here needs, is loaded here.
         from hgn.kernels.gns.op import FusedEdges, fits
 
         if fits(width):
             return FusedEdges()
-    if precision == "half":
+    if precision == "fp16":
         return PlainEdges(torch.float16)
     return PlainEdges() if device.type == "cpu" else None
 
@@ -63,8 +63,8 @@ def require_agreement(
     for name, bound, a, b in zip(("outputs", "gradients"), bounds, found, expected, strict=False):
         if not relative_error(a, b) <= bound:  # NaN fails
             raise ConfigError(
-                f"{field} must be high on this machine, got half: its {name} differ by {relative_error(a, b):.1e} from "
-                f"the plain network's (at most {bound}); set {field}=high, and report device and versions"
+                f"{field} must be tf32 on this machine, got fp16: its {name} differ by {relative_error(a, b):.1e} from "
+                f"the plain network's (at most {bound}); set {field}=tf32, and report device and versions"
             )
 
 

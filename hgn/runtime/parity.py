@@ -1,4 +1,4 @@
-"""How far apart two computations of the same thing are, and how far the fast path may be from the plain one."""
+"""How far apart two computations of the same thing are, and how far backend triton may be from the plain one."""
 
 from __future__ import annotations
 

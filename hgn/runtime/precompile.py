@@ -1,4 +1,4 @@
-"""The fast path's kernels compiled before they are needed, by child processes.
+"""Triton kernels compiled before they are needed, by child processes.
 
 Triton compiles a kernel when it is first launched, one after the other, a second or more each: a minute before a
 training's first update, and again in the midst of a simulation that grows. The children fill its cache on disk; what
@@ -73,19 +73,19 @@ class Precompilation:
         while self.running:
             if interrupted():
                 self.stop()
-                return "fast path: compiling was interrupted"
+                return "backend triton: compiling was interrupted"
             time.sleep(0.05)
         seconds = time.monotonic() - self._started
         texts = [self._message(i) for i in range(len(self._processes))]
         failed = [i for i, process in enumerate(self._processes) if process.returncode != 0]
         if failed:
             return (
-                f"fast path: {len(failed)} of {len(self._processes)} processes that compile kernels ahead failed "
+                f"backend triton: {len(failed)} of {len(self._processes)} processes that compile kernels ahead failed "
                 f"(exit code {self._processes[failed[0]].returncode}: {texts[failed[0]]}); "
                 "what is missing is compiled when it is first used"
             )
         count = sum(int(text) for text in texts)
-        return f"fast path: {count} kernels ready {seconds:.0f} s after the start"
+        return f"backend triton: {count} kernels ready {seconds:.0f} s after the start"
 
     def stop(self) -> None:
         """Ends those that still run; the cache holds whole kernels only."""

@@ -32,12 +32,12 @@ class RolloutResult:
 def network_trials(
     simulator: Simulator, scenes: Sequence[InitialState], frames: int, on_frame: Callable[[int], None] | None = None
 ) -> list[RolloutResult]:
-    """Rollouts side by side. One that diverges ends where it must and the others go on: off the fast path without it,
-    on the fast path again in halves.
+    """Rollouts side by side. One that diverges ends where it must and the others go on: off backend triton without it,
+    on backend triton again in halves.
     """
     if not scenes:
         return []
-    if simulator.path != "fast":
+    if simulator.backend != "triton":
         return _plain_trials(simulator, scenes, frames, on_frame)
     try:
         return [RolloutResult(path_TN3) for path_TN3 in simulator.rollout(scenes, frames, on_frame)]

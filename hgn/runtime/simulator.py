@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from hgn.config import PATHS, PRECISIONS
+from hgn.config import BACKENDS, PRECISIONS
 from hgn.cpu import compiled
 from hgn.cpu.allocator import keep_freed_memory
 from hgn.network.base import ParticleNetwork
@@ -42,7 +42,7 @@ from hgn.system.device import choose_device
 if TYPE_CHECKING:
     from hgn.runtime.triton_rollout import TritonRollout
 
-KEPT = 2  # simulations of the fast path, of different numbers of scenes
+KEPT = 2  # simulations of backend triton, of different numbers of scenes
 FILLED = 0.5  # of the room of one that is kept, at least: launches are as large as the room
 
 
@@ -105,17 +105,17 @@ class Simulator:
     """Runs a trained network on one or several scenes at once."""
 
     def __init__(
-        self, network: ParticleNetwork, frame_rate_hz: float, path: str = "plain", precision: str = "high"
+        self, network: ParticleNetwork, frame_rate_hz: float, backend: str = "torch", precision: str = "tf32"
     ) -> None:
-        """`path` is plain or fast, as hgn.runtime.backend chooses it; `precision` is that of the fast path, and
+        """`backend` is torch or triton, as hgn.runtime.backend chooses it; `precision` is that of triton, and
         of a GNS, which works on its edges accordingly from now on."""
         self.network = network
         self.frame_rate_hz = frame_rate_hz
-        self.path_said = ""  # which path it is and why, where `load` chose it
+        self.backend_note = ""  # which backend it is and why, where `load` chose it
         self._info: WeightsInfo | None = None
-        self.path, self.precision = path, precision
+        self.backend, self.precision = backend, precision
         self.device = next(network.parameters()).device
-        self.growths = 0  # of the fast path's buffers, in all rollouts
+        self.growths = 0  # of backend triton's buffers, in all rollouts
         self._kept: dict[int, TritonRollout] = {}
         self.predict: Callable[[ParticleState], torch.Tensor] = network
         use_edges(network, precision)
@@ -127,23 +127,23 @@ class Simulator:
 
     @staticmethod
     def load(
-        weights: str | Path = "obstacles", device: str = "auto", path: str = "auto", precision: str = "high"
+        weights: str | Path = "obstacles", device: str = "auto", backend: str = "auto", precision: str = "tf32"
     ) -> Simulator:
         """A simulator of exported weights: a file, or the name of shipped ones. The options are those of hgn.rollout.
 
         Sets the precision of PyTorch's own float32 products, too.
-        Raises: ConfigError when the weights, the device or the path do not exist or do not fit each other.
+        Raises: ConfigError when the weights, the device or the backend do not exist or do not fit each other.
         """
-        for field, value, known in (("path", path, PATHS), ("precision", precision, PRECISIONS)):
+        for field, value, known in (("backend", backend, BACKENDS), ("precision", precision, PRECISIONS)):
             require(value in known, field, f"one of {', '.join(known)}", value)
         place = choose_device(device)
         network, info = load_weights(find_weights(str(weights)), place)
-        chosen, said = path_on(place, network.config, path, precision)
+        chosen, said = path_on(place, network.config, backend, precision)
         if place.type == "cpu" and isinstance(network, HierarchicalGraphNetwork):
             said = f"{said}, {compiled.said(network.config.width)}"
         set_matmul_precision(precision)
         simulator = Simulator(network, info.frame_rate_hz, chosen, precision)
-        simulator._info, simulator.path_said = info, said
+        simulator._info, simulator.backend_note = info, said
         return simulator
 
     @property
@@ -213,7 +213,7 @@ class Simulator:
         scenes = _initial(scenes)
         state = self._start(scenes)
         positions = [state.position_N3[None].cpu().numpy()]
-        if self.path == "fast":
+        if self.backend == "triton":
             with self._fast(state) as rollout:
                 positions.append(rollout.run(frames - 1, on_frame))
         else:
@@ -227,12 +227,12 @@ class Simulator:
     def frames(self, scene: InitialState | Scene) -> Iterator[np.ndarray]:
         """Positions float32 [N, 3] of frame after frame, the initial ones first, for as long as they are asked for.
 
-        The fast path is some frames ahead. Several scenes may be simulated side by side, each by a call of its own.
+        Backend triton is some frames ahead. Several scenes may be simulated side by side, each by a call of its own.
         Raises: what `rollout` does, ConfigError with the first frame and DivergenceError behind the last good one.
         """
         state = self.start([scene])
         yield state.position_N3.cpu().numpy()
-        if self.path == "fast":
+        if self.backend == "triton":
             with self._fast(state) as rollout:
                 yield from rollout.frames()
         else:
@@ -251,8 +251,8 @@ class Simulator:
 
     @contextmanager
     def _fast(self, state: ParticleState) -> Iterator[TritonRollout]:
-        """A simulation on the fast path, which is kept for others once it is over."""
-        # Triton, which the plain path does without, is loaded here.
+        """A simulation on backend triton, which is kept for others once it is over."""
+        # Triton, which backend torch does without, is loaded here.
         from hgn.runtime.triton_rollout import CHECKED_PARTICLES, LeftDomainError, TritonRollout
 
         assert isinstance(self.network, HierarchicalGraphNetwork)

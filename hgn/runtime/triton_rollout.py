@@ -92,7 +92,7 @@ class TritonRollout:
         room: int = 0,
         obstacles: ObstacleTable | None = None,
     ) -> None:
-        """`precision` is highest, high or half; `capacities` are cells of each level to begin with.
+        """`capacities` are cells of each level to begin with.
 
         `room` is for particles of states that `begin` brings later. `obstacles` replace those of the state.
         """
@@ -201,7 +201,9 @@ class TritonRollout:
         self._integrate()
         self.grid.status.zero_()
 
-    def require_agreement(self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "path") -> None:
+    def require_agreement(
+        self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "backend"
+    ) -> None:
         """Compares the first output with the plain network's, as all kernels still stand at the start: `state` is that
         of the start, or its first scenes.
 
@@ -214,8 +216,8 @@ class TritonRollout:
             error = relative_error(found_N3, network.normalised_acceleration(state))
         if not error <= OUTPUT_BOUND:  # NaN fails
             raise ConfigError(
-                f"{field} must be plain on this machine, got fast: its output differs by {error:.1e} "
-                f"from the plain network's (at most {OUTPUT_BOUND}); set {field}=plain, and report device and versions"
+                f"{field} must be torch on this machine, got triton: its output differs by {error:.1e} "
+                f"from the plain network's (at most {OUTPUT_BOUND}); set {field}=torch, and report device and versions"
             )
 
     def frame_launches(self) -> None:

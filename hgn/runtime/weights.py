@@ -39,12 +39,12 @@ class WeightsInfo:
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions
 
 
-def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, half: bool = False) -> None:
-    """Writes the file whole or not at all. `half` stores the learned tensors as float16, for shipping."""
+def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored_precision: str = "fp32") -> None:
+    """Writes the file whole or not at all. With fp16 the learned tensors are rounded, for shipping."""
     tensors = {}
     for name, tensor in network.state_dict().items():
-        shrink = half and not name.startswith("normaliser.")
-        tensors[name] = tensor.detach().to("cpu", torch.float16 if shrink else torch.float32).contiguous()
+        rounded = stored_precision == "fp16" and not name.startswith("normaliser.")
+        tensors[name] = tensor.detach().to("cpu", torch.float16 if rounded else torch.float32).contiguous()
     payload = save(tensors, metadata={"hgn": json.dumps(to_mapping(info), sort_keys=True)})
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, payload)

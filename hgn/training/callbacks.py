@@ -205,10 +205,10 @@ class Monitor(Callback):
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
         """Errors are means over the scenes that came so far; told beside them is how many came to the end."""
-        # frames of a GNS are captured on the plain path
+        # frames of a GNS are captured on backend torch
         fast = not module.automatic_optimization and module.network.config.kind == "hgn"
-        path = "fast" if fast else "plain"
-        simulator = Simulator(module.result, episodes[0].frame_rate_hz, path, module.training_config.precision)
+        backend = "triton" if fast else "torch"
+        simulator = Simulator(module.result, episodes[0].frame_rate_hz, backend, module.training_config.precision)
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
         trials = network_trials(simulator, [InitialState.of_episode(episode) for episode in episodes], frames)
         error_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)

@@ -93,7 +93,7 @@ def averaging_options() -> dict[str, Any]:
 
 
 def sum_over_ranks(tensor: torch.Tensor) -> None:
-    """Sums a tensor over all ranks, in place. The fast path does so with the gradients of an update, in one message."""
+    """Sums a tensor over all ranks, in place. Backend triton does so with an update's gradients, in one message."""
     torch.distributed.all_reduce(tensor)
 
 

@@ -32,7 +32,7 @@ class GradientGuard(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         counters = pl_module.gradient_counters
         assert isinstance(counters, torch.Tensor)
-        self._counters = counters  # the fast path's kernels count there by themselves
+        self._counters = counters  # the Triton kernels count there by themselves
 
     def state_dict(self) -> dict[str, Any]:
         return {"skipped": self.skipped}

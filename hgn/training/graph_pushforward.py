@@ -1,4 +1,4 @@
-"""The pool of the network's own states on the fast path: simulated, cut into windows and read on the device.
+"""The pool of the network's own states on backend triton: simulated, cut into windows and read on the device.
 
 A window is an episode of W frames with its scene's material and obstacles, so that the kernels of an update read it as
 any other. Buffers and the captured graph are kept from one simulation to the next.
@@ -30,7 +30,7 @@ ROOM = 1.1  # more particles than the scenes of the first simulation have
 
 
 class GraphPushforwardPool:
-    """The pool on the fast path; what it holds is what hgn.training.pushforward.PushforwardPool would."""
+    """The pool on backend triton; what it holds is what hgn.training.pushforward.PushforwardPool would."""
 
     def __init__(
         self, network: HierarchicalGraphNetwork, training: TrainingConfig, obstacle_cell_size: float, rank: int
@@ -133,7 +133,7 @@ class GraphPushforwardPool:
         if capacities is None:
             first = self._first_scenes(episodes, state)
             if first is not None:
-                made.require_agreement(self.network, first, "training.path")
+                made.require_agreement(self.network, first, "training.backend")
                 if device.type == "cuda":
                     torch.cuda.empty_cache()  # what is free decides where episodes are kept
         made.use_values(values)

@@ -125,7 +125,7 @@ class GraphTrainer:
         parts = [f"{seconds:.1f} s {what}" for what, seconds in self._seconds.items()]
         parts.append(f"{updates.capture_seconds:.1f} s capturing {updates.captures} times")
         return (
-            f"fast path: the first {self._made} updates took {total:.1f} s, {', '.join(parts)}; "
+            f"backend triton: the first {self._made} updates took {total:.1f} s, {', '.join(parts)}; "
             f"in that {late.seconds:.1f} s for {late.count} kernels that were not compiled ahead"
         )
 

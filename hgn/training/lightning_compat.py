@@ -24,9 +24,9 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", ".*GPU available but not used.*")  # training.accelerator=cpu says so
 
 
-def gradient_averaging(path: str) -> DDPStrategy:
-    """The strategy of a training on several ranks; `path` is plain or fast."""
-    return DDPStrategy(**averaging_options()) if path == "plain" else _Unwrapped()
+def gradient_averaging(backend: str) -> DDPStrategy:
+    """The strategy of a training on several ranks; `backend` is torch or triton."""
+    return DDPStrategy(**averaging_options()) if backend == "torch" else _Unwrapped()
 
 
 class _Unwrapped(DDPStrategy):

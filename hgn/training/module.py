@@ -40,10 +40,12 @@ from hgn.training.symmetry import drawn_symmetries, under_symmetries
 class TrainingModule(LightningModule):
     """Trains a network on one-step accelerations (paper sec. 3.3)."""
 
-    def __init__(self, network: ParticleNetwork, training: TrainingConfig, data: DataInfo, path: str = "plain") -> None:
-        """`path` is plain or fast, see hgn.runtime.backend: a training step is one update, or a chunk of them."""
+    def __init__(
+        self, network: ParticleNetwork, training: TrainingConfig, data: DataInfo, backend: str = "torch"
+    ) -> None:
+        """`backend` is torch or triton, see hgn.runtime.backend: a training step is one update, or a chunk of them."""
         super().__init__()
-        self.automatic_optimization = path == "plain"
+        self.automatic_optimization = backend == "torch"
         self.network = network
         self.averaged = copy.deepcopy(network).requires_grad_(False) if training.ema_decay else None
         self.training_config = training
@@ -129,7 +131,7 @@ class TrainingModule(LightningModule):
         if self.automatic_optimization and config.rollout_share > 0:
             self._own = PushforwardPool(self.result, config, self.data.frame_rate_hz, self.trainer.global_rank)
         if not self.automatic_optimization:
-            # Triton, which the plain path does without, is loaded here.
+            # Triton, which backend torch does without, is loaded here.
             from hgn.training.graph_trainer import GraphTrainer
 
             optimizer = self.optimizers(use_pl_optimizer=False)
@@ -174,7 +176,7 @@ class TrainingModule(LightningModule):
         if new and self.trainer.is_global_zero:
             outputs, gradients = self._fast.agreement
             text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"
-            print(f"fast path: {text if math.isfinite(outputs) else 'batch too large to check'}", file=sys.stderr)
+            print(f"backend triton: {text if math.isfinite(outputs) else 'batch too large to check'}", file=sys.stderr)
         report = self._fast.report()
         if report and self.trainer.is_global_zero:
             print(report, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Whether the fast path's kernels, as compiled for this machine, compute what the plain network computes.
+"""Whether the Triton kernels, as compiled for this machine, compute what the plain network computes.
 
 Compared on the first update's own batch, before anything is trained: outputs, and the gradients of a random weighting
 of them. Both paths round, and rounding turns the activations next to their kink, so the bounds are wide; kernels that
@@ -60,9 +60,9 @@ def require_agreement(
     )
     if not (output_error <= OUTPUT_BOUND and gradient_error <= GRADIENT_BOUND):  # NaN fails
         raise ConfigError(
-            f"training.path must be plain on this machine, got fast: its outputs differ by {output_error:.1e} from the "
-            f"plain network's (at most {OUTPUT_BOUND}), its gradients by {gradient_error:.1e} (at most "
-            f"{GRADIENT_BOUND}); set training.path=plain, and report device and versions"
+            f"training.backend must be torch on this machine, got triton: its outputs differ by {output_error:.1e} "
+            f"from the plain network's (at most {OUTPUT_BOUND}), its gradients by {gradient_error:.1e} (at most "
+            f"{GRADIENT_BOUND}); set training.backend=torch, and report device and versions"
         )
     if updates.device.type == "cuda":
         del output_N3, expected

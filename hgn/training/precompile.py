@@ -5,7 +5,6 @@ from __future__ import annotations
 from hgn.config import SceneConfig, TrainConfig
 from hgn.kernels.precompile import PrecompileJob
 from hgn.kernels.update.op import UpdateSettings
-from hgn.runtime.backend import KERNEL_PRECISION
 
 NEIGHBOURS = 100  # of a particle of GNS, about
 
@@ -21,7 +20,7 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
     return PrecompileJob(
         network,
         UpdateSettings.of(training, config.scene.cell_size),
-        KERNEL_PRECISION[training.precision],
+        training.precision,
         several_ranks,
         training.ema_decay > 0,
         training.batch_scenes * particles,

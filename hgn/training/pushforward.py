@@ -105,7 +105,7 @@ def lost_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: tor
 
 
 class PushforwardPool:
-    """The pool on the plain path, which serves every network."""
+    """The pool on backend torch, which serves every network."""
 
     def __init__(self, network: ParticleNetwork, training: TrainingConfig, frame_rate_hz: float, rank: int) -> None:
         """`network` simulates."""

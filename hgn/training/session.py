@@ -63,18 +63,19 @@ def train_network(
     )
     lightning_compat.quieten()
     devices, nodes = layout(training)
-    path, text = _path(config)
+    backend, text = _backend(config)
     if first_rank():
         print(text, file=sys.stderr)
     keep_to_quota()
     set_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
-    module = TrainingModule(build_network(config.network), training, data, path)
+    module = TrainingModule(build_network(config.network), training, data, backend)
     if begin_with is None:
         module.set_statistics(store.statistics())
     else:
         module.begin_with(begin_with)
-    feed = EpisodeDataModule(store, config.network, training, chunks=path == "fast", interrupted=lambda: stop.requested)
+    chunks = backend == "triton"
+    feed = EpisodeDataModule(store, config.network, training, chunks=chunks, interrupted=lambda: stop.requested)
     if checkpoint is not None:
         feed.cursor = checkpoint[1]
     _write_run_files(config, run)
@@ -89,7 +90,7 @@ def train_network(
         accelerator=training.accelerator,
         devices=devices,
         num_nodes=nodes,
-        strategy=lightning_compat.gradient_averaging(path) if devices * nodes > 1 else "auto",
+        strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
         max_steps=training.maximum_updates,
         max_epochs=-1,
         callbacks=[SameStart(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
@@ -111,25 +112,25 @@ def train_network(
     return 0 if trainer.global_step >= training.maximum_updates else stop.exit_code
 
 
-def _path(config: TrainConfig) -> tuple[str, str]:
-    """`plain` or `fast`, and a line that says so."""
+def _backend(config: TrainConfig) -> tuple[str, str]:
+    """`torch` or `triton`, and a line that says so."""
     training = config.training
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
     own_states = training.rollout_share > 0
     reason = why_not_trained_fast(device, config.network, training.precision, own_states)
-    half_plainly = config.network.kind != "hgn"
-    return choose_path("training.path", training.path, training.precision, reason, half_plainly)
+    torch_has_fp16 = config.network.kind != "hgn"
+    return choose_path("training.backend", training.backend, training.precision, reason, torch_has_fp16)
 
 
 def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation | None:
     """Lets the kernels be compiled while others wait for data, where this process leads its machine's on GPUs."""
     training = config.training
-    path, _ = _path(config)
+    backend, _ = _backend(config)
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available() and torch.version.hip is None
-    if path != "fast" or not on_gpu or not first_on_machine():
+    if backend != "triton" or not on_gpu or not first_on_machine():
         return None
-    # Triton, which the plain path does without, is loaded here.
+    # Triton, which backend torch does without, is loaded here.
     from hgn.runtime.precompile import Precompilation
     from hgn.training.precompile import job_of_training
 

@@ -1,4 +1,4 @@
-"""Symmetry augmentation on the plain path: a batch as each scene's symmetry shows it, on the batch's device.
+"""Symmetry augmentation on backend torch: a batch as each scene's symmetry shows it, on the batch's device.
 
 Shape legend: W window frames, N particles, K obstacle cells, P surface particles of all scenes, S scenes.
 """

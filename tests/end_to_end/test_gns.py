@@ -32,13 +32,13 @@ def test_every_command_takes_a_baseline(
     tmp_path: Path,
     kind: str,
 ) -> None:
-    """A baseline is trained, resumed, exported, simulated and evaluated, in half precision, by the HGN's commands."""
+    """A baseline is trained, resumed, exported, simulated and evaluated, in fp16, by the HGN's commands."""
     config = make_config()
     make_dataset(config)
     network = GNS | {"kind": kind, "obstacle_features": kind == "gns"}
     run = tmp_path / "run"
     for updates in (2, 4):
-        mapping = train_mapping(config, run, maximum_updates=updates, precision="half")
+        mapping = train_mapping(config, run, maximum_updates=updates, precision="fp16")
         assert train.main(mapping | {"network": network}) == 0
     with pytest.raises(ConfigError, match=r"network\.kind must be '.*' to go on with"):
         train.main(train_mapping(config, run))
@@ -47,7 +47,7 @@ def test_every_command_takes_a_baseline(
     loaded, info = load_weights(weights)
     assert type(loaded).__name__ == "GraphNetworkSimulator" and info.network.kind == kind and info.updates == 4
     data = config.dataset.folder
-    place = {"weights": str(weights), "data": data, "precision": "half"}
+    place = {"weights": str(weights), "data": data, "precision": "fp16"}
     out = tmp_path / "rollout.vtkhdf"
     assert rollout.main(place | {"episode": "validation-000000", "frames": 4, "out": str(out)}) == 0
     report = tmp_path / "errors.json"

@@ -310,16 +310,16 @@ def trained_and_scored(
     assert list(mappings) == ["hgn.train", "hgn.export", "hgn.evaluate"]
     mappings["hgn.train"].pop("name")
     config = from_mapping(TrainConfig, mappings["hgn.train"])
-    assert config.run == f"runs/{name}" and config.training.precision == "half"
+    assert config.run == f"runs/{name}" and config.training.precision == "fp16"
     made = data[config.dataset.folder]
     assert config.dataset.training_scenes == made.dataset.training_scenes
     assert dataset_identity(config.datagen) == dataset_identity(made)
     assert made.scene.obstacle_count > 0 or not config.network.sees_obstacles
     export = from_mapping(ExportConfig, mappings["hgn.export"])
-    assert (export.checkpoint, export.half) == (f"runs/{name}/checkpoints/last.ckpt", True)
+    assert (export.checkpoint, export.stored_precision) == (f"runs/{name}/checkpoints/last.ckpt", "fp16")
     score = from_mapping(EvaluateConfig, mappings["hgn.evaluate"])
     assert score.weights == export.out
-    assert (score.split, score.scenes, score.frame_stride, score.precision) == ("test", 20, 5, "half")
+    assert (score.split, score.scenes, score.frame_stride, score.precision) == ("test", 20, 5, "fp16")
     return config, score
 
 
@@ -360,7 +360,7 @@ def test_own_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             data[made.dataset.folder] = made
         elif "hgn.average" in mappings:
             mean = from_mapping(AverageConfig, mappings["hgn.average"])
-            assert set(mean.weights) <= there and mean.half
+            assert set(mean.weights) <= there and mean.stored_precision == "fp16"
             there.add(mean.out)
         else:
             config, score = trained_and_scored(name, mappings, data)

@@ -21,7 +21,7 @@ def device() -> torch.device:
 def engine_of(
     network: HierarchicalGraphNetwork,
     state: ParticleState,
-    precision: str = "ieee",
+    precision: str = "fp32",
     capacities: tuple[int, ...] = (),
     spare_particles: int = 3,
     loss_scale: float = 1.0,

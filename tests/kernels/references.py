@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+import triton
 from kernels.launches import Launch
 from torch.nn import functional
 
@@ -221,7 +222,12 @@ def pair_hidden(k: Launch) -> torch.Tensor:
 def pair_activation(k: Launch) -> torch.Tensor:
     """Of pairs whose hidden layer a kernel computes again: in float16 as its products take it."""
     a = leaky(pair_hidden(k).float())
-    return (a.half() if k["PRECISION"] == "half" else a).double()
+    return (a.half() if k["PRECISION"] == "fp16" else a).double()
+
+
+def keeps_pair_hidden(k: Launch) -> bool:
+    """As hgn.kernels.forward.FusedNetwork: float32 is made of TF32 products natively."""
+    return k["PRECISION"] == "tf32" or (k["PRECISION"] == "fp32" and not triton.knobs.runtime.interpret)
 
 
 @reference
@@ -240,7 +246,7 @@ def pairs_forward(k: Launch) -> Pairs:
     if k["SAVE"]:
         pairs["normalised"] = k.found("normalised", count, 8, width), z
         pairs["deviation"] = k.found("deviation", count, 8), scale
-        if k["PRECISION"] in ("tf32", "tf32x3"):
+        if keeps_pair_hidden(k):
             pairs["hidden"] = k.found("hidden", count, 8, width), a
     return pairs
 
@@ -255,7 +261,7 @@ def pairs_backward(k: Launch) -> Pairs:
     dy = dy * k.rows("weight_of", count, 8)[..., None]
     kept, scale = k.rows("normalised", count, 8, width), k.rows("deviation", count, 8)
     dz, gain, shift = through_kept_norm(dy, kept, scale, k.parameter("gain_at", width))
-    if k["PRECISION"] in ("tf32", "tf32x3"):
+    if keeps_pair_hidden(k):
         positive = k.rows("hidden", count, 8, width) > 0
     else:
         positive = pair_activation(k) > 0

@@ -31,15 +31,15 @@ def on_device(state: ParticleState) -> ParticleState:
 @pytest.mark.parametrize(
     ("counts", "width", "precision", "output_bound", "gradient_bound"),
     [
-        ((23, 9), 16, "half", 2e-3, 2e-2),
-        ((1,), 32, "half", 2e-3, 2e-2),
+        ((23, 9), 16, "fp16", 2e-3, 2e-2),
+        ((1,), 32, "fp16", 2e-3, 2e-2),
         ((19,), 16, "tf32", 2e-3, 2e-2),
-        pytest.param((23, 9), 16, "ieee", 1e-5, 1e-3, marks=pytest.mark.skipif(NATIVE, reason="the interpreter's")),
+        pytest.param((23, 9), 16, "fp32", 1e-5, 1e-3, marks=pytest.mark.skipif(NATIVE, reason="the interpreter's")),
         *(
             pytest.param(
                 (300, 1, 80), 128, precision, 2e-3, 5e-2, marks=pytest.mark.skipif(not NATIVE, reason="needs a GPU")
             )
-            for precision in ("half", "tf32")
+            for precision in ("fp16", "tf32")
         ),
     ],
 )
@@ -95,7 +95,7 @@ def test_wrong_kernels_are_refused(monkeypatch):
     ):
         with monkeypatch.context() as patch:
             patch.setattr(FusedEdges, name, wrong)
-            with pytest.raises(ConfigError, match=f"precision must be high on this machine, got half: its {what}"):
+            with pytest.raises(ConfigError, match=f"precision must be tf32 on this machine, got fp16: its {what}"):
                 require_agreement(network, state, gradients)
     assert network.edges is edges
 
@@ -104,6 +104,6 @@ def test_what_works_where():
     """Half precision takes the kernels on a GPU for widths of matrix units, else PyTorch; float32 autograd there."""
     cpu, cuda = torch.device("cpu"), torch.device("cuda")
     assert fits(64) and not fits(24) and not fits(8)
-    assert edges_for(cpu, 128, "high") == PlainEdges() and edges_for(cpu, 128, "half") == PlainEdges(torch.float16)
-    assert edges_for(cuda, 128, "half") == FusedEdges() and edges_for(cuda, 24, "half") == PlainEdges(torch.float16)
-    assert edges_for(cuda, 128, "high") is None
+    assert edges_for(cpu, 128, "tf32") == PlainEdges() and edges_for(cpu, 128, "fp16") == PlainEdges(torch.float16)
+    assert edges_for(cuda, 128, "fp16") == FusedEdges() and edges_for(cuda, 24, "fp16") == PlainEdges(torch.float16)
+    assert edges_for(cuda, 128, "tf32") is None

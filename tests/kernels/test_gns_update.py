@@ -20,7 +20,7 @@ from hgn.schema import ConfigError
 from hgn.training.muon import Muon
 from hgn.training.parity import require_agreement
 
-PRECISION = "ieee" if device().type == "cpu" else "half"
+PRECISION = "fp32" if device().type == "cpu" else "fp16"
 
 
 def updates_of(network: GraphNetworkSimulator, scenes: int, edges: int = 0, **changes: object) -> GnsUpdates:
@@ -57,7 +57,7 @@ def test_updates_are_those_of_torch(optimizer: str) -> None:
     muon = Muon(reference, 1.0) if optimizer == "muon" else None
     losses = plain_updates(reference, chunk, [[grid, none], [other, none], [grid, none]], rates, math.inf, muon)
     total, count = updates.loss_sum.tolist()
-    exact = PRECISION == "ieee"
+    exact = PRECISION == "fp32"
     assert count == 3 and total == pytest.approx(sum(losses), rel=1e-5 if exact else 1e-2)
     expected = torch.cat([p.detach().flatten() for p in reference.parameters()])
     before = torch.cat([p.detach().flatten() for p in network.parameters()])
@@ -75,7 +75,7 @@ def test_wrong_kernels_are_refused() -> None:
     made, grids = episode(1, 5, True)
     still, _ = episode(2, 3, False)
     updates = updates_of(network, 2, noise_std=1e-3)
-    use_edges(updates.network, "half")  # as for a training: the comparison is with other edges all the same
+    use_edges(updates.network, "fp16")  # as for a training: the comparison is with other edges all the same
     edges = updates.network.edges
     none = torch.zeros(0, 3)
     cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
@@ -85,11 +85,11 @@ def test_wrong_kernels_are_refused() -> None:
     ]
     samples = [(made, 1, 3), (still, 0, 4)]
     updates.predict(samples)
-    assert max(require_agreement(updates, episodes)) < (1e-3 if PRECISION == "ieee" else 0.1)
+    assert max(require_agreement(updates, episodes)) < (1e-3 if PRECISION == "fp32" else 0.1)
     assert updates.network.edges is edges
     updates.values.mul_(1.3)
     updates.predict(samples)
-    with pytest.raises(ConfigError, match=r"training.path must be plain on this machine.*set training.path=plain"):
+    with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
         require_agreement(updates, episodes)
 
 

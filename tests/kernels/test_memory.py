@@ -50,7 +50,7 @@ def test_a_pass_without_room_stays_within_memory(training: bool) -> None:
     reads nothing in its place. The same where particles are outside of the window, or nowhere."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.05)
     state = random_state((4, 3), obstacles=False, spread=0.9)
-    precision = "ieee" if device().type == "cpu" else "tf32x3"
+    precision = "fp32"
     engine = engine_of(network, state, precision, capacities=(64, 8))
     state.position_N3[5] = 40.0
     state.position_N3[6] = float("nan")
@@ -75,7 +75,7 @@ def test_own_states_stay_within_memory() -> None:
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     scenes = [scene_with_obstacles(0, 4), falling_episode(3, seed=1), scene_with_obstacles(3, 14)]
     own = GraphPushforwardPool(
-        network, training_of(precision="highest", rollout_frames=2, rollout_share=0.9), CELL_SIZE, 0
+        network, training_of(precision="fp32", rollout_frames=2, rollout_share=0.9), CELL_SIZE, 0
     )
     episodes = [placed(scene, network) for scene in scenes]
     updates = updates_of(network, 4)

@@ -87,7 +87,7 @@ def test_outputs_and_gradients(
         monkeypatch.setattr("hgn.kernels.forward.FEW_ROWS", 0)  # every level is one of many rows
     network = network_of(width=16, **changes)
     state = float32_state(counts, network.config.obstacle_features, spread)
-    precision = "ieee" if device().type == "cpu" else "tf32x3"
+    precision = "fp32"
     output, together, each = compare(network, state, precision, 1.0, 128)
     assert output < 1e-5 and together < 1e-5 and max(each) < 2e-5
 
@@ -97,10 +97,10 @@ def test_half_precision_keeps_small_gradients() -> None:
     network = network_of(width=16, levels=1, message_passing_steps=1)
     state = float32_state((5,), spread=0.1)
     weight = 2.0**-14
-    output, _, _ = compare(network, state, "half", 1.0, 64)
+    output, _, _ = compare(network, state, "fp16", 1.0, 64)
     assert output < 5e-3
     origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
-    engine = engine_of(network, state, "half", (64,), loss_scale=1 / weight)
+    engine = engine_of(network, state, "fp16", (64,), loss_scale=1 / weight)
     run_forward(engine, network, state, origin_S3)
     engine.output_gradient[:5, :3] = 1.0
     engine.backward()
@@ -110,7 +110,7 @@ def test_half_precision_keeps_small_gradients() -> None:
 
 @pytest.mark.parametrize(
     ("precision", "half_cells", "half_sums", "few_rows"),
-    [("tf32", False, False, None), ("half", False, False, None), ("half", True, False, 0), ("half", True, True, 0)],
+    [("tf32", False, False, None), ("fp16", False, False, None), ("fp16", True, False, 0), ("fp16", True, True, 0)],
 )
 def test_inference_alone(
     precision: str, half_cells: bool, half_sums: bool, few_rows: int | None, monkeypatch: pytest.MonkeyPatch
@@ -134,7 +134,7 @@ def test_cells_on_the_border_of_the_grid() -> None:
     position = torch.tensor([[0.0, 0.0, 0.0], [0.03125, 0.09375, 0.0625], [0.125, 0.125, 0.125], [0.28125, 0.25, 0.0]])
     state = replace(state, position_N3=position.double())
     origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
-    engine = engine_of(network, state, "ieee" if device().type == "cpu" else "tf32x3", (64, 32))
+    engine = engine_of(network, state, "fp32", (64, 32))
     found = run_forward(engine, network, state, origin_S3)
     assert relative_error(found, network.normalised_acceleration(state, origin_S3).detach()) < 1e-5
 
@@ -149,7 +149,7 @@ def test_without_obstacles_nothing_is_looked_up() -> None:
     origin_S3 = torch.zeros(1, 3, dtype=torch.float64)
     outputs = []
     for obstacles in (None, far):
-        engine = engine_of(network, state, "ieee" if device().type == "cpu" else "tf32", (64,))
+        engine = engine_of(network, state, "fp32" if device().type == "cpu" else "tf32", (64,))
         outputs.append(run_forward(engine, network, replace(state, obstacles=obstacles), origin_S3).clone())
     assert torch.equal(*outputs)
 
@@ -173,8 +173,8 @@ def test_rounded_reference() -> None:
     ("precision", "width", "counts", "draws"),
     [
         ("tf32", 128, (300, 131, 77), 5),
-        ("half", 128, (300, 131, 77), 5),
-        ("tf32x3", 64, (131, 77), 1),
+        ("fp16", 128, (300, 131, 77), 5),
+        ("fp32", 64, (131, 77), 1),
         ("tf32", 128, (1,), 9),
     ],
 )
@@ -187,14 +187,14 @@ def test_whole_networks_on_a_gpu(precision: str, width: int, counts: tuple[int, 
     found, explained = [], []
     for seed in range(3, 3 + draws):
         state = float32_state(counts, seed=seed)
-        output, together, _ = compare(network, state, precision, 256.0 if precision == "half" else 1.0, 8192)
+        output, together, _ = compare(network, state, precision, 256.0 if precision == "fp16" else 1.0, 8192)
         origin_S3, _ = drawn(network, state)
         engine = inference_of(engine_of(network, state, precision, (8192,) * 4), network)
         alone = run_forward(engine, network, state, origin_S3)
         expected = network.normalised_acceleration(state, origin_S3).detach()
         found.append((output, relative_error(alone, expected), together))
-        if precision != "tf32x3":
-            rounded_output, rounded_together = rounding_errors(network, state, precision == "half")
+        if precision != "fp32":
+            rounded_output, rounded_together = rounding_errors(network, state, precision == "fp16")
             explained.append((rounded_output, rounded_output, rounded_together))
     assert all(output < OUTPUT_BOUND and alone < OUTPUT_BOUND for output, alone, _ in found)
     middle = torch.tensor(found).median(0).values

@@ -1,4 +1,4 @@
-"""The network's own states on the fast path against the plain one."""
+"""The network's own states on backend triton against the plain one."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_the_pool_is_that_of_the_plain_path() -> None:
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
-    training = training_of(precision="highest", rollout_frames=2, noise_std=0.5, noise_at_rest=0.1)
+    training = training_of(precision="fp32", rollout_frames=2, noise_std=0.5, noise_at_rest=0.1)
     fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 60.0, 0)
     rollouts = []
     for starts in ([(0, 0), (1, 4)], [(1, 0), (2, 6)], [(0, 5), (3, 2)]):
@@ -90,7 +90,7 @@ def test_lost_scenes_are_dropped() -> None:
     network = wild_network().to(device())
     small, large = falling(episode(4, seed=1), 0.27), episode(4, seed=2)
     starts = [(small, 2), (large, 2)]
-    training = training_of(precision="highest")
+    training = training_of(precision="fp32")
     fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 60.0, 0)
     for mean, kept in ((0.02, 4), (float("nan"), 0), (0.01, 5)):
         network.normaliser.acceleration_mean.fill_(mean)
@@ -103,7 +103,7 @@ def test_lost_scenes_are_dropped() -> None:
 def test_wrong_kernels_are_refused() -> None:
     """Before anything is trained on them, the simulation's kernels are compared with the plain network."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
-    fast = GraphPushforwardPool(network, training_of(precision="highest"), CELL_SIZE, 0)
+    fast = GraphPushforwardPool(network, training_of(precision="fp32"), CELL_SIZE, 0)
     starts = [(placed(scene_with_obstacles(i, 5), network), 2) for i in range(2)]
     kept = GraphPushforwardPool._first_scenes
 
@@ -114,7 +114,7 @@ def test_wrong_kernels_are_refused() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(GraphPushforwardPool, "_first_scenes", another)
-        with pytest.raises(ConfigError, match=r"training.path must be plain on this machine.*set training.path=plain"):
+        with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
             fast.refresh(starts, values_of(network))
 
 
@@ -138,20 +138,20 @@ def test_fast_training_is_the_plain_one(
 
     monkeypatch.setattr(TrainingModule, "set_statistics", set_statistics)
     ends, lines = {}, {}
-    for path in ("plain", "fast"):
-        assert train.main(run_mapping(data, tmp_path / path, path=path, **same, **own, **counts)) == 0
-        ends[path] = read_checkpoint(tmp_path / path / "checkpoints" / "last.ckpt")
-        lines[path] = next(line for line in metrics(tmp_path / path) if "loss" in line)
+    for backend in ("torch", "triton"):
+        assert train.main(run_mapping(data, tmp_path / backend, backend=backend, **same, **own, **counts)) == 0
+        ends[backend] = read_checkpoint(tmp_path / backend / "checkpoints" / "last.ckpt")
+        lines[backend] = next(line for line in metrics(tmp_path / backend) if "loss" in line)
     assert re.findall(r"the first 2 updates took .* s own states, .* capturing \d+ times", capsys.readouterr().err)
     # Adam's first steps are signs of gradients: where those are next to nothing, rounding decides
-    for key, value in ends["plain"]["state_dict"].items():
-        assert float((ends["fast"]["state_dict"][key] - value).double().abs().mean()) < 1e-5, key
+    for key, value in ends["torch"]["state_dict"].items():
+        assert float((ends["triton"]["state_dict"][key] - value).double().abs().mean()) < 1e-5, key
     moments = [
         torch.cat([s["exp_avg"].flatten() for s in end["optimizer_states"][0]["state"].values()])
-        for end in (ends["fast"], ends["plain"])
+        for end in (ends["triton"], ends["torch"])
     ]
     assert float((moments[0] - moments[1]).norm() / moments[1].norm()) < 1e-4
-    assert ends["fast"]["hgn"] == ends["plain"]["hgn"]
-    assert lines["fast"]["own_states/windows"] == lines["plain"]["own_states/windows"] == 4
+    assert ends["triton"]["hgn"] == ends["torch"]["hgn"]
+    assert lines["triton"]["own_states/windows"] == lines["torch"]["own_states/windows"] == 4
     for name in ("loss", "own_states/mse"):
-        assert lines["fast"][name] == pytest.approx(lines["plain"][name], rel=1e-3)
+        assert lines["triton"][name] == pytest.approx(lines["torch"][name], rel=1e-3)

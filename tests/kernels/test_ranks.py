@@ -1,4 +1,4 @@
-"""Training updates of several ranks on the fast path: averaged gradients, the same updates on all."""
+"""Training updates of several ranks on backend triton: averaged gradients, the same updates on all."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def test_frames_are_those_of_the_plain_loop() -> None:
     """Two scenes at once move as in the plain simulator, frame by frame, and each frame is announced once."""
     scenes, seen = [scene(5), scene(3, 1)], []
     expected = Simulator(network(2), 60.0).rollout(scenes, 3)
-    found = Simulator(network(2), 60.0, "fast", "highest").rollout(scenes, 3, seen.append)
+    found = Simulator(network(2), 60.0, "triton", "fp32").rollout(scenes, 3, seen.append)
     assert seen == [1, 2]
     for path_TN3, expected_TN3 in zip(found, expected, strict=True):
         assert path_TN3.shape == expected_TN3.shape and path_TN3.dtype == np.float32
@@ -58,8 +58,8 @@ def test_overflow_loses_nothing() -> None:
     with torch.no_grad():
         spreading.normaliser.acceleration_std.fill_(0.03)
     state = Simulator(spreading, 60.0).start([scene(5)])
-    roomy = TritonRollout(spreading, state, "highest", (64,))
-    tight = TritonRollout(spreading, state, "highest", (16,))
+    roomy = TritonRollout(spreading, state, "fp32", (64,))
+    tight = TritonRollout(spreading, state, "fp32", (16,))
     expected = roomy.run(3)
     found = np.concatenate([tight.run(1), tight.run(2)])
     assert tight.growths > 0 and roomy.growths == 0
@@ -70,11 +70,11 @@ def test_later_simulations_begin_anew() -> None:
     """What a simulator has captured it uses again, for a scene of fewer particles and other obstacles too; the frames
     are bitwise those of a new simulator, after one that diverged as well."""
     first, second = scene(3), scene(2, 1)
-    again = Simulator(network(), 60.0, "fast", "highest")
+    again = Simulator(network(), 60.0, "triton", "fp32")
     again.rollout([first], 2)
     kept = again._kept[1]
     for one in (second, first):
-        (expected,) = Simulator(network(), 60.0, "fast", "highest").rollout([one], 2)
+        (expected,) = Simulator(network(), 60.0, "triton", "fp32").rollout([one], 2)
         (found,) = again.rollout([one], 2)
         assert again._kept[1] is kept
         np.testing.assert_array_equal(found, expected)
@@ -93,7 +93,7 @@ def test_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator; the one that ends last is kept. What diverges gives its good frames first."""
     monkeypatch.setattr(triton_rollout, "LOOK_FRAMES", 2)
     first, second = scene(3), scene(2, 1)
-    simulator = Simulator(network(), 60.0, "fast", "highest")
+    simulator = Simulator(network(), 60.0, "triton", "fp32")
     (expected,) = simulator.rollout([first], 4)
     one, other = simulator.frames(first), simulator.frames(second)
     found = [(next(one), next(other))[0] for _ in range(4)]
@@ -121,7 +121,7 @@ def test_first_room() -> None:
 
 @pytest.mark.parametrize(("particles", "side", "most"), [(1_000_000, 128, 2.35e9), (4_296, 48, 0.055e9)])
 def test_memory_of_a_simulation(particles: int, side: int, most: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In half precision the network of the paper's size simulates a million particles, of which a cell has three as on
+    """In fp16 the network of the paper's size simulates a million particles, of which a cell has three as on
     the bench, within 2.35 KB each, and 4,296 within 0.055 GB; what is asked are 3 KB and 0.1 GB. Counted over all
     tensors of a simulation without memory: weights, state and positions on their way to the host too."""
     monkeypatch.setattr(TritonRollout, "_window", lambda _: Window((0, 0, 0), (side, side, side)))
@@ -132,11 +132,11 @@ def test_memory_of_a_simulation(particles: int, side: int, most: float, monkeypa
         position_N3, velocity_NM3 = torch.zeros(particles, 3), torch.zeros(particles, 5, 3)
         index_N = torch.zeros(particles, dtype=torch.int64)
         state = ParticleState(position_N3, velocity_NM3, index_N, index_N, torch.zeros(1, 3), None)
-    rollout = TritonRollout(whole, state, "half", first_capacities(cells, particles))
+    rollout = TritonRollout(whole, state, "fp16", first_capacities(cells, particles))
     gc.collect()
     held = sum(size for storage, size in on_meta().items() if storage not in before)
     assert 0.8 * most < held <= most
-    assert rollout.engine.precision == "half"
+    assert rollout.engine.precision == "fp16"
 
 
 def on_meta() -> dict[int, int]:
@@ -152,8 +152,8 @@ def test_growing_gives_back_first(monkeypatch: pytest.MonkeyPatch) -> None:
     with torch.no_grad():
         spreading.normaliser.acceleration_std.fill_(0.03)
     state = Simulator(spreading, 60.0).start([scene(5)])
-    expected = TritonRollout(spreading, state, "highest", (64,)).run(3)
-    tight = TritonRollout(spreading, state, "highest", (16,))
+    expected = TritonRollout(spreading, state, "fp32", (64,)).run(3)
+    tight = TritonRollout(spreading, state, "fp32", (16,))
     old = [weakref.ref(tight.grid), weakref.ref(tight.engine)]
     build, asked = DeviceGrid.__init__, []
 
@@ -182,7 +182,7 @@ def test_frames_taken_away_beside_the_next(monkeypatch: pytest.MonkeyPatch) -> N
     state = Simulator(spreading, 60.0).start([scene(5)])
     paths, growths, lost = [], [], []
     for overlap in (False, True):
-        tight = TritonRollout(spreading, state, "highest", (16,))
+        tight = TritonRollout(spreading, state, "fp32", (16,))
         tight.overlap = overlap
         seen: list[int] = []
         paths.append(tight.run(3, seen.append))
@@ -198,15 +198,15 @@ def test_frames_taken_away_beside_the_next(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_divergence_names_the_frame() -> None:
-    """Particles that leave the domain by more than its size end the simulation with the plain path's message."""
+    """Particles that leave the domain by more than its size end the simulation with backend torch's message."""
     wild = network()
     with torch.no_grad():
         wild.normaliser.acceleration_mean.fill_(0.15)
         wild.normaliser.acceleration_std.fill_(0.0)
     messages = []
-    for path in ("plain", "fast"):
+    for backend in ("torch", "triton"):
         with pytest.raises(DivergenceError) as caught:
-            Simulator(wild, 60.0, path).rollout([scene(4)], 4)
+            Simulator(wild, 60.0, backend).rollout([scene(4)], 4)
         messages.append(str(caught.value))
     assert messages[0] == messages[1] and "4 of 4 particles" in messages[0]
 
@@ -215,10 +215,10 @@ def test_wrong_kernels_are_refused() -> None:
     """A rollout whose first output is not the plain network's is refused before it moves anything."""
     plain = network()
     state = Simulator(plain, 60.0).start([scene(5)])
-    rollout = TritonRollout(plain, state, "highest")
+    rollout = TritonRollout(plain, state, "fp32")
     rollout.require_agreement(plain, state)
     other = network()
     with torch.no_grad():
         next(other.decode.parameters()).mul_(1.5)
-    with pytest.raises(ConfigError, match="path must be plain on this machine"):
+    with pytest.raises(ConfigError, match="backend must be torch on this machine"):
         rollout.require_agreement(other, state)

@@ -86,7 +86,7 @@ def updates_of(
     return Updates(
         copy.deepcopy(network).float().to(device()),
         UpdateSettings(scenes=scenes, obstacle_cell_size=CELL_SIZE, **settings),
-        "ieee" if device().type == "cpu" else "tf32x3",
+        "fp32",
         torch.zeros(2, device=device()),
         torch.zeros(5, device=device()),
         capacities=capacities,
@@ -190,7 +190,7 @@ def test_noise_and_jitter() -> None:
 
 
 def test_smooth_noise() -> None:
-    """With noise_smooth=1 a scene gets the sum of its waves for noise, as in the plain path, of the asked spread; other
+    """With noise_smooth=1 a scene gets the sum of its waves for noise, as in backend torch, of the asked spread; other
     scenes have other waves; half of the variance leaves the other half to each particle."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.01)
     made, _ = episode(1, 400, False, spread=0.3)
@@ -243,5 +243,5 @@ def test_wrong_kernels_are_refused() -> None:
     updates.values.mul_(1.3)
     updates.engine.refresh()
     updates.predict(samples)
-    with pytest.raises(ConfigError, match=r"training.path must be plain on this machine.*set training.path=plain"):
+    with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
         require_agreement(updates, episodes)

@@ -1,4 +1,4 @@
-"""GNS's own gradients by its edges: exact in float64, near it in half precision, whatever the size of the gradients."""
+"""GNS's own gradients by its edges: exact in float64, near it in fp16, whatever the size of the gradients."""
 
 from __future__ import annotations
 

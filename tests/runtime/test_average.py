@@ -16,33 +16,37 @@ from hgn.runtime.weights import load_weights, save_weights
 from hgn.schema import ConfigError
 
 
-def moved(path: Path, by: float, updates: int = 7, normaliser: float = 0.0, half: bool = False) -> Path:
+def moved(path: Path, by: float, updates: int = 7, normaliser: float = 0.0, stored_precision: str = "fp32") -> Path:
     """The weights of `weights_file`, each moved by a random number of this size."""
-    network, info = load_weights(weights_file(path, half=False))
+    network, info = load_weights(weights_file(path, "fp32"))
     generator = torch.Generator().manual_seed(updates)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter += by * torch.randn(parameter.shape, generator=generator)
         network.normaliser.velocity_std += normaliser
-    save_weights(path, network, replace(info, updates=updates, provenance={"part": path.name}), half)
+    save_weights(path, network, replace(info, updates=updates, provenance={"part": path.name}), stored_precision)
     return path
 
 
 @pytest.mark.parametrize(("shares", "expected"), [(None, (0.5, 0.5)), ((0.7, 0.3), (0.7, 0.3))])
 def test_the_mean(tmp_path: Path, shares: tuple[float, ...] | None, expected: tuple[float, ...]) -> None:
-    """Each tensor is the mean of the files' by their shares, halved where asked; the normaliser stays bit by bit, and
-    the file says what it was made of."""
-    files = [moved(tmp_path / "a.safetensors", 0.1, 5, half=True), moved(tmp_path / "b.safetensors", 0.1, 9)]
-    for half in (False, True):
+    """Each tensor is the mean of the files' by their shares, in float16 where asked; the normaliser stays bit by bit,
+    and the file says what it was made of."""
+    files = [
+        moved(tmp_path / "a.safetensors", 0.1, 5, stored_precision="fp16"),
+        moved(tmp_path / "b.safetensors", 0.1, 9),
+    ]
+    for stored in ("fp32", "fp16"):
         out = tmp_path / "mean.safetensors"
-        assert main({"weights": [str(f) for f in files], "shares": shares, "out": str(out), "half": half}) == 0
+        options = {"shares": shares, "out": str(out), "stored_precision": stored}
+        assert main({"weights": [str(f) for f in files], **options}) == 0
         (first, _), (second, _), (mean, info) = (load_weights(file) for file in (*files, out))
         for name, tensor in mean.state_dict().items():
             a, b = first.state_dict()[name], second.state_dict()[name]
             wanted = a if name.startswith("normaliser.") else expected[0] * a + expected[1] * b
-            if half and not name.startswith("normaliser."):
+            if stored == "fp16" and not name.startswith("normaliser."):
                 wanted = wanted.half().float()
-            torch.testing.assert_close(tensor, wanted, rtol=0, atol=1e-3 if half else 1e-7)
+            torch.testing.assert_close(tensor, wanted, rtol=0, atol=1e-3 if stored == "fp16" else 1e-7)
             assert not name.startswith("normaliser.") or torch.equal(tensor, a)
         assert info.updates == 9
         parts = info.provenance["average_of"]

@@ -179,7 +179,9 @@ def test_frame_by_frame(tmp_path: Path) -> None:
     network = network_of(torch.float32)
     save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
     simulator = Simulator.load(tmp_path / "w.safetensors", device="cpu")
-    assert simulator.frame_rate_hz == 60.0 and simulator.path_said.startswith("runtime path: plain (it needs a CUDA")
+    assert simulator.frame_rate_hz == 60.0 and simulator.backend_note.startswith(
+        "runtime backend: torch (it needs a CUDA"
+    )
     start, other = initial(30), initial(10, 1)
     scene = Scene(start.position_N3, start.velocity_N3, start.material_N)
     (expected,) = simulator.rollout([scene], 4)
@@ -228,7 +230,7 @@ def test_scenes_of_arrays(change: dict[str, object], message: str) -> None:
 
 def test_options_of_load() -> None:
     """As on the command line, an option that does not exist is refused with those that do."""
-    for option, value in (("path", "quick"), ("precision", "fp16"), ("weights", "obstacle"), ("device", "abacus")):
+    for option, value in (("backend", "quick"), ("precision", "half"), ("weights", "obstacle"), ("device", "abacus")):
         with pytest.raises(ConfigError, match=f"{option} must be .*, got '{value}'"):
             Simulator.load(**{option: value})
     with pytest.raises(ConfigError, match="frames must be at least 1, got 0"):

@@ -1,4 +1,4 @@
-"""hgn.runtime.triton_host: what is missing is named, and the fast path does not begin without it."""
+"""hgn.runtime.triton_host: what is missing is named, and backend triton does not begin without it."""
 
 from __future__ import annotations
 
@@ -49,9 +49,11 @@ def test_what_is_missing(host: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_it_is_said(host: Path) -> None:
-    """The plain path runs instead, and says why; who asks for the fast one is told what to install."""
+    """Backend torch runs instead, and says why; who asks for the fast one is told what to install."""
     device = torch.device("cuda")
-    path, said = path_on(device, NetworkConfig(), "auto", "high")
-    assert path == "plain" and "Python.h" in said
-    with pytest.raises(ConfigError, match="path must be plain or auto here, got fast: Triton needs Python's headers"):
-        path_on(device, NetworkConfig(), "fast", "high")
+    path, said = path_on(device, NetworkConfig(), "auto", "tf32")
+    assert path == "torch" and "Python.h" in said
+    with pytest.raises(
+        ConfigError, match="backend must be torch or auto here, got triton: Triton needs Python's headers"
+    ):
+        path_on(device, NetworkConfig(), "triton", "tf32")

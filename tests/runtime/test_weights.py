@@ -90,11 +90,11 @@ def test_same_network_same_bytes(weights: Path, tmp_path: Path) -> None:
 
 
 def test_half_precision(weights: Path, tmp_path: Path) -> None:
-    """`half` rounds each learned tensor to float16 and halves the file; the normaliser keeps its float32 values, and
+    """fp16 rounds each learned tensor to float16 and halves the file; the normaliser keeps its float32 values, and
     the network computes in float32 again."""
     network, info = load_weights(weights)
-    path = tmp_path / "half.safetensors"
-    save_weights(path, network, info, half=True)
+    path = tmp_path / "fp16.safetensors"
+    save_weights(path, network, info, stored_precision="fp16")
     tensors, _ = content(path)
     for name, tensor in network.state_dict().items():
         kept = name.startswith("normaliser.")
@@ -215,6 +215,6 @@ def test_failed_save_leaves_the_old_file(weights: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("hgn.system.files.os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        save_weights(weights, network, info, half=True)
+        save_weights(weights, network, info, stored_precision="fp16")
     assert weights.read_bytes() == before
     assert [file.name for file in weights.parent.iterdir()] == [weights.name]

@@ -123,7 +123,7 @@ def test_the_naive_network_is_the_same_function(changes: dict[str, Any]) -> None
 
 
 def test_gns_in_half_precision(tmp_path: Path) -> None:
-    """Our GNS is checked and timed in half precision where there is no fast path either, and nothing else is."""
+    """Our GNS is checked and timed in fp16 where there is no backend triton either, and nothing else is."""
     path = tmp_path / "bench.json"
     assert main(SMALL | {"scenes": [1], "precisions": ["fp16"], "json": str(path)}) == 0
     rows = json.loads(path.read_text())["rows"]
@@ -132,7 +132,7 @@ def test_gns_in_half_precision(tmp_path: Path) -> None:
 
 
 def test_the_fast_path_is_checked_like_the_plain_one() -> None:
-    """Frames, loss and gradients of the fast path pass in float32 (in Triton's interpreter), and a wrong weight not."""
+    """Frames, loss and gradients of backend triton pass in float32 (in the interpreter), and a wrong weight not."""
     config = NetworkConfig(width=16, levels=1, message_passing_steps=1)
     frame = FastFrame("fp32", config, Workload(2, 1), CPU)
     assert frame.check("fp32") == "pass"

@@ -170,7 +170,7 @@ def test_trivial_errors_are_those_of_training(data: str) -> None:
 
 
 def test_the_fast_path_tells_its_own_errors(data: str) -> None:
-    """One-step errors of the fast path come from its kernels, several frames at once: in float32 they are the plain
+    """One-step errors of backend triton come from its kernels, several frames at once: in float32 they are the plain
     network's; what is captured serves the next frames, and those of fewer particles too."""
     (episode,) = EpisodeStore(data, "test").episodes
     fewer = replace(
@@ -181,7 +181,7 @@ def test_the_fast_path_tells_its_own_errors(data: str) -> None:
         material_N=episode.material_N[1:],
     )
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1)
-    predict, made = FastPredictor(network, "highest"), []
+    predict, made = FastPredictor(network, "fp32"), []
     with torch.inference_mode():
         for samples in ([(episode, 0), (episode, 2)], [(fewer, 1), (fewer, 3)], [(episode, 3)]):
             batch = make_batch(samples, network.config)
@@ -191,7 +191,7 @@ def test_the_fast_path_tells_its_own_errors(data: str) -> None:
 
 
 def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Half precision off the fast path is left out, and that is said; the fast path must run where it is asked for."""
+    """The HGN in fp16 on backend torch is left out, and that is said; triton must run where it is asked for."""
     files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
     options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": files}
     config = from_mapping(ErrorVsTimeConfig, options | {"precisions": ["fp32", "fp16"]})
@@ -199,15 +199,15 @@ def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys:
     found = [(c.row["system"], c.row["precision"]) for c in network_contenders(config, CPU, [episode])]
     assert found == [("hgn", "fp32"), ("gns", "fp32"), ("gns", "fp16")]
     assert "left out: hgn.safetensors at fp16" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match="path must be plain or auto here, got fast"):
-        network_contenders(replace(config, path="fast"), CPU, [episode])
+    with pytest.raises(ConfigError, match="backend must be torch or auto here, got triton"):
+        network_contenders(replace(config, backend="triton"), CPU, [episode])
 
 
 def test_what_counts_most_comes_first(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What is simulated with the reference, networks at the precision that tells most, coarse grids, then other
-    precisions, whose rollouts off the fast path are short; the report keeps its order. What fails is named with the
+    precisions, whose rollouts off backend triton are short; the report keeps its order. What fails is named with the
     cause, the others go on, and only a fault that nobody foresaw makes the exit code 1."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
     monkeypatch.setattr("tools.error_vs_time.__main__.GNS_ORDER", ("fp32", "fp16", "tf32"))
@@ -510,7 +510,7 @@ def test_weights_that_do_not_fit_are_told_at_once(data: str, tmp_path: Path, mon
 
 @pytest.mark.parametrize("kind", ["hgn", "gns"])
 def test_scenes_beside_one_that_diverges_go_their_way(data: str, kind: str) -> None:
-    """Off the fast path they are simulated once, as if it had never been there."""
+    """Off backend triton they are simulated once, as if it had never been there."""
     episodes = EpisodeStore(data, "validation").episodes
     scenes = [InitialState.of_episode(episode) for episode in (*episodes, episodes[0])]
     scenes[1] = replace(scenes[1], velocity_N3=scenes[1].velocity_N3 + np.float32(60.0))
@@ -534,7 +534,9 @@ def report_row(system: str, error: float, ms: float | None, **more: Any) -> dict
     row |= {"position_quartiles": {"50": [0.5 * error, 2 * error]}, "scenes_reached": {"50": 2, "299": 1}}
     row |= {"seeds": [1, 2], "failed_scenes": 1, "curve": [0.0, error, None], "penetration": 0.01, "sinkhorn": {}}
     row |= {"reference_penetration": 0.005, "worst_penetration": worst, "ms": ms, "ms_batched": ms, "batch_scenes": 2}
-    return row | {"weights": f"{system}.safetensors", "levels": 3, "message_passing_steps": 4, "path": "fast"} | more
+    return (
+        row | {"weights": f"{system}.safetensors", "levels": 3, "message_passing_steps": 4, "backend": "triton"} | more
+    )
 
 
 def report_rows() -> list[dict[str, Any]]:

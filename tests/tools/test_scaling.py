@@ -50,7 +50,7 @@ def test_rows_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     report = json.loads(path.read_text())
     assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
     rows = {case: [row for row in report["rows"] if row["case"] == case] for case in ("weak_scaling", "all_reduce")}
-    assert {row["path"] for row in rows["weak_scaling"]} == {"plain"}  # without a GPU
+    assert {row["backend"] for row in rows["weak_scaling"]} == {"torch"}  # without a GPU
     found = [(row["devices"], row["averaged"], row["particle_spread"]) for row in rows["weak_scaling"]]
     assert found == [(1, False, 0), (1, False, 0.17), (2, False, 0), (2, True, 0), (2, True, 0.17)]
     assert all(row["check"] == "pass" and row["ms"] > 0 and row["efficiency"] > 0 for row in rows["weak_scaling"])
@@ -61,7 +61,7 @@ def test_rows_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     model = [row for row in report["rows"] if row["case"] == "model"]
     assert [row["devices"] for row in model] == 2 * list(SIZES)
     printed = capsys.readouterr().out
-    assert "| plain | highest | 2 | 2 | 0.17 | 1, up to 0.0 MB |" in printed
+    assert "| torch | fp32 | 2 | 2 | 0.17 | 1, up to 0.0 MB |" in printed
     assert model_table(report["rows"]) in printed and "| 1024 | 128 |" in printed
 
 
@@ -130,7 +130,7 @@ def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pyt
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the interpreter, which takes tensors of the CPU, is off here")
 def test_the_fast_path_is_timed_alike(alone: dist.ProcessGroup) -> None:
-    """Its updates are those of the plain path on the same scenes: weights agree after them; averages are checked."""
+    """Its updates are those of backend torch on the same scenes: weights agree after them; averages are checked."""
     small = {"network": {"width": 16, "levels": 1, "message_passing_steps": 1}, "particles": 6}
     config = from_mapping(ScalingConfig, SMALL | small | {"scenes": 1, "batches": 1})
     plain, fast = (averaged(alone, make, config) for make in (measure.PlainUpdates, measure.FastUpdates))
@@ -197,7 +197,7 @@ def test_fit_finds_the_link() -> None:
         ({"batches": 0}, "batches must be at least 1"),
         ({"update_ms": 0}, "update_ms must be"),
         ({"update_ms": 5, "backward_ms": 6}, "backward_ms must be at most update_ms, got 6"),
-        ({"paths": ["slow"]}, r"paths\[0\] must be plain or fast"),
+        ({"backends": ["slow"]}, r"backends\[0\] must be torch or triton"),
         ({"message_mb": [0]}, r"message_mb\[0\] must be > 0"),
         ({"particle_spread": -1}, "particle_spread must be"),
         ({"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),

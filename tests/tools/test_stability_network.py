@@ -217,8 +217,8 @@ def test_scenes_follow_the_network() -> None:
         ({"domain_factors": [5]}, r"domain_factors\[0\] must be a square"),
         ({"frames": 1}, "frames must be at least 2"),
         ({"energy_bound": 0.0}, "energy_bound must be a finite number > 0"),
-        ({"precision": "fp8"}, "precision must be one of highest, high, half"),
-        ({"path": "quick"}, "path must be one of auto, plain, fast"),
+        ({"precision": "fp8"}, "precision must be one of fp32, tf32, fp16"),
+        ({"backend": "quick"}, "backend must be one of auto, torch, triton, cpu"),
     ],
 )
 def test_bad_options(change: dict[str, Any], message: str) -> None:

@@ -36,7 +36,7 @@ network, sizes = NetworkConfig(width=16, levels=2, message_passing_steps=2), (20
 if "gns" in sys.argv:
     settings = replace(settings, optimizer="muon")
     network, sizes = NetworkConfig(kind="gns", width=16, levels=1, message_passing_steps=2), (9000,)
-found = list(launches_of(PrecompileJob(network, settings, "half", True, True, 300, sizes, 90)).values())
+found = list(launches_of(PrecompileJob(network, settings, "fp16", True, True, 300, sizes, 90)).values())
 JITFunction._do_compile = not_compiled
 for function, data in found if sys.argv[1] == "launch" else reversed(found):
     function.preload(data)

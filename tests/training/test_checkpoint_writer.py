@@ -92,7 +92,7 @@ def test_the_content_is_that_of_the_moment(writer, tmp_path, monkeypatch):
 
 
 def test_shared_memory_is_stored_once(writer, tmp_path):
-    """Tensors that are parts of one buffer, as on the fast path, take the buffer's size in the file."""
+    """Tensors that are parts of one buffer, as on backend triton, take the buffer's size in the file."""
     flat = torch.randn(100_000)
     writer.save_checkpoint({str(n): part for n, part in enumerate(flat.split(1000))}, tmp_path / "a.ckpt")
     writer.wait()

@@ -21,7 +21,7 @@ CHECKOUT = Path(__file__).parents[2]
 
 
 def job(batch_scenes: int = 8) -> PrecompileJob:
-    training = TrainingConfig(batch_scenes=batch_scenes, precision="half")
+    training = TrainingConfig(batch_scenes=batch_scenes, precision="fp16")
     config = TrainConfig(SceneConfig(), network=NetworkConfig(width=16, levels=2), training=training)
     return job_of_training(config, (9, 0), False)
 
@@ -42,7 +42,7 @@ def start(started: list[Precompilation], program: str) -> Precompilation:
 def test_the_job_follows_from_the_configuration() -> None:
     """Sizes are those of the scenes' distribution as it begins, to a few per cent, and the job survives its text."""
     made = job()
-    assert made.precision == "half" and made.capability == 90 and made.settings.scenes == 8
+    assert made.precision == "fp16" and made.capability == 90 and made.settings.scenes == 8
     assert made.particles == pytest.approx(8 * 4296, rel=0.05)
     assert made.cells == pytest.approx((8 * 1419, 8 * 231), rel=0.2)  # of a measured batch
     assert job_of(job_text(made)) == made
@@ -51,7 +51,7 @@ def test_the_job_follows_from_the_configuration() -> None:
 def test_jobs_of_simulations() -> None:
     """Networks keep their precisions through the job's text; few and many particles, dense and spread, are among the
     sizes, and as many as there are cases change little."""
-    networks = ((NetworkConfig(width=16), "half"), (NetworkConfig(width=16, levels=2), "high"))
+    networks = ((NetworkConfig(width=16), "fp16"), (NetworkConfig(width=16, levels=2), "tf32"))
     made = FrameJob(networks, frame_sizes([2_763, 30_000, 1, 30_000]), 90)
     assert job_of(job_text(made)) == made
     assert {particles for particles, _ in made.sizes} == {1, 2_763, 30_000} and len(made.sizes) == 9
@@ -61,8 +61,8 @@ def test_jobs_of_simulations() -> None:
 
 def test_what_was_compiled_is_counted(started: list[Precompilation]) -> None:
     """Each process gets its share and the job; the counts of all are told together."""
-    ahead = start(started, "assert 'half' in sys.stdin.read(); print(10 + int(sys.argv[1]) + int(sys.argv[2]))")
-    assert "fast path: 25 kernels ready" in ahead.wait(lambda: False)
+    ahead = start(started, "assert 'fp16' in sys.stdin.read(); print(10 + int(sys.argv[1]) + int(sys.argv[2]))")
+    assert "backend triton: 25 kernels ready" in ahead.wait(lambda: False)
 
 
 def test_a_failure_is_told(started: list[Precompilation]) -> None:

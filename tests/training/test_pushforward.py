@@ -1,4 +1,4 @@
-"""Training on the network's own states, on the plain path."""
+"""Training on the network's own states, on backend torch."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_a_resume_where_the_pool_is_made_anew_changes_nothing(
     def trained(name: str, stops: list[int], **changes: Any) -> dict[str, Any]:
         for stop in (*stops, None):
             stop_at(stop)
-            train.main(train_mapping(data, tmp_path / name, path="plain", **own | changes))
+            train.main(train_mapping(data, tmp_path / name, backend="torch", **own | changes))
         return read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
 
     whole, again, elsewhere = trained("whole", []), trained("again", [4, 8]), trained("elsewhere", [6])

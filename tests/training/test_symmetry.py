@@ -1,4 +1,4 @@
-"""Symmetry augmentation on the plain path."""
+"""Symmetry augmentation on backend torch."""
 
 from __future__ import annotations
 

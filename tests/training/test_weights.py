@@ -30,13 +30,15 @@ def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[Data
     return config
 
 
-def weights_file(path: Path, half: bool = True, rate: float = 60.0, cell_size: float = 1 / 64, **network: Any) -> Path:
+def weights_file(
+    path: Path, stored_precision: str = "fp16", rate: float = 60.0, cell_size: float = 1 / 64, **network: Any
+) -> Path:
     torch.manual_seed(3)
     config = NetworkConfig(**NETWORK | network)
     built = build_network(config)
     for quantity in ("velocity", "acceleration"):
         built.normaliser.set(quantity, torch.tensor([0.1, 0.2, 0.3]), torch.tensor([1.5, 2.5, 3.5]), 0.0)
-    save_weights(path, built, WeightsInfo(config, rate, cell_size), half)
+    save_weights(path, built, WeightsInfo(config, rate, cell_size), stored_precision)
     return path
 
 
@@ -51,13 +53,13 @@ def last(run: Path) -> dict[str, Any]:
     return read_checkpoint(run / "checkpoints" / "last.ckpt")
 
 
-@pytest.mark.parametrize("half", [True, False])
+@pytest.mark.parametrize("stored_precision", ["fp16", "fp32"])
 def test_a_run_begins_with_weights(
-    data: DatagenConfig, tmp_path: Path, half: bool, capsys: pytest.CaptureFixture[str]
+    data: DatagenConfig, tmp_path: Path, stored_precision: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A new run has the file's weights and its normaliser, whether halved or not; one that goes on takes its
+    """A new run has the file's weights and its normaliser, whether rounded or not; one that goes on takes its
     checkpoint's, even where the file is gone, and says so."""
-    file = weights_file(tmp_path / "begin.safetensors", half)
+    file = weights_file(tmp_path / "begin.safetensors", stored_precision)
     tiny = {"learning_rate": 1e-12, "final_learning_rate": 1e-12, "maximum_updates": 1}
     mapping = train_mapping(data, tmp_path / "run", weights=str(file), **tiny)
     assert train.main(mapping) == 0

@@ -15,15 +15,15 @@ from typing import Any
 import torch
 
 from hgn.command import run_command
-from hgn.runtime.backend import why_not_fast, why_not_trained_fast
+from hgn.runtime.backend import set_matmul_precision, why_not_fast, why_not_trained_fast
 from hgn.schema import from_mapping, to_mapping
 from hgn.system.device import choose_device
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
 from tools.bench.config import CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
-from tools.bench.contenders import MATMUL, PASS, Frame, MpmFrame, NaiveFrame, Train, checked_workload
-from tools.bench.fast import PATH_PRECISION, FastFrame, FastTrain
+from tools.bench.contenders import PASS, Frame, MpmFrame, NaiveFrame, Train, checked_workload
+from tools.bench.fast import FastFrame, FastTrain
 from tools.bench.public_gns import PublicFrame, PublicTrain
 from tools.bench.states import TILE_PARTICLES, Workload
 from tools.bench.timing import Timed, alternate
@@ -84,7 +84,7 @@ def group_rows(
 ) -> list[dict[str, Any]]:
     """The rows of contenders that are timed in turns."""
     before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision(MATMUL[precision])
+    set_matmul_precision(precision)
     try:
         entries = [_prepare(config, device, precision, case, work) for case in cases]
         ready = [entry.timed for entry in entries if entry.timed is not None]
@@ -132,8 +132,8 @@ def _prepare(config: BenchConfig, device: torch.device, precision: str, case: st
         if case == "mpm_frame":
             mpm = MpmFrame(work, config.network.cell_size, config.mpm_frames, device)
             return Entry(row | {"check": PASS}, mpm.timed(), mpm)
-        make, path = _maker(config, device, precision, case)
-        row |= {} if path is None else {"path": path}
+        make, backend = _maker(config, device, precision, case)
+        row |= {} if backend is None else {"backend": backend}
         checked = checked_workload(work, "frame" if case.endswith("frame") else "train")
         row["check"] = make(network, checked, device).check(precision)
         row["checked_particles"] = checked.particles * checked.scenes
@@ -156,22 +156,22 @@ def _prepare(config: BenchConfig, device: torch.device, precision: str, case: st
 def _maker(
     config: BenchConfig, device: torch.device, precision: str, case: str
 ) -> tuple[Callable[..., Contender], str | None]:
-    """What makes the contender from configuration, workload and device, and the path of ours."""
+    """What makes the contender from configuration, workload and device, and the backend of ours."""
     frame = case.endswith("frame")
     if config.public_gns is not None and case in PUBLIC_GNS_CASES:
         return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
-    if case in ("frame", "train") and why_not_fast(device, config.network, PATH_PRECISION[precision]) is None:
-        return functools.partial(FastFrame if frame else FastTrain, precision), "fast"
-    if case == "gns_train" and why_not_trained_fast(device, config.gns, PATH_PRECISION[precision]) is None:
-        return functools.partial(FastTrain, precision), "fast"
+    if case in ("frame", "train") and why_not_fast(device, config.network, precision) is None:
+        return functools.partial(FastFrame if frame else FastTrain, precision), "triton"
+    if case == "gns_train" and why_not_trained_fast(device, config.gns, precision) is None:
+        return functools.partial(FastTrain, precision), "triton"
     plain = NaiveFrame if case == "naive_frame" else Frame if frame else Train
-    made = functools.partial(plain, precision=PATH_PRECISION[precision])
-    return made, None if "gns" in case else "plain"
+    made = functools.partial(plain, precision=precision)
+    return made, None if "gns" in case else "torch"
 
 
 def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tuple[str, ...]) -> list[str]:
-    """Those of `cases` that are asked for and mean something; half precision is the fast path's and our GNS's alone."""
-    fast = why_not_fast(device, config.network, PATH_PRECISION[precision]) is None
+    """Those of `cases` that are asked for and mean something; fp16 is backend triton's and our GNS's alone."""
+    fast = why_not_fast(device, config.network, precision) is None
     wanted = config.cases or tuple(
         case
         for case in CASES

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hgn.config import NetworkConfig
+from hgn.config import PRECISIONS, NetworkConfig
 from hgn.schema import require, require_positive
 
 PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
 PLAIN_CASES = ("plain_frame", "plain_train")
 CASES = ("frame", "train", "naive_frame", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
-PRECISIONS = ("fp32", "tf32", "fp16")
 
 
 def _bench_gns() -> NetworkConfig:

@@ -35,7 +35,6 @@ BOUNDS = {"fp32": 1e-5, "tf32": 2e-3, "fp16": 2e-3}  # relative error of acceler
 # Of all gradients together. Looser, for rounding turns the activations that lie next to their kink: of millions of
 # them a share like the rounding itself, and the gradient's error is like that share's root.
 GRADIENT_BOUNDS = {"fp32": 1e-3, "tf32": 5e-2, "fp16": 5e-2}
-MATMUL = {"fp32": "highest", "tf32": "high", "fp16": "high"}  # torch.set_float32_matmul_precision
 FRAME_RATE_HZ = 60.0
 CHECKED_AT_MOST = {"frame": 50_000, "train": TILE_PARTICLES}  # particles of all scenes
 MPM_ROUNDS = 5
@@ -61,7 +60,7 @@ def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwor
 class Frame:
     """One frame of a simulation: features, grid or neighbours, network, integration."""
 
-    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "highest") -> None:
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
         self.device = device
         self.network = self.reference = bench_network(config, device)
         self.simulator = Simulator(self.network, FRAME_RATE_HZ, precision=precision)
@@ -113,7 +112,7 @@ class Frame:
 class NaiveFrame(Frame):
     """The same frame by the network as one writes it first, which has to agree with ours in float64."""
 
-    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "highest") -> None:
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
         super().__init__(config, work, device, precision)
         self.network = NaiveNetwork(config)
         self.network.load_state_dict(self.reference.state_dict())
@@ -124,7 +123,7 @@ class NaiveFrame(Frame):
 class Train:
     """One training step on data that is on the device: noise, jitter, forward, backward, Adam."""
 
-    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "highest") -> None:
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
         self.device = device
         training = TrainingConfig(batch_scenes=work.scenes)
         self.module = TrainingModule(bench_network(config, device).train(), training, _data_info()).to(device)

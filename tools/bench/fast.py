@@ -1,4 +1,4 @@
-"""The fast path on the bench: frames and training updates in CUDA graphs, checked like the plain ones.
+"""Backend triton on the bench: frames and training updates in CUDA graphs, checked like the plain ones.
 
 Shape legend: N particles of all scenes, S scenes.
 """
@@ -26,7 +26,6 @@ from tools.bench.contenders import (
 from tools.bench.states import Workload, batch_of, state_of
 from tools.bench.timing import Timed, once
 
-PATH_PRECISION = {"fp32": "highest", "tf32": "high", "fp16": "half"}
 FRAMES_AT_ONCE = 16  # at most, so that a frame's launch hides behind the one before, as in a simulation
 UPDATES_AT_ONCE = 20
 OBSTACLE_CELL_SIZE = 1 / 64
@@ -44,7 +43,7 @@ class FastFrame:
         assert isinstance(network, HierarchicalGraphNetwork)
         self.network, self.state = network, state_of(work, config, device)
         self.velocity_NV = self.state.velocity_NM3.flatten(1)  # a view
-        self.rollout = TritonRollout(network, self.state, PATH_PRECISION[precision])
+        self.rollout = TritonRollout(network, self.state, precision)
         self.failure: str | None = None
 
     @property
@@ -118,7 +117,7 @@ class FastTrain:
         return kind(
             copy.deepcopy(self.network),
             UpdateSettings(len(self.samples), noise_std, grid_jitter, OBSTACLE_CELL_SIZE),
-            kernel_precision(PATH_PRECISION[self.precision], self.device),
+            kernel_precision(self.precision, self.device),
             torch.zeros(2, device=self.device),
             torch.zeros(5, device=self.device),
         )

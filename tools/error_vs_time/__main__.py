@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from hgn.command import EXIT_MACHINE, run_command
-from hgn.config import MpmConfig
+from hgn.config import PRECISIONS, MpmConfig
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, shipped_weights
@@ -46,7 +46,7 @@ from tools.error_vs_time.earlier import Earlier, is_among
 from tools.error_vs_time.plot import CONVENTION
 from tools.error_vs_time.run import Run, draw
 from tools.error_vs_time.score import pay_back, table
-from tools.error_vs_time.settings import PRECISIONS, ErrorVsTimeConfig
+from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.solver_launches import Setting, SolverLaunches
 from tools.solver_rollouts import other_grid
 
@@ -143,7 +143,7 @@ def _reference_name(config: ErrorVsTimeConfig) -> str:
 def network_contenders(
     config: ErrorVsTimeConfig, device: torch.device, episodes: Sequence[Episode]
 ) -> list[NetworkContender]:
-    """Every weights file at every precision that its path knows; what is left out is said."""
+    """Every weights file at every precision that its backend knows; what is left out is said."""
     files = fitting_weights(episodes) if config.weights is None else named_weights(config.weights, episodes)
     contenders: list[NetworkContender] = []
     rate = episodes[0].frame_rate_hz
@@ -157,7 +157,7 @@ def network_contenders(
         for precision in precisions:
             rank = ranked.index(precision)
             try:
-                made = NetworkContender(file, precision, config.path, device, rate, rank, config.repeated_frames)
+                made = NetworkContender(file, precision, config.backend, device, rate, rank, config.repeated_frames)
             except ConfigError as error:
                 if precision != "fp16":
                     raise
@@ -216,11 +216,11 @@ def _why_unfit(info: WeightsInfo, episodes: Sequence[Episode]) -> str | None:
 def _kernels_ahead(
     networks: Sequence[NetworkContender], episodes: Sequence[Episode], device: torch.device
 ) -> Precompilation | None:
-    """Compiles what the fast networks launch: beside the solver, which needs one core."""
-    fast = [contender for contender in networks if contender.path == "fast"]
+    """Compiles what networks on backend triton launch: beside the solver, which needs one core."""
+    fast = [contender for contender in networks if contender.backend == "triton"]
     if not fast:
         return None
-    # Triton, which the plain path does without, is loaded here.
+    # Triton, which backend torch does without, is loaded here.
     from hgn.runtime.precompile import frames_ahead
 
     particles = max(len(episode.material_N) for episode in episodes)

@@ -34,10 +34,9 @@ if TYPE_CHECKING:
     from hgn.runtime.triton_rollout import TritonRollout
 
 PARTICLES_PER_BATCH = 32_768
-PARTICLES_AT_ONCE = 150_000  # of the fast path's one-step errors
+PARTICLES_AT_ONCE = 150_000  # of backend triton's one-step errors
 # What is measured first, a point of each kind before the others; what is last may be left out when the time is over.
 HGN_FIRST, SAME_GRID, GNS_FIRST, HGN_NEXT, COARSE_GRIDS, STATIC_PARTICLES_FIRST, HGN_LAST, GNS_LAST = range(8)
-PRECISIONS = {"fp32": "highest", "tf32": "high", "fp16": "half"}  # names of the report, and of the paths
 
 
 @dataclass
@@ -69,29 +68,29 @@ class Contender(Protocol):
 
 
 class NetworkContender:
-    """A weights file at one precision of its matrix products, on the path that a simulation would take."""
+    """A weights file at one precision of its matrix products, on the backend that a simulation would take."""
 
     def __init__(
         self,
         file: Path,
         precision: str,
-        path: str,
+        backend: str,
         device: torch.device,
         frame_rate_hz: float,
         rank: int = 0,
         repeated_frames: int | None = None,
     ) -> None:
-        """`rank` counts the precisions of these weights that tell more; but for the first, rollouts off the fast path
+        """`rank` counts the precisions of these weights that tell more; but for the first, rollouts on backend torch
         end at `repeated_frames`.
 
-        Raises: ConfigError where the path does not take the network or the precision.
+        Raises: ConfigError where the backend does not take the network or the precision.
         """
         self.network, info = load_weights(file, device)
         require_frame_rate(info, frame_rate_hz)
         config = info.network
-        self.device, self.precision = device, PRECISIONS[precision]
-        self.path, _ = path_on(device, config, path, self.precision)
-        fast, hgn = self.path == "fast", config.kind == "hgn"
+        self.device, self.precision = device, precision
+        self.backend, _ = path_on(device, config, backend, self.precision)
+        fast, hgn = self.backend == "triton", config.kind == "hgn"
         if rank == 0:
             others = STATIC_PARTICLES_FIRST if config.obstacle_particles else GNS_FIRST
             self.importance = HGN_FIRST if hgn else others
@@ -101,14 +100,14 @@ class NetworkContender:
         self.frames = None if fast or rank == 0 else repeated_frames
         self._fast: FastPredictor | None = None
         with self.matmul():
-            self.simulator = Simulator(self.network, info.frame_rate_hz, self.path, self.precision)
+            self.simulator = Simulator(self.network, info.frame_rate_hz, self.backend, self.precision)
         self.row: dict[str, Any] = {
             "system": config.kind,
             "weights": file.name,
             "levels": config.levels,
             "message_passing_steps": config.message_passing_steps,
             "width": config.width,
-            "path": self.path,
+            "backend": self.backend,
             "precision": precision,
             "updates": info.updates,
         }
@@ -125,7 +124,7 @@ class NetworkContender:
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep:
         config = self.network.config
         with self.matmul():
-            if self.path == "fast":
+            if self.backend == "triton":
                 assert isinstance(self.network, HierarchicalGraphNetwork)
                 self._fast = self._fast or FastPredictor(self.network, self.precision)
                 return one_step(self._fast, config, episode, stride, rest_speed, self.device, PARTICLES_AT_ONCE)
@@ -219,7 +218,7 @@ class TrivialContender:
 
 
 class FastPredictor:
-    """Accelerations by the fast path's own launches: a frame simulated from each given state."""
+    """Accelerations by backend triton's own launches: a frame simulated from each given state."""
 
     def __init__(self, network: HierarchicalGraphNetwork, precision: str) -> None:
         self.network, self.precision = network, precision

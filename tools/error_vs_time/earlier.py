@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hgn.renamed import current_names
 from hgn.schema import ConfigError, require
 from tools.error_vs_time.settings import UNTIMED
 
-IDENTITY = ("system", "weights", "path", "precision", "updates", "grid", "step", "predictor", "floor")
+IDENTITY = ("system", "weights", "backend", "precision", "updates", "grid", "step", "predictor", "floor")
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,12 @@ class Earlier:
         """Raises: ConfigError where there is no such file, or it is none of this report."""
         try:
             report = json.loads(Path(file).read_text(encoding="utf-8"))
-            meta, rows = report["meta"], report["rows"]
+            meta, rows = report["meta"], [current_names(row) for row in report["rows"]]
             whole = [row for row in rows if row["system"] in UNTIMED or row.get("ms") is not None]
             wanted = all("curve" in row for row in rows) and {"episodes", "frames", "reference"} <= meta.keys()
         except FileNotFoundError:
             raise ConfigError(f"{field} must be an existing file, got {file}; leave it out to begin anew") from None
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
+        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
             wanted = False
         if not wanted:
             raise ConfigError(

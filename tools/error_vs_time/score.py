@@ -141,7 +141,7 @@ def label(row: Mapping[str, Any]) -> str:
             return f"chaos floor: {row['floor']}"
     size = f"M = {row['message_passing_steps']}"
     size = f"L = {row['levels']}, {size}" if row["system"] == "hgn" else size
-    return f"{row['system'].upper().replace('_', ' ')} {size}, {row['path']} {row['precision']} ({row['weights']})"
+    return f"{row['system'].upper().replace('_', ' ')} {size}, {row['backend']} {row['precision']} ({row['weights']})"
 
 
 def report(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

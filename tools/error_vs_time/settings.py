@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from hgn.config import PRECISIONS
 from hgn.data.manifest import SPLITS
 from hgn.schema import require, require_non_negative, require_one_of, require_positive
 
-PRECISIONS = ("fp32", "tf32", "fp16")
 UNTIMED = ("trivial", "chaos")  # rows without run times
 
 
@@ -25,7 +25,7 @@ class ErrorVsTimeConfig:
     frames: int = 300
     frame_stride: int = 10
     precisions: tuple[str, ...] | None = None
-    path: str = "auto"
+    backend: str = "auto"
     mpm_grids: tuple[int, ...] = (32, 48, 64)
     mpm_steps: tuple[float, ...] = (1.0, 0.5)
     reference_step: float = 0.25
@@ -86,7 +86,7 @@ class ErrorVsTimeConfig:
             require(grid >= 8, f"mpm_grids[{i}]", "at least 8", grid)
         for i, name in enumerate(self.precisions or ()):
             require(name in PRECISIONS, f"precisions[{i}]", f"one of {', '.join(PRECISIONS)}", name)
-        require_one_of(self, "path", ("auto", "plain", "fast"))
+        require_one_of(self, "backend", ("auto", "torch", "triton"))
         names = [Path(file).name for file in self.weights or ()]
         require(len(set(names)) == len(names), "weights", "files of different names", names)
         if self.training_hours is not None:

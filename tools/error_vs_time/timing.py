@@ -45,7 +45,7 @@ class Timing:
         will be timed, as far as something is captured or compiled for it. Tells the most GPU memory that the first
         scene took, of what torch knows.
         """
-        kind, fast = contender.row["system"], contender.row.get("path") == "fast"
+        kind, fast = contender.row["system"], contender.row.get("backend") == "triton"
         contender.release()
         before = 0
         if self.device.type == "cuda":

@@ -78,9 +78,9 @@ def devices(config: ScalingConfig) -> tuple[str, int]:
 
 def with_efficiency(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Adds each row's scenes per second and device, against one device alone with the same kind of scenes."""
-    alone = {(row["path"], row["particle_spread"]): row["ms"] for row in rows if row["devices"] == 1}
+    alone = {(row["backend"], row["particle_spread"]): row["ms"] for row in rows if row["devices"] == 1}
     for row in rows:
-        base = alone.get((row["path"], row["particle_spread"]))
+        base = alone.get((row["backend"], row["particle_spread"]))
         row["efficiency"] = base / row["ms"] if base and row["ms"] else None
     return rows
 
@@ -106,15 +106,15 @@ def fitted(rows: Sequence[dict[str, Any]], node_devices: int) -> Cluster:
 def model_rows(
     rows: list[dict[str, Any]], backward_seconds: dict[str, float], config: ScalingConfig
 ) -> list[dict[str, Any]]:
-    """One row for each path, network and number of GPUs; none without several devices to take the figures from."""
+    """One row for each backend, network and number of GPUs; none without several devices to take the figures from."""
     found = []
-    for path in config.paths:
-        trained = [row for row in rows if row["case"] == "weak_scaling" and row["path"] == path and row["ms"]]
+    for backend in config.backends:
+        trained = [row for row in rows if row["case"] == "weak_scaling" and row["backend"] == backend and row["ms"]]
         alone = next((row for row in trained if row["devices"] == 1 and row["particle_spread"] == 0), None)
         sent = next((row["messages"] for row in trained if row["messages"]), None)
         if alone is not None and sent is not None:
-            step = Step(alone["ms"] / 1e3, backward_seconds[path], tuple(sent), _spread(config))
-            found += _rows_of(step, path, fitted(rows, config.node_devices), config)
+            step = Step(alone["ms"] / 1e3, backward_seconds[backend], tuple(sent), _spread(config))
+            found += _rows_of(step, backend, fitted(rows, config.node_devices), config)
     return found
 
 
@@ -135,20 +135,20 @@ def _spread(config: ScalingConfig) -> float:
     return config.particle_spread / config.scenes**0.5
 
 
-def _rows_of(step: Step, path: str, node: Cluster, config: ScalingConfig) -> list[dict[str, Any]]:
+def _rows_of(step: Step, backend: str, node: Cluster, config: ScalingConfig) -> list[dict[str, Any]]:
     found = []
     for name, link in NETWORKS.items():
         cluster = replace(node, between=link)
-        found += [_model_row(path, name, update(step, gpus, cluster), cluster, config) for gpus in SIZES]
+        found += [_model_row(backend, name, update(step, gpus, cluster), cluster, config) for gpus in SIZES]
     return found
 
 
-def _model_row(path: str, network: str, seen: Update, cluster: Cluster, config: ScalingConfig) -> dict[str, Any]:
+def _model_row(backend: str, network: str, seen: Update, cluster: Cluster, config: ScalingConfig) -> dict[str, Any]:
     scene_bytes = config.particles * (config.network.velocity_history + 2) * 12  # a window of float32 positions
     read_bytes = config.scenes * min(seen.gpus, cluster.node_gpus) * scene_bytes
     return {
         "case": "model",
-        "path": path,
+        "backend": backend,
         "network": network,
         "devices": seen.gpus,
         "nodes": seen.nodes,
@@ -165,7 +165,7 @@ def _model_row(path: str, network: str, seen: Update, cluster: Cluster, config: 
 def table(rows: list[dict[str, Any]]) -> str:
     """The figures for people, as Markdown."""
     lines = [
-        "| path | precision | devices | scenes | spread | messages | update, ms | quartiles | efficiency | check |",
+        "| backend | precision | devices | scenes | spread | messages | update, ms | quartiles | efficiency | check |",
         "| :-- | :-- | --: | --: | --: | :-- | --: | --: | --: | :-- |",
     ]
     for row in rows:
@@ -173,7 +173,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             sent = f"{len(row['messages'])}, up to {max(row['messages']) / 1e6:.1f} MB" if row["averaged"] else "none"
             times = ("-", "-") if row["ms"] is None else (f"{row['ms']:.2f}", _range(row["ms_quartiles"]))
             share = "-" if row["efficiency"] is None else f"{row['efficiency']:.3f}"
-            work = (row[key] for key in ("path", "precision", "devices", "scenes", "particle_spread"))
+            work = (row[key] for key in ("backend", "precision", "devices", "scenes", "particle_spread"))
             lines.append(_line((*work, sent, *times, share, row["check"])))
     if any(row["case"] == "all_reduce" for row in rows):
         lines += ["", "| devices | bytes | all-reduce, ms | quartiles | model, ms |", "| --: | --: | --: | --: | --: |"]
@@ -194,7 +194,7 @@ def model_table(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         if row["case"] == "model":
             if row["devices"] == 1:
-                lines.append(_line((f"*{row['path']}, {row['network']}*", *[""] * 8)))
+                lines.append(_line((f"*{row['backend']}, {row['network']}*", *[""] * 8)))
             parts = [f"{row[key]:.2f}" for key in ("all_reduce_ms", "not_hidden_ms", "slowest_ms", "ms", "efficiency")]
             reading = f"{row['read_mb_per_second_and_node']:,.0f}"
             lines.append(_line((row["devices"], row["nodes"], *parts, f"{row['scenes_per_second']:,.0f}", reading)))

@@ -17,13 +17,13 @@ class ScalingConfig:
     particles: int = 4_296  # of a scene
     particle_spread: float = 0.17  # standard deviation of a scene's particles, as a share of their mean
     batches: int = 8  # of each device; one sample is an update on each of them
-    paths: tuple[str, ...] = ("plain", "fast")  # the fast one where there are GPUs
-    precision: str = "high"  # as for training; the plain path takes high for half
+    backends: tuple[str, ...] = ("torch", "triton")  # triton where there are GPUs
+    precision: str = "tf32"  # as for training; backend torch takes tf32 for fp16
     message_mb: tuple[float, ...] = (25.0,)  # sizes of messages that are timed beside the one that training uses
     network: NetworkConfig = field(default_factory=NetworkConfig)
     node_devices: int = 8  # of the clusters that the model tells of
     update_ms: float | None = None  # of one device alone: the model of that, and nothing is measured
-    backward_ms: float = 0.0  # of these; 0: all gradients leave at the end, as on the fast path
+    backward_ms: float = 0.0  # of these; 0: all gradients leave at the end, as on backend triton
     rounds: int = 20  # samples of each contender
     seconds: float = 30.0  # at most for all contenders, once three rounds are done
     device: str = "auto"
@@ -39,8 +39,8 @@ class ScalingConfig:
         for name in ("scenes", "particles", "batches", "node_devices"):
             require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
         require(self.devices is None or self.devices >= 1, "devices", "at least 1", self.devices)
-        for i, path in enumerate(self.paths):
-            require(path in ("plain", "fast"), f"paths[{i}]", "plain or fast", path)
+        for i, backend in enumerate(self.backends):
+            require(backend in ("torch", "triton"), f"backends[{i}]", "torch or triton", backend)
         for i, value in enumerate(self.message_mb):
             require(value > 0, f"message_mb[{i}]", "> 0", value)
         require(self.device in ("auto", "cpu", "cuda"), "device", "auto, cpu or cuda", self.device)

@@ -25,7 +25,7 @@ from torch.nn.parallel import DistributedDataParallel
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import kernel_precision, why_not_fast
+from hgn.runtime.backend import kernel_precision, set_matmul_precision, why_not_fast
 from hgn.runtime.parity import relative_error
 from hgn.system.machine import available_cpus
 from hgn.training.checkpoint import DataInfo
@@ -51,10 +51,10 @@ PATIENCE = datetime.timedelta(minutes=2)
 class Contender:
     """Some of the devices training at the same time, together or each for itself."""
 
-    path: str  # plain or fast
+    backend: str  # torch or triton
     devices: int
     averaged: bool
-    message_mb: float | None  # of the plain path; the fast one sends all gradients at once
+    message_mb: float | None  # of backend torch; triton sends all gradients at once
     spread: float  # of the particles of a scene
     update: PlainUpdates | FastUpdates | None = field(default=None, repr=False)  # none in processes that take no part
     check: str = PASS
@@ -124,7 +124,7 @@ class FastUpdates:
     """The same with hgn.kernels.update, on episodes of one window each."""
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
-        # Triton, which the plain path does without, is loaded here.
+        # Triton, which backend torch does without, is loaded here.
         from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
 
         training = TrainingConfig(batch_scenes=config.scenes)
@@ -191,7 +191,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         torch.cuda.set_device(device)
     else:
         torch.set_num_threads(max(1, available_cpus() // count))
-    torch.set_float32_matmul_precision(_plain_precision(config, device))
+    set_matmul_precision(_torch_precision(config, device))
     # all processes talk through this group when nothing is timed; it leaves the devices alone
     dist.init_process_group(
         "gloo", init_method=f"file://{folder / 'store'}", rank=rank, world_size=count, timeout=PATIENCE
@@ -202,8 +202,8 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
         batches = {spread: _batches(config, rank, spread, device) for spread in {0.0, config.particle_spread}}
         contenders = [_prepared(c, config, rank, groups, batches, device) for c in _contenders(config, sizes, device)]
-        alone = {c.path: c.update for c in contenders if c.devices == 1 and c.spread == 0}
-        backward = {path: update.backward_seconds() for path, update in alone.items() if update is not None}
+        alone = {c.backend: c.update for c in contenders if c.devices == 1 and c.spread == 0}
+        backward = {name: update.backward_seconds() for name, update in alone.items() if update is not None}
         _alternate(contenders, config, rank)
         for contender in contenders:
             _check_weights(contender, groups, rank)
@@ -220,24 +220,24 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         dist.destroy_process_group()
 
 
-def _plain_precision(config: ScalingConfig, device: torch.device) -> str:
-    """The plain path has no half precision, and a CPU no TF32."""
-    return "high" if device.type == "cuda" and config.precision != "highest" else "highest"
+def _torch_precision(config: ScalingConfig, device: torch.device) -> str:
+    """Backend torch has no fp16, and a CPU no TF32."""
+    return "tf32" if device.type == "cuda" and config.precision != "fp32" else "fp32"
 
 
 def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -> list[Contender]:
     chosen = averaging_options()["bucket_cap_mb"]
     found = []
-    for path in config.paths:
-        if path == "fast" and why_not_fast(device, config.network, config.precision):
+    for backend in config.backends:
+        if backend == "triton" and why_not_fast(device, config.network, config.precision):
             continue
-        sent = list(dict.fromkeys([chosen, *config.message_mb])) if path == "plain" else [None]
+        sent = list(dict.fromkeys([chosen, *config.message_mb])) if backend == "torch" else [None]
         for size in sizes:
-            found.append(Contender(path, size, False, None, 0.0))
+            found.append(Contender(backend, size, False, None, 0.0))
             if size > 1:
-                found += [Contender(path, size, True, message_mb, 0.0) for message_mb in sent]
+                found += [Contender(backend, size, True, message_mb, 0.0) for message_mb in sent]
             if config.particle_spread > 0:
-                found.append(Contender(path, size, size > 1, sent[0] if size > 1 else None, config.particle_spread))
+                found.append(Contender(backend, size, size > 1, sent[0] if size > 1 else None, config.particle_spread))
     return found
 
 
@@ -262,7 +262,7 @@ def _prepared(
     device: torch.device,
 ) -> Contender:
     if rank < contender.devices:
-        made = PlainUpdates if contender.path == "plain" else FastUpdates
+        made = PlainUpdates if contender.backend == "torch" else FastUpdates
         contender.update = made(config, batches[contender.spread], device)
         if contender.averaged:
             _average(contender, groups[contender.devices])
@@ -358,10 +358,10 @@ def _all_reduce_often(values: torch.Tensor, group: dist.ProcessGroup) -> None:
 
 
 def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> dict[str, Any]:
-    plain = contender.path == "plain"
+    plain = contender.backend == "torch"
     row: dict[str, Any] = {
-        "path": contender.path,
-        "precision": _plain_precision(config, device) if plain else config.precision,
+        "backend": contender.backend,
+        "precision": _torch_precision(config, device) if plain else config.precision,
         "devices": contender.devices,
         "scenes": config.scenes,
         "particles": config.particles,

@@ -51,14 +51,14 @@ def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; what does not hold is a finding, and the exit code is 0."""
     begun = time.monotonic()
     config = from_mapping(StabilityNetworkConfig, mapping)
-    simulator = Simulator.load(config.weights, config.device, config.path, config.precision)
-    network, device, path, info = simulator.network, simulator.device, simulator.path, simulator.info
-    print(simulator.path_said, file=sys.stderr)
+    simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
+    network, device, backend, info = simulator.network, simulator.device, simulator.backend, simulator.info
+    print(simulator.backend_note, file=sys.stderr)
     rows: list[Row] = []
     pictures: list[Image.Image] = []
     drawn = 0.0  # when the picture was last written
     meta = provenance(device) | {"config": without_folders(to_mapping(config)), "weights": Path(config.weights).name}
-    meta |= {"updates": info.updates, "path": path, "network": to_mapping(info.network)}
+    meta |= {"updates": info.updates, "backend": backend, "network": to_mapping(info.network)}
 
     def keep(done: bool = False) -> None:  # a run that is cut off leaves the cases that it had
         nonlocal drawn
@@ -74,8 +74,8 @@ def main(mapping: dict[str, Any]) -> int:
         order = sorted(range(len(made)), key=lambda i: -sum(len(scene.obstacles) for scene in made[i].scenes))
         starts = {i: threads.submit(initial_states, made[i]) for i in order}
         ahead = None
-        if path == "fast":
-            # Triton, which the plain path does without, is loaded here.
+        if backend == "triton":
+            # Triton, which backend torch does without, is loaded here.
             from hgn.runtime.precompile import frames_ahead
 
             particles = [sum(len(scene.position_N3) for scene in case.scenes) for case in made]
@@ -90,7 +90,7 @@ def main(mapping: dict[str, Any]) -> int:
         if ahead is not None:
             print(ahead.wait(), file=sys.stderr)
     meta["seconds_before_cases"] = time.monotonic() - begun
-    late = late_kernels(path)
+    late = late_kernels(backend)
     with bar("cases", total=len(made), unit="case") as progress:
         for case, states in zip(made, initial, strict=True):
             started, growths, compiled = time.monotonic(), simulator.growths, late()
@@ -111,9 +111,9 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def late_kernels(path: str) -> Callable[[], int]:
+def late_kernels(backend: str) -> Callable[[], int]:
     """How many kernels were compiled in this process by now: each holds a simulation up for a second or more."""
-    if path != "fast":
+    if backend != "triton":
         return lambda: 0
     from hgn.kernels.jit_misses import JitMisses
 
@@ -275,7 +275,7 @@ def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
     scenes: Sequence[InitialState] = [
         InitialState.of_scene(scene) for case in cases(only, broken.config) for scene in case.scenes
     ]
-    sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.path, simulator.precision)
+    sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.backend, simulator.precision)
     trials = network_trials(sabotaged, scenes, only.frames)
     caught = all(trial.cause is not None and trial.frame_count == 1 for trial in trials)
     beyond = next((trial.cause for trial in trials if trial.cause is not None), "the runtime did not say so")

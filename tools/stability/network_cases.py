@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hgn.config import NetworkConfig, SceneConfig
+from hgn.config import BACKENDS, PRECISIONS, NetworkConfig, SceneConfig
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation
@@ -42,16 +42,16 @@ class StabilityNetworkConfig:
     seeds: int = 1
     energy_bound: float = 0.02
     scene: SceneConfig = field(default_factory=SceneConfig)
-    path: str = "auto"
-    precision: str = "high"
+    backend: str = "auto"
+    precision: str = "tf32"
     device: str = "auto"
     picture: str | None = None
     json: str | None = None
 
     def __post_init__(self) -> None:
         require_positive(self, "particle_factor", "speed_factor", "far_cells", "seeds", "energy_bound")
-        require_one_of(self, "path", ("auto", "plain", "fast"))
-        require_one_of(self, "precision", ("highest", "high", "half"))
+        require_one_of(self, "backend", BACKENDS)
+        require_one_of(self, "precision", PRECISIONS)
         for name in ("frames", "long_frames"):
             require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
         for i, case in enumerate(self.cases or ()):

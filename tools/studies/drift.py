@@ -1,8 +1,8 @@
 """python -m tools.studies.drift data=data/obstacles out=drift: how far backends and precisions lead from float32.
 
 Motion is chaotic: a rollout departs from plain float32's whatever is changed in it. How far plain float32 departs from
-itself once its particles begin a little displaced is the network's chaos floor, and a path or precision below it is as
-good. Beside them stand the solver's own floors and the network's error.
+itself once its particles begin a little displaced is the network's chaos floor, and a backend or precision below it is
+as good. Beside them stand the solver's own floors and the network's error.
 Shape legend: S scenes, T frames, N particles of a scene.
 """
 
@@ -68,18 +68,18 @@ class DriftConfig:
 class Run:
     """A network's simulations that are set beside plain float32's."""
 
-    path: str
+    backend: str
     precision: str
     displacement: float = 0.0  # at most, of each coordinate at the start; domain units
 
     @property
     def name(self) -> str:
-        if (self.path, self.precision) != ("plain", "highest"):
-            return f"{self.path}, {self.precision}"
-        return f"displaced by {self.displacement:g}" if self.displacement else "plain, highest, once more"
+        if (self.backend, self.precision) != ("torch", "fp32"):
+            return f"{self.backend}, {self.precision}"
+        return f"displaced by {self.displacement:g}" if self.displacement else "torch, fp32, once more"
 
 
-PLAIN = Run("plain", "highest")
+PLAIN = Run("torch", "fp32")
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -88,14 +88,14 @@ def main(mapping: dict[str, Any]) -> int:
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     report = Report(config, episodes)
-    simulator = Simulator.load(config.weights, config.device, PLAIN.path, PLAIN.precision)
+    simulator = Simulator.load(config.weights, config.device, PLAIN.backend, PLAIN.precision)
     require_frame_rate(simulator.info, episodes[0].frame_rate_hz)
     network, device = simulator.network.config, simulator.device
     plain = simulated(simulator, PLAIN, episodes, report.frames)
     truth = [RolloutResult(np.asarray(episode.position_TN3[: report.frames])) for episode in episodes]
     report.add("network", "error: from the data", plain, truth)
     for run in runs(device, network, config.displacements):
-        simulator = Simulator.load(config.weights, str(device), run.path, run.precision)
+        simulator = Simulator.load(config.weights, str(device), run.backend, run.precision)
         report.add("network", run.name, simulated(simulator, run, episodes, report.frames), plain)
     if config.solver:
         simulator.release()
@@ -108,10 +108,10 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def runs(device: torch.device, network: NetworkConfig, displacements: Sequence[float]) -> list[Run]:
-    """Plain float32 again and displaced, then every other path and precision of this device."""
-    fast = [Run("fast", name) for name in ("highest", "high", "half") if why_not_fast(device, network, name) is None]
+    """Plain float32 again and displaced, then every other backend and precision of this device."""
+    fast = [Run("triton", name) for name in ("fp32", "tf32", "fp16") if why_not_fast(device, network, name) is None]
     cuda = device.type == "cuda"  # elsewhere all plain products are float32's
-    plain = [Run("plain", name) for name in ("high", "half") if cuda and (name == "high" or network.kind != "hgn")]
+    plain = [Run("torch", name) for name in ("tf32", "fp16") if cuda and (name == "tf32" or network.kind != "hgn")]
     return [PLAIN, *(replace(PLAIN, displacement=size) for size in displacements), *plain, *fast]
 
 
@@ -217,8 +217,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def draw(rows: Sequence[dict[str, Any]]) -> bytes:
-    """Mean and median position MSE over the frames; PNG bytes. Full lines are paths, precisions and the error; dotted
-    ones the network's floors, broken ones the solver's.
+    """Mean and median position MSE over the frames; PNG bytes. Full lines are backends, precisions and the error;
+    dotted ones the network's floors, broken ones the solver's.
     """
     figure, (panels,) = new_figure(1, 2, (14.5, 5.4), share_y=True)
     for panel, which in zip(panels, ("mean", "median"), strict=True):

@@ -22,6 +22,7 @@ import triton.language as tl
 from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 
 from hgn.kernels.blocks import (
+    EXACT_FP32,
     added,
     chosen_rows,
     column_sums,
@@ -148,7 +149,7 @@ def edge_forward(
     second_bias = tl.load(values + second_bias_at + column)
     gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
     # Where it is exact, a cell's row comes to its edges by a product, with the sides' rows in its spare places.
-    BY_PRODUCT: tl.constexpr = PRECISION == "half" or PRECISION == "ieee"
+    BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)
     if BY_PRODUCT:
         receiver = chosen_rows(ROWS, SLOTS, SUMS)
         member = tl.arange(0, SUMS)
@@ -346,7 +347,7 @@ def edge_backward(
             side_total += weighted_sums(tl.where(slot[None, :] // 2 == axis, sign[None, :], 0.0), dh, PRECISION)
         else:
             through = product(dh, own, PRECISION)
-            if PRECISION == "half":
+            if PRECISION == "fp16":
                 de = added(de, through.to(de.dtype))
             else:
                 # read again: registers are dearer than a cache

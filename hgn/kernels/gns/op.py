@@ -49,9 +49,9 @@ def fits(width: int) -> bool:
 
 @dataclass(frozen=True)
 class FusedEdges(Edges):
-    """On a CUDA device (or in Triton's interpreter). `precision` is half, tf32 (float32 edges), or ieee for tests."""
+    """On a CUDA device (or in Triton's interpreter). `precision` is fp16, tf32 (float32 edges), or fp32 for tests."""
 
-    precision: str = "half"
+    precision: str = "fp16"
     tuning: Tuning = field(default_factory=Tuning)
 
     @staticmethod
@@ -187,7 +187,7 @@ class FusedEdges(Edges):
 
     @property
     def _dtype(self) -> torch.dtype:
-        return torch.float16 if self.precision == "half" else torch.float32
+        return torch.float16 if self.precision == "fp16" else torch.float32
 
     def _stored(self, value: torch.Tensor) -> torch.Tensor:
         return value.to(self._dtype, memory_format=torch.contiguous_format).contiguous()

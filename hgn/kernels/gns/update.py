@@ -60,7 +60,7 @@ def views_of(network: GraphNetworkSimulator, values: torch.Tensor) -> GraphNetwo
 class GnsEngine:
     """Forward and backward passes of a network on a neighbour list of fixed capacity."""
 
-    copy_precision = "ieee"  # products read the values themselves
+    copy_precision = "fp32"  # products read the values themselves
     unscale = 1.0  # gradients are scaled on the way, see hgn.network.gns_edges
 
     def __init__(

@@ -76,7 +76,7 @@ def step_blocks(
     x = tl.load(value + at)
     x -= rate * (decay * x + step_size * along)
     tl.store(value + at, x)
-    if PRECISION == "half":
+    if PRECISION == "fp16":
         tl.store(weight + at, x)
     if PRECISION == "tf32":
         tl.store(weight + at, nearest_tf32(x))

@@ -10,6 +10,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import (
+    EXACT_FP32,
     added,
     chosen_rows,
     column_sums,
@@ -122,7 +123,7 @@ def pairs_forward(
     second_bias = tl.load(values + second_bias_at + column)
     gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
     # Where it is exact, a particle's row comes to its pairs by a product, with the bits' rows in its spare places.
-    BY_PRODUCT: tl.constexpr = PRECISION == "half" or PRECISION == "ieee"
+    BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)
     SIGN: tl.constexpr = 1 if TO_CELL else -1
     if BY_PRODUCT:
         choice = _choice(PARTICLES, SUMS, SIGN)
@@ -248,7 +249,7 @@ def pairs_backward(
     sums = tl.arange(0, SUMS)
     gain_total, shift_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     side_total = tl.zeros((SUMS, WIDTH), tl.float32)
-    BY_PRODUCT: tl.constexpr = PRECISION == "half" or PRECISION == "ieee"  # as in pairs_forward
+    BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)  # as in pairs_forward
     if BY_PRODUCT:
         SIGN: tl.constexpr = 1 if TO_CELL else -1
         choice = _choice(PARTICLES, SUMS, SIGN)

@@ -268,7 +268,7 @@ def adam(
     x = tl.load(value + at, mask=mask, other=0.0)
     x -= rate / first_bias * m / (tl.sqrt(v / second_bias) + EPSILON)
     tl.store(value + at, x, mask=mask)
-    if PRECISION == "half":
+    if PRECISION == "fp16":
         tl.store(weight + at, x, mask=mask)
     if PRECISION == "tf32":
         tl.store(weight + at, nearest_tf32(x), mask=mask)

@@ -515,7 +515,7 @@ class Updates:
     def _engine(self) -> TrainedEngine:
         assert isinstance(self.grid, DeviceGrid) and isinstance(self.packed, PackedNetwork)
         # gradients of the mean over particles are small: float16 would lose them
-        scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "half" else 1.0
+        scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
         return FusedTrainingNetwork(
             self.config, self.packed, self.values, self.grid, self.particle_count, self.precision, scale, tail=TAIL
         )

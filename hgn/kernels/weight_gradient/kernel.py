@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import column_sums, settled
+from hgn.kernels.blocks import FP32_PRODUCT, column_sums, settled
 from hgn.kernels.triton_compat import settle_keys
 
 JOB_COLUMNS = 8
@@ -58,10 +58,12 @@ def weight_gradient(
             right + b_at + place * b_width + column[None, :], mask=live & (column < b_width)[None, :], other=0.0
         )
         lines += column_sums(a.to(tl.float32), STEP, TILE, 16)
-        if PRECISION == "half":
+        if PRECISION == "fp16":
             total = tl.dot(tl.trans(a.to(tl.float16)), b.to(tl.float16), total)
+        elif PRECISION == "tf32":
+            total = tl.dot(tl.trans(a), b, total, input_precision="tf32")
         else:
-            total = tl.dot(tl.trans(a), b, total, input_precision=PRECISION)
+            total = tl.dot(tl.trans(a), b, total, input_precision=FP32_PRODUCT)
         if PIPELINED:
             total = settled(total)
     bias_at = tl.load(job + 7)

@@ -61,10 +61,10 @@ def test_the_report(
     rows = {(row["system"], row["name"]): row for row in report["rows"]}
     assert len(report["meta"]["episodes"]) == 2 and report["meta"]["frames"] == FRAMES
     assert [name for system, name in rows if system == "network"] == [
-        *("error: from the data", "plain, highest, once more", "displaced by 0.001", "displaced by 0.002")
+        *("error: from the data", "torch, fp32, once more", "displaced by 0.001", "displaced by 0.002")
     ]
     assert rows["network", "error: from the data"]["mean"]["5"] > 1e-8
-    assert all(value < 1e-10 for value in rows["network", "plain, highest, once more"]["curves"]["mean"])
+    assert all(value < 1e-10 for value in rows["network", "torch, fp32, once more"]["curves"]["mean"])
     for system in ("network", "solver"):
         small, large = (rows[system, f"displaced by {size}"]["curves"]["mean"] for size in (0.001, 0.002))
         assert small[0] == pytest.approx(1e-6, rel=0.2) and large[0] == pytest.approx(4e-6, rel=0.2)
@@ -115,12 +115,12 @@ def test_what_a_device_takes() -> None:
     """On a GPU every path and precision that simulates the network; on a CPU, where all products are float32's, none
     but the floors."""
     wide, narrow, gns = network_of(width=128).config, network_of(width=64).config, gns_of(width=128).config
-    floors = [Run("plain", "highest"), Run("plain", "highest", 1e-6)]
+    floors = [Run("torch", "fp32"), Run("torch", "fp32", 1e-6)]
     cuda, cpu = torch.device("cuda"), torch.device("cpu")
-    fast = [Run("plain", "high"), Run("fast", "high"), Run("fast", "half")]
+    fast = [Run("torch", "tf32"), Run("triton", "tf32"), Run("triton", "fp16")]
     assert runs(cuda, wide, [1e-6]) == [*floors, *fast]
-    assert runs(cuda, narrow, [1e-6]) == [*floors, fast[0], Run("fast", "highest"), *fast[1:]]
-    assert runs(cuda, gns, [1e-6]) == [*floors, Run("plain", "high"), Run("plain", "half")]
+    assert runs(cuda, narrow, [1e-6]) == [*floors, fast[0], Run("triton", "fp32"), *fast[1:]]
+    assert runs(cuda, gns, [1e-6]) == [*floors, Run("torch", "tf32"), Run("torch", "fp16")]
     assert runs(cpu, wide, [1e-6]) == floors
 
 
