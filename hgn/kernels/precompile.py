@@ -24,6 +24,7 @@ from triton.backends.compiler import GPUTarget
 from hgn.config import NetworkConfig
 from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.grid.op import ObstacleTable, Window
+from hgn.kernels.triton_compat import preload
 from hgn.kernels.update.op import Updates, UpdateSettings
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
@@ -150,7 +151,7 @@ def compile_share(job: PrecompileJob | FrameJob, share: int, shares: int) -> int
     """Compiles every `shares`-th kernel from number `share` on; how many those are."""
     mine = list(launches_of(job).values())[share::shares]
     for function, data in mine:
-        kernel = function.preload(data)
+        kernel = preload(function, data)
         triton.runtime.driver.active.launcher_cls(kernel.src, kernel.metadata)  # C, compiled as well
     return len(mine)
 

@@ -16,6 +16,7 @@ from triton.runtime.jit import JITFunction
 
 from hgn.config import NetworkConfig
 from hgn.kernels.precompile import PrecompileJob, launches_of
+from hgn.kernels.triton_compat import preload
 from hgn.kernels.update.op import UpdateSettings
 
 
@@ -39,4 +40,4 @@ if "gns" in sys.argv:
 found = list(launches_of(PrecompileJob(network, settings, "fp16", True, True, 300, sizes, 90)).values())
 JITFunction._do_compile = not_compiled
 for function, data in found if sys.argv[1] == "launch" else reversed(found):
-    function.preload(data)
+    preload(function, data)

@@ -9,6 +9,7 @@ from no_gpu import use_h100
 
 from hgn.config import NetworkConfig
 from hgn.kernels.precompile import PrecompileJob, launches_of
+from hgn.kernels.triton_compat import preload
 from hgn.kernels.update.op import UpdateSettings
 
 use_h100()
@@ -16,7 +17,7 @@ settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 network = NetworkConfig(levels=2, message_passing_steps=1)
 for function, data in launches_of(PrecompileJob(network, settings, "fp16", False, False, 300, (200, 60), 90)).values():
     if function.__name__ in ("weight_gradient", "pairs_weight_gradient"):
-        text = function.preload(data).asm["ttgir"]
+        text = preload(function, data).asm["ttgir"]
         ahead = len(re.findall(r"local_alloc : \(\) -> !ttg.memdesc<[2-9]x", text))
         pending = max(map(int, re.findall(r"warp_group_dot_wait.*pendings = (\d+)", text)))
         print(function.__name__, ahead, pending)
