@@ -12,13 +12,13 @@ import triton
 
 from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT, Block
-from hgn.kernels.cell_mlp.kernel import cell_backward
+from hgn.kernels.cell_mlp.kernel import cell_mlp_backward
 from hgn.kernels.edges.kernel import edge_backward
 from hgn.kernels.forward import FusedNetwork, Tuning
 from hgn.kernels.grid.op import DeviceGrid
-from hgn.kernels.mlp.kernel import gather_project_backward, rows_backward
-from hgn.kernels.packing import PackedFCN, PackedNetwork
-from hgn.kernels.particle_cell.kernel import pairs_backward, pairs_weight_gradient
+from hgn.kernels.mlp.kernel import gather_project_backward, mlp_backward
+from hgn.kernels.packing import PackedMLP, PackedNetwork
+from hgn.kernels.particle_cell.kernel import particle_cell_backward, particle_cell_weight_gradient
 from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
 
 CHUNK_ROWS = (512, 2048)  # of a program of the weights' products: where there are few rows, and many
@@ -141,7 +141,7 @@ class FusedTrainingNetwork(FusedNetwork):
             chunk_job: list[int] = []
             chunk_first: list[int] = []
             for left, right, at, count, bias, multiple in mine:
-                rows_held = _rows(left)
+                rows_held = _mlp(left)
                 multiple = 6 if left.dim() == 3 else multiple
                 left_at = (left.data_ptr() - self.left.data_ptr()) // left.element_size()
                 right_at = (right.data_ptr() - base.data_ptr()) // right.element_size()
@@ -162,7 +162,7 @@ class FusedTrainingNetwork(FusedNetwork):
         self._clear(self.product_gradient)
         self.counts[: grid.levels].copy_(grid.counts_L)
         self.counts[grid.levels :].copy_(self.particle_count)
-        self._rows_backward(
+        self._mlp_backward(
             packed.decode,
             self.output_gradient,
             self.particle_count,
@@ -174,7 +174,7 @@ class FusedTrainingNetwork(FusedNetwork):
         )
         top = self.up[0] if levels > 1 else self.down[0]
         assert top.product is not None
-        self._pairs_backward(
+        self._particle_cell_backward(
             packed.cell_to_particle,
             self.latent_gradient,
             self.by_particle_up,
@@ -189,17 +189,17 @@ class FusedTrainingNetwork(FusedNetwork):
             0, self.product_gradient, grid.children(0), 0, top.next_at, g["product0"], self._gradient_of(top)
         )
         for i in range(levels - 1):
-            block, fcn = self.up[i], packed.coarse_to_fine[i]
+            block, mlp = self.up[i], packed.coarse_to_fine[i]
             self._passing_backward(block, f"up{i}_")
-            self._rows_backward(
-                fcn,
+            self._mlp_backward(
+                mlp,
                 self.cell_gradient_up[i],
                 grid.count(i),
                 self.transfer_hidden_up[i],
                 g[f"cf_h{i}"],
                 g[f"cf_z{i}"],
-                first_at=fcn.parts[1],
-                offset=(fcn.parts[2], -1),
+                first_at=mlp.parts[1],
+                offset=(mlp.parts[2], -1),
                 octant=grid.octant(i),
                 into=(self.cell_gradient_down[i], 1),
                 residual=True,
@@ -216,21 +216,21 @@ class FusedTrainingNetwork(FusedNetwork):
             )
         for i in reversed(range(levels)):
             if i < levels - 1:
-                fcn = packed.fine_to_coarse[i]
-                self._rows_backward(
-                    fcn,
+                mlp = packed.fine_to_coarse[i]
+                self._mlp_backward(
+                    mlp,
                     self.cell_gradient_down[i + 1],
                     grid.count(i),
                     self.transfer_hidden_down[i],
                     g[f"fc_h{i}"],
                     g[f"fc_z{i}"],
                     gradient_index=grid.parent(i),
-                    offset=(fcn.parts[1], 1),
+                    offset=(mlp.parts[1], 1),
                     octant=grid.octant(i),
                     into=(self.cell_gradient_down[i], 2),
                 )
             self._passing_backward(self.down[i], f"down{i}_")
-        self._pairs_backward(
+        self._particle_cell_backward(
             packed.particle_to_cell,
             self.cell_gradient_down[0],
             self.by_particle_down,
@@ -241,7 +241,7 @@ class FusedTrainingNetwork(FusedNetwork):
             self.product_gradient,
             True,
         )
-        self._rows_backward(
+        self._mlp_backward(
             packed.encode,
             self.latent_gradient,
             self.particle_count,
@@ -296,9 +296,9 @@ class FusedTrainingNetwork(FusedNetwork):
         embedding.copy_(table.T @ value[:, used:])
         bias.copy_(table.sum(1))
 
-    def _rows_backward(
+    def _mlp_backward(
         self,
-        fcn: PackedFCN,
+        mlp: PackedMLP,
         gradient: torch.Tensor,
         count: torch.Tensor,
         hidden: torch.Tensor,
@@ -316,7 +316,7 @@ class FusedTrainingNetwork(FusedNetwork):
     ) -> None:
         block, warps = self._row_block(len(hidden), True)
         at, given = (*following, 0, 0), (*products, hidden, hidden)
-        rows_backward[self._blocks(len(hidden), block)](
+        mlp_backward[self._blocks(len(hidden), block)](
             gradient=gradient,
             gradient_index=gradient_index if gradient_index is not None else count,
             from_0=given[0],
@@ -326,12 +326,12 @@ class FusedTrainingNetwork(FusedNetwork):
             weights=self.weights,
             values=self.values,
             totals=self.totals,
-            first_at=fcn.parts[0] if first_at is None else first_at,
+            first_at=mlp.parts[0] if first_at is None else first_at,
             offset_at=offset[0],
-            second_at=fcn.second,
-            second_bias_at=fcn.second_bias,
-            gain_at=fcn.gain,
-            shift_at=fcn.shift,
+            second_at=mlp.second,
+            second_bias_at=mlp.second_bias,
+            norm_weight_at=mlp.norm_weight,
+            norm_bias_at=mlp.norm_bias,
             octant=octant if octant is not None else count,
             next_at_0=at[0],
             next_at_1=at[1],
@@ -340,7 +340,7 @@ class FusedTrainingNetwork(FusedNetwork):
             second_gradient=second_gradient,
             unscale=self.unscale,
             WIDTH=self.width,
-            OUT=fcn.out,
+            OUT=mlp.out,
             GATHER=gradient_index is not None,
             OFFSET=offset[1],
             NORM=norm,
@@ -352,9 +352,9 @@ class FusedTrainingNetwork(FusedNetwork):
             num_warps=warps,
         )
 
-    def _pairs_backward(
+    def _particle_cell_backward(
         self,
-        fcn: PackedFCN,
+        mlp: PackedMLP,
         gradient: torch.Tensor,
         by_particle: torch.Tensor,
         by_cell: torch.Tensor,
@@ -366,7 +366,7 @@ class FusedTrainingNetwork(FusedNetwork):
     ) -> None:
         grid = self.grid
         programs = self._programs(grid.particles, self.tuning.pair_particles)
-        pairs_backward[programs](
+        particle_cell_backward[programs](
             gradient=gradient,
             by_particle=by_particle,
             by_cell=by_cell,
@@ -377,13 +377,13 @@ class FusedTrainingNetwork(FusedNetwork):
             weights=self.weights,
             values=self.values,
             totals=self.totals,
-            offset_at=fcn.parts[-1],
-            second_at=fcn.second,
-            gain_at=fcn.gain,
-            shift_at=fcn.shift,
+            offset_at=mlp.parts[-1],
+            second_at=mlp.second,
+            norm_weight_at=mlp.norm_weight,
+            norm_bias_at=mlp.norm_bias,
             hidden=kept[0],
             normalised=kept[1],
-            deviation=kept[2],
+            rstd=kept[2],
             second_gradient=second_gradient,
             by_particle_gradient=by_particle_gradient,
             by_cell_gradient=by_cell_gradient,
@@ -395,7 +395,7 @@ class FusedTrainingNetwork(FusedNetwork):
             num_warps=self.tuning.pair_warps,
         )
         if not self.keeps_pair_hidden():
-            pairs_weight_gradient[programs](
+            particle_cell_weight_gradient[programs](
                 second_gradient=second_gradient,
                 by_particle=by_particle,
                 by_cell=by_cell,
@@ -403,9 +403,9 @@ class FusedTrainingNetwork(FusedNetwork):
                 count_ptr=self.particle_count,
                 values=self.values,
                 totals=self.totals,
-                offset_at=fcn.parts[-1],
-                second_at=fcn.second,
-                second_bias_at=fcn.second_bias,
+                offset_at=mlp.parts[-1],
+                second_at=mlp.second,
+                second_bias_at=mlp.second_bias,
                 unscale=self.unscale,
                 TO_CELL=to_cell,
                 WIDTH=self.width,
@@ -472,7 +472,7 @@ class FusedTrainingNetwork(FusedNetwork):
             gathers = self._gathers(rows) and not last
             if gathers:
                 self._gather(level, g[f"{name}{later}_eh"], table, g[f"{name}{later}_s"], True)
-            cell_backward[self._blocks(rows, size)](
+            cell_mlp_backward[self._blocks(rows, size)](
                 gradient=gradient,
                 later_hidden_gradient=g[f"{name}{later}_eh"],
                 later_receive_gradient=g[f"{name}{later}_r"],
@@ -486,11 +486,11 @@ class FusedTrainingNetwork(FusedNetwork):
                 first_at=cell.parts[0],
                 sum_first_at=cell.parts[1],
                 second_at=cell.second,
-                gain_at=cell.gain,
-                shift_at=cell.shift,
+                norm_weight_at=cell.norm_weight,
+                norm_bias_at=cell.norm_bias,
                 hidden=block.cell_hidden[m],
                 normalised=block.cell_normalised[m],
-                deviation=block.cell_deviation[m],
+                rstd=block.cell_rstd[m],
                 send_gradient=g[f"{name}{later}_s"],
                 hidden_gradient=g[f"{name}{m}_ch"],
                 second_gradient=g[f"{name}{m}_cz"],
@@ -516,11 +516,11 @@ class FusedTrainingNetwork(FusedNetwork):
                 totals=self.totals,
                 own_at=edge.parts[2],
                 second_at=edge.second,
-                gain_at=edge.gain,
-                shift_at=edge.shift,
+                norm_weight_at=edge.norm_weight,
+                norm_bias_at=edge.norm_bias,
                 hidden=block.edge_hidden[m],
                 normalised=block.edge_normalised[m],
-                deviation=block.edge_deviation[m],
+                rstd=block.edge_rstd[m],
                 hidden_gradient=g[f"{name}{m}_eh"],
                 second_gradient=g[f"{name}{m}_ez"],
                 receive_gradient=g[f"{name}{m}_r"],
@@ -540,9 +540,9 @@ class FusedTrainingNetwork(FusedNetwork):
         self._gather_backward(level, g[f"{name}0_eh"], table, 6, first.parts[0], into, gradient, True, received)
 
 
-def _rows(table: torch.Tensor) -> int:
+def _mlp(table: torch.Tensor) -> int:
     return table.numel() // table.shape[-1]
 
 
 def _chunk_rows(table: torch.Tensor) -> int:
-    return CHUNK_ROWS[_rows(table) >= MANY_ROWS]
+    return CHUNK_ROWS[_mlp(table) >= MANY_ROWS]

@@ -182,8 +182,8 @@ def leaky_backward(gradient, a):
 def normalise(z, WIDTH: tl.constexpr):
     """Rows of zero mean and unit variance, and one over the standard deviation."""
     centred = z - (tl.sum(z, 1) / WIDTH)[:, None]
-    scale = 1.0 / tl.sqrt(tl.sum(centred * centred, 1) / WIDTH + EPSILON)
-    return centred * scale[:, None], scale
+    rstd = 1.0 / tl.sqrt(tl.sum(centred * centred, 1) / WIDTH + EPSILON)
+    return centred * rstd[:, None], rstd
 
 
 @triton.jit
@@ -193,11 +193,11 @@ def normalise_once(z, WIDTH: tl.constexpr, PRECISION: tl.constexpr):
     if PRECISION == "fp16":
         mean = tl.sum(z, 1) / WIDTH
         variance = tl.maximum(tl.sum(z * z, 1) / WIDTH - mean * mean, 0.0)
-        scale = 1.0 / tl.sqrt(variance + EPSILON)
-        z = z * scale[:, None] - (mean * scale)[:, None]
+        rstd = 1.0 / tl.sqrt(variance + EPSILON)
+        z = z * rstd[:, None] - (mean * rstd)[:, None]
     else:
-        z, scale = normalise(z, WIDTH)
-    return z, scale
+        z, rstd = normalise(z, WIDTH)
+    return z, rstd
 
 
 @triton.jit
@@ -228,12 +228,12 @@ def high_and_low(pointer, FIRST: tl.constexpr, SUMS: tl.constexpr, WIDTH: tl.con
 
 
 @triton.jit
-def normalise_backward(gradient, normalised, scale, gamma, WIDTH: tl.constexpr):
-    """The gradient before the normalisation, from the gradient after its gain `gamma` [W]."""
+def normalise_backward(gradient, normalised, rstd, gamma, WIDTH: tl.constexpr):
+    """The gradient before the normalisation, from the gradient after its weight `gamma` [W]."""
     inner = gradient * gamma[None, :]
     mean = tl.sum(inner, 1) / WIDTH
     slope = tl.sum(inner * normalised, 1) / WIDTH
-    return (inner - mean[:, None] - normalised * slope[:, None]) * scale[:, None]
+    return (inner - mean[:, None] - normalised * slope[:, None]) * rstd[:, None]
 
 
 @triton.jit

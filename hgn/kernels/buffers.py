@@ -30,11 +30,11 @@ class Block:
     edge: list[torch.Tensor] = field(default_factory=list)  # M - 1 of [C, 6, W]
     edge_hidden: list[torch.Tensor] = field(default_factory=list)
     edge_normalised: list[torch.Tensor] = field(default_factory=list)
-    edge_deviation: list[torch.Tensor] = field(default_factory=list)  # one over it, float32 [C, 6]
+    edge_rstd: list[torch.Tensor] = field(default_factory=list)  # one over the rstd, float32 [C, 6]
     sum: list[torch.Tensor] = field(default_factory=list)
     cell_hidden: list[torch.Tensor] = field(default_factory=list)
     cell_normalised: list[torch.Tensor] = field(default_factory=list)
-    cell_deviation: list[torch.Tensor] = field(default_factory=list)
+    cell_rstd: list[torch.Tensor] = field(default_factory=list)
     send: list[torch.Tensor] = field(default_factory=list)  # 2, by turns; in inference one, read before it is written
     receive: list[torch.Tensor] = field(default_factory=list)
     product: torch.Tensor | None = None  # of the block's output, for the step that follows
@@ -95,7 +95,7 @@ class Buffers:
         self.by_particle_up = self._operand(self.grid.particles, self.width)
         pairs = 8 * self.grid.particles if self.training else 1
         hidden = pairs if keeps_pair_hidden else 1
-        # hidden layer, normalised output, one over its deviation
+        # hidden layer, normalised output, one over its rstd
         self.kept_down, self.kept_up = (
             (self._operand(hidden, self.width), self._operand(pairs, self.width), self._float(pairs)) for _ in range(2)
         )
@@ -125,11 +125,11 @@ class Buffers:
             block.edge = [self._operand(capacity, 6, width) for _ in range(steps - 1)]
             block.edge_hidden = [self._operand(capacity, 6, width) for _ in range(steps)]
             block.edge_normalised = [self._operand(capacity, 6, width) for _ in range(steps)]
-            block.edge_deviation = [self._float(capacity, 6) for _ in range(steps)]
+            block.edge_rstd = [self._float(capacity, 6) for _ in range(steps)]
             block.sum = [self._operand(capacity, width) for _ in range(steps)]
             block.cell_hidden = [self._operand(capacity, width) for _ in range(steps)]
             block.cell_normalised = [self._operand(capacity, width) for _ in range(steps)]
-            block.cell_deviation = [self._float(capacity) for _ in range(steps)]
+            block.cell_rstd = [self._float(capacity) for _ in range(steps)]
         for level, capacity in enumerate(capacities):
             self._last(level).product = self._operand(capacity, width)
 
@@ -165,7 +165,7 @@ class Buffers:
                 block.edge = [shared[: 6 * capacity].view(capacity, 6, width)] * (steps - 1)
                 # not kept
                 block.edge_hidden = block.edge_normalised = block.cell_hidden = block.cell_normalised = [send] * steps
-                block.edge_deviation = block.cell_deviation = [total] * steps
+                block.edge_rstd = block.cell_rstd = [total] * steps
             self._last(level).product = shared[:capacity]
         if self.tuning.half_cells and not self.tuning.half_sums:
             self.down[0].cell[0] = self._first_cell(finest, width)

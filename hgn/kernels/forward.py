@@ -13,12 +13,12 @@ import triton
 
 from hgn.config import NetworkConfig
 from hgn.kernels.buffers import Block, Buffers
-from hgn.kernels.cell_mlp.kernel import cell_forward
+from hgn.kernels.cell_mlp.kernel import cell_mlp_forward
 from hgn.kernels.edges.kernel import edge_forward
 from hgn.kernels.grid.op import DeviceGrid
-from hgn.kernels.mlp.kernel import clear_rows, gather_project, gather_sums, rows_forward
-from hgn.kernels.packing import PackedFCN, PackedNetwork, rounded_to_tf32
-from hgn.kernels.particle_cell.kernel import pairs_forward
+from hgn.kernels.mlp.kernel import clear_rows, gather_project, gather_sums, mlp_forward
+from hgn.kernels.packing import PackedMLP, PackedNetwork, rounded_to_tf32
+from hgn.kernels.particle_cell.kernel import particle_cell_forward
 
 PRECISIONS = ("fp32", "tf32", "fp16")
 PROCESSORS = 132  # an H100's
@@ -162,7 +162,7 @@ class FusedNetwork(Buffers):
     def forward(self) -> None:
         """From the grid's features and tables to `output` [N, OUT]: normalised accelerations in columns 0 to 2."""
         packed, grid, levels = self.packed, self.grid, self.config.levels
-        self._rows(
+        self._mlp(
             packed.encode,
             grid.feature_NF,
             self.particle_count,
@@ -177,7 +177,7 @@ class FusedNetwork(Buffers):
             fine=self.fine,
         )
         self._clear(self.down[0].cell[0])
-        self._pairs(
+        self._particle_cell(
             packed.particle_to_cell,
             self.by_particle_down,
             self.by_particle_down,
@@ -189,7 +189,7 @@ class FusedNetwork(Buffers):
             self._begin(block, i > 0)
             self._passing(block)
             if i < levels - 1:
-                self._rows(
+                self._mlp(
                     packed.fine_to_coarse[i],
                     block.cell[-1],
                     grid.count(i),
@@ -203,7 +203,7 @@ class FusedNetwork(Buffers):
             block = self.up[i]
             edge = block.packed.edge[0]
             assert coarse.product is not None
-            self._rows(
+            self._mlp(
                 packed.coarse_to_fine[i],
                 self.down[i].cell[-1],
                 grid.count(i),
@@ -222,10 +222,10 @@ class FusedNetwork(Buffers):
             self._passing(block)
             coarse = block
         assert coarse.product is not None
-        self._pairs(
+        self._particle_cell(
             packed.cell_to_particle, self.by_particle_up, coarse.product, self.kept_up, self.decoder_input, False
         )
-        self._rows(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
+        self._mlp(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
 
     def _clear(self, x: torch.Tensor) -> None:
         """Zeros into the finest cells' rows of x."""
@@ -269,7 +269,7 @@ class FusedNetwork(Buffers):
         return target.backend == "cuda" and target.arch >= 90
 
     def keeps_pair_hidden(self) -> bool:
-        """Whether the pairs' hidden layer is kept for the backward pass, and not computed again: see pairs_forward."""
+        """Whether the pairs' hidden layer is kept for the backward pass, and not computed again: see particle_cell_forward."""
         return self.precision == "tf32" or (self.precision == "fp32" and not triton.knobs.runtime.interpret)
 
     def _edge_cells(self, block: int) -> int:
@@ -284,9 +284,9 @@ class FusedNetwork(Buffers):
         """Programs that take one block after the other: as many as run at once, `at_once` on a processor."""
         return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS * at_once // 2),)
 
-    def _rows(
+    def _mlp(
         self,
-        fcn: PackedFCN,
+        mlp: PackedMLP,
         x: torch.Tensor,
         count: torch.Tensor,
         y: torch.Tensor,
@@ -305,12 +305,12 @@ class FusedNetwork(Buffers):
         fractions: tuple[int, int] = (0, 0),
         fine: bool = False,
     ) -> None:
-        first = first or (self.weights, fcn.parts[0])
+        first = first or (self.weights, mlp.parts[0])
         block, warps = self._row_block(len(x))
         at, bias_at = (*following, 0, 0), (*following_bias, NONE, NONE)
         into = (*products, hidden, hidden)
         loops = self._loops(len(x), block, 4)
-        rows_forward[self._row_programs(len(x), block, loops, 1 if norm else 2)](
+        mlp_forward[self._row_programs(len(x), block, loops, 1 if norm else 2)](
             x=x,
             count_ptr=count,
             weights=self.weights,
@@ -318,11 +318,11 @@ class FusedNetwork(Buffers):
             first_weights=first[0],
             first_at=first[1],
             offset_at=offset[0],
-            bias_at=fcn.first_bias,
-            second_at=fcn.second,
-            second_bias_at=fcn.second_bias,
-            gain_at=fcn.gain,
-            shift_at=fcn.shift,
+            bias_at=mlp.first_bias,
+            second_at=mlp.second,
+            second_bias_at=mlp.second_bias,
+            norm_weight_at=mlp.norm_weight,
+            norm_bias_at=mlp.norm_bias,
             gathered=gathered if gathered is not None else x,
             index=index if index is not None else count,
             octant=octant if octant is not None else count,
@@ -339,7 +339,7 @@ class FusedNetwork(Buffers):
             next_1=into[1],
             INPUT=x.shape[-1],
             WIDTH=self.width,
-            OUT=fcn.out,
+            OUT=mlp.out,
             GATHER=gathered is not None,
             OFFSET=offset[1],
             BIAS=bias,
@@ -355,9 +355,9 @@ class FusedNetwork(Buffers):
             num_warps=warps,
         )
 
-    def _pairs(
+    def _particle_cell(
         self,
-        fcn: PackedFCN,
+        mlp: PackedMLP,
         by_particle: torch.Tensor,
         by_cell: torch.Tensor,
         kept: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
@@ -366,7 +366,7 @@ class FusedNetwork(Buffers):
     ) -> None:
         grid, tuning = self.grid, self.tuning
         at_once, registers = tuning.light_programs, tuning.light_registers
-        pairs_forward[self._programs(grid.particles, tuning.pair_particles, at_once)](
+        particle_cell_forward[self._programs(grid.particles, tuning.pair_particles, at_once)](
             by_particle=by_particle,
             by_cell=by_cell,
             particle=self.latent,
@@ -375,14 +375,14 @@ class FusedNetwork(Buffers):
             count_ptr=self.particle_count,
             weights=self.weights,
             values=self.values,
-            offset_at=fcn.parts[-1],
-            second_at=fcn.second,
-            second_bias_at=fcn.second_bias,
-            gain_at=fcn.gain,
-            shift_at=fcn.shift,
+            offset_at=mlp.parts[-1],
+            second_at=mlp.second,
+            second_bias_at=mlp.second_bias,
+            norm_weight_at=mlp.norm_weight,
+            norm_bias_at=mlp.norm_bias,
             hidden=kept[0],
             normalised=kept[1],
-            deviation=kept[2],
+            rstd=kept[2],
             out=out,
             TO_CELL=to_cell,
             SAVE=self.training,
@@ -474,13 +474,13 @@ class FusedNetwork(Buffers):
                 own_at=edge.parts[2],
                 second_at=edge.second,
                 second_bias_at=edge.second_bias,
-                gain_at=edge.gain,
-                shift_at=edge.shift,
+                norm_weight_at=edge.norm_weight,
+                norm_bias_at=edge.norm_bias,
                 edge_out=block.edge[m] if not last else block.cell[m],
                 sum_out=block.sum[m],
                 hidden=block.edge_hidden[m],
                 normalised=block.edge_normalised[m],
-                deviation=block.edge_deviation[m],
+                rstd=block.edge_rstd[m],
                 capacity=rows,
                 FIRST=m == 0,
                 STORE_EDGE=not last,
@@ -496,7 +496,7 @@ class FusedNetwork(Buffers):
                 maxnreg=self.tuning.light_registers if light else None,
                 launch_pdl=overlap,
             )
-            cell_forward[self._row_programs(rows, size, loops)](
+            cell_mlp_forward[self._row_programs(rows, size, loops)](
                 cell=block.cell[m],
                 total=block.sum[m],
                 count_ptr=grid.count(level),
@@ -507,15 +507,15 @@ class FusedNetwork(Buffers):
                 bias_at=cell.first_bias,
                 second_at=cell.second,
                 second_bias_at=cell.second_bias,
-                gain_at=cell.gain,
-                shift_at=cell.shift,
+                norm_weight_at=cell.norm_weight,
+                norm_bias_at=cell.norm_bias,
                 next_at_0=next_at[0],
                 next_at_1=next_at[1],
                 next_bias_at=next_bias,
                 cell_out=block.cell[m + 1],
                 hidden=block.cell_hidden[m],
                 normalised=block.cell_normalised[m],
-                deviation=block.cell_deviation[m],
+                rstd=block.cell_rstd[m],
                 next_0=into[0],
                 next_1=into[1],
                 NEXT=products,

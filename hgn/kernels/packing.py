@@ -1,7 +1,7 @@
 """The network's parameters in one flat buffer, each MLP a contiguous block that the kernels can read in whole tiles.
 
 Block of an MLP: the first layer's wide parts, each [hidden, part] row-major; its narrow parts (offsets), each
-transposed to [part, hidden]; bias; second layer [out, hidden]; its bias; the norm's gain and shift.
+transposed to [part, hidden]; bias; second layer [out, hidden]; its bias; the LayerNorm's weight and bias.
 An output of 3 is padded with zero rows to PADDED_OUT. Padding never receives a gradient.
 """
 
@@ -19,22 +19,22 @@ PADDED_OUT = 16
 
 
 @dataclass(frozen=True)
-class PackedFCN:
+class PackedMLP:
     """Offsets of an MLP's tensors in the flat buffer, in elements."""
 
     parts: tuple[int, ...]
     first_bias: int
     second: int
     second_bias: int
-    gain: int  # 0 without a norm
-    shift: int
+    norm_weight: int  # 0 without a norm
+    norm_bias: int
     out: int
 
 
 @dataclass(frozen=True)
 class PackedMessagePassing:
-    edge: tuple[PackedFCN, ...]
-    cell: tuple[PackedFCN, ...]
+    edge: tuple[PackedMLP, ...]
+    cell: tuple[PackedMLP, ...]
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class PackedNetwork:
     """Where everything is. `index` (int32, on the host) maps packed elements to the concatenated parameters, -1 for
     padding."""
 
-    encode: PackedFCN
-    particle_to_cell: PackedFCN
+    encode: PackedMLP
+    particle_to_cell: PackedMLP
     passing_down: tuple[PackedMessagePassing, ...]
-    fine_to_coarse: tuple[PackedFCN, ...]
-    coarse_to_fine: tuple[PackedFCN, ...]
+    fine_to_coarse: tuple[PackedMLP, ...]
+    coarse_to_fine: tuple[PackedMLP, ...]
     passing_up: tuple[PackedMessagePassing, ...]
-    cell_to_particle: PackedFCN
-    decode: PackedFCN
+    cell_to_particle: PackedMLP
+    decode: PackedMLP
     embedding: int
     size: int
     index: torch.Tensor
@@ -91,26 +91,26 @@ class _Packer:
         self.size += len(flat) + padding
         return offset
 
-    def fcn(self, fcn: MLP, whole_first: bool = False) -> PackedFCN:
-        out = max(len(fcn.second.weight), PADDED_OUT)
-        missing = out - len(fcn.second.weight)
-        first = self.positions(fcn.first.weight)
-        parts = [first] if whole_first else list(first.split(fcn.parts, dim=1))
+    def mlp(self, mlp: MLP, whole_first: bool = False) -> PackedMLP:
+        out = max(len(mlp.second.weight), PADDED_OUT)
+        missing = out - len(mlp.second.weight)
+        first = self.positions(mlp.first.weight)
+        parts = [first] if whole_first else list(first.split(mlp.parts, dim=1))
         offsets = [self.add(part.T if part.shape[1] < NARROW else part) for part in parts]
-        bias = self.add(self.positions(fcn.first.bias))
-        second = self.add(torch.nn.functional.pad(self.positions(fcn.second.weight), (0, 0, 0, missing), value=-1))
-        second_bias = self.add(torch.nn.functional.pad(self.positions(fcn.second.bias), (0, missing), value=-1))
-        gain = shift = 0
-        if fcn.norm is not None:
-            gain, shift = self.add(self.positions(fcn.norm.weight)), self.add(self.positions(fcn.norm.bias))
-        return PackedFCN(tuple(offsets), bias, second, second_bias, gain, shift, out)
+        bias = self.add(self.positions(mlp.first.bias))
+        second = self.add(torch.nn.functional.pad(self.positions(mlp.second.weight), (0, 0, 0, missing), value=-1))
+        second_bias = self.add(torch.nn.functional.pad(self.positions(mlp.second.bias), (0, missing), value=-1))
+        norm_weight = norm_bias = 0
+        if mlp.norm is not None:
+            norm_weight, norm_bias = self.add(self.positions(mlp.norm.weight)), self.add(self.positions(mlp.norm.bias))
+        return PackedMLP(tuple(offsets), bias, second, second_bias, norm_weight, norm_bias, out)
 
-    def fcns(self, modules: torch.nn.ModuleList) -> tuple[PackedFCN, ...]:
-        return tuple(self.fcn(module) for module in modules if isinstance(module, MLP))
+    def mlps(self, modules: torch.nn.ModuleList) -> tuple[PackedMLP, ...]:
+        return tuple(self.mlp(module) for module in modules if isinstance(module, MLP))
 
     def passings(self, modules: torch.nn.ModuleList) -> tuple[PackedMessagePassing, ...]:
         return tuple(
-            PackedMessagePassing(self.fcns(module.edge), self.fcns(module.cell))
+            PackedMessagePassing(self.mlps(module.edge), self.mlps(module.cell))
             for module in modules
             if isinstance(module, MessagePassing)
         )
@@ -119,14 +119,14 @@ class _Packer:
 def pack_network(network: HierarchicalGraphNetwork) -> PackedNetwork:
     """The layout of a network; a pure function of its configuration."""
     packer = _Packer(network)
-    encode = packer.fcn(network.encode, whole_first=True)
-    particle_to_cell = packer.fcn(network.particle_to_cell)
+    encode = packer.mlp(network.encode, whole_first=True)
+    particle_to_cell = packer.mlp(network.particle_to_cell)
     down = packer.passings(network.passing_down)
-    fine_to_coarse = packer.fcns(network.fine_to_coarse)
-    coarse_to_fine = packer.fcns(network.coarse_to_fine)
+    fine_to_coarse = packer.mlps(network.fine_to_coarse)
+    coarse_to_fine = packer.mlps(network.coarse_to_fine)
     up = packer.passings(network.passing_up)
-    cell_to_particle = packer.fcn(network.cell_to_particle)
-    decode = packer.fcn(network.decode)
+    cell_to_particle = packer.mlp(network.cell_to_particle)
+    decode = packer.mlp(network.decode)
     embedding = packer.add(packer.positions(network.embedding.weight))
     return PackedNetwork(
         encode,

@@ -5,7 +5,6 @@ Launches are seen where Triton makes them: whatever launches a kernel, none is m
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,48 +17,51 @@ from triton.runtime.jit import KernelInterface
 
 from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.gns.op import FusedEdges
+from hgn.kernels.reference import Added, Outputs, ProgramSums, rows
 
 
 @dataclass(frozen=True)
 class Launch:
-    """Numbers come in float64, those of buffers with room to spare as their first rows."""
+    """What a kernel was given and what it left."""
 
     kernel: str
     given: dict[str, Any]  # by the kernel's names; tensors as they were before
     left: dict[str, torch.Tensor]  # the same after
     parameters: dict[int, torch.Tensor]  # float64 and not rounded, by the address of what the kernel reads
-    buffers: dict[int, torch.Tensor]  # of the engine, by their address
+    buffers: dict[int, torch.Tensor]  # of the network, by their address
 
-    def __getitem__(self, name: str) -> Any:
-        return self.given[name]
+    def arguments(self) -> dict[str, Any]:
+        """Those of the kernel's reference: numbers in float64, parameters not rounded."""
+        result = dict(self.given)
+        for name, tensor in self.left.items():
+            if tensor.data_ptr() in self.parameters:
+                result[name] = self.parameters[tensor.data_ptr()]
+            elif tensor.is_floating_point():
+                result[name] = self.given[name].double()
+        if self.kernel == "weight_gradient":
+            result["right"] = {row[1]: self._operand(row[1], row[5]) for row in self.given["jobs"].tolist()}
+        return result
 
-    @property
-    def count(self) -> int:
-        return int(self.given["count_ptr"])
+    def _operand(self, at: int, width: int) -> torch.Tensor:
+        """The buffer that lies at an offset from the weights' products' `right`."""
+        right = self.left["right"]
+        operand = self.buffers[right.data_ptr() + at * right.element_size()]
+        assert operand.dtype == right.dtype and operand.shape[-1] == width
+        return operand.double()
 
-    def rows(self, name: str, *shape: int) -> torch.Tensor:
-        return _first(self.given[name], shape).double()
-
-    def found(self, name: str, *shape: int) -> torch.Tensor:
-        return _first(self.left[name], shape).double()
-
-    def indices(self, name: str, *shape: int) -> torch.Tensor:
-        """Below zero: none."""
-        return _first(self.given[name], shape).long()
-
-    def parameter(self, at: str, *shape: int, of: str = "") -> torch.Tensor:
-        """The parameters at the place that the argument `at` names, which may be of several."""
-        every = self.parameters[self.given[of or ("values" if "values" in self.given else "weights")].data_ptr()]
-        return _first(every.flatten()[self.given[at] :], shape)
-
-    def added(self, at: int, *shape: int) -> torch.Tensor:
-        """What was added to `totals` at a place, without the loss scale's share."""
-        found = [_first(totals["totals"].flatten()[at:], shape).double() for totals in (self.left, self.given)]
-        return (found[0] - found[1]) / self.given["unscale"]
-
-
-def _first(x: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
-    return x.flatten()[: math.prod(shape)].view(shape)
+    def pairs(self, outputs: Outputs) -> Iterator[tuple[str, torch.Tensor, torch.Tensor, float]]:
+        """Of each output its name, what was left, what should have been, and the size of its summands."""
+        for name, output in outputs.items():
+            if isinstance(output, Added):
+                shape = output.value.shape
+                after, before = (rows(x["totals"].flatten()[output.at :], *shape) for x in (self.left, self.given))
+                yield name, (after.double() - before.double()) / self.given["unscale"], output.value, output.summands
+            elif isinstance(output, ProgramSums):
+                total = self.left["partial"].double().sum(0)
+                yield name, total[output.first : output.first + len(output.value)], output.value, 0.0
+            else:
+                promised = ~output.isnan()
+                yield name, rows(self.left[name], *output.shape).double()[promised], output[promised], 0.0
 
 
 @contextmanager

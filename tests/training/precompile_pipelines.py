@@ -16,7 +16,7 @@ use_h100()
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 network = NetworkConfig(levels=2, message_passing_steps=1)
 for function, data in launches_of(PrecompileJob(network, settings, "fp16", False, False, 300, (200, 60), 90)).values():
-    if function.__name__ in ("weight_gradient", "pairs_weight_gradient"):
+    if function.__name__ in ("weight_gradient", "particle_cell_weight_gradient"):
         text = preload(function, data).asm["ttgir"]
         ahead = len(re.findall(r"local_alloc : \(\) -> !ttg.memdesc<[2-9]x", text))
         pending = max(map(int, re.findall(r"warp_group_dot_wait.*pendings = (\d+)", text)))

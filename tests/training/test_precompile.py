@@ -100,7 +100,7 @@ def test_no_tile_is_copied_over_one_that_is_being_multiplied(tmp_path: Path) -> 
     """Of the weights' products tiles are copied to shared memory ahead, and each product is over before the next copy:
     the compiler keeps too few buffers for one that is under way meanwhile."""
     lines = [line.split() for line in run_compiled(tmp_path, "precompile_pipelines.py").split("\n")]
-    assert {kernel for kernel, _, _ in lines} == {"weight_gradient", "pairs_weight_gradient"}
+    assert {kernel for kernel, _, _ in lines} == {"weight_gradient", "particle_cell_weight_gradient"}
     assert all(int(ahead) >= 2 and int(pending) == 0 for _, ahead, pending in lines), lines
 
 
@@ -110,9 +110,9 @@ def test_an_update_of_gns_never_asks_the_device(tmp_path: Path) -> None:
     names = {line.split()[0] for line in run_compiled(tmp_path, "precompile_keys.py", "launch", "gns").split("\n")}
     assert names >= {
         "walk_neighbours",
-        "step_forward",
-        "norm_backward",
-        "encode_layers_backward",
+        "gns_step_forward",
+        "gns_norm_backward",
+        "gns_encode_layers_backward",
         "momentum_directions",
     }
 

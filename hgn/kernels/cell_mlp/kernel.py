@@ -33,7 +33,7 @@ from hgn.kernels.triton_compat import settle_keys
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
-def cell_forward(
+def cell_mlp_forward(
     cell,
     total,
     count_ptr,
@@ -44,15 +44,15 @@ def cell_forward(
     bias_at,
     second_at,
     second_bias_at,
-    gain_at,
-    shift_at,
+    norm_weight_at,
+    norm_bias_at,
     next_at_0,
     next_at_1,
     next_bias_at,
     cell_out,
     hidden,
     normalised,
-    deviation,
+    rstd,
     next_0,
     next_1,
     NEXT: tl.constexpr,
@@ -65,10 +65,12 @@ def cell_forward(
     OVERLAP: tl.constexpr,
     PREFETCH: tl.constexpr,
 ):
-    """The cells' new features from theirs and their edges' sums, both [C, W], and up to two products of them, of which
-    the second with a bias.
+    """Paper steps 2, 4, … (fig. 5): the cells' new features from theirs and their edges' sums, all [C, W], and up to two
+    products of them, of which the second with a bias.
 
     RESIDENT: all weights are read before the first tile, and kept. LOOP: a program has more than one tile.
+
+    Reference: hgn.kernels.cell_mlp.reference; test: tests/kernels/test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -78,12 +80,17 @@ def cell_forward(
     column = tl.arange(0, WIDTH)
     IN_PLACE: tl.constexpr = BLOCK > 16 and not LOOP  # where many vectors would not fit into registers
     if LOOP:
-        lines = vectors(values, bias_at, second_bias_at, gain_at, shift_at, next_bias_at, WIDTH)
-        bias, second_bias, gain, shift = vector(lines, 0), vector(lines, 1), vector(lines, 2), vector(lines, 3)
+        lines = vectors(values, bias_at, second_bias_at, norm_weight_at, norm_bias_at, next_bias_at, WIDTH)
+        bias, second_bias, norm_weight, norm_bias = (
+            vector(lines, 0),
+            vector(lines, 1),
+            vector(lines, 2),
+            vector(lines, 3),
+        )
         next_bias = vector(lines, 4)
     elif not IN_PLACE:
         bias, second_bias = tl.load(values + bias_at + column), tl.load(values + second_bias_at + column)
-        gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
+        norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
         next_bias = tl.load(values + next_bias_at + column)
     if RESIDENT:
         first = transposed(weights + first_at, WIDTH, WIDTH)
@@ -122,14 +129,14 @@ def cell_forward(
         z = product(a, second, PRECISION)
         if IN_PLACE:
             second_bias = tl.load(values + second_bias_at + column)
-        z, scale = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
+        z, row_rstd = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
         if SAVE:
             tl.store(hidden + at, a, mask=here)
             tl.store(normalised + at, z, mask=here)
-            tl.store(deviation + row, scale, mask=row < count)
+            tl.store(rstd + row, row_rstd, mask=row < count)
         if IN_PLACE:
-            gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
-        feature = feature.to(tl.float32) + (z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :])
+            norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
+        feature = feature.to(tl.float32) + (z * inside(norm_weight, tile)[None, :] + inside(norm_bias, tile)[None, :])
         tl.store(cell_out + at, feature, mask=here)
         if NEXT > 0:
             if not RESIDENT:
@@ -148,7 +155,7 @@ def cell_forward(
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
-def cell_backward(
+def cell_mlp_backward(
     gradient,
     later_hidden_gradient,
     later_receive_gradient,
@@ -162,11 +169,11 @@ def cell_backward(
     first_at,
     sum_first_at,
     second_at,
-    gain_at,
-    shift_at,
+    norm_weight_at,
+    norm_bias_at,
     hidden,
     normalised,
-    deviation,
+    rstd,
     send_gradient,
     hidden_gradient,
     second_gradient,
@@ -186,7 +193,9 @@ def cell_backward(
     in send_gradient), and leaves as that of `cell`, again less what goes through its own.
 
     sum_gradient [C, W] is that of the edges' sums. Without GATHER send_gradient is there already. RESIDENT as in
-    cell_forward.
+    cell_mlp_forward.
+
+    Reference: hgn.kernels.cell_mlp.reference; test: tests/kernels/test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -196,7 +205,7 @@ def cell_backward(
     column = tl.arange(0, WIDTH)
     EARLY: tl.constexpr = BLOCK <= 16  # all loads first, where there are registers for it
     if EARLY:
-        gain = tl.load(values + gain_at + column)
+        norm_weight = tl.load(values + norm_weight_at + column)
     if RESIDENT:
         if not LAST:
             later_send = matrix(weights + later_send_at, WIDTH, WIDTH)
@@ -205,7 +214,7 @@ def cell_backward(
         sum_first = matrix(weights + sum_first_at, WIDTH, WIDTH)
         first = matrix(weights + first_at, WIDTH, WIDTH)
     sums = tl.arange(0, 16)[:, None]  # of which one is used: the least that the matrix units take
-    gain_total, shift_total = tl.zeros((16, WIDTH), tl.float32), tl.zeros((16, WIDTH), tl.float32)
+    norm_weight_total, norm_bias_total = tl.zeros((16, WIDTH), tl.float32), tl.zeros((16, WIDTH), tl.float32)
     tile = tl.program_id(0)
     while (tile * BLOCK < count) & (tile < LAST_TILE):
         row = tile * BLOCK + tl.arange(0, BLOCK)
@@ -218,7 +227,7 @@ def cell_backward(
         df = tl.load(gradient + at, mask=here, other=0.0)
         if EARLY:
             z = tl.load(normalised + at, mask=here, other=0.0)
-            scale = tl.load(deviation + row, mask=row < count, other=0.0)
+            row_rstd = tl.load(rstd + row, mask=row < count, other=0.0)
             a = tl.load(hidden + at, mask=here, other=0.0)
             if not LAST:
                 received = tl.load(later_receive_gradient + at, mask=here, other=0.0)
@@ -239,15 +248,15 @@ def cell_backward(
             df += product(received, later_receive, PRECISION)
         if not EARLY:
             z = tl.load(normalised + at, mask=here, other=0.0)
-            scale = tl.load(deviation + row, mask=row < count, other=0.0)
+            row_rstd = tl.load(rstd + row, mask=row < count, other=0.0)
         z = z.to(tl.float32)
         whole = tl.where((sums == 0) & (row < count)[None, :], 1.0, 0.0)
         if tile >= 0:  # as in hgn.kernels.edges.kernel.edge_backward
-            gain_total += weighted_sums(whole, df * z, PRECISION)
-            shift_total += weighted_sums(whole, df, PRECISION)
+            norm_weight_total += weighted_sums(whole, df * z, PRECISION)
+            norm_bias_total += weighted_sums(whole, df, PRECISION)
         if not EARLY:
-            gain = tl.load(values + gain_at + column)
-        dz = normalise_backward(df, z, scale, inside(gain, tile), WIDTH)
+            norm_weight = tl.load(values + norm_weight_at + column)
+        dz = normalise_backward(df, z, row_rstd, inside(norm_weight, tile), WIDTH)
         tl.store(second_gradient + at, dz, mask=here)
         if not RESIDENT:
             second = matrix(weights + second_at, WIDTH, WIDTH)
@@ -266,10 +275,10 @@ def cell_backward(
         tile = next_tile(tile, not EARLY)
     if OVERLAP:
         gdc_wait()
-    at_gain = totals + gain_at + sums * WIDTH + column[None, :]
-    at_shift = totals + shift_at + sums * WIDTH + column[None, :]
-    tl.atomic_add(at_gain, gain_total * unscale, mask=sums < 1, sem="relaxed")
-    tl.atomic_add(at_shift, shift_total * unscale, mask=sums < 1, sem="relaxed")
+    at_norm_weight = totals + norm_weight_at + sums * WIDTH + column[None, :]
+    at_norm_bias = totals + norm_bias_at + sums * WIDTH + column[None, :]
+    tl.atomic_add(at_norm_weight, norm_weight_total * unscale, mask=sums < 1, sem="relaxed")
+    tl.atomic_add(at_norm_bias, norm_bias_total * unscale, mask=sums < 1, sem="relaxed")
 
 
 settle_keys(globals())

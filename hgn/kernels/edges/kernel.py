@@ -107,13 +107,13 @@ def edge_forward(
     own_at,
     second_at,
     second_bias_at,
-    gain_at,
-    shift_at,
+    norm_weight_at,
+    norm_bias_at,
     edge_out,
     sum_out,
     hidden,
     normalised,
-    deviation,
+    rstd,
     capacity,
     FIRST: tl.constexpr,
     STORE_EDGE: tl.constexpr,
@@ -126,11 +126,14 @@ def edge_forward(
     PREFETCH: tl.constexpr,
     AHEAD: tl.constexpr,
 ):
-    """The edges' new features and their sums by receiver [C, W]; send and receive [C, W] are the cells' products with
-    the edge network's first two parts, receive with the bias.
+    """Paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W]; send and
+    receive [C, W] are the cells' products with the edge MLP's first two parts, receive with the bias.
 
     FIRST: edges have no features yet, their unit offset takes the place. The last iteration stores no edges. SAVE keeps
-    what edge_backward reads: the hidden layer, the normalised output and one over its deviation.
+    what edge_backward reads: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6], one over its
+    rstd.
+
+    Reference: hgn.kernels.edges.reference; test: tests/kernels/test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -147,7 +150,7 @@ def edge_forward(
     other = _senders(neighbour, slot, owner, used, count, capacity)
     # vectors once: in the loop each would be waited for again
     second_bias = tl.load(values + second_bias_at + column)
-    gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
+    norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
     # Where it is exact, a cell's row comes to its edges by a product, with the sides' rows in its spare places.
     BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)
     if BY_PRODUCT:
@@ -211,11 +214,11 @@ def edge_forward(
             # also where there is no edge: what lies there meets zero gradients in the weights' products
             tl.store(hidden + edge_at, a, mask=holds[:, None])
         z = product(a, second, PRECISION)
-        z, scale = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
+        z, row_rstd = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
         if SAVE:
             tl.store(normalised + edge_at, z, mask=there)
-            tl.store(deviation + place, tl.where(other >= 0, scale, 0.0), mask=holds)
-        z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
+            tl.store(rstd + place, tl.where(other >= 0, row_rstd, 0.0), mask=holds)
+        z = z * inside(norm_weight, tile)[None, :] + inside(norm_bias, tile)[None, :]
         if not FIRST:
             if AHEAD:
                 z = added(edge, z.to(edge.dtype))
@@ -271,11 +274,11 @@ def edge_backward(
     totals,
     own_at,
     second_at,
-    gain_at,
-    shift_at,
+    norm_weight_at,
+    norm_bias_at,
     hidden,
     normalised,
-    deviation,
+    rstd,
     hidden_gradient,
     second_gradient,
     receive_gradient,
@@ -291,7 +294,9 @@ def edge_backward(
     """In place: edge_gradient [C, 6, W] comes in as that of edge_out, less the sums' part (there is none if LAST), and
     leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`.
 
-    `deviation` is zero where there is no edge. It is read a tile ahead, for it says what else is read.
+    `rstd` is zero where there is no edge. It is read a tile ahead, for it says what else is read.
+
+    Reference: hgn.kernels.edges.reference; test: tests/kernels/test_kernels_alone.py.
     """
     if OVERLAP:
         gdc_launch_dependents()
@@ -305,17 +310,17 @@ def edge_backward(
     second = matrix(weights + second_at, WIDTH, WIDTH)
     if not FIRST:
         own = matrix(weights + own_at, WIDTH, WIDTH)
-    gain = tl.load(values + gain_at + column)
-    gain_total, shift_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
+    norm_weight = tl.load(values + norm_weight_at + column)
+    norm_weight_total, norm_bias_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     if FIRST:
         side_total = tl.zeros((16, WIDTH), tl.float32)
     tile = tl.program_id(0)
     place, holds = _edges_of(tile, count, ROWS, SLOTS)
-    scale = tl.load(deviation + place, mask=holds, other=0.0)
+    row_rstd = tl.load(rstd + place, mask=holds, other=0.0)
     while tile * BLOCK < count:
         slot = tl.arange(0, ROWS) % SLOTS
         place, holds = _edges_of(tile, count, ROWS, SLOTS)
-        there = (scale != 0)[:, None]
+        there = (row_rstd != 0)[:, None]
         if OVERLAP:
             gdc_wait()
         edge_at = place[:, None] * WIDTH + column[None, :]
@@ -325,19 +330,19 @@ def edge_backward(
             later = tl.load(edge_gradient + edge_at, mask=there, other=0.0)
         owner = tile * BLOCK + tl.arange(0, ROWS) // SLOTS
         de = tl.load(sum_gradient + owner[:, None] * WIDTH + column[None, :], mask=there, other=0.0)
-        scale = tl.load(deviation + place, mask=holds, other=0.0)
+        row_rstd = tl.load(rstd + place, mask=holds, other=0.0)
         if not LAST:
             de = added(de, later)
         dy, z = de.to(tl.float32), z.to(tl.float32)
         if tile >= 0:  # always, and the compiler does not know: else it puts these sums off, and keeps what they are of
-            gain_total += column_sums(dy * z, ROWS, WIDTH, 8)
-            shift_total += column_sums(dy, ROWS, WIDTH, 8)
-        dz = normalise_backward(dy, z, scale, inside(gain, tile), WIDTH)
+            norm_weight_total += column_sums(dy * z, ROWS, WIDTH, 8)
+            norm_bias_total += column_sums(dy, ROWS, WIDTH, 8)
+        dz = normalise_backward(dy, z, row_rstd, inside(norm_weight, tile), WIDTH)
         # earlier there are no registers for it; it comes while the product runs
         a = tl.load(hidden + edge_at, mask=there, other=0.0)
         tl.store(second_gradient + edge_at, dz, mask=holds[:, None])
         later_place, later_holds = _edges_of(tile + tl.num_programs(0), count, ROWS, SLOTS)
-        later_scale = tl.load(deviation + later_place, mask=later_holds, other=0.0)
+        later_rstd = tl.load(rstd + later_place, mask=later_holds, other=0.0)
         dh = product(dz, second, PRECISION)
         dh = leaky_backward(dh, a.to(tl.float32))
         tl.store(hidden_gradient + edge_at, dh, mask=holds[:, None])
@@ -361,11 +366,11 @@ def edge_backward(
         received = weighted_sums(members(SUMS, ROWS, SLOTS), dh, PRECISION)
         tl.store(receive_gradient + mine[:, None] * WIDTH + column[None, :], received, mask=ends)
         tile += tl.num_programs(0)
-        scale = later_scale
+        row_rstd = later_rstd
     if OVERLAP:
         gdc_wait()
-    tl.atomic_add(totals + gain_at + column, tl.sum(gain_total, 0) * unscale, sem="relaxed")
-    tl.atomic_add(totals + shift_at + column, tl.sum(shift_total, 0) * unscale, sem="relaxed")
+    tl.atomic_add(totals + norm_weight_at + column, tl.sum(norm_weight_total, 0) * unscale, sem="relaxed")
+    tl.atomic_add(totals + norm_bias_at + column, tl.sum(norm_bias_total, 0) * unscale, sem="relaxed")
     if FIRST:
         axis = tl.arange(0, 16)[:, None]
         at = totals + own_at + axis * WIDTH + column[None, :]

@@ -51,7 +51,7 @@ def _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WI
 
 
 @triton.jit
-def encode_forward(
+def gns_encode_forward(
     position,
     sender,
     receiver,
@@ -61,14 +61,17 @@ def encode_forward(
     first_bias,
     second,
     second_bias,
-    gain,
-    shift,
+    norm_weight,
+    norm_bias,
     edge,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """edge [E, W] from sender minus receiver and their distance."""
+    """edge [E, W] from sender minus receiver and their distance.
+
+    Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
+    """
     count = tl.load(offset + particles)
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
@@ -76,12 +79,12 @@ def encode_forward(
     h = _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WIDTH)
     z = product(tl.maximum(h, 0.0), transposed(second, WIDTH, WIDTH), PRECISION)
     z, _ = normalise(z + tl.load(second_bias + column)[None, :], WIDTH)
-    z = z * tl.load(gain + column)[None, :] + tl.load(shift + column)[None, :]
+    z = z * tl.load(norm_weight + column)[None, :] + tl.load(norm_bias + column)[None, :]
     tl.store(edge + row[:, None] * WIDTH + column[None, :], z, mask=live[:, None])
 
 
 @triton.jit
-def encode_norm_backward(
+def gns_encode_norm_backward(
     gradient,
     position,
     sender,
@@ -92,7 +95,7 @@ def encode_norm_backward(
     first_bias,
     second,
     second_bias,
-    gain,
+    norm_weight,
     activation,
     second_gradient,
     partial,
@@ -101,12 +104,15 @@ def encode_norm_backward(
     PRECISION: tl.constexpr,
 ):
     """The encoder backward through its norm, from the edges' gradient [E, W]: activation and second_gradient [E, W] are
-    the second layer's input and the gradient of its output; in `partial` [programs, 8, W] come first those of gain and
-    shift."""
+    the second layer's input and the gradient of its output; rows 0 and 1 of `partial` [programs, 8, W] are the norm's
+    weight's and bias's.
+
+    Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
+    """
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     second_t = transposed(second, WIDTH, WIDTH)
-    gain_total, shift_total = tl.zeros((BLOCK // 16, 8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
+    norm_weight_total, norm_bias_total = tl.zeros((BLOCK // 16, 8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     tile = tl.program_id(0).to(tl.int64)
     while tile * BLOCK < count:
         row = tile * BLOCK + tl.arange(0, BLOCK)
@@ -118,21 +124,21 @@ def encode_norm_backward(
         z = product(a, second_t, PRECISION) + tl.load(second_bias + column)[None, :]
         z, scale = normalise(z, WIDTH)
         dm = tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
-        if count > 0:  # see norm_backward, and why 0 z
-            shift_total += column_sums(dm, BLOCK, WIDTH, 8)
+        if count > 0:  # see gns_norm_backward, and why 0 z
+            norm_bias_total += column_sums(dm, BLOCK, WIDTH, 8)
         dm += 0.0 * z
         if count > 0:
-            gain_total += tl.sum(tl.reshape(dm * z, (BLOCK // 16, 2, 8, WIDTH)), 1)
-        dz = normalise_backward(dm, z, scale, inside(tl.load(gain + column), tile), WIDTH)
+            norm_weight_total += tl.sum(tl.reshape(dm * z, (BLOCK // 16, 2, 8, WIDTH)), 1)
+        dz = normalise_backward(dm, z, scale, inside(tl.load(norm_weight + column), tile), WIDTH)
         tl.store(second_gradient + at, dz, mask=live[:, None])
         tile += tl.num_programs(0)
     mine = partial + tl.program_id(0) * 8 * WIDTH + column
-    tl.store(mine, tl.sum(tl.sum(gain_total, 0), 0))
-    tl.store(mine + WIDTH, tl.sum(shift_total, 0))
+    tl.store(mine, tl.sum(tl.sum(norm_weight_total, 0), 0))
+    tl.store(mine + WIDTH, tl.sum(norm_bias_total, 0))
 
 
 @triton.jit
-def encode_layers_backward(
+def gns_encode_layers_backward(
     second_gradient,
     activation,
     position,
@@ -147,7 +153,10 @@ def encode_layers_backward(
     PRECISION: tl.constexpr,
 ):
     """The rest of the encoder backward: in `partial` [programs, 8, W] come last the gradients of the second bias, the
-    first layer's four columns and its bias."""
+    first layer's four columns and its bias.
+
+    Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
+    """
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     second_w = matrix(second, WIDTH, WIDTH)
@@ -180,7 +189,7 @@ def encode_layers_backward(
 
 
 @triton.jit
-def step_forward(
+def gns_step_forward(
     edge,
     edge_out,
     message_out,
@@ -193,8 +202,8 @@ def step_forward(
     own,
     second,
     second_bias,
-    gain,
-    shift,
+    norm_weight,
+    norm_bias,
     LAST: tl.constexpr,
     WIDTH: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -203,14 +212,16 @@ def step_forward(
     """message_out [E, W]: the edges' messages. edge_out [E, W] is edge with the messages added, unless LAST.
 
     send and receive [N, W], stored like edges, are the particles' products with the first layer, its bias in `receive`.
+
+    Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
     """
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     own_t = transposed(own, WIDTH, WIDTH)
     second_t = transposed(second, WIDTH, WIDTH)
     bias = tl.load(second_bias + column)
-    gain_row = tl.load(gain + column)
-    shift_row = tl.load(shift + column)
+    norm_weight_row = tl.load(norm_weight + column)
+    norm_bias_row = tl.load(norm_bias + column)
     tile = tl.program_id(0).to(tl.int64)
     while tile * BLOCK < count:
         row = tile * BLOCK + tl.arange(0, BLOCK)
@@ -224,7 +235,7 @@ def step_forward(
         h = product(state, own_t, PRECISION) + ends.to(tl.float32)
         z = product(tl.maximum(h, 0.0), second_t, PRECISION) + inside(bias, tile)[None, :]
         z, _ = normalise(z, WIDTH)
-        message = z * inside(gain_row, tile)[None, :] + inside(shift_row, tile)[None, :]
+        message = z * inside(norm_weight_row, tile)[None, :] + inside(norm_bias_row, tile)[None, :]
         tl.store(message_out + at, message, mask=live[:, None])
         if not LAST:
             # read again: registers are dearer than a cache
@@ -234,7 +245,7 @@ def step_forward(
 
 
 @triton.jit
-def norm_backward(
+def gns_norm_backward(
     sum_gradient,
     gradient,
     edge,
@@ -247,7 +258,7 @@ def norm_backward(
     own,
     second,
     second_bias,
-    gain,
+    norm_weight,
     activation,
     second_gradient,
     partial,
@@ -258,17 +269,19 @@ def norm_backward(
 ):
     """A step backward through its norm, from the gradients of the sums [N, W] and of edge_out (none if LAST).
 
-    activation and second_gradient [E, W] are the second layer's input and the gradient of its output; in `partial`
-    [programs, 3, W] come first those of gain and shift. All gradients are multiplied by the graph's scale; those of the
-    sums, send and receive are stored like edges.
+    activation and second_gradient [E, W] are the second layer's input and the gradient of its output; rows 0 and 1 of
+    `partial` [programs, 3, W] are the norm's weight's and bias's. All gradients are multiplied by the graph's scale;
+    those of the sums, send and receive are stored like edges.
+
+    Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
     """
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     own_t = transposed(own, WIDTH, WIDTH)
     second_t = transposed(second, WIDTH, WIDTH)
     bias = tl.load(second_bias + column)
-    gain_row = tl.load(gain + column)
-    gain_total, shift_total = tl.zeros((BLOCK // 16, 8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
+    norm_weight_row = tl.load(norm_weight + column)
+    norm_weight_total, norm_bias_total = tl.zeros((BLOCK // 16, 8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     tile = tl.program_id(0).to(tl.int64)
     while tile * BLOCK < count:
         row = tile * BLOCK + tl.arange(0, BLOCK)
@@ -289,23 +302,23 @@ def norm_backward(
             dm += tl.load(gradient + at, mask=live[:, None], other=0.0).to(tl.float32)
         if count > 0:  # always; else the compiler keeps the summands to the loop's end, and registers spill
             # rows that one thread has, here as they were loaded, below in the matrix units' layout
-            shift_total += column_sums(dm, BLOCK, WIDTH, 8)
+            norm_bias_total += column_sums(dm, BLOCK, WIDTH, 8)
         z = product(a, second_t, PRECISION) + inside(bias, tile)[None, :]
         z, scale = normalise(z, WIDTH)
         # 0 z: else the compiler brings z, and with it float32, to where dm was loaded
         dm = dm.to(summed.dtype).to(tl.float32) + 0.0 * z
         if count > 0:
-            gain_total += tl.sum(tl.reshape(dm * z, (BLOCK // 16, 2, 8, WIDTH)), 1)
-        dz = normalise_backward(dm, z, scale, inside(gain_row, tile), WIDTH)
+            norm_weight_total += tl.sum(tl.reshape(dm * z, (BLOCK // 16, 2, 8, WIDTH)), 1)
+        dz = normalise_backward(dm, z, scale, inside(norm_weight_row, tile), WIDTH)
         tl.store(second_gradient + at, dz, mask=live[:, None])
         tile += tl.num_programs(0)
     mine = partial + tl.program_id(0) * 3 * WIDTH + column
-    tl.store(mine, tl.sum(tl.sum(gain_total, 0), 0))
-    tl.store(mine + WIDTH, tl.sum(shift_total, 0))
+    tl.store(mine, tl.sum(tl.sum(norm_weight_total, 0), 0))
+    tl.store(mine + WIDTH, tl.sum(norm_bias_total, 0))
 
 
 @triton.jit
-def layers_backward(
+def gns_layers_backward(
     second_gradient,
     activation,
     gradient,
@@ -322,7 +335,10 @@ def layers_backward(
     PRECISION: tl.constexpr,
 ):
     """The rest of the step backward: hidden_gradient [E, W] is that before the activation, edge_gradient [E, W] that of
-    the edges that came in; in `partial` [programs, 3, W] comes last the second bias's."""
+    the edges that came in; in `partial` [programs, 3, W] comes last the second bias's.
+
+    Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
+    """
     count = tl.load(offset + particles)
     column = tl.arange(0, WIDTH)
     own_w = matrix(own, WIDTH, WIDTH)
@@ -349,7 +365,7 @@ def layers_backward(
 
 
 @triton.jit
-def edge_sums(
+def gns_edge_sums(
     value,
     order,
     offset,
@@ -361,7 +377,10 @@ def edge_sums(
     BLOCK: tl.constexpr,
 ):
     """total [N, W]: the sum of each particle's rows of `value` [E, W], those from its offset to the next one's, or with
-    ORDERED those that `order` [E] has there; SCALED: divided by the scale. A program a particle."""
+    ORDERED those that `order` [E] has there; SCALED: divided by the scale. A program a particle.
+
+    Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
+    """
     particle = tl.program_id(0)
     column = tl.arange(0, WIDTH)
     block = tl.load(offset + particle)
@@ -404,7 +423,7 @@ def _weight_product(left, right, count, partial, WIDTH: tl.constexpr, STEP: tl.c
 
 
 @triton.jit
-def weight_products(
+def gns_weight_products(
     second_gradient,
     activation,
     hidden_gradient,
@@ -418,7 +437,10 @@ def weight_products(
     PRECISION: tl.constexpr,
 ):
     """partial [programs, 1 or 2, W, W]: the gradients of the second and, with BOTH, of the first layer's part for the
-    edge, of the program's share of the edges."""
+    edge, of the program's share of the edges.
+
+    Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
+    """
     count = tl.load(offset + particles)
     mine = partial + tl.program_id(0).to(tl.int64) * (2 if BOTH else 1) * WIDTH * WIDTH
     _weight_product(second_gradient, activation, count, mine, WIDTH, STEP, PRECISION)

@@ -12,14 +12,14 @@ import torch
 import triton
 
 from hgn.kernels.gns.kernel import (
-    edge_sums,
-    encode_forward,
-    encode_layers_backward,
-    encode_norm_backward,
-    layers_backward,
-    norm_backward,
-    step_forward,
-    weight_products,
+    gns_edge_sums,
+    gns_encode_forward,
+    gns_encode_layers_backward,
+    gns_encode_norm_backward,
+    gns_layers_backward,
+    gns_norm_backward,
+    gns_step_forward,
+    gns_weight_products,
 )
 from hgn.kernels.packing import rounded_to_tf32
 from hgn.network.gns_edges import Edges, Ends, Graph, Weights
@@ -63,9 +63,9 @@ class FusedEdges(Edges):
         edges, width = graph.neighbours.edge_count, len(weights.second)
         edge_EW = torch.empty(edges, width, dtype=self._dtype, device=weights.second.device)
         if edges:
-            encode_forward[(triton.cdiv(edges, self.tuning.block),)](
+            gns_encode_forward[(triton.cdiv(edges, self.tuning.block),)](
                 **self._encoder(graph, first_bias_W, weights),
-                shift=weights.shift,
+                norm_bias=weights.shift,
                 edge=edge_EW,
                 WIDTH=width,
                 BLOCK=self.tuning.block,
@@ -83,7 +83,7 @@ class FusedEdges(Edges):
         programs = self._programs(tuning.backward_programs, wanted, gradient_EW.device)
         partial_P8W = weights.second.new_empty(programs, 8, width)
         encoder = self._encoder(graph, first_bias_W, weights)
-        encode_norm_backward[(programs,)](
+        gns_encode_norm_backward[(programs,)](
             gradient=gradient_EW,
             **encoder,
             activation=activation_EW,
@@ -94,10 +94,10 @@ class FusedEdges(Edges):
             PRECISION=self.precision,
             num_warps=tuning.backward_warps,
         )
-        encode_layers_backward[(programs,)](
+        gns_encode_layers_backward[(programs,)](
             second_gradient=second_EW,
             activation=activation_EW,
-            **{name: encoder[name] for name in encoder.keys() - {"first", "first_bias", "second_bias", "gain"}},
+            **{name: encoder[name] for name in encoder.keys() - {"first", "first_bias", "second_bias", "norm_weight"}},
             partial=partial_P8W,
             WIDTH=width,
             BLOCK=tuning.backward_block,
@@ -116,12 +116,12 @@ class FusedEdges(Edges):
         message_EW = torch.empty_like(edge_EW)
         edges, width = edge_EW.shape
         programs = self._programs(self.tuning.programs, triton.cdiv(edges, self.tuning.block), edge_EW.device)
-        step_forward[(programs,)](
+        gns_step_forward[(programs,)](
             edge=edge_EW,
             edge_out=edge_EW if out_EW is None else out_EW,
             message_out=message_EW,
             **self._step(graph, ends, weights),
-            shift=weights.shift,
+            norm_bias=weights.shift,
             LAST=last,
             WIDTH=width,
             BLOCK=self.tuning.block,
@@ -148,7 +148,7 @@ class FusedEdges(Edges):
         last = gradient_EW is None
         gradient_EW = edge_EW if gradient_EW is None else gradient_EW.contiguous()
         step = self._step(graph, ends, weights)
-        norm_backward[(programs,)](
+        gns_norm_backward[(programs,)](
             sum_gradient=self._stored(sum_gradient_NW * graph.scale),
             gradient=gradient_EW,
             edge=edge_EW,
@@ -162,7 +162,7 @@ class FusedEdges(Edges):
             PRECISION=self.precision,
             num_warps=tuning.backward_warps,
         )
-        layers_backward[(programs,)](
+        gns_layers_backward[(programs,)](
             second_gradient=second_EW,
             activation=activation_EW,
             gradient=gradient_EW,
@@ -222,7 +222,7 @@ class FusedEdges(Edges):
             "particles": receivers.count,
             "second": self._operand(weights.second),
             "second_bias": weights.bias,
-            "gain": weights.gain,
+            "norm_weight": weights.gain,
         }
 
     def _sums(
@@ -237,7 +237,7 @@ class FusedEdges(Edges):
         receivers = graph.neighbours.receivers
         order_E, offset_N1 = by_sender or (receivers.segment_E, receivers.offset_N1)
         total_NW = torch.empty_like(like_NW, memory_format=torch.contiguous_format)
-        edge_sums[(receivers.count,)](
+        gns_edge_sums[(receivers.count,)](
             value=value_EW,
             order=order_E,
             offset=offset_N1,
@@ -263,7 +263,7 @@ class FusedEdges(Edges):
         programs = self._programs(tuning.product_programs, triton.cdiv(edges, tuning.product_rows), second_EW.device)
         shape = (programs, 1 if own is None else 2, width, width)
         partial_PCWW = torch.empty(shape, dtype=torch.float32, device=second_EW.device)
-        weight_products[(programs,)](
+        gns_weight_products[(programs,)](
             second_gradient=second_EW,
             activation=activation_EW,
             hidden_gradient=second_EW if own is None else own[0],

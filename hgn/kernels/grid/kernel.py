@@ -51,13 +51,16 @@ def mark_cells(
     particle_count,
     low,
     geometry,
-    mark,
+    occupied,
     status,
     cell_size,
     LEVELS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Sets the slots of the cells that particles reach, and of their ancestors; one pass for all levels."""
+    """Sets the slots of the cells that particles reach, and of their ancestors; one pass for all levels.
+
+    Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
+    """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -82,7 +85,7 @@ def mark_cells(
     levels = ()
     for level in tl.static_range(LEVELS):
         levels = levels + (_slots_of(geometry, level),)  # noqa: RUF005 - Triton knows no unpacking here
-    # all levels are read before the first mark is written: the compiler keeps that order, and would wait for each
+    # all levels are read before the first slot is written: the compiler keeps that order, and would wait for each
     for level in tl.static_range(LEVELS):
         slots = levels[level]
         for corner in tl.static_range(8):
@@ -97,50 +100,50 @@ def mark_cells(
                 first = first & (cy != y >> level)
             if corner & 1:
                 first = first & (cz != z >> level)
-            tl.store(mark + _slot(cx, cy, cz, scene, slots), 1, mask=first)
+            tl.store(occupied + _slot(cx, cy, cz, scene, slots), 1, mask=first)
 
 
 @triton.jit
-def _marked(mark, slot, ask):
+def _marked(occupied, slot, ask):
     """Whether the cell in a slot is active."""
-    return ask & (tl.load(mark + slot, mask=ask, other=0) > 0)
+    return ask & (tl.load(occupied + slot, mask=ask, other=0) > 0)
 
 
 @triton.jit
-def _number(rank, slot, first, capacity, there):
+def _number(prefix_sum, slot, first, capacity, there):
     """The number of the cell in a slot, -1 where it is not active."""
-    cell = tl.load(rank + slot, mask=there, other=0) - 1 - first
+    cell = tl.load(prefix_sum + slot, mask=there, other=0) - 1 - first
     return tl.where(there & (cell < capacity), cell, -1)
 
 
 @triton.jit
-def _cell(mark, rank, slot, first, capacity, ask):
+def _cell(occupied, prefix_sum, slot, first, capacity, ask):
     """The same, of slots that may be asked for."""
-    return _number(rank, slot, first, capacity, _marked(mark, slot, ask))
+    return _number(prefix_sum, slot, first, capacity, _marked(occupied, slot, ask))
 
 
 @triton.jit
-def _write_cells(table, cell, live, mark, rank, slots, first, capacity, own_capacity, COUNT: tl.constexpr):
+def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity, own_capacity, COUNT: tl.constexpr):
     """Line i of the table [COUNT, own_capacity] gets the numbers of the cells in slots i of the tuple `slots`.
 
     All are read before the first is written: the compiler keeps that order, and would wait for each in turn.
     """
     there = ()
     for i in tl.static_range(COUNT):
-        there = there + (_marked(mark, slots[i], live),)  # noqa: RUF005 - Triton knows no unpacking here
+        there = there + (_marked(occupied, slots[i], live),)  # noqa: RUF005 - Triton knows no unpacking here
     found = ()
     for i in tl.static_range(COUNT):
-        found = found + (_number(rank, slots[i], first, capacity, there[i]),)  # noqa: RUF005
+        found = found + (_number(prefix_sum, slots[i], first, capacity, there[i]),)  # noqa: RUF005
     for i in tl.static_range(COUNT):
         tl.store(table + i * own_capacity + cell, found[i], mask=live)
 
 
 @triton.jit
 def fill_tables(
-    mark,
-    rank,
+    occupied,
+    prefix_sum,
     geometry,
-    slot_of,
+    slot_of_cell,
     neighbour,
     parent,
     octant,
@@ -151,7 +154,10 @@ def fill_tables(
     LEVELS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Each active slot writes its cell's neighbours, parent and children, int32, -1 where there is none."""
+    """Each active slot writes its cell's neighbours, parent and children, int32, -1 where there is none.
+
+    Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
+    """
     level = tl.program_id(1)
     line = geometry + level * GEOMETRY_COLUMNS
     start, slots = tl.load(line), tl.load(line + 1)
@@ -164,20 +170,20 @@ def fill_tables(
         tl.load(line + 5),
         tl.load(line + 6),
     )
-    first = tl.load(rank + start - 1, mask=level > 0, other=0)
+    first = tl.load(prefix_sum + start - 1, mask=level > 0, other=0)
     if tl.program_id(0) == 0:
-        total = tl.load(rank + start + slots - 1) - first
+        total = tl.load(prefix_sum + start + slots - 1) - first
         tl.store(needed + level, total)
         tl.store(counts + level, tl.minimum(total, capacity))
         if total > capacity:
             tl.atomic_or(status, OVERFLOW)
     local = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     slot = start + local
-    cell = _cell(mark, rank, slot, first, capacity, local < slots)
+    cell = _cell(occupied, prefix_sum, slot, first, capacity, local < slots)
     live = cell >= 0
     if tl.sum(live.to(tl.int32), 0) == 0:
         return
-    tl.store(slot_of + at + cell, local, mask=live)
+    tl.store(slot_of_cell + at + cell, local, mask=live)
     slots_of = ()
     for direction in tl.static_range(6):
         step = ny * nz
@@ -188,7 +194,7 @@ def fill_tables(
         if direction % 2 == 1:
             step = -step
         slots_of = slots_of + (slot + step,)  # noqa: RUF005
-    _write_cells(neighbour + 6 * at, cell, live, mark, rank, slots_of, first, capacity, capacity, 6)
+    _write_cells(neighbour + 6 * at, cell, live, occupied, prefix_sum, slots_of, first, capacity, capacity, 6)
     scene = local // stride
     inside = local % stride
     x, y, z = inside // (ny * nz) - 1, inside // nz % ny - 1, inside % nz - 1
@@ -198,13 +204,13 @@ def fill_tables(
         above_y, above_z = tl.load(above + 2), tl.load(above + 3)
         above_slot = tl.load(above) + scene * tl.load(above + 4)
         above_slot += (((x >> 1) + 1) * above_y + (y >> 1) + 1) * above_z + (z >> 1) + 1
-        above_first = tl.load(rank + tl.load(above) - 1)
-        found = _cell(mark, rank, above_slot, above_first, tl.load(above + 5), live)
+        above_first = tl.load(prefix_sum + tl.load(above) - 1)
+        found = _cell(occupied, prefix_sum, above_slot, above_first, tl.load(above + 5), live)
         tl.store(parent + at + cell, found, mask=live)
     if level > 0:
         below = line - GEOMETRY_COLUMNS
         below_y, below_z = tl.load(below + 2), tl.load(below + 3)
-        below_first = tl.load(rank + tl.load(below) - 1, mask=level > 1, other=0)
+        below_first = tl.load(prefix_sum + tl.load(below) - 1, mask=level > 1, other=0)
         below_start = tl.load(below) + scene * tl.load(below + 4)
         slots_below = ()
         for child in tl.static_range(8):
@@ -212,7 +218,7 @@ def fill_tables(
             below_slot = below_start + ((cx + 1) * below_y + cy + 1) * below_z + cz + 1
             slots_below = slots_below + (below_slot,)  # noqa: RUF005
         table = children + 8 * at
-        _write_cells(table, cell, live, mark, rank, slots_below, below_first, tl.load(below + 5), capacity, 8)
+        _write_cells(table, cell, live, occupied, prefix_sum, slots_below, below_first, tl.load(below + 5), capacity, 8)
 
 
 @triton.jit
@@ -345,8 +351,8 @@ def prepare_particles(
     particle_count,
     low,
     geometry,
-    mark,
-    rank,
+    occupied,
+    prefix_sum,
     mean,
     std,
     obstacle_table,
@@ -365,7 +371,10 @@ def prepare_particles(
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Features of each particle, see _store_features; its 8 cells, their weights, and its fraction."""
+    """Features of each particle, see _store_features; its 8 cells, their weights, and its fraction.
+
+    Reference: hgn.network.features; test: tests/kernels/test_network.py.
+    """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -389,7 +398,9 @@ def prepare_particles(
     cy = y[:, None] + (high_y & (fy > 0)[:, None]).to(tl.int32)
     cz = z[:, None] + (high_z & (fz > 0)[:, None]).to(tl.int32)
     here = live[:, None] & (corner >= 0)
-    cell = _cell(mark, rank, _slot(cx, cy, cz, scene[:, None], slots), 0, capacity, inside[:, None] & (corner >= 0))
+    cell = _cell(
+        occupied, prefix_sum, _slot(cx, cy, cz, scene[:, None], slots), 0, capacity, inside[:, None] & (corner >= 0)
+    )
     weight = tl.where(high_x, fx[:, None], 1 - fx[:, None])
     weight *= tl.where(high_y, fy[:, None], 1 - fy[:, None])
     weight *= tl.where(high_z, fz[:, None], 1 - fz[:, None])
@@ -443,7 +454,10 @@ def prepare_features(
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """The features alone, see _store_features."""
+    """The features alone, see _store_features.
+
+    Reference: hgn.network.features; test: tests/kernels/test_gns_update.py.
+    """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
         return

@@ -143,8 +143,8 @@ class DeviceGrid:
 
         self.geometry = torch.tensor(rows, dtype=torch.int32, device=device)
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
-        self.mark, self.rank = integers(start), integers(start)
-        self.slot_of, self._parent, self._octant = integers(at), integers(at), integers(at)
+        self.occupied, self.prefix_sum = integers(start), integers(start)
+        self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
         self._neighbour, self._children = integers(6 * at), integers(8 * at)
         self.counts_L, self.needed_L = integers(self.levels), integers(self.levels)
         self.status = integers(1)
@@ -178,7 +178,7 @@ class DeviceGrid:
         self, position: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor, count: torch.Tensor
     ) -> None:
         """Marks, numbers and tabulates the cells of all levels."""
-        self.mark.zero_()
+        self.occupied.zero_()
         kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
             position=position,
             scene_of=scene_N,
@@ -186,18 +186,18 @@ class DeviceGrid:
             particle_count=count,
             low=self.low,
             geometry=self.geometry,
-            mark=self.mark,
+            occupied=self.occupied,
             status=self.status,
             cell_size=self.cell_size,
             LEVELS=self.levels,
             BLOCK=MARK_BLOCK,
         )
-        torch.cumsum(self.mark, 0, dtype=torch.int32, out=self.rank)
+        torch.cumsum(self.occupied, 0, dtype=torch.int32, out=self.prefix_sum)
         kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](
-            mark=self.mark,
-            rank=self.rank,
+            occupied=self.occupied,
+            prefix_sum=self.prefix_sum,
             geometry=self.geometry,
-            slot_of=self.slot_of,
+            slot_of_cell=self.slot_of_cell,
             neighbour=self._neighbour,
             parent=self._parent,
             octant=self._octant,
@@ -240,8 +240,8 @@ class DeviceGrid:
             particle_count=count,
             low=self.low,
             geometry=self.geometry,
-            mark=self.mark,
-            rank=self.rank,
+            occupied=self.occupied,
+            prefix_sum=self.prefix_sum,
             mean=mean_3,
             std=std_3,
             obstacle_table=obstacles.row_S5 if obstacles else self.counts_L,

@@ -58,7 +58,7 @@ def _three_rows(pointer, WIDTH: tl.constexpr):
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
-def rows_forward(
+def mlp_forward(
     x,
     count_ptr,
     weights,
@@ -69,8 +69,8 @@ def rows_forward(
     bias_at,
     second_at,
     second_bias_at,
-    gain_at,
-    shift_at,
+    norm_weight_at,
+    norm_bias_at,
     gathered,
     index,
     octant,
@@ -101,12 +101,17 @@ def rows_forward(
     PRECISION: tl.constexpr,
     LOOP: tl.constexpr,
 ):
-    """With FINE the MLP's own products are finer than PRECISION, and read the weights themselves.
+    """y [R, OUT] of x [R, INPUT] as above: the encoder (paper step 0, with the products that steps 1 and 11 begin with),
+    messages to parents (3, 5, …) and to children (with their product, GATHER), the decoder (12).
+
+    With FINE the MLP's own products are finer than PRECISION, and read the weights themselves.
 
     FRACTION: the products that follow are a particle's part of its pairs: the first less what its fraction [R, 3] makes
     of the offsets' weights [3, W], the second with it.
 
     LOOP: a program takes one tile after the other, and reads its weights once.
+
+    Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
@@ -119,8 +124,8 @@ def rows_forward(
     if LOOP:
         lines = vectors(values, bias_at, next_bias_at_0, next_bias_at_1, bias_at, bias_at, WIDTH)
         bias, next_bias_0, next_bias_1 = vector(lines, 0), vector(lines, 1), vector(lines, 2)
-        lines = vectors(values, second_bias_at, gain_at, shift_at, shift_at, shift_at, OUT)
-        second_bias, gain, shift = vector(lines, 0), vector(lines, 1), vector(lines, 2)
+        lines = vectors(values, second_bias_at, norm_weight_at, norm_bias_at, norm_bias_at, norm_bias_at, OUT)
+        second_bias, norm_weight, norm_bias = vector(lines, 0), vector(lines, 1), vector(lines, 2)
         first = transposed(first_weights + first_at, WIDTH, INPUT)
         second = transposed((values if FINE else weights) + second_at, OUT, WIDTH)
         if NEXT > 0:
@@ -132,7 +137,7 @@ def rows_forward(
         next_bias_0 = optional_vector(values, next_bias_at_0, WIDTH)
         next_bias_1 = optional_vector(values, next_bias_at_1, WIDTH)
         second_bias = tl.load(values + second_bias_at + outs)
-        gain, shift = tl.load(values + gain_at + outs), tl.load(values + shift_at + outs)
+        norm_weight, norm_bias = tl.load(values + norm_weight_at + outs), tl.load(values + norm_bias_at + outs)
     tile = tl.program_id(0)
     if LOOP:
         x_rows = _rows_of(x, tile, count, INPUT, BLOCK)
@@ -170,10 +175,10 @@ def rows_forward(
             second_bias = tl.load(values + second_bias_at + outs)
         z += inside(second_bias, tile)[None, :]
         if NORM:
-            z, _scale = normalise(z, OUT)
+            z, _rstd = normalise(z, OUT)
             if IN_PLACE:
-                gain, shift = tl.load(values + gain_at + outs), tl.load(values + shift_at + outs)
-            z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
+                norm_weight, norm_bias = tl.load(values + norm_weight_at + outs), tl.load(values + norm_bias_at + outs)
+            z = z * inside(norm_weight, tile)[None, :] + inside(norm_bias, tile)[None, :]
         if RESIDUAL:
             z += x_tile
         tl.store(y + row[:, None] * OUT + outs[None, :], z, mask=live)
@@ -206,7 +211,7 @@ def rows_forward(
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
-def rows_backward(
+def mlp_backward(
     gradient,
     gradient_index,
     from_0,
@@ -220,8 +225,8 @@ def rows_backward(
     offset_at,
     second_at,
     second_bias_at,
-    gain_at,
-    shift_at,
+    norm_weight_at,
+    norm_bias_at,
     octant,
     next_at_0,
     next_at_1,
@@ -240,11 +245,13 @@ def rows_backward(
     BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """Gradients of all inputs of rows_forward.
+    """Gradients of all inputs of mlp_forward.
 
     The gradient of y is `gradient` (row gradient_index_r if GATHER) plus from_0, from_1 times their products' weights
     (NEXT). INTO: 0 no gradient of x, 1 write it, 2 add it to what is there. Gains, shifts and offset weights are summed
-    into `totals`, divided by the loss scale (`unscale`); hidden_gradient and second_gradient are left for the others.
+    into `totals`, divided by the loss rstd (`unscale`); hidden_gradient and second_gradient are left for the others.
+
+    Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
@@ -271,14 +278,14 @@ def rows_backward(
     if NORM:
         z = product(a, transposed(weights + second_at, OUT, WIDTH), PRECISION)
         z += tl.load(values + second_bias_at + outs)[None, :]
-        normalised, scale = normalise(z, OUT)
+        normalised, rstd = normalise(z, OUT)
         summand = tl.arange(0, 16)[:, None]  # the least that the matrix units take
         whole = tl.where((summand == 0) & live.trans(), 1.0, 0.0)
-        at_gain = totals + gain_at + summand * OUT + outs[None, :]
-        at_shift = totals + shift_at + summand * OUT + outs[None, :]
-        tl.atomic_add(at_gain, weighted_sums(whole, dy * normalised, PRECISION) * unscale, mask=summand < 1)
-        tl.atomic_add(at_shift, weighted_sums(whole, dy, PRECISION) * unscale, mask=summand < 1)
-        dz = normalise_backward(dy, normalised, scale, tl.load(values + gain_at + outs), OUT)
+        at_norm_weight = totals + norm_weight_at + summand * OUT + outs[None, :]
+        at_norm_bias = totals + norm_bias_at + summand * OUT + outs[None, :]
+        tl.atomic_add(at_norm_weight, weighted_sums(whole, dy * normalised, PRECISION) * unscale, mask=summand < 1)
+        tl.atomic_add(at_norm_bias, weighted_sums(whole, dy, PRECISION) * unscale, mask=summand < 1)
+        dz = normalise_backward(dy, normalised, rstd, tl.load(values + norm_weight_at + outs), OUT)
     else:
         dz = dy
     dz = tl.where(live, dz, 0.0)
@@ -302,7 +309,10 @@ def rows_backward(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def clear_rows(x, count_ptr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
-    """Zeros into the rows of x [.., W] that are in use: capacities have room for twice as many."""
+    """Zeros into the rows of x [.., W] that are in use: capacities have room for twice as many.
+
+    Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
+    """
     count = tl.load(count_ptr)
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     zeros = tl.zeros((BLOCK, WIDTH), x.dtype.element_ty)
@@ -325,6 +335,8 @@ def gather_sums(
 
     In a kernel of its own where there are many rows: its programs are small enough that many wait at once, while a
     kernel with products has registers for two rows at a time.
+
+    Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
@@ -357,7 +369,10 @@ def gather_project(
     LOOP: tl.constexpr,
 ):
     """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products of y, the
-    second with a bias. LOOP as in rows_forward."""
+    second with a bias. LOOP as in mlp_forward.
+
+    Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
+    """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -412,6 +427,8 @@ def gather_project_backward(
 
     With EDGES, x is [capacity, SUM, W], of the row listed for a direction the opposite direction's part is taken, and
     the product of `other` [capacity, W] with its own weights is added to the gradient.
+
+    Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
     """
     count = tl.load(count_ptr)
     if tl.program_id(0) * BLOCK >= count:

@@ -26,6 +26,8 @@ def momentum_directions(
     """Momentum of square blocks (hgn.network.orthogonal), which begin at `starts`, their rows `pitch` apart;
     Nesterov's, normalised, goes to direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does
     nothing.
+
+    Reference: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
     """
     if tl.load(status) != 0:
         return
@@ -62,6 +64,8 @@ def step_blocks(
 ):
     """Moves square blocks against their directions by rate times `step_size`, and shrinks them by rate times `decay`.
     Values and weights are written as `adam` does.
+
+    Reference: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
     """
     if tl.load(status) != 0:
         return

@@ -23,7 +23,10 @@ OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or too far from the 
 
 @triton.jit
 def cell_keys(position, scene_of, particle_count, key, status, size, particles, BLOCK: tl.constexpr):
-    """key [N], int64, of each particle's cell; rows beyond particle_count come behind all."""
+    """key [N], int64, of each particle's cell; rows beyond particle_count come behind all.
+
+    Reference: hgn.network.neighbours.neighbour_list; test: tests/kernels/test_neighbours.py.
+    """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)
     packed = tl.load(scene_of + row, mask=live, other=0).to(tl.int64)
@@ -46,6 +49,8 @@ def find_runs(
 ):
     """Of each sorted particle's runs of candidates, int32 [N, SIDE]: where each ends when they are counted one after
     the other, and what takes such a number to a place in the sorted particles. SIDE is RUNS, and empty ones.
+
+    Reference: hgn.network.neighbours.neighbour_list; test: tests/kernels/test_neighbours.py.
     """
     count = tl.load(particle_count)
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -93,6 +98,8 @@ def walk_neighbours(
 ):
     """counts [N], int64, of each sorted particle, itself among them; with FILL sender and receiver [E] of each edge,
     int64, grouped by receiver, none beyond `capacity`. Positions are in the sorted order.
+
+    Reference: hgn.network.neighbours.neighbour_list; test: tests/kernels/test_neighbours.py.
     """
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = place < particles
@@ -132,7 +139,10 @@ def walk_neighbours(
 
 @triton.jit
 def check_room(offset, particles, capacity, needed, status):
-    """Writes down how many edges there are, and whether they have room."""
+    """Writes down how many edges there are, and whether they have room.
+
+    Reference: hgn.network.neighbours.neighbour_list; test: tests/kernels/test_neighbours.py.
+    """
     total = tl.load(offset + particles)
     tl.store(needed, total.to(tl.int32))
     if total > capacity:

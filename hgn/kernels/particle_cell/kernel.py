@@ -82,7 +82,7 @@ def _first_layer(choice, rows, of_cells, TO_CELL: tl.constexpr, PRECISION: tl.co
 
 
 @triton.jit
-def pairs_forward(
+def particle_cell_forward(
     by_particle,
     by_cell,
     particle,
@@ -94,11 +94,11 @@ def pairs_forward(
     offset_at,
     second_at,
     second_bias_at,
-    gain_at,
-    shift_at,
+    norm_weight_at,
+    norm_bias_at,
     hidden,
     normalised,
-    deviation,
+    rstd,
     out,
     TO_CELL: tl.constexpr,
     SAVE: tl.constexpr,
@@ -106,12 +106,14 @@ def pairs_forward(
     PARTICLES: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """TO_CELL: out [C, W] += weight * MLP(by_particle_n + offset). Otherwise out [N, W] = particle + sum over the
-    corners of weight * MLP(by_cell_c + by_particle_n - offset). The by_… are products with first-layer weights,
-    by_particle with the particle's part of the offset: what is left of it are the corner's three bits.
+    """Paper step 1 (TO_CELL): out [C, W] += weight * MLP(by_particle_n + offset). Paper step 11: out [N, W] =
+    particle + sum over the corners of weight * MLP(by_cell_c + by_particle_n - offset). The by_… are products with
+    first-layer weights, by_particle with the particle's part of the offset: what is left of it are the corner's bits.
 
-    SAVE keeps what pairs_backward reads: the normalised output [8 N, W], one over its deviation, and the hidden layer
-    unless BY_PRODUCT: then it is cheaper to compute again.
+    SAVE keeps what particle_cell_backward reads: the normalised output [8 N, W], `rstd` [8 N], one over its rstd,
+    and the hidden layer unless BY_PRODUCT: then it is cheaper to compute again.
+
+    Reference: hgn.kernels.particle_cell.reference; test: tests/kernels/test_kernels_alone.py.
     """
     ROWS: tl.constexpr = PARTICLES * 8
     SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
@@ -121,7 +123,7 @@ def pairs_forward(
     column = tl.arange(0, WIDTH)
     # vectors once: in the loop each would be waited for again
     second_bias = tl.load(values + second_bias_at + column)
-    gain, shift = tl.load(values + gain_at + column), tl.load(values + shift_at + column)
+    norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
     # Where it is exact, a particle's row comes to its pairs by a product, with the bits' rows in its spare places.
     BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)
     SIGN: tl.constexpr = 1 if TO_CELL else -1
@@ -166,11 +168,11 @@ def pairs_forward(
         if SAVE and not BY_PRODUCT:
             tl.store(hidden + pair_at, a, mask=here)
         z = product(a, second, PRECISION)
-        z, scale = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
+        z, row_rstd = normalise_once(z + inside(second_bias, tile)[None, :], WIDTH, PRECISION)
         if SAVE:
             tl.store(normalised + pair_at, z, mask=here)
-            tl.store(deviation + owner * 8 + corner, scale, mask=live)
-        z = z * inside(gain, tile)[None, :] + inside(shift, tile)[None, :]
+            tl.store(rstd + owner * 8 + corner, row_rstd, mask=live)
+        z = z * inside(norm_weight, tile)[None, :] + inside(norm_bias, tile)[None, :]
         if TO_CELL:
             z = z * weight[:, None]
             # a weight of zero points at a cell that may be another's: it adds nothing
@@ -206,7 +208,7 @@ def _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS: tl.constexpr):
 
 
 @triton.jit
-def pairs_backward(
+def particle_cell_backward(
     gradient,
     by_particle,
     by_cell,
@@ -219,11 +221,11 @@ def pairs_backward(
     totals,
     offset_at,
     second_at,
-    gain_at,
-    shift_at,
+    norm_weight_at,
+    norm_bias_at,
     hidden,
     normalised,
-    deviation,
+    rstd,
     second_gradient,
     by_particle_gradient,
     by_cell_gradient,
@@ -237,6 +239,8 @@ def pairs_backward(
 
     second_gradient [8 N, W] is left for the weight product. Where the hidden layer was not kept it is computed again,
     to the same bits.
+
+    Reference: hgn.kernels.particle_cell.reference; test: tests/kernels/test_kernels_alone.py.
     """
     ROWS: tl.constexpr = PARTICLES * 8
     SUMS: tl.constexpr = 16  # the least that the matrix units take; room for PARTICLES sums and three more
@@ -245,11 +249,11 @@ def pairs_backward(
         return
     column = tl.arange(0, WIDTH)
     second = matrix(weights + second_at, WIDTH, WIDTH)
-    gain = tl.load(values + gain_at + column)
+    norm_weight = tl.load(values + norm_weight_at + column)
     sums = tl.arange(0, SUMS)
-    gain_total, shift_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
+    norm_weight_total, norm_bias_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     side_total = tl.zeros((SUMS, WIDTH), tl.float32)
-    BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)  # as in pairs_forward
+    BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)  # as in particle_cell_forward
     if BY_PRODUCT:
         SIGN: tl.constexpr = 1 if TO_CELL else -1
         choice = _choice(PARTICLES, SUMS, SIGN)
@@ -269,16 +273,16 @@ def pairs_backward(
             rows = _particles(by_particle, tile, count, PARTICLES, SUMS, WIDTH)
         else:
             a = tl.load(hidden + pair_at, mask=here, other=0.0)
-        scale = tl.load(deviation + owner * 8 + corner, mask=live, other=0.0)
+        row_rstd = tl.load(rstd + owner * 8 + corner, mask=live, other=0.0)
         if TO_CELL:
             dy = tl.load(gradient + cell[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
         else:
             dy = tl.load(gradient + owner[:, None] * WIDTH + column[None, :], mask=here, other=0.0)
         dy, z = dy * weight[:, None], z.to(tl.float32)
         if tile >= 0:  # always, and the compiler does not know: else it puts these sums off, and keeps what they are of
-            gain_total += column_sums(dy * z, ROWS, WIDTH, 8)
-            shift_total += column_sums(dy, ROWS, WIDTH, 8)
-        dz = normalise_backward(dy, z, scale, inside(gain, tile), WIDTH)
+            norm_weight_total += column_sums(dy * z, ROWS, WIDTH, 8)
+            norm_bias_total += column_sums(dy, ROWS, WIDTH, 8)
+        dz = normalise_backward(dy, z, row_rstd, inside(norm_weight, tile), WIDTH)
         tl.store(second_gradient + pair_at, dz, mask=here)
         later = _pairs_of(tile + tl.num_programs(0), count, cell_of, weight_of, fraction, ROWS)
         if BY_PRODUCT:
@@ -305,8 +309,8 @@ def pairs_backward(
         side_total += summed
         tile += tl.num_programs(0)
         cell, weight, side_0, side_1, side_2 = later
-    tl.atomic_add(totals + gain_at + column, tl.sum(gain_total, 0) * unscale, sem="relaxed")
-    tl.atomic_add(totals + shift_at + column, tl.sum(shift_total, 0) * unscale, sem="relaxed")
+    tl.atomic_add(totals + norm_weight_at + column, tl.sum(norm_weight_total, 0) * unscale, sem="relaxed")
+    tl.atomic_add(totals + norm_bias_at + column, tl.sum(norm_bias_total, 0) * unscale, sem="relaxed")
     axis = sums[:, None] - (SUMS - 3)
     sign = unscale if TO_CELL else -unscale
     at = totals + offset_at + axis * WIDTH + column[None, :]
@@ -350,7 +354,7 @@ def _weight_tile(
 
 
 @triton.jit
-def pairs_weight_gradient(
+def particle_cell_weight_gradient(
     second_gradient,
     by_particle,
     by_cell,
@@ -369,11 +373,13 @@ def pairs_weight_gradient(
     PIPELINED: tl.constexpr,
 ):
     """Gradients of the second layer and its bias, as weight_gradient makes them, where the hidden layer was not kept:
-    it is computed again, to the same bits, from an eighth of the bytes. Tiles come from behind: what pairs_backward
-    wrote last is still in the L2 cache.
+    it is computed again, to the same bits, from an eighth of the bytes. Tiles come from behind: what
+    particle_cell_backward wrote last is still in the L2 cache.
 
     PIPELINED: the compiler has a counted loop's tiles copied to shared memory two ahead. The interpreter of Triton 3.6
     counts to no number that was loaded.
+
+    Reference: hgn.kernels.particle_cell.reference; test: tests/kernels/test_kernels_alone.py.
     """
     SUMS: tl.constexpr = 16
     count = tl.load(count_ptr)

@@ -36,6 +36,8 @@ def integrate(
 
     Where the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its
     own size are counted in `lost`, once an axis; `advance` then ends the simulation.
+
+    Reference: hgn.runtime.simulator.Simulator on the torch backend; test: tests/kernels/test_rollout.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -69,7 +71,10 @@ def integrate(
 
 @triton.jit
 def advance(status, lost, frame):
-    """Counts the frame, unless it was not taken."""
+    """Counts the frame, unless it was not taken.
+
+    Reference: hgn.runtime.simulator.Simulator on the torch backend; test: tests/kernels/test_rollout.py.
+    """
     if tl.load(status) == 0:
         tl.store(frame, tl.load(frame) + 1)
         if tl.load(lost) > 0:

@@ -43,6 +43,8 @@ def draw_waves(
 
     waves [S, WAVES, 4 + 3 HISTORY]: wave vector (direction uniform, length log-uniform), phase, and what the amplitude
     gains with each velocity, the oldest first.
+
+    Reference: hgn.training.noise; test: tests/kernels/test_update.py.
     """
     scene = tl.program_id(0)
     sample = samples + (tl.load(update).to(tl.int64) * scenes + scene) * SAMPLE_COLUMNS
@@ -99,6 +101,8 @@ def assemble_batch(
     Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY the window is the image of the
     stored one; velocities come from the stored positions, for mirrored ones are rounded. SCENES: a power of two, at
     least `scenes`.
+
+    Reference: hgn.training.noise; test: tests/kernels/test_update.py.
     """
     table = samples + tl.load(update).to(tl.int64) * scenes * SAMPLE_COLUMNS
     domains = sample_domain + tl.load(update) * scenes * 3
@@ -191,6 +195,8 @@ def loss_gradient(
 ):
     """Mean squared error of the normalised acceleration over axes, particles, scenes; its gradient times `scale`.
     Errors above `huber` count linearly.
+
+    Reference: torch's huber_loss and autograd; test: tests/kernels/test_update.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -209,13 +215,19 @@ def loss_gradient(
 
 @triton.jit
 def tell_overflow(status, flag):
-    """Puts into the gradient's last element whether this rank must repeat the update: it travels with the gradient."""
+    """Puts into the gradient's last element whether this rank must repeat the update: it travels with the gradient.
+
+    Test: tests/kernels/test_ranks.py.
+    """
     tl.store(flag, (tl.load(status) & AGAIN).to(tl.float32))
 
 
 @triton.jit
 def square_norm(gradient, size, share, flag, status, norm, BLOCK: tl.constexpr):
-    """Adds the squares of `gradient` times `share` to norm[0]; not finite if one of them is not."""
+    """Adds the squares of `gradient` times `share` to norm[0]; not finite if one of them is not.
+
+    Test: tests/kernels/test_ranks.py.
+    """
     if tl.program_id(0) == 0 and tl.load(flag) > 0:
         tl.atomic_or(status, REPEAT)
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -245,6 +257,8 @@ def adam(
 
     rates [updates]; step, float64 [1], counts the steps made. `weight` is the copy that products at
     this precision read. `others`, int8 [size] or none, tells which elements another optimiser steps.
+
+    Reference: torch.optim.Adam; test: tests/kernels/test_update.py.
     """
     if tl.load(status) != 0:
         return
@@ -279,6 +293,8 @@ def average_values(value, average, shares, update, status, size, BLOCK: tl.const
     """Moving average of the values, with the update's share, shares [updates], of the new ones.
 
     Not while the update has to be made again; after one that was skipped, with the values that stayed.
+
+    Reference: hgn.training.module's average; test: tests/kernels/test_training.py.
     """
     if (tl.load(status) & AGAIN) != 0:
         return
@@ -295,6 +311,8 @@ def finish_update(status, update, step, loss, norm, loss_sum, counters):
 
     loss_sum: sum and number of finite losses. counters: sum of finite norms, how many those are, skipped updates,
     skipped in a row, most in a row.
+
+    Test: tests/kernels/test_update.py.
     """
     if (tl.load(status) & AGAIN) == 0:
         tl.store(update, tl.load(update) + 1)

@@ -34,6 +34,8 @@ def weight_gradient(
     """Program i adds its chunk's part of A^T B [width A, width B] to totals; widths are at most TILE.
 
     PIPELINED: the compiler has tiles copied to shared memory two ahead, as it has not in the interpreter.
+
+    Reference: hgn.kernels.weight_gradient.reference; test: tests/kernels/test_kernels_alone.py.
     """
     job = jobs + tl.load(chunk_job + tl.program_id(0)) * 8
     first = tl.load(chunk_first + tl.program_id(0))
