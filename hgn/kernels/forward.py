@@ -62,10 +62,8 @@ class Tuning:
     @staticmethod
     def of(precision: str) -> Tuning:
         """What was fastest on an H100 at width 128."""
-        if precision == "fp32" and triton.knobs.runtime.interpret:
-            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
         if precision == "fp32":
-            return Tuning(4, 8, 4, 8, 16, 8, 8, 4, 8, 528)
+            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
         if precision == "tf32":  # operands of twice the size
             return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8, 528)
         half = Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, 1056, dense=True, overlap=True, loops=True)
@@ -269,8 +267,8 @@ class FusedNetwork(Buffers):
         return target.backend == "cuda" and target.arch >= 90
 
     def keeps_pair_hidden(self) -> bool:
-        """Whether the pairs' hidden layer is kept for the backward pass, and not computed again: see particle_cell_forward."""
-        return self.precision == "tf32" or (self.precision == "fp32" and not triton.knobs.runtime.interpret)
+        """Whether the hidden layer of the pairs is kept for the backward pass (see particle_cell_forward)."""
+        return self.precision == "tf32"
 
     def _edge_cells(self, block: int) -> int:
         """Cells that a tile of edges takes where it has rows for `block` of eight each."""

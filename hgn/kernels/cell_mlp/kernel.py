@@ -65,8 +65,8 @@ def cell_mlp_forward(
     OVERLAP: tl.constexpr,
     PREFETCH: tl.constexpr,
 ):
-    """Paper steps 2, 4, … (fig. 5): the cells' new features from theirs and their edges' sums, all [C, W], and up to two
-    products of them, of which the second with a bias.
+    """Paper steps 2, 4, … (fig. 5): the cells' new features from theirs and their edges' sums, all [C, W], and up to
+    two products of them, of which the second with a bias.
 
     RESIDENT: all weights are read before the first tile, and kept. LOOP: a program has more than one tile.
 

@@ -22,7 +22,6 @@ import triton.language as tl
 from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 
 from hgn.kernels.blocks import (
-    EXACT_FP32,
     added,
     chosen_rows,
     column_sums,
@@ -152,7 +151,7 @@ def edge_forward(
     second_bias = tl.load(values + second_bias_at + column)
     norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
     # Where it is exact, a cell's row comes to its edges by a product, with the sides' rows in its spare places.
-    BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)
+    BY_PRODUCT: tl.constexpr = PRECISION != "tf32"
     if BY_PRODUCT:
         receiver = chosen_rows(ROWS, SLOTS, SUMS)
         member = tl.arange(0, SUMS)

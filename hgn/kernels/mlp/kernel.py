@@ -101,8 +101,8 @@ def mlp_forward(
     PRECISION: tl.constexpr,
     LOOP: tl.constexpr,
 ):
-    """y [R, OUT] of x [R, INPUT] as above: the encoder (paper step 0, with the products that steps 1 and 11 begin with),
-    messages to parents (3, 5, …) and to children (with their product, GATHER), the decoder (12).
+    """y [R, OUT] of x [R, INPUT] as above: the encoder (paper step 0, with the products that steps 1 and 11 take),
+    messages to parents (3, 5, …) and from them (7, 9, …; GATHER), the decoder (12).
 
     With FINE the MLP's own products are finer than PRECISION, and read the weights themselves.
 

@@ -10,7 +10,6 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import (
-    EXACT_FP32,
     added,
     chosen_rows,
     column_sums,
@@ -125,7 +124,7 @@ def particle_cell_forward(
     second_bias = tl.load(values + second_bias_at + column)
     norm_weight, norm_bias = tl.load(values + norm_weight_at + column), tl.load(values + norm_bias_at + column)
     # Where it is exact, a particle's row comes to its pairs by a product, with the bits' rows in its spare places.
-    BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)
+    BY_PRODUCT: tl.constexpr = PRECISION != "tf32"
     SIGN: tl.constexpr = 1 if TO_CELL else -1
     if BY_PRODUCT:
         choice = _choice(PARTICLES, SUMS, SIGN)
@@ -253,7 +252,7 @@ def particle_cell_backward(
     sums = tl.arange(0, SUMS)
     norm_weight_total, norm_bias_total = tl.zeros((8, WIDTH), tl.float32), tl.zeros((8, WIDTH), tl.float32)
     side_total = tl.zeros((SUMS, WIDTH), tl.float32)
-    BY_PRODUCT: tl.constexpr = PRECISION == "fp16" or (PRECISION == "fp32" and EXACT_FP32)  # as in particle_cell_forward
+    BY_PRODUCT: tl.constexpr = PRECISION != "tf32"  # as in particle_cell_forward
     if BY_PRODUCT:
         SIGN: tl.constexpr = 1 if TO_CELL else -1
         choice = _choice(PARTICLES, SUMS, SIGN)

@@ -6,11 +6,10 @@ from hgn.kernels.reference import Added, Outputs
 
 
 def weight_gradient(left, right, jobs, counts, **_) -> Outputs:
-    """Each entry of the list by itself. `right` gives, by their offsets, the buffers that lie about the kernel's one."""
+    """Each entry of the list by itself. `right` gives, by their offsets, the buffers about the kernel's own."""
     outputs: Outputs = {}
-    for number, (left_at, right_at, at, counted, left_width, right_width, multiple, bias_at) in enumerate(
-        jobs.tolist()
-    ):
+    for number, job in enumerate(jobs.tolist()):
+        left_at, right_at, at, counted, left_width, right_width, multiple, bias_at = job
         count = int(counts[counted]) * multiple
         a = left[left_at : left_at + count * left_width].view(count, left_width)
         b = right[right_at].flatten()[: count * right_width].view(count, right_width)
