@@ -13,7 +13,6 @@ from hgn.schema import ConfigError
 
 FAST_WIDTHS = (16, 32, 64, 128)
 FAST_LEVELS = 8
-FP32_WIDTH = 64  # wider matrices in three parts each do not fit into an H100's shared memory
 
 
 def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "tf32") -> str | None:
@@ -22,8 +21,8 @@ def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "
         return f"it computes hgn networks, not {config.kind}"
     if reason := _why_no_kernels(device) or _why_not_wide_so(config):
         return reason
-    if precision == "fp32" and config.width > FP32_WIDTH:
-        return f"with precision fp32 it computes widths up to {FP32_WIDTH}, not {config.width}"
+    if precision == "fp32":
+        return "it computes in tf32 or fp16, not fp32"
     if config.levels > FAST_LEVELS:
         return f"network.levels must be at most {FAST_LEVELS} for it, not {config.levels}"
     return None

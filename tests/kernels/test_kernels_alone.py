@@ -171,7 +171,7 @@ def test_several_scenes(precision: str, table: Table) -> None:
     judge, engine = Judge(table, precision), made(network, state, precision, ROOM)
     judged(judge, engine, network, state)
     assert not judge.wrong and (engine.grid.weight_N8[:5] == 0).any()  # cells on whose borders particles are
-    if precision == "fp16" or (precision == "fp32" and not NATIVE):
+    if precision != "tf32":
         assert judge.kernels == kernels_of("forward", "backward")
 
 

@@ -170,20 +170,18 @@ def test_rounded_reference() -> None:
 @gpu
 @pytest.mark.gpu
 @pytest.mark.parametrize(
-    ("precision", "width", "counts", "draws"),
+    ("precision", "counts", "draws"),
     [
-        ("tf32", 128, (300, 131, 77), 5),
-        ("fp16", 128, (300, 131, 77), 5),
-        ("fp32", 64, (131, 77), 1),
-        ("tf32", 128, (1,), 9),
+        ("tf32", (300, 131, 77), 5),
+        ("fp16", (300, 131, 77), 5),
+        ("tf32", (1,), 9),
     ],
 )
-def test_whole_networks_on_a_gpu(precision: str, width: int, counts: tuple[int, ...], draws: int) -> None:
-    """With all levels and steps outputs are within 1e-5 of float64 in float32, gradients within 1e-3. In TF32 and
-    float16 the median error of several states is at most 1.5 times that of the plain network in float64 with operands
-    so rounded (and what float16 keeps rounded): that is what rounding does, most of it by activations next to their
-    kink, and how much is chance for each state."""
-    network = network_of(width=width, levels=4, message_passing_steps=4)
+def test_whole_networks_on_a_gpu(precision: str, counts: tuple[int, ...], draws: int) -> None:
+    """With all levels and steps, in TF32 and float16, the median error of several states is at most 1.5 times that of
+    the plain network in float64 with operands so rounded (and what float16 keeps rounded): that is what rounding does,
+    most of it by activations next to their kink, and how much is chance for each state."""
+    network = network_of(width=128, levels=4, message_passing_steps=4)
     found, explained = [], []
     for seed in range(3, 3 + draws):
         state = float32_state(counts, seed=seed)
@@ -193,12 +191,11 @@ def test_whole_networks_on_a_gpu(precision: str, width: int, counts: tuple[int, 
         alone = run_forward(engine, network, state, origin_S3)
         expected = network.normalised_acceleration(state, origin_S3).detach()
         found.append((output, relative_error(alone, expected), together))
-        if precision != "fp32":
-            rounded_output, rounded_together = rounding_errors(network, state, precision == "fp16")
-            explained.append((rounded_output, rounded_output, rounded_together))
+        rounded_output, rounded_together = rounding_errors(network, state, precision == "fp16")
+        explained.append((rounded_output, rounded_output, rounded_together))
     assert all(output < OUTPUT_BOUND and alone < OUTPUT_BOUND for output, alone, _ in found)
     middle = torch.tensor(found).median(0).values
-    bounds = 1.5 * torch.tensor(explained).median(0).values if explained else torch.tensor([1e-5, 1e-5, 1e-3])
+    bounds = 1.5 * torch.tensor(explained).median(0).values
     assert (middle < bounds).all(), (middle, bounds)
 
 
