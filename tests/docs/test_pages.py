@@ -23,6 +23,8 @@ NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 CODE = re.compile(r"`[^`]+`")
 LINK = re.compile(r"!?\[(?:[^\]\\]|\\.)*\]\(([^)\s]+)\)")
 ADDRESS = re.compile(r"\S*(?:https?://|s3://)\S*")
+NAMES_IN = re.compile(r"((?:`[\w.]+`(?:, | and |,\n|\n)?)+)\s+in\s+`([\w/]+\.py)`")
+TESTS_IN = re.compile(r"`(tests/[\w/]+\.py)`\s+\(((?:`\w+`(?:,\s+)?)+)\)")
 # folders of the checkout whose names begin a path in prose
 PATH = re.compile(r"`((?:hgn|datagen|tools|tests|conf|jobs|docs|results)/[\w./-]*\w/?)`")
 
@@ -71,6 +73,24 @@ def test_paths_exist(page: Path) -> None:
     for number, line in prose_lines(page):
         for path in PATH.findall(line):
             assert (ROOT / path).exists(), f"{page.relative_to(ROOT)}:{number}: {path}"
+
+
+def test_names_exist() -> None:
+    """What a page says to be in a file is there: "`NAME` in `FILE`", and names in brackets behind a file of tests."""
+    checked = 0
+    for page in (page for page in PAGES if page.is_relative_to(ROOT / "docs") and "log" not in page.parts):
+        text = "\n".join(line for _, line in prose_lines(page))
+        pairs = [(name, file) for names, file in NAMES_IN.findall(text) for name in re.findall(r"`([\w.]+)`", names)]
+        pairs += [(name, file) for file, names in TESTS_IN.findall(text) for name in re.findall(r"`(\w+)`", names)]
+        for name, file in pairs:
+            last = name.rpartition(".")[2]
+            assert re.search(rf"\b{last}\b", (ROOT / file).read_text()), f"{page.relative_to(ROOT)}: {name} in {file}"
+            checked += 1
+    assert checked > 20
+    for row in re.findall(r"^\| .*\| `hgn/kernels/.*\|$", (ROOT / "docs/backends.md").read_text(), re.MULTILINE):
+        *_, kernels, folders, _ = row.split("|")
+        sources = "".join((ROOT / folder / "kernel.py").read_text() for folder in re.findall(r"`([\w/]+)`", folders))
+        assert all(f"def {name}(" in sources for name in re.findall(r"`(\w+)`", kernels)), row
 
 
 def commands() -> list[tuple[str, str]]:
