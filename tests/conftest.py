@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
 
 import interpreter
 import torch
+from processes import wait_until
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # kernels run in Triton's interpreter; said before any of them is defined
@@ -102,3 +104,21 @@ def stage(backend: Backend) -> Callable[[DatasetWriter, str, int], None]:
 def make_dataset(backend: Backend) -> Callable[[DatagenConfig], Path]:
     """Makes a whole data set without any worker process."""
     return ballistic_dataset.make_dataset
+
+
+@pytest.fixture(scope="session")
+def warm_python(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """An interpreter that has the training stack loaded, see warm_server.py."""
+    folder, tests = tmp_path_factory.mktemp("warm"), Path(__file__).parent
+    interpreter, address = folder / "python", folder / "socket"
+    interpreter.write_text(f'#!/bin/sh\nexec {sys.executable} -SEs {tests / "warm_client.py"} {address} "$@"\n')
+    interpreter.chmod(0o755)
+    environment = os.environ | {"PYTHONPATH": str(tests.parent), "OMP_NUM_THREADS": "1"}
+    server = subprocess.Popen([sys.executable, str(tests / "warm_server.py"), str(address)], env=environment)
+    try:
+        wait_until(lambda: address.exists() or server.poll() is not None)
+        assert server.poll() is None
+        yield interpreter
+    finally:
+        server.kill()
+        server.wait()

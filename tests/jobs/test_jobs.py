@@ -111,6 +111,12 @@ def slurm(tmp_path: Path) -> dict[str, str]:
     }
 
 
+@pytest.fixture
+def warm(warm_python: Path) -> dict[str, str]:
+    """The environment in which scripts, torchrun among them, start trainings that need not load anything."""
+    return {"PYTHON": str(warm_python), "PYTHON_EXEC": str(warm_python)}
+
+
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
 def test_scripts_are_valid(script: Path) -> None:
     """Bash parses each launch file, shellcheck finds nothing, and each may be executed."""
@@ -144,12 +150,15 @@ def test_options_of_slurm_come_first(script: Path) -> None:
 
 
 def test_torchrun_trains(
-    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path], tmp_path: Path
+    warm: dict[str, str],
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    tmp_path: Path,
 ) -> None:
     """jobs/torchrun.sh starts one training on two processes, which writes one run folder."""
     config = make_config()
     make_dataset(config)
-    done = run("torchrun.sh", *train_arguments(config, tmp_path / "run", **SHORT), cwd=tmp_path, GPUS="2")
+    done = run("torchrun.sh", *train_arguments(config, tmp_path / "run", **SHORT), cwd=tmp_path, GPUS="2", **warm)
     assert done.returncode == 0, done.stderr[-4000:]
     assert done.stdout.count("trained 4 of 4 updates") == 1
     stored = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
@@ -191,6 +200,7 @@ def test_torchrun_on_several_machines(tmp_path: Path) -> None:
 
 def test_slurm_trains(
     slurm: dict[str, str],
+    warm: dict[str, str],
     make_config: Callable[..., DatagenConfig],
     make_dataset: Callable[[DatagenConfig], Path],
     tmp_path: Path,
@@ -198,7 +208,8 @@ def test_slurm_trains(
     """jobs/slurm/train.sbatch starts one training of two tasks that know their ranks from Slurm's variables."""
     config = make_config()
     make_dataset(config)
-    done = run("slurm/train.sbatch", *train_arguments(config, tmp_path / "run", **SHORT), cwd=tmp_path, **slurm)
+    arguments = train_arguments(config, tmp_path / "run", **SHORT)
+    done = run("slurm/train.sbatch", *arguments, cwd=tmp_path, **slurm, **warm)
     assert done.returncode == 0, done.stderr[-4000:]
     assert done.stdout.count("trained 4 of 4 updates") == 1
     checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
@@ -209,6 +220,7 @@ def test_slurm_trains(
 
 def test_slurm_trains_with_torchrun(
     slurm: dict[str, str],
+    warm: dict[str, str],
     make_config: Callable[..., DatagenConfig],
     make_dataset: Callable[[DatagenConfig], Path],
     tmp_path: Path,
@@ -219,7 +231,7 @@ def test_slurm_trains_with_torchrun(
     make_dataset(config)
     (tmp_path / "jobs").symlink_to(JOBS)
     arguments = [a for a in train_arguments(config, tmp_path, **SHORT) if not a.startswith("run=")]
-    slurm |= {"SLURM_NTASKS": "1", "EXPERIMENT": "small"}
+    slurm |= {"SLURM_NTASKS": "1", "EXPERIMENT": "small"} | warm
     started = start(
         "slurm/train_torchrun.sbatch", *arguments, "training.maximum_updates=1000000", cwd=tmp_path, **slurm
     )

@@ -1,0 +1,112 @@
+"""A Python that has the training stack loaded: each program that it is asked to run is a fork of it.
+
+Loading PyTorch and Lightning takes seconds, and the tests start dozens of trainings. `python warm_server.py SOCKET`
+loads them once and forks, before any thread or device exists, for each request of warm_client.py, which stands in for
+the interpreter: same arguments, folder, environment, standard streams, signals and exit status.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import json
+import os
+import random
+import runpy
+import selectors
+import signal
+import socket
+import sys
+from typing import Any
+
+PRELOADED = (
+    *("lightning.pytorch", "lightning.pytorch.loggers", "tensorboard.compat.proto.summary_pb2", "hydra", "h5py"),
+    *("torch.distributed.run", "torch.distributed.elastic.rendezvous.c10d_rendezvous_backend", "scipy.spatial"),
+    *("hgn.rollout", "hgn.evaluate", "hgn.export", "hgn.train", "hgn.training.session"),
+)
+REQUEST_BYTES = 1 << 20
+
+
+def serve(path: str) -> dict[str, Any]:
+    """Forks for each request; returns a request in the child alone."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(path)
+    listener.listen(64)
+    wake_read, wake_write = os.pipe()
+    os.set_blocking(wake_write, False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(wake_write)
+    selector = selectors.DefaultSelector()
+    selector.register(listener, selectors.EVENT_READ)
+    selector.register(wake_read, selectors.EVENT_READ)
+    children: dict[int, socket.socket] = {}
+    while True:
+        for key, _ in selector.select():
+            if key.fileobj is listener:
+                connection, _ = listener.accept()
+                data, streams, _, _ = socket.recv_fds(connection, REQUEST_BYTES, 3)
+                while not data.endswith(b"\n"):
+                    data += connection.recv(REQUEST_BYTES)
+                child = os.fork()
+                if child == 0:
+                    signal.set_wakeup_fd(-1)
+                    for inherited in (listener, connection, *children.values()):
+                        inherited.close()
+                    selector.close()
+                    os.close(wake_read), os.close(wake_write)
+                    for target, stream in enumerate(streams):
+                        os.dup2(stream, target)
+                        os.close(stream)
+                    return json.loads(data)
+                for stream in streams:
+                    os.close(stream)
+                connection.sendall(f"{child}\n".encode())
+                children[child] = connection
+                selector.register(connection, selectors.EVENT_READ, child)
+            elif key.fileobj == wake_read:
+                os.read(wake_read, 4096)
+                while children:
+                    child, status = os.waitpid(-1, os.WNOHANG)
+                    if child == 0:
+                        break
+                    connection = children.pop(child)
+                    with contextlib.suppress(KeyError):  # a client that was killed is no longer listened to
+                        selector.unregister(connection)
+                    with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # its client was killed
+                        connection.sendall(f"{os.waitstatus_to_exitcode(status)}\n".encode())
+                    connection.close()
+            elif key.data in children and not key.fileobj.recv(1):  # the client was killed: so is the program
+                os.kill(key.data, signal.SIGKILL)
+                selector.unregister(key.fileobj)
+
+
+def run(request: dict[str, Any]) -> None:
+    """What the interpreter does with its arguments."""
+    for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    random.seed()
+    os.chdir(request["cwd"])
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    arguments = request["arguments"]
+    while arguments[:1] == ["-u"]:
+        arguments = arguments[1:]
+    paths = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    if arguments[0] == "-m":
+        sys.path[:0] = ["", *paths]
+        sys.argv = arguments[1:]
+        runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
+    else:
+        sys.path[:0] = paths
+        sys.argv = arguments
+        runpy.run_path(arguments[0], run_name="__main__")
+
+
+if __name__ == "__main__":
+    import importlib
+
+    for name in PRELOADED:
+        importlib.import_module(name)
+    gc.freeze()
+    run(serve(sys.argv[1]))
