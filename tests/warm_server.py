@@ -8,7 +8,6 @@ the interpreter: same arguments, folder, environment, standard streams, signals 
 from __future__ import annotations
 
 import contextlib
-import gc
 import json
 import os
 import random
@@ -96,6 +95,7 @@ def run(request: dict[str, Any]) -> None:
     if arguments[0] == "-m":
         sys.path[:0] = ["", *paths]
         sys.argv = arguments[1:]
+        sys.modules.pop(arguments[1], None)  # runpy warns of a program that is loaded already
         runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
     else:
         sys.path[:0] = paths
@@ -108,5 +108,4 @@ if __name__ == "__main__":
 
     for name in PRELOADED:
         importlib.import_module(name)
-    gc.freeze()
     run(serve(sys.argv[1]))

@@ -416,14 +416,14 @@ def test_errors_file_makes_its_folder(place: Place, monkeypatch: pytest.MonkeyPa
         ("hgn.evaluate", EVALUATE, "error: data/validation-000000-000001.tar must have "),
     ],
 )
-def test_as_processes(place: Place, module: str, arguments: list[str], message: str) -> None:
+def test_as_processes(place: Place, warm_python: Path, module: str, arguments: list[str], message: str) -> None:
     """Started as a person would, each command ends with exit code 2 and that one line on standard error alone."""
     place.scene(SCENE.replace("[0.5, 0.8, 0.5]", "[0.5, 0.45, 0.5]"))
     for shard in place.path("data").glob("validation-*.tar"):
         truncate(shard)
     before = content(place.folder)
     done = subprocess.run(
-        [sys.executable, "-m", module, *arguments],
+        [str(warm_python), "-m", module, *arguments],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,

@@ -26,7 +26,7 @@ def main(folder: Path) -> int:
     mapping: dict[str, Any] = json.loads((folder / "mapping.json").read_text())
     rank, restart = int(os.environ["RANK"]), int(os.environ["TORCHELASTIC_RESTART_COUNT"])
     signals = {
-        update: (os.getppid() if target == "launcher" else os.getpid(), number)
+        update: (int(os.environ.get("WARM_PARENT", os.getppid())) if target == "launcher" else os.getpid(), number)
         for in_start, of_rank, update, number, target in json.loads((folder / "signals.json").read_text())
         if (in_start, of_rank) == (restart, rank)
     }

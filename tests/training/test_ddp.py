@@ -42,13 +42,16 @@ def free_port() -> int:
         return int(listener.getsockname()[1])
 
 
-def torchrun(folder: Path, *options: str, prefix: Sequence[str] = (), **variables: str) -> subprocess.Popen[str]:
+def torchrun(
+    folder: Path, *options: str, python: str = sys.executable, prefix: Sequence[str] = (), **variables: str
+) -> subprocess.Popen[str]:
     """Starts torchrun on ddp_program.py, CPU processes that talk through gloo."""
     return subprocess.Popen(
-        [*prefix, sys.executable, "-m", "torch.distributed.run", *options, str(PROGRAM), str(folder)],
+        [*prefix, python, "-m", "torch.distributed.run", *options, str(PROGRAM), str(folder)],
         cwd=folder,
         env=os.environ
         | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
+        | {"PYTHON_EXEC": python}
         | variables,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -131,14 +134,14 @@ def reference(
     return Reference(lambda folder: train_mapping(config, folder / "run", **two), gradients)
 
 
-def test_two_ranks_train_as_one(reference: Reference, tmp_path: Path) -> None:
+def test_two_ranks_train_as_one(reference: Reference, warm_python: Path, tmp_path: Path) -> None:
     """Two ranks with a scene each have the gradients of one with both (to 1e-6); their weights stay bitwise equal;
     SIGTERM to one of them ends both at the same update, with a checkpoint and the same exit code. A `kill -9` of a rank
     instead restarts both from the last checkpoint, SIGTERM to torchrun then ends all ranks in order, and the weights
     are bitwise the same. A training goes on from there on one rank, where it left the order."""
     one_machine = ("--nnodes", "1", "--nproc-per-node", "2", "--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0")
     cut = reference.folder(tmp_path / "cut", [(0, 1, 13, signal.SIGTERM, "self")])
-    assert "exitcode  : 143" in output(torchrun(cut, *one_machine))
+    assert "exitcode  : 143" in output(torchrun(cut, *one_machine, python=str(warm_python)))
     weights = reference.check(cut, 128 + signal.SIGTERM)
     assert (cut / "starts_0").read_text() == "0\n"
     assert len(list((cut / "run" / "tensorboard").glob("events.*"))) == 1
@@ -147,7 +150,7 @@ def test_two_ranks_train_as_one(reference: Reference, tmp_path: Path) -> None:
 
     signals = [(0, 1, 13, signal.SIGKILL, "self"), (1, 0, 16, signal.SIGTERM, "launcher")]
     killed = reference.folder(tmp_path / "killed", signals)
-    process = torchrun(killed, *one_machine, "--max-restarts", "1")
+    process = torchrun(killed, *one_machine, "--max-restarts", "1", python=str(warm_python))
     text = output(process)
     assert process.returncode != 0 and "signal" in text.lower()
     assert (killed / "starts_1").read_text() == "0\n10\n", text  # a checkpoint at every fifth update
