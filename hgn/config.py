@@ -98,8 +98,10 @@ class MpmConfig:
     youngs_modulus_pa: float = 1e6
     poisson_ratio: float = 0.2
     density_kg_m3: float = 1000.0
-    sand_friction_angle_deg: float = 45.0
-    sand_friction_law: str = "compression"  # or plane_strain: which plane sin(phi) is matched in
+    sand_friction_angle_deg: float = 31.0
+    # mohr_coulomb: the angle in every direction of shear; or a cone (Drucker-Prager) that has it in triaxial
+    # compression alone (Taichi Elements, with 45 degrees) or in plane_strain alone
+    sand_friction_law: str = "mohr_coulomb"  # or compression, plane_strain
     sand_volume_correction: str = "tampubolon"  # or taichi_elements
     snow_hardening: float = 10.0
     snow_critical_compression: float = 0.025
@@ -154,8 +156,11 @@ class MpmConfig:
         require(0 <= self.poisson_ratio < 0.5, "poisson_ratio", "in [0, 0.5)", self.poisson_ratio)
         require(self.sand_friction_angle_deg < 90, "sand_friction_angle_deg", "< 90", self.sand_friction_angle_deg)
         require(self.wall_cells >= 2, "wall_cells", "at least 2, the reach of a particle", self.wall_cells)
-        require_one_of(self, "sand_friction_law", ("compression", "plane_strain"))
+        require_one_of(self, "sand_friction_law", ("mohr_coulomb", "compression", "plane_strain"))
         require_one_of(self, "sand_volume_correction", ("tampubolon", "taichi_elements"))
+        if self.sand_volume_correction == "taichi_elements":  # whose strains have no deviator to speak of
+            rule = "compression or plane_strain with sand_volume_correction=taichi_elements"
+            require(self.sand_friction_law != "mohr_coulomb", "sand_friction_law", rule, self.sand_friction_law)
         require_one_of(self, "water_equation", ("linear", "stiffening"))
         require_one_of(self, "water_volume_update", ("trace", "taichi_elements"))
         require_one_of(self, "time_integration", ("leapfrog", "symplectic_euler"))

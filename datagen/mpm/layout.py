@@ -29,7 +29,8 @@ class Constant(NamedTuple):
     water_smallest_volume: int = 8
     smallest_singular_value: int = 9
     mass: int = 10  # of a particle, in units of the config's
-    length: int = 11
+    sand_sine: int = 11  # of the friction angle, where sand yields as Mohr-Coulomb has it; else 0
+    length: int = 12
 
 
 class Count(NamedTuple):
@@ -172,6 +173,12 @@ def lame_parameters(config: MpmConfig) -> tuple[float, float]:
     return modulus / (2 * (1 + ratio)), modulus * ratio / ((1 + ratio) * (1 - 2 * ratio))
 
 
+def sand_sine(config: MpmConfig) -> float:
+    """Sine of the friction angle, at which sand yields in every direction of shear; 0 where its law is a cone."""
+    sine = float(np.sin(np.deg2rad(config.sand_friction_angle_deg)))
+    return sine if config.sand_friction_law == "mohr_coulomb" else 0.0
+
+
 def sand_alpha(config: MpmConfig) -> float:
     """The Drucker-Prager slope, matched to Mohr-Coulomb in compression (Taichi Elements) or in plane strain."""
     sine = np.sin(np.deg2rad(config.sand_friction_angle_deg))
@@ -189,6 +196,7 @@ def constants(config: MpmConfig, unit_density: float | None = None) -> np.ndarra
     out[CONSTANT.density] = config.density_kg_m3
     out[CONSTANT.mass] = config.density_kg_m3 / (unit_density or config.density_kg_m3)
     out[CONSTANT.sand_alpha] = sand_alpha(config)
+    out[CONSTANT.sand_sine] = sand_sine(config)
     out[CONSTANT.hardening] = config.snow_hardening
     out[CONSTANT.snow_smallest] = 1 - config.snow_critical_compression
     out[CONSTANT.snow_largest] = 1 + config.snow_critical_stretch

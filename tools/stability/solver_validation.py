@@ -36,20 +36,28 @@ DAM_DEPTH = 1 / 16  # of the width: where water is as deep, there is the front
 DAM_LEADS, DAM_RESOLVED = 0.18, 0.05
 DAM_RATE_HZ = 200.0
 
+# quarters of round columns on a rough floor: run-out beside Lube et al. 2004, height beside Lajeunesse et al. 2004
 COLUMN_CELL = 1 / 16
-COLUMN_CELLS = 16
-COLUMN_DEPTH = 1 / 64  # of the radius
-LUBE = 0.15
+COLUMN_CELLS = 16  # in radius
+COLUMN_DEPTH = 1 / 64  # of the radius: where sand is as deep, there is its edge
+COLUMN_WITHIN = 0.1
+COLUMN_ASPECTS = (0.5, 1.0, 1.5, 2.5, 4.0)
+COLUMN_ROOM = 1.6  # times the radius expected
+COLUMN_TOP_CELLS = 2.5  # around the axis, where the height is taken
 LUBE_ANGLE_DEG = 31.0  # at which the quartz sand of Lube et al. 2004 rests
-COLUMNS = (  # aspect, friction angle
-    (0.6, LUBE_ANGLE_DEG), (1.0, LUBE_ANGLE_DEG), (2.0, LUBE_ANGLE_DEG), (1.0, 45.0),
+SAND_LAWS = (  # beside the config's own, and what they are for
+    ("plane_strain", LUBE_ANGLE_DEG), ("compression", LUBE_ANGLE_DEG), ("compression", 45.0),
 )  # fmt: skip
-LAWS = ("plane_strain", "compression")
+OTHER_ASPECTS = (0.5, 1.5, 4.0)  # at which the other laws are shown
 TIMES = 4.0  # of sqrt(height / g) until all stands; the experiments took about 3
+STRAY = 1e-3  # of the particles: fewer may reach the walls of their room
 
-REPOSE_ANGLES_DEG = (20.0, LUBE_ANGLE_DEG, 45.0)
-REPOSE_CELLS = 12
-REPOSE_TIMES = 6.0
+# a bed of sand on a platform that ends: what does not run off stands at its angle of repose
+REPOSE_ANGLES_DEG = (20.0, LUBE_ANGLE_DEG, 40.0)
+REPOSE_WITHIN_DEG = 3.0
+REPOSE_CELLS = 16  # high; LENGTH times as long
+REPOSE_LENGTH = 1.5
+REPOSE_TIMES = 10.0
 AT_REST = 1e-2  # m/s, root mean square
 
 
@@ -85,33 +93,44 @@ def dam_front(position_N3: np.ndarray, cells: int) -> float:
     """How far the water is DAM_DEPTH deep, in widths; depth is what the particles of a cell's width would fill."""
     place = position_N3[:, 0] * cells / DAM_WIDTH - WALL
     depth = np.bincount(np.maximum(np.floor(place).astype(int), 0)) / (SLAB * PARTICLES_PER_CELL)
-    return _edge(depth, DAM_DEPTH * cells) / cells
+    return edge(depth, DAM_DEPTH * cells) / cells
 
 
 def columns(base: MpmConfig) -> list[Row]:
-    """How far quarters of round columns run out, beside Lube et al. 2004, with the friction slope of both laws."""
+    """Run-out and height of collapsed columns by the config's own law, and by others that are there for comparison."""
+    cases = [(aspect, base.sand_friction_law, base.sand_friction_angle_deg) for aspect in COLUMN_ASPECTS]
+    cases += [(aspect, law, angle) for law, angle in SAND_LAWS for aspect in OTHER_ASPECTS]
+    return [row for case in cases for row in column_rows(*case, base, COLUMN_CELLS)]
+
+
+def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cells: int) -> list[Row]:
+    """How far a column of so many cells in radius runs out, and how high it stays at its axis, in initial radii."""
+    scene = column(aspect, cells)
+    duration = TIMES * math.sqrt(aspect * cells * COLUMN_CELL / GRAVITY)
+    path = _path(scene, _sand(base, law, angle_deg), 41, 40 / duration)
+    place = _above_floor(path[-1]) / COLUMN_CELL
+    distance = np.hypot(place[:, 0], place[:, 2])
+    many = np.bincount(np.floor(distance).astype(int))
+    depth = many / PARTICLES_PER_CELL / (math.pi / 4 * np.diff(np.arange(len(many) + 1) ** 2))
+    run_out = edge(depth, COLUMN_DEPTH * cells) / cells - 1
+    height = float(np.quantile(place[distance < COLUMN_TOP_CELLS, 1], 0.95)) / 0.95 / cells
+    room = math.ceil(COLUMN_ROOM * lube(aspect) * cells)
+    touched = _strays(path, room, (0, 2))
+    name = f"sand column, aspect {aspect:g}, {law.replace('_', ' ')}, {angle_deg:g} degrees, {cells} cells in radius"
     rows = []
-    for aspect, angle in COLUMNS:
-        expected = lube(aspect)
-        for law in LAWS:
-            config = _sand(base, law, angle)
-            duration = TIMES * math.sqrt(aspect * COLUMN_CELLS * COLUMN_CELL / GRAVITY)
-            path = _path(column(aspect, COLUMN_CELLS), config, 41, 40 / duration)
-            cells = _above_floor(path[-1]) / COLUMN_CELL
-            distance = np.hypot(cells[:, 0], cells[:, 2])
-            many = np.bincount(np.floor(distance).astype(int))
-            depth = many / PARTICLES_PER_CELL / (math.pi / 4 * np.diff(np.arange(len(many) + 1) ** 2))
-            front = _edge(depth, COLUMN_DEPTH * COLUMN_CELLS) / COLUMN_CELLS
-            change = front / expected - 1
-            beyond = f"{change:+.0%}; speed at the end {_speed(path, 40 / duration):.2g} m/s"
-            name = f"sand column, aspect {aspect:g}, friction {angle:g} degrees, {law.replace('_', ' ')}"
-            rows.append(Row(name, expected, front, abs(change) <= LUBE, beyond))
+    for what, value, expected in (("run-out", run_out, lube(aspect) - 1), ("height", height, lajeunesse(aspect))):
+        change = value / expected - 1
+        beyond = f"{change:+.1%}; speed at the end {_speed(path, 40 / duration):.2g} m/s{touched}"
+        more = {"cells": cells, "particles": scene.particle_count}
+        rows.append(
+            Row(f"{name}, {what}", expected, value, abs(change) <= COLUMN_WITHIN and not touched, beyond, more)
+        )
     return rows
 
 
 def column(aspect: float, cells: int) -> Scene:
     """A quarter of a round column of sand `cells` in radius on a rough floor, between two smooth walls."""
-    room = math.ceil(1.15 * lube(aspect) * cells)
+    room = math.ceil(COLUMN_ROOM * lube(aspect) * cells)
     scene = basin(SAND, (cells, aspect * cells, cells), (room, aspect * cells + 2, room), COLUMN_CELL, floor=2.0)
     cell = _above_floor(scene.position_N3) / COLUMN_CELL
     round_N = np.hypot(cell[:, 0], cell[:, 2]) < cells
@@ -122,34 +141,53 @@ def column(aspect: float, cells: int) -> Scene:
 
 
 def lube(aspect: float) -> float:
-    """The final radius of a column, in initial radii."""
+    """The final radius of a column, in initial radii (Lube et al. 2004)."""
     return 1 + (1.24 * aspect if aspect < 1.7 else 1.6 * math.sqrt(aspect))
 
 
+def lajeunesse(aspect: float) -> float:
+    """The final height of a column at its axis, in initial radii (Lajeunesse et al. 2004)."""
+    return min(aspect, 0.74)
+
+
 def reposes(base: MpmConfig) -> list[Row]:
-    """The slope of what a slab of sand leaves: it grows with the friction angle and stays below it."""
-    rows, before = [], 0.0
+    """The slope at which sand stops to run off a platform, by its friction angle."""
+    rows = []
     for angle in REPOSE_ANGLES_DEG:
         slope, speed = repose(angle, base, REPOSE_CELLS)
-        held = before < slope < angle and speed < AT_REST
-        beyond = f"at rest at {speed:.2g} m/s root mean square"
+        held = abs(slope - angle) <= REPOSE_WITHIN_DEG and speed < AT_REST
+        beyond = f"{slope - angle:+.1f} degrees; at rest at {speed:.2g} m/s root mean square"
         rows.append(Row(f"angle of repose, friction {angle:g} degrees", angle, slope, held, beyond))
-        before = slope
     return rows
 
 
 def repose(angle_deg: float, base: MpmConfig, cells: int) -> tuple[float, float]:
-    """Slope, degrees, and root mean square speed, m/s, of a slab of sand as high as wide that has collapsed."""
-    room = round((2.8 if angle_deg < 25 else 2.3) * cells)
-    scene = basin(SAND, (cells, cells, SLAB), (room, cells + 2, SLAB), COLUMN_CELL, floor=2.0)
+    """Slope, degrees, and root mean square speed, m/s, of a bed of sand that has run off the end of its platform."""
+    length = round(REPOSE_LENGTH * cells)
+    scene = platform(cells, length)
     duration = REPOSE_TIMES * math.sqrt(cells * COLUMN_CELL / GRAVITY)
-    path = _path(scene, _sand(base, "plane_strain", angle_deg), 31, 30 / duration)
-    place = np.floor(_above_floor(path[-1])[:, 0] / COLUMN_CELL).astype(int)
-    depth = np.bincount(place, minlength=room)[:room] / (SLAB * PARTICLES_PER_CELL)
-    between = np.flatnonzero((depth > 0.2 * depth.max()) & (depth < 0.8 * depth.max()))
-    own = np.arange(between[0], between[-1] + 1)
-    slope = -np.polyfit(own, depth[own], 1)[0]
-    return math.degrees(math.atan(slope)), _speed(path, 30 / duration)
+    path = _path(scene, _sand(base, base.sand_friction_law, angle_deg), 31, 30 / duration)
+    return surface_slope(path[-1], cells, length), _speed(path, 30 / duration)
+
+
+def platform(cells: int, length: int) -> Scene:
+    """A bed of sand, `length` cells long and `cells` high, on a rough platform above a pit that takes what runs off."""
+    pit = round(1.2 * cells)
+    scene = basin(SAND, (length, cells, SLAB), (length + round(1.5 * cells), cells + 2, SLAB), COLUMN_CELL, floor=pit)
+    sheet = scene.obstacles[0]
+    corner = sheet.vertex_V3.copy()
+    corner[:, 0] = np.minimum(corner[:, 0], (WALL + length) * COLUMN_CELL)
+    return dataclasses.replace(scene, obstacles=(dataclasses.replace(sheet, vertex_V3=corner),))
+
+
+def surface_slope(position_N3: np.ndarray, cells: int, length: int) -> float:
+    """The slope of the bed between a tenth and nine tenths of the platform's length, from its depth there, degrees."""
+    place = np.asarray(position_N3, np.float64) / COLUMN_CELL - np.array([WALL, WALL + round(1.2 * cells), WALL])
+    on = place[(place[:, 1] > 0) & (place[:, 0] < length)]
+    depth = np.bincount(np.floor(on[:, 0]).astype(int), minlength=length)[:length] / (SLAB * PARTICLES_PER_CELL)
+    own = np.arange(round(0.2 * length), round(0.9 * length))
+    own = own[(depth[own] < 0.95 * cells)]  # what still lies level behind the slope does not count
+    return math.degrees(math.atan(-np.polyfit(own, depth[own], 1)[0]))
 
 
 def basin(
@@ -175,11 +213,24 @@ def basin(
     )  # fmt: skip
 
 
-def _edge(depth: np.ndarray, least: float) -> float:
-    """Where depths, each of a cell in turn, fall below `least` for good, in cells."""
-    depth = np.append(depth, 0.0)
-    last = int(np.flatnonzero(depth >= least).max())
-    return last + 0.5 + float((depth[last] - least) / (depth[last] - depth[last + 1]))
+def edge(depth: np.ndarray, least: float) -> float:
+    """Where depths, each the mean of a cell in turn, fall below `least` for good, in cells from the first.
+
+    Between centres of cells depth is linear; but what ends in a cliff fills its last cell in part alone, and ends
+    where the height behind would have filled it.
+    """
+    depth = np.concatenate([depth, [0.0, 0.0]])
+    last = int(np.flatnonzero(depth >= least).max(initial=0))
+    linear = last + 0.5 + float((depth[last] - least) / max(depth[last] - depth[last + 1], least))
+    behind = depth[max(last - 1, 0)]
+    return min(linear, last + float((depth[last] + depth[last + 1]) / max(behind, least)))
+
+
+def _strays(path_TN3: np.ndarray, room_cells: float, axes: Sequence[int]) -> str:
+    """What to say where particles come within a cell of the far walls of their room; empty where hardly any does."""
+    reach = (WALL + room_cells - 1) * COLUMN_CELL
+    share = float(np.mean([(path_TN3[..., axis] > reach).any(axis=0) for axis in axes]))
+    return f"; {share:.1%} of it reached the walls of its room, {room_cells:g} cells wide" if share > STRAY else ""
 
 
 def _above_floor(position_N3: np.ndarray) -> np.ndarray:

@@ -113,11 +113,19 @@ def test_snow(spread: float) -> None:
     assert counter[COUNT.hardening_caps] == (np.exp(10 * (1 - new_Jp)) >= MpmConfig().snow_maximum_hardening).sum()
 
 
-@pytest.mark.parametrize("correction", ["tampubolon", "taichi_elements"])
-@pytest.mark.parametrize("law", ["compression", "plane_strain"])
+@pytest.mark.parametrize(
+    ("correction", "law"),
+    [
+        ("tampubolon", "mohr_coulomb"),
+        ("tampubolon", "compression"),
+        ("tampubolon", "plane_strain"),
+        ("taichi_elements", "compression"),
+        ("taichi_elements", "plane_strain"),
+    ],
+)
 @pytest.mark.parametrize("spread", [1e-3, 0.1])
 def test_sand(correction: str, law: str, spread: float) -> None:
-    """Drucker-Prager with log strain: the apex in tension, the cone in compression, v_c as each source has it."""
+    """Log strain: no stress in tension, a cone or Mohr-Coulomb's in compression, v_c as each source has it."""
     config = MpmConfig(sand_volume_correction=correction, sand_friction_law=law)
     rng = np.random.default_rng(2)
     F = deformations(rng, 500, spread)
@@ -134,8 +142,14 @@ def test_sand(correction: str, law: str, spread: float) -> None:
             strain[n] = 0
         else:
             size = np.linalg.norm(deviator)
-            gamma = size + (3 * bulk + 2 * shear) / (2 * shear) * trace * sand_alpha(config)
-            strain[n] = e - max(gamma, 0) * deviator / size
+            pressure = -(3 * bulk + 2 * shear) * trace / 3
+            if law == "mohr_coulomb":  # on the ray p - r s / |s| of principal pressures
+                high, low = -deviator.min() / size, -deviator.max() / size
+                sine = np.sin(np.deg2rad(config.sand_friction_angle_deg))
+                largest = 2 * sine * pressure / ((high - low) - sine * (high + low))
+            else:
+                largest = 3 * sand_alpha(config) * pressure
+            strain[n] = e - max(1 - largest / (2 * shear * size), 0) * deviator
         if correction == "tampubolon":
             new_v_c[n] = v_c[n] + log_sigma[n].sum() - strain[n].sum()
         else:
@@ -152,8 +166,11 @@ def test_sand(correction: str, law: str, spread: float) -> None:
 
 def test_friction_slope() -> None:
     """alpha is 0.5036 in compression (Taichi Elements, 45 degrees) and sqrt(2) sin(phi) / 3 in plane strain."""
-    assert sand_alpha(MpmConfig()) == pytest.approx(0.5036, abs=1e-4)
-    assert sand_alpha(MpmConfig(sand_friction_law="plane_strain")) == pytest.approx(1 / 3)
+    slope = [
+        sand_alpha(MpmConfig(sand_friction_law=law, sand_friction_angle_deg=45.0))
+        for law in ("compression", "plane_strain")
+    ]
+    assert slope == pytest.approx([0.5036, 1 / 3], abs=1e-4)
 
 
 def test_water() -> None:
@@ -226,3 +243,109 @@ def test_collapsed_and_inverted_deformations(material: int) -> None:
     assert counter[COUNT.singular_value_floors] == 3 + 1 + 1 + 2
     if material == SNOW:
         assert counter[COUNT.plastic_volume_bounds] == 2  # the zero matrix and the huge one
+
+
+class Element:
+    """One particle of sand or snow that is strained step by step, as an element of soil is in a laboratory."""
+
+    def __init__(self, material: int, config: MpmConfig) -> None:
+        self.material, self.config = material, config
+        self.F = np.eye(3)
+        self.volume = 0.0 if material == SAND else 1.0
+
+    def answer(self, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """F, Kirchhoff stress and volume scalar after a step of the gradient (times its time), not yet taken."""
+        F, volume, stress, *_ = run(
+            self.material, ((np.eye(3) + gradient) @ self.F)[None], np.array([self.volume]), self.config
+        )
+        return F[0].astype(float), stress[0].astype(float), float(volume[0])
+
+    def step(self, gradient: np.ndarray) -> np.ndarray:
+        self.F, stress, self.volume = self.answer(gradient)
+        return stress
+
+    def step_against(self, gradient: np.ndarray, direction: np.ndarray, axis: int, pressure: float) -> np.ndarray:
+        """A step with as much of `direction` as keeps the stress along `axis` at -pressure (secant method)."""
+        tries = [0.0, -0.3 * float(np.abs(gradient).max())]
+        errors = [self.answer(gradient + t * direction)[1][axis, axis] + pressure for t in tries]
+        for _ in range(8):
+            if abs(errors[1]) < 1e-4 * pressure or errors[1] == errors[0]:
+                break
+            tries = [tries[1], tries[1] - errors[1] * (tries[1] - tries[0]) / (errors[1] - errors[0])]
+            errors = [errors[1], self.answer(gradient + tries[1] * direction)[1][axis, axis] + pressure]
+        assert abs(errors[1]) < 1e-2 * pressure
+        return self.step(gradient + tries[1] * direction)
+
+
+def confined(law: str, angle_deg: float, pressure: float = 5e3) -> Element:
+    """Sand under the same pressure from all sides."""
+    config = MpmConfig(sand_friction_law=law, sand_friction_angle_deg=angle_deg)
+    shear, bulk = lame_parameters(config)
+    element = Element(SAND, config)
+    stress = element.step(-pressure / (3 * bulk + 2 * shear) * np.eye(3))
+    assert stress == pytest.approx(-pressure * np.eye(3), rel=0.01, abs=1.0)
+    return element
+
+
+LATERAL = {  # what is strained, what gives way so that the pressure on that side stays
+    "triaxial compression": (np.diag([0, -1, 0]), np.diag([1, 0, 1])),
+    "triaxial extension": (np.diag([0, 1, 0]), np.diag([1, 0, 1])),
+    "plane strain": (np.diag([0, -1, 0]), np.diag([1, 0, 0])),
+}
+
+
+def sheared(law: str, angle_deg: float, path: str, steps: int = 40, size: float = 2e-3) -> tuple[list[float], float]:
+    """The mobilised sin phi of each step, and the principal stress of the middle over the mean of the others."""
+    element = confined(law, angle_deg)
+    drive, side = LATERAL[path]
+    mobilised = []
+    for _ in range(steps):
+        stress = element.step_against(size * drive, side, 0, 5e3)
+        low, middle, high = np.sort(np.linalg.eigvalsh(-stress))
+        mobilised.append((high - low) / (high + low))
+    return mobilised, middle / (0.5 * (high + low))
+
+
+@pytest.mark.parametrize("path", LATERAL)
+def test_sand_has_its_friction_angle_on_every_path(path: str) -> None:
+    """Mohr-Coulomb sand of 31 degrees yields at 31 degrees, whether sheared in compression, extension or a plane; before
+    that it is elastic: in compression the axial stress grows by Young's modulus times the strain.
+    """
+    mobilised, _ = sheared("mohr_coulomb", 31.0, path)
+    assert mobilised[-1] == pytest.approx(np.sin(np.deg2rad(31)), rel=2e-3)
+    assert mobilised == sorted(mobilised) or np.ptp(mobilised[-15:]) < 2e-3
+    if path == "triaxial compression":  # q = E strain
+        q = MpmConfig().youngs_modulus_pa * 2e-3
+        assert mobilised[0] == pytest.approx(q / (q + 2 * 5e3), rel=0.02)
+
+
+def test_cones_have_it_on_one_path() -> None:
+    """A cone matched in compression has 31 degrees there, 45.9 in a plane; matched in a plane, 31 there, 22.9 in
+    compression. Taichi Elements' own (compression, 45 degrees) never yields in a plane.
+    """
+    angles = {
+        (law, path): float(np.rad2deg(np.arcsin(sheared(law, 31.0, path, 60)[0][-1])))
+        for law in ("compression", "plane_strain")
+        for path in ("triaxial compression", "plane strain")
+    }
+    assert angles["compression", "triaxial compression"] == pytest.approx(31.0, abs=0.1)
+    assert angles["compression", "plane strain"] == pytest.approx(45.9, abs=0.3)
+    assert angles["plane_strain", "plane strain"] == pytest.approx(31.0, abs=0.1)
+    assert angles["plane_strain", "triaxial compression"] == pytest.approx(22.85, abs=0.1)
+    mobilised, _ = sheared("compression", 45.0, "plane strain", 30)
+    assert np.diff(mobilised).min() > 0 and mobilised[-1] > 0.8
+
+
+@pytest.mark.parametrize("law", ["mohr_coulomb", "plane_strain"])
+def test_simple_shear_of_sand(law: str) -> None:
+    """Sheared between plates under a constant load, sand carries the shear stress sin phi times the load: principal
+    axes turn to 45 degrees, and the stress across the plane of shear is the mean of the others.
+    """
+    element = confined(law, 31.0)
+    drive, side = np.zeros((3, 3)), np.diag([0, 1, 0])
+    drive[0, 1] = 2e-3
+    for _ in range(80):
+        stress = element.step_against(drive, side, 1, 5e3)
+    assert stress[0, 1] / -stress[1, 1] == pytest.approx(np.sin(np.deg2rad(31)), rel=0.01)
+    assert stress[0, 0] / stress[1, 1] == pytest.approx(1, rel=0.02)
+    assert 2 * stress[2, 2] / (stress[0, 0] + stress[1, 1]) == pytest.approx(1, rel=0.02)
