@@ -99,9 +99,9 @@ class MpmConfig:
     poisson_ratio: float = 0.2
     density_kg_m3: float = 1000.0
     sand_friction_angle_deg: float = 31.0
-    # mohr_coulomb: the angle in every direction of shear; or a cone (Drucker-Prager) that has it in triaxial
-    # compression alone (Taichi Elements, with 45 degrees) or in plane_strain alone
-    sand_friction_law: str = "mohr_coulomb"  # or compression, plane_strain
+    # matsuoka_nakai: 31 degrees in triaxial compression and extension, 34.8 in plane strain, as sand has; or a cone
+    # (Drucker-Prager) that has the angle in triaxial compression alone (Taichi Elements, with 45) or in plane_strain
+    sand_friction_law: str = "matsuoka_nakai"  # or compression, plane_strain
     sand_volume_correction: str = "tampubolon"  # or taichi_elements
     snow_hardening: float = 10.0
     snow_critical_compression: float = 0.025
@@ -156,11 +156,11 @@ class MpmConfig:
         require(0 <= self.poisson_ratio < 0.5, "poisson_ratio", "in [0, 0.5)", self.poisson_ratio)
         require(self.sand_friction_angle_deg < 90, "sand_friction_angle_deg", "< 90", self.sand_friction_angle_deg)
         require(self.wall_cells >= 2, "wall_cells", "at least 2, the reach of a particle", self.wall_cells)
-        require_one_of(self, "sand_friction_law", ("mohr_coulomb", "compression", "plane_strain"))
+        require_one_of(self, "sand_friction_law", ("matsuoka_nakai", "compression", "plane_strain"))
         require_one_of(self, "sand_volume_correction", ("tampubolon", "taichi_elements"))
         if self.sand_volume_correction == "taichi_elements":  # whose strains have no deviator to speak of
             rule = "compression or plane_strain with sand_volume_correction=taichi_elements"
-            require(self.sand_friction_law != "mohr_coulomb", "sand_friction_law", rule, self.sand_friction_law)
+            require(self.sand_friction_law != "matsuoka_nakai", "sand_friction_law", rule, self.sand_friction_law)
         require_one_of(self, "water_equation", ("linear", "stiffening"))
         require_one_of(self, "water_volume_update", ("trace", "taichi_elements"))
         require_one_of(self, "time_integration", ("leapfrog", "symplectic_euler"))

@@ -66,11 +66,11 @@ def water(
 
 @ti.func
 def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, taichi_elements_sand: ti.template()):
-    """Return mapping of the principal log strains, which descend: new ones, and the new volume correction.
+    """Return mapping of the principal log strains: new ones, and the new volume correction.
 
     Stress yields where |s| > alpha (-tr tau), s its deviator: alpha is constant (Drucker and Prager), or such that
-    (s_max - s_min) / (s_max + s_min) = sin phi for the largest and smallest pressure (Mohr and Coulomb). The deviator
-    shrinks and keeps its direction: no plastic flow changes the volume.
+    I1 I2 = (9 - sin² phi) / (1 - sin² phi) I3 for the invariants of tau (Matsuoka and Nakai 1974). The deviator shrinks
+    and keeps its direction: no plastic flow changes the volume.
 
     Tampubolon et al. 2017: v_c / 3 joins each log strain first, and v_c += log det F_trial - log det F_new.
     `taichi_elements_sand` is Taichi Elements' form, where v_c enters the trace but not the strains.
@@ -91,9 +91,14 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, t
         alpha = law[row + CONSTANT.sand_alpha]
         sine = law[row + CONSTANT.sand_sine]
         if sine > 0.0:
-            # at least 0.81 of the size, but for rounding
-            spread = ti.max((1.0 + sine) * deviator[0] - (1.0 - sine) * deviator[2], 0.8 * size)
-            alpha = 2.0 / 3.0 * sine * size / spread
+            # with z = p / |s| the criterion is z³ - a z + b = 0, and stress meets it first at the largest root
+            a = (3.0 + sine * sine) / (8.0 * sine * sine)
+            direction = deviator / size
+            third = -direction[0] * direction[1] * direction[2]
+            half_b = (9.0 - sine * sine) / (16.0 * sine * sine) * third
+            root = ti.sqrt(a / 3.0)
+            cosine = ti.min(ti.max(-half_b / (root * root * root), -1.0), 1.0)
+            alpha = 1.0 / (6.0 * root * ti.cos(ti.acos(cosine) / 3.0))
         excess = size + (3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * alpha
         # the mapping keeps the trace, so log det F takes up all of v_c, which ends at 0
         new_strain = strain - deviator * (ti.max(excess, 0.0) / size)

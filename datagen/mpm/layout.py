@@ -29,7 +29,7 @@ class Constant(NamedTuple):
     water_smallest_volume: int = 8
     smallest_singular_value: int = 9
     mass: int = 10  # of a particle, in units of the config's
-    sand_sine: int = 11  # of the friction angle, where sand yields as Mohr-Coulomb has it; else 0
+    sand_sine: int = 11  # of the friction angle, where sand yields as Matsuoka and Nakai have it; else 0
     length: int = 12
 
 
@@ -174,9 +174,9 @@ def lame_parameters(config: MpmConfig) -> tuple[float, float]:
 
 
 def sand_sine(config: MpmConfig) -> float:
-    """Sine of the friction angle, at which sand yields in every direction of shear; 0 where its law is a cone."""
+    """Sine of the friction angle of Matsuoka and Nakai's law; 0 where the law is a cone."""
     sine = float(np.sin(np.deg2rad(config.sand_friction_angle_deg)))
-    return sine if config.sand_friction_law == "mohr_coulomb" else 0.0
+    return sine if config.sand_friction_law == "matsuoka_nakai" else 0.0
 
 
 def sand_alpha(config: MpmConfig) -> float:

@@ -65,16 +65,18 @@ def test_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Even four cells of water lead the experiment by less than 18 %; sand runs further by the plane-strain slope."""
+    """Even four cells of water lead the experiment by less than 18 %; columns have run-out and height by each law."""
     monkeypatch.setattr(solver_validation, "DAM_CELLS", (4, 5))
     monkeypatch.setattr(solver_validation, "COLUMN_CELLS", 4)
-    monkeypatch.setattr(solver_validation, "COLUMNS", ((1.0, 31.0),))
+    monkeypatch.setattr(solver_validation, "COLUMN_ASPECTS", (1.0,))
+    monkeypatch.setattr(solver_validation, "OTHER_ASPECTS", (1.0,))
+    monkeypatch.setattr(solver_validation, "SAND_LAWS", (("compression", 45.0),))
     monkeypatch.setattr(solver_validation, "REPOSE_ANGLES_DEG", ())
     rows = solver_validation.validation(MpmConfig(device="cpu"))
-    assert [row.case.split(",")[0] for row in rows] == ["dam break"] * 3 + ["sand column"] * 2
+    assert [row.case.split(",")[0] for row in rows] == ["dam break"] * 3 + ["sand column"] * 4
     assert rows[0].held and rows[1].held
-    assert rows[3].measured > rows[4].measured
-    assert rows[3].predicted == pytest.approx(2.24)
+    assert [row.predicted for row in rows[3:5]] == pytest.approx([1.24, 0.74])
+    assert rows[3].measured > rows[5].measured
 
 
 def test_height_is_taken_while_there_is_a_block() -> None:

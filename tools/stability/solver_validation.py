@@ -32,13 +32,14 @@ DAM = np.array(
 )
 DAM_WIDTH = 0.2  # m: of a free surface at a speed of sound of 17 m/s
 DAM_CELLS = (8, 16)
+DAM_ROOM = 8  # widths
 DAM_DEPTH = 1 / 16  # of the width: where water is as deep, there is the front
 DAM_LEADS, DAM_RESOLVED = 0.18, 0.05
 DAM_RATE_HZ = 200.0
 
 # quarters of round columns on a rough floor: run-out beside Lube et al. 2004, height beside Lajeunesse et al. 2004
-COLUMN_CELL = 1 / 16
-COLUMN_CELLS = 16  # in radius
+COLUMN_RADIUS = 0.5  # m; the tallest column's own weight presses it by 2 %
+COLUMN_CELLS = 24  # in radius
 COLUMN_DEPTH = 1 / 64  # of the radius: where sand is as deep, there is its edge
 COLUMN_WITHIN = 0.1
 COLUMN_ASPECTS = (0.5, 1.0, 1.5, 2.5, 4.0)
@@ -52,17 +53,20 @@ OTHER_ASPECTS = (0.5, 1.5, 4.0)  # at which the other laws are shown
 TIMES = 4.0  # of sqrt(height / g) until all stands; the experiments took about 3
 STRAY = 1e-3  # of the particles: fewer may reach the walls of their room
 
-# a bed of sand on a platform that ends: what does not run off stands at its angle of repose
+# a slope of sand on a rough platform that ends: it stands, or runs off and leaves one that does
 REPOSE_ANGLES_DEG = (20.0, LUBE_ANGLE_DEG, 40.0)
-REPOSE_WITHIN_DEG = 3.0
-REPOSE_CELLS = 16  # high; LENGTH times as long
-REPOSE_LENGTH = 1.5
-REPOSE_TIMES = 10.0
+REPOSE_WITHIN_DEG = 3.0  # at so much less than the friction angle a slope stands; steeper ones come to rest so near it
+REPOSE_STEEPER_DEG = 4.0  # what runs off a much steeper one takes more along than a poured heap would
+STANDS_DEG = 1.0  # of change
+REPOSE_LENGTH = 0.5  # m, of the platform
+REPOSE_CELLS = 24  # along it
+REPOSE_TIMES = 12.0  # of sqrt(length / g)
+PIT = 0.4  # of the platform's length, below it
 AT_REST = 1e-2  # m/s, root mean square
 
 
 def validation(base: MpmConfig) -> list[Row]:
-    """Rows of the dam break, of columns by both friction laws, and of angles of repose."""
+    """Rows of the dam break, of columns by each friction law, and of angles of repose."""
     return [*dam_breaks(base), *columns(base), *reposes(base)]
 
 
@@ -78,7 +82,9 @@ def dam_breaks(base: MpmConfig) -> list[Row]:
         beyond = "fronts " + ", ".join(f"{x:.2f} at {t:.2f} ({y:.2f})" for x, (t, y) in zip(front, DAM, strict=True))
         more = {"front": front.tolist(), "experiment": DAM.tolist()}
         worst = float(np.abs(lead).max())
-        rows.append(Row(f"dam break, {cells} cells wide", DAM_LEADS, worst, worst <= DAM_LEADS, beyond, more))
+        touched = _strays(path * (cells / DAM_WIDTH), DAM_ROOM * cells, (0,))
+        held = worst <= DAM_LEADS and not touched
+        rows.append(Row(f"dam break, {cells} cells wide", DAM_LEADS, worst, held, beyond + touched, more))
     change = float(np.abs(fronts[1] / fronts[0] - 1).max())
     name = f"dam break, {DAM_CELLS[0]} against {DAM_CELLS[1]} cells"
     return [*rows, Row(name, DAM_RESOLVED, change, change <= DAM_RESOLVED, "largest change of the front")]
@@ -86,7 +92,7 @@ def dam_breaks(base: MpmConfig) -> list[Row]:
 
 def dam(cells: int) -> Scene:
     """Water `cells` wide and twice as high, three cells thick, left of an empty basin."""
-    return basin(WATER, (cells, 2 * cells, SLAB), (7 * cells, 3 * cells, SLAB), DAM_WIDTH / cells)
+    return basin(WATER, (cells, 2 * cells, SLAB), (DAM_ROOM * cells, 3 * cells, SLAB), DAM_WIDTH / cells)
 
 
 def dam_front(position_N3: np.ndarray, cells: int) -> float:
@@ -106,33 +112,31 @@ def columns(base: MpmConfig) -> list[Row]:
 def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cells: int) -> list[Row]:
     """How far a column of so many cells in radius runs out, and how high it stays at its axis, in initial radii."""
     scene = column(aspect, cells)
-    duration = TIMES * math.sqrt(aspect * cells * COLUMN_CELL / GRAVITY)
+    duration = TIMES * math.sqrt(aspect * COLUMN_RADIUS / GRAVITY)
     path = _path(scene, _sand(base, law, angle_deg), 41, 40 / duration)
-    place = _above_floor(path[-1]) / COLUMN_CELL
+    place = _above_floor(path[-1], scene.cell_size)
     distance = np.hypot(place[:, 0], place[:, 2])
     many = np.bincount(np.floor(distance).astype(int))
     depth = many / PARTICLES_PER_CELL / (math.pi / 4 * np.diff(np.arange(len(many) + 1) ** 2))
     run_out = edge(depth, COLUMN_DEPTH * cells) / cells - 1
     height = float(np.quantile(place[distance < COLUMN_TOP_CELLS, 1], 0.95)) / 0.95 / cells
     room = math.ceil(COLUMN_ROOM * lube(aspect) * cells)
-    touched = _strays(path, room, (0, 2))
+    touched = _strays(path / scene.cell_size, room, (0, 2))
     name = f"sand column, aspect {aspect:g}, {law.replace('_', ' ')}, {angle_deg:g} degrees, {cells} cells in radius"
     rows = []
     for what, value, expected in (("run-out", run_out, lube(aspect) - 1), ("height", height, lajeunesse(aspect))):
         change = value / expected - 1
         beyond = f"{change:+.1%}; speed at the end {_speed(path, 40 / duration):.2g} m/s{touched}"
         more = {"cells": cells, "particles": scene.particle_count}
-        rows.append(
-            Row(f"{name}, {what}", expected, value, abs(change) <= COLUMN_WITHIN and not touched, beyond, more)
-        )
+        rows.append(Row(f"{name}, {what}", expected, value, abs(change) <= COLUMN_WITHIN and not touched, beyond, more))
     return rows
 
 
 def column(aspect: float, cells: int) -> Scene:
     """A quarter of a round column of sand `cells` in radius on a rough floor, between two smooth walls."""
     room = math.ceil(COLUMN_ROOM * lube(aspect) * cells)
-    scene = basin(SAND, (cells, aspect * cells, cells), (room, aspect * cells + 2, room), COLUMN_CELL, floor=2.0)
-    cell = _above_floor(scene.position_N3) / COLUMN_CELL
+    scene = basin(SAND, (cells, aspect * cells, cells), (room, aspect * cells + 2, room), COLUMN_RADIUS / cells, 2)
+    cell = _above_floor(scene.position_N3, scene.cell_size)
     round_N = np.hypot(cell[:, 0], cell[:, 2]) < cells
     return dataclasses.replace(
         scene, position_N3=scene.position_N3[round_N], velocity_N3=scene.velocity_N3[round_N],
@@ -151,47 +155,56 @@ def lajeunesse(aspect: float) -> float:
 
 
 def reposes(base: MpmConfig) -> list[Row]:
-    """The slope at which sand stops to run off a platform, by its friction angle."""
+    """Slopes of sand below and above its friction angle: the former stand, the latter come to rest near it."""
     rows = []
     for angle in REPOSE_ANGLES_DEG:
-        slope, speed = repose(angle, base, REPOSE_CELLS)
-        held = abs(slope - angle) <= REPOSE_WITHIN_DEG and speed < AT_REST
-        beyond = f"{slope - angle:+.1f} degrees; at rest at {speed:.2g} m/s root mean square"
-        rows.append(Row(f"angle of repose, friction {angle:g} degrees", angle, slope, held, beyond))
+        for start in (angle - REPOSE_WITHIN_DEG, angle + REPOSE_STEEPER_DEG):
+            before, after, speed = repose(angle, start, base, REPOSE_CELLS)
+            beyond = f"{after - before:+.1f} degrees; at the end {speed:.2g} m/s root mean square"
+            if start < angle:
+                held = abs(after - before) <= STANDS_DEG
+                rows.append(Row(f"slope that stands, friction {angle:g} degrees", before, after, held, beyond))
+            else:
+                held = abs(after - angle) <= REPOSE_WITHIN_DEG and speed < AT_REST
+                rows.append(Row(f"angle of repose, friction {angle:g} degrees", angle, after, held, beyond))
     return rows
 
 
-def repose(angle_deg: float, base: MpmConfig, cells: int) -> tuple[float, float]:
-    """Slope, degrees, and root mean square speed, m/s, of a bed of sand that has run off the end of its platform."""
-    length = round(REPOSE_LENGTH * cells)
-    scene = platform(cells, length)
-    duration = REPOSE_TIMES * math.sqrt(cells * COLUMN_CELL / GRAVITY)
-    path = _path(scene, _sand(base, base.sand_friction_law, angle_deg), 31, 30 / duration)
-    return surface_slope(path[-1], cells, length), _speed(path, 30 / duration)
+def repose(angle_deg: float, start_deg: float, base: MpmConfig, cells: int) -> tuple[float, float, float]:
+    """The slope of sand on a platform before and after, degrees, and its root mean square speed at the end, m/s."""
+    scene = platform(start_deg, cells)
+    rate_hz = 30 / (REPOSE_TIMES * math.sqrt(REPOSE_LENGTH / GRAVITY))
+    path = _path(scene, _sand(base, base.sand_friction_law, angle_deg), 31, rate_hz)
+    place = path / scene.cell_size - WALL - np.array([0.0, round(PIT * cells), 0.0])
+    on = (place[-1, :, 1] > 0) & (place[-1, :, 0] < cells)
+    return surface_slope(place[0], cells), surface_slope(place[-1, on], cells), _speed(path[:, on], rate_hz)
 
 
-def platform(cells: int, length: int) -> Scene:
-    """A bed of sand, `length` cells long and `cells` high, on a rough platform above a pit that takes what runs off."""
-    pit = round(1.2 * cells)
-    scene = basin(SAND, (length, cells, SLAB), (length + round(1.5 * cells), cells + 2, SLAB), COLUMN_CELL, floor=pit)
+def platform(slope_deg: float, cells: int) -> Scene:
+    """A slope of sand from a smooth wall down to the end of a rough platform, so many cells long, above a pit."""
+    height = math.ceil(cells * math.tan(math.radians(slope_deg)))
+    pit = round(PIT * cells)
+    scene = basin(SAND, (cells, height, SLAB), (2 * cells, height + 2, SLAB), REPOSE_LENGTH / cells, pit)
+    place = scene.position_N3.astype(np.float64) / scene.cell_size - WALL
+    below = place[:, 1] - pit < (cells - place[:, 0]) * math.tan(math.radians(slope_deg))
     sheet = scene.obstacles[0]
     corner = sheet.vertex_V3.copy()
-    corner[:, 0] = np.minimum(corner[:, 0], (WALL + length) * COLUMN_CELL)
-    return dataclasses.replace(scene, obstacles=(dataclasses.replace(sheet, vertex_V3=corner),))
+    corner[:, 0] = np.minimum(corner[:, 0], (WALL + cells) * scene.cell_size)
+    return dataclasses.replace(
+        scene, position_N3=scene.position_N3[below], velocity_N3=scene.velocity_N3[below],
+        material_N=scene.material_N[below], obstacles=(dataclasses.replace(sheet, vertex_V3=corner),),
+    )  # fmt: skip
 
 
-def surface_slope(position_N3: np.ndarray, cells: int, length: int) -> float:
-    """The slope of the bed between a tenth and nine tenths of the platform's length, from its depth there, degrees."""
-    place = np.asarray(position_N3, np.float64) / COLUMN_CELL - np.array([WALL, WALL + round(1.2 * cells), WALL])
-    on = place[(place[:, 1] > 0) & (place[:, 0] < length)]
-    depth = np.bincount(np.floor(on[:, 0]).astype(int), minlength=length)[:length] / (SLAB * PARTICLES_PER_CELL)
-    own = np.arange(round(0.2 * length), round(0.9 * length))
-    own = own[(depth[own] < 0.95 * cells)]  # what still lies level behind the slope does not count
+def surface_slope(place_N3: np.ndarray, cells: int) -> float:
+    """The slope of sand over the middle of a platform, degrees, from its depth there; places in cells from its wall."""
+    depth = np.bincount(np.floor(place_N3[:, 0]).astype(int), minlength=cells)[:cells] / (SLAB * PARTICLES_PER_CELL)
+    own = np.arange(round(0.15 * cells), round(0.85 * cells))
     return math.degrees(math.atan(-np.polyfit(own, depth[own], 1)[0]))
 
 
 def basin(
-    material: int, size_cells: Sequence[float], room_cells: Sequence[float], cell: float, floor: float | None = None
+    material: int, size_cells: Sequence[float], room_cells: Sequence[float], cell: float, floor: int | None = None
 ) -> Scene:
     """A box of particles at random places in the corner of a basin, wall to wall where the room is as large; above
     the wall's floor, or with `floor` that many cells higher on a sheet.
@@ -202,7 +215,7 @@ def basin(
     obstacles: tuple[Obstacle, ...] = ()
     if floor is not None:
         place[:, 1] += floor
-        nodes[1] += math.ceil(floor)
+        nodes[1] += floor
         low, high, y = -cell, (max(nodes) + 1) * cell, (WALL + floor) * cell
         corner = np.array([[low, y, low], [high, y, low], [high, y, high], [low, y, high]])
         obstacles = (Obstacle("floor", corner, np.array([[0, 1, 2], [0, 2, 3]], np.int32), False),)
@@ -216,26 +229,30 @@ def basin(
 def edge(depth: np.ndarray, least: float) -> float:
     """Where depths, each the mean of a cell in turn, fall below `least` for good, in cells from the first.
 
-    Between centres of cells depth is linear; but what ends in a cliff fills its last cell in part alone, and ends
-    where the height behind would have filled it.
+    Between centres of cells depth is linear; but what ends in a cliff fills its last cells in part alone, and ends
+    where the slope behind would have filled them.
     """
-    depth = np.concatenate([depth, [0.0, 0.0]])
-    last = int(np.flatnonzero(depth >= least).max(initial=0))
-    linear = last + 0.5 + float((depth[last] - least) / max(depth[last] - depth[last + 1], least))
-    behind = depth[max(last - 1, 0)]
-    return min(linear, last + float((depth[last] + depth[last + 1]) / max(behind, least)))
+    depth = np.concatenate([depth[:1], depth[:1], depth, [0.0, 0.0]])
+    last = int(np.flatnonzero(depth[2:] >= least).max(initial=0)) + 2
+    linear = 0.5 + float((depth[last] - least) / max(depth[last] - depth[last + 1], least))
+    # a cliff is where the depth behind, with its slope, would hold what lies in the last two cells
+    slope = max(float(depth[last - 2] - depth[last - 1]), 0.0)
+    mass, begin = float(depth[last] + depth[last + 1]), max(float(depth[last - 1]) - 0.5 * slope, least)
+    square = begin * begin - 2 * slope * mass
+    cliff = 2 * mass / (begin + math.sqrt(square)) if square >= 0 else math.inf
+    return last - 2 + min(linear, cliff)
 
 
-def _strays(path_TN3: np.ndarray, room_cells: float, axes: Sequence[int]) -> str:
+def _strays(place_TN3: np.ndarray, room_cells: float, axes: Sequence[int]) -> str:
     """What to say where particles come within a cell of the far walls of their room; empty where hardly any does."""
-    reach = (WALL + room_cells - 1) * COLUMN_CELL
-    share = float(np.mean([(path_TN3[..., axis] > reach).any(axis=0) for axis in axes]))
+    reach = WALL + room_cells - 1
+    share = float(np.mean([(place_TN3[..., axis] > reach).any(axis=0) for axis in axes]))
     return f"; {share:.1%} of it reached the walls of its room, {room_cells:g} cells wide" if share > STRAY else ""
 
 
-def _above_floor(position_N3: np.ndarray) -> np.ndarray:
-    """From the edge where the walls meet the sheet of a basin's floor."""
-    return np.asarray(position_N3, np.float64) - np.array([WALL, WALL + 2.0, WALL]) * COLUMN_CELL
+def _above_floor(position_N3: np.ndarray, cell: float) -> np.ndarray:
+    """From the edge where the walls meet the sheet of a column's floor, in cells."""
+    return np.asarray(position_N3, np.float64) / cell - np.array([WALL, WALL + 2.0, WALL])
 
 
 def _sand(base: MpmConfig, law: str, angle_deg: float) -> MpmConfig:

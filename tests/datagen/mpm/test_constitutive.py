@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import taichi as ti
+from numpy.polynomial import Polynomial
 
 from datagen.mpm.constitutive import solid, water
 from datagen.mpm.layout import COUNT, SETTING, VARIANT, constants, lame_parameters, sand_alpha
@@ -116,7 +117,7 @@ def test_snow(spread: float) -> None:
 @pytest.mark.parametrize(
     ("correction", "law"),
     [
-        ("tampubolon", "mohr_coulomb"),
+        ("tampubolon", "matsuoka_nakai"),
         ("tampubolon", "compression"),
         ("tampubolon", "plane_strain"),
         ("taichi_elements", "compression"),
@@ -143,10 +144,12 @@ def test_sand(correction: str, law: str, spread: float) -> None:
         else:
             size = np.linalg.norm(deviator)
             pressure = -(3 * bulk + 2 * shear) * trace / 3
-            if law == "mohr_coulomb":  # on the ray p - r s / |s| of principal pressures
-                high, low = -deviator.min() / size, -deviator.max() / size
-                sine = np.sin(np.deg2rad(config.sand_friction_angle_deg))
-                largest = 2 * sine * pressure / ((high - low) - sine * (high + low))
+            if law == "matsuoka_nakai":  # the first root of I1 I2 - k I3 on the way from p to p - r s / |s|
+                ray = [Polynomial([pressure, -d / size]) for d in deviator]
+                pairs = ray[0] * ray[1] + ray[1] * ray[2] + ray[2] * ray[0]
+                square = np.sin(np.deg2rad(config.sand_friction_angle_deg)) ** 2
+                roots = (sum(ray) * pairs - (9 - square) / (1 - square) * ray[0] * ray[1] * ray[2]).roots()
+                largest = min(r.real for r in roots if abs(r.imag) < 1e-6 * abs(r) and r.real > 0)
             else:
                 largest = 3 * sand_alpha(config) * pressure
             strain[n] = e - max(1 - largest / (2 * shear * size), 0) * deviator
@@ -306,14 +309,21 @@ def sheared(law: str, angle_deg: float, path: str, steps: int = 40, size: float 
     return mobilised, middle / (0.5 * (high + low))
 
 
+PLANE_STRAIN_SINE = 2 * np.sin(np.deg2rad(31)) / np.sqrt(3 + np.sin(np.deg2rad(31)) ** 2)  # 34.8 degrees
+
+
 @pytest.mark.parametrize("path", LATERAL)
-def test_sand_has_its_friction_angle_on_every_path(path: str) -> None:
-    """Mohr-Coulomb sand of 31 degrees yields at 31 degrees, whether sheared in compression, extension or a plane; before
-    that it is elastic: in compression the axial stress grows by Young's modulus times the strain.
+def test_sand_has_the_friction_angle_of_its_law(path: str) -> None:
+    """Sand of 31 degrees (Matsuoka and Nakai 1974) yields at 31 degrees in triaxial compression and extension, and in
+    plane strain at sin phi = 2 s / sqrt(3 + s²), 34.8 degrees, where the middle stress is the mean of the others.
+    Before that it is elastic: in compression the axial stress grows by Young's modulus times the strain.
     """
-    mobilised, _ = sheared("mohr_coulomb", 31.0, path)
-    assert mobilised[-1] == pytest.approx(np.sin(np.deg2rad(31)), rel=2e-3)
-    assert mobilised == sorted(mobilised) or np.ptp(mobilised[-15:]) < 2e-3
+    mobilised, middle = sheared("matsuoka_nakai", 31.0, path)
+    expected = PLANE_STRAIN_SINE if path == "plane strain" else np.sin(np.deg2rad(31))
+    assert mobilised[-1] == pytest.approx(expected, rel=2e-3)
+    assert np.ptp(mobilised[-10:]) < 2e-3
+    if path == "plane strain":
+        assert middle == pytest.approx(1, rel=0.01)
     if path == "triaxial compression":  # q = E strain
         q = MpmConfig().youngs_modulus_pa * 2e-3
         assert mobilised[0] == pytest.approx(q / (q + 2 * 5e3), rel=0.02)
@@ -336,16 +346,18 @@ def test_cones_have_it_on_one_path() -> None:
     assert np.diff(mobilised).min() > 0 and mobilised[-1] > 0.8
 
 
-@pytest.mark.parametrize("law", ["mohr_coulomb", "plane_strain"])
-def test_simple_shear_of_sand(law: str) -> None:
-    """Sheared between plates under a constant load, sand carries the shear stress sin phi times the load: principal
-    axes turn to 45 degrees, and the stress across the plane of shear is the mean of the others.
+@pytest.mark.parametrize(
+    ("law", "sine"), [("matsuoka_nakai", PLANE_STRAIN_SINE), ("plane_strain", np.sin(np.deg2rad(31)))]
+)
+def test_simple_shear_of_sand(law: str, sine: float) -> None:
+    """Sheared between plates under a constant load, sand carries sin phi times the load (phi that of plane strain):
+    principal axes turn to 45 degrees, and the stress across the plane of shear is the mean of the others.
     """
     element = confined(law, 31.0)
     drive, side = np.zeros((3, 3)), np.diag([0, 1, 0])
     drive[0, 1] = 2e-3
     for _ in range(80):
         stress = element.step_against(drive, side, 1, 5e3)
-    assert stress[0, 1] / -stress[1, 1] == pytest.approx(np.sin(np.deg2rad(31)), rel=0.01)
+    assert stress[0, 1] / -stress[1, 1] == pytest.approx(sine, rel=0.01)
     assert stress[0, 0] / stress[1, 1] == pytest.approx(1, rel=0.02)
     assert 2 * stress[2, 2] / (stress[0, 0] + stress[1, 1]) == pytest.approx(1, rel=0.02)

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import tools.studies.taichi_elements
 from hgn.schema import ConfigError
-from tools.studies.taichi_elements import TaichiElementsConfig, cases, main, taichi_elements_substeps
+from tools.studies.taichi_elements import TaichiElementsConfig, cases, faithful_mode, main, taichi_elements_substeps
 
 
 @pytest.fixture
@@ -41,3 +42,13 @@ def test_cases_and_steps(copy: str) -> None:
     assert taichi_elements_substeps() in (54, 55)
     with pytest.raises(ConfigError, match="folder must hold a copy"):
         TaichiElementsConfig("nowhere")
+
+
+def test_faithful_mode_is_that_of_the_config() -> None:
+    """The comparison takes what conf/mpm/taichi_elements.yaml says, but for the step, which is a hair shorter."""
+    given = yaml.safe_load((Path(__file__).resolve().parents[3] / "conf" / "mpm" / "taichi_elements.yaml").read_text())
+    own, _ = faithful_mode("cpu")
+    # without obstacles the band is nowhere, and with a fixed step every step is a transfer
+    for name in given.keys() - {"defaults", "fixed_time_step_s", "collider_band_cells", "transfer_speed_m_s"}:
+        assert getattr(own, name) == given[name], name
+    assert own.fixed_time_step_s == pytest.approx(float(given["fixed_time_step_s"]), rel=0.02)
