@@ -234,7 +234,7 @@ def edge(depth: np.ndarray, least: float) -> float:
     """
     depth = np.concatenate([depth[:1], depth[:1], depth, [0.0, 0.0]])
     last = int(np.flatnonzero(depth[2:] >= least).max(initial=0)) + 2
-    linear = 0.5 + float((depth[last] - least) / max(depth[last] - depth[last + 1], least))
+    linear = 0.5 + float((depth[last] - least) / max(depth[last] - depth[last + 1], 1e-9))
     # a cliff is where the depth behind, with its slope, would hold what lies in the last two cells
     slope = max(float(depth[last - 2] - depth[last - 1]), 0.0)
     mass, begin = float(depth[last] + depth[last + 1]), max(float(depth[last - 1]) - 0.5 * slope, least)
