@@ -12,7 +12,7 @@ project = "HGN"
 author = "the HGN maintainers"
 copyright = "the HGN maintainers, MIT licence"
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "reference_pages"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "reference_pages", "repository_pages"]
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build", "_generated", "_ext"]
 suppress_warnings = ["epub.unknown_project_files"]
