@@ -94,7 +94,7 @@ def test_names_exist() -> None:
 def commands() -> list[tuple[str, str]]:
     """Each `python -m` line of README and docs/, in blocks and in code within lines, with its place."""
     found = []
-    for page in [ROOT / name for name in NAMES if name.startswith(("README.md", "docs/"))]:
+    for page in [page for page in PAGES if page.relative_to(ROOT).parts[0] in ("README.md", "docs")]:
         if {"log", "results"} & set(page.parts):
             continue
         for block in blocks_of(page):
