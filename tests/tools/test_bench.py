@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -218,12 +218,15 @@ def test_workloads() -> None:
     assert workloads(BenchConfig(), CPU) == [Workload(TILE_PARTICLES, 1)]
 
 
-def test_json_option(tmp_path: Path) -> None:
+def test_json_option(warm_python: Path, tmp_path: Path) -> None:
     """The command takes --json FILE as other tools do, beside overrides; without a name it says so."""
     path = tmp_path / "bench.json"
     small = ["cases=[frame]", "particles=[30]", "rounds=5", "network.width=8", "network.levels=1", "device=cpu"]
-    command = [sys.executable, "-m", "tools.bench"]
-    subprocess.run([*command, "--json", str(path), *small], check=True, capture_output=True, timeout=120)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [str(warm_python), "-m", "tools.bench"]
+    subprocess.run(
+        [*command, "--json", str(path), *small], env=environment, check=True, capture_output=True, timeout=120
+    )
     assert json.loads(path.read_text())["rows"][0]["case"] == "frame"
     assert _with_json_as_override(["a=1", "--json=b.json", "c=2"]) == ["a=1", "json=b.json", "c=2"]
     with pytest.raises(ConfigError, match="--json must be followed by a file name"):

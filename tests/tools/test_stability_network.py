@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -227,9 +226,10 @@ def test_bad_options(change: dict[str, Any], message: str) -> None:
         from_mapping(StabilityNetworkConfig, {"weights": "w"} | change)
 
 
-def test_the_command_names_its_parts() -> None:
+def test_the_command_names_its_parts(warm_python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Help says what parts there are; an unknown one is refused with them; a known one takes the options of its own."""
-    command = [sys.executable, "-m", "tools.stability"]
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    command = [str(warm_python), "-m", "tools.stability"]
     told = subprocess.run([*command, "--help"], capture_output=True, text=True, timeout=120)
     assert told.returncode == 0 and "python -m tools.stability network" in told.stdout and not told.stderr
     refused = subprocess.run([*command, "bridge"], capture_output=True, text=True, timeout=120)
