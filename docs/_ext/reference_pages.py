@@ -1,5 +1,5 @@
-"""Writes the references from the sources, the dataclasses of hgn/config.py and each command's docstring and settings,
-and makes files of the checkout that pages link to part of the site."""
+"""Writes the references from the sources: the dataclasses of hgn/config.py, each command's docstring and settings, and
+the fields of documented dataclasses."""
 
 from __future__ import annotations
 
@@ -113,27 +113,8 @@ def _document_fields(_: Any, what: str, name: str, obj: Any, options: Any, lines
             lines.append(f":param {item.target.id}: ``{ast.unparse(item.annotation)}``; {comment}".rstrip("; "))
 
 
-_LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)(?:#[^)\s]*)?\)")
-
-
-def outside_as_files(folder: Path, text: str) -> str:
-    """A page's text, with links to files outside of docs/ as downloads; `folder` is the page's."""
-
-    def target(link: re.Match[str]) -> str:
-        path = (folder / link[1]).resolve()
-        outside = not path.is_relative_to(ROOT / "docs") and path.is_file()
-        return f"](path:{link[1]})" if outside else link[0]
-
-    return _LINK.sub(target, text)
-
-
-def _read(app: Any, name: str, content: list[str]) -> None:
-    content[0] = outside_as_files(Path(app.env.doc2path(name)).parent, content[0])
-
-
 def setup(app: Any) -> dict[str, bool]:
     """Called by Sphinx."""
     app.connect("builder-inited", _write)
-    app.connect("source-read", _read)
     app.connect("autodoc-process-docstring", _document_fields)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

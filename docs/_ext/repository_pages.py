@@ -1,7 +1,8 @@
 """Markdown pages from outside of docs/ as pages of the site.
 
-A page of docs/ that begins with `<!-- page: ../../results/recipe/README.md -->` becomes that file. Links between such
-files become links between their pages, pictures are found where they lie, and other files are offered as downloads.
+A page of docs/ that begins with `<!-- page: ../../results/recipe/README.md -->` becomes that file. Links to such files,
+from each other and from any page, become links to their pages; pictures are found where they lie, and other files of
+the checkout are offered as downloads.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
+DOCS = Path(__file__).resolve().parents[1]
 MARKER = re.compile(r"<!-- page: (\S+) -->")
 TARGET = re.compile(r"(?P<image>!?)\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\((?P<target>[^)\s#]+)(?P<anchor>#[^)\s]*)?\)")
 
@@ -32,12 +34,13 @@ def _find_pages(app: Sphinx) -> None:
 
 
 def _read(app: Sphinx, name: str, source: list[str]) -> None:
-    if not (match := MARKER.match(source[0])):
-        return
-    page = Path(app.env.doc2path(name))
-    file = _file(page, match[1])
-    app.env.note_dependency(str(file))
-    source[0] = TARGET.sub(lambda link: _moved(link, file, page, app.env.repository_pages), file.read_text())  # type: ignore[attr-defined]
+    page = file = Path(app.env.doc2path(name))
+    text = source[0]
+    if match := MARKER.match(text):
+        file = _file(page, match[1])
+        app.env.note_dependency(str(file))
+        text = file.read_text()
+    source[0] = TARGET.sub(lambda link: _moved(link, file, page, app.env.repository_pages), text)  # type: ignore[attr-defined]
 
 
 def _moved(link: re.Match[str], file: Path, page: Path, pages: dict[Path, Path]) -> str:
@@ -49,7 +52,7 @@ def _moved(link: re.Match[str], file: Path, page: Path, pages: dict[Path, Path])
         raise ValueError(f"{file}: {link['target']} is not a file; link to a page, a picture or a file")
     text = TARGET.sub(lambda inner: _moved(inner, file, page, pages), link["text"])
     where = os.path.relpath(pages.get(target, target), page.parent)
-    download = target not in pages and target.suffix != ".md" and not link["image"]
+    download = target not in pages and not target.is_relative_to(DOCS) and not link["image"]
     return f"{link['image']}[{text}]({f'<path:{where}>' if download else where}{link['anchor'] or ''})"
 
 
