@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from datagen.generate import StopRequest, datagen_config, generate
+from datagen.generate import StopSignal, datagen_config, generate
 from datagen.pool.progress import PROGRESS_KINDS, make_progress
 from datagen.pool.worker import Backend
 from hgn.command import run_command
@@ -16,7 +16,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     kind = mapping.get("progress", "bar")
     require(kind in PROGRESS_KINDS, "progress", f"one of {', '.join(PROGRESS_KINDS)}", kind)
     config = datagen_config(mapping)
-    with StopRequest() as stop:
+    with StopSignal() as stop:
         finished = generate(config, make_progress(kind), stop.requested, backend)
     return 0 if finished else 128 + (stop.signal or 0)
 

@@ -33,7 +33,7 @@ KEYS = {
 }
 
 
-class StopRequest:
+class StopSignal:
     """Ctrl-C or SIGTERM while it is entered: noted, so that what is being written is finished. A second one acts
     at once.
     """
@@ -41,7 +41,7 @@ class StopRequest:
     def __init__(self) -> None:
         self.signal: int | None = None
 
-    def __enter__(self) -> StopRequest:
+    def __enter__(self) -> StopSignal:
         self._previous = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from datagen.generate import StopRequest
+from datagen.generate import StopSignal
 from hgn.command import run_command
 from hgn.config import UploadConfig
 from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
@@ -28,7 +28,7 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(UploadConfig, mapping)
     require(is_remote(config.to), "to", "a URL", config.to, "as in to=s3://bucket/obstacles")
     require(not is_remote(config.data), "data", "a folder of this machine", config.data)
-    with StopRequest() as stop:
+    with StopSignal() as stop:
         target = Target(config.to)
         while not stop.requested():
             target.copy(Path(config.data), stop)
@@ -62,7 +62,7 @@ class Target:
         """Whether that is the whole data set."""
         return self._manifest is not None and self._manifest.complete
 
-    def copy(self, folder: Path, stop: StopRequest) -> None:
+    def copy(self, folder: Path, stop: StopSignal) -> None:
         """Copies the shards that are not there yet, then the manifest; leaves that out when asked to stop before.
 
         Raises: ConfigError when another data set is there, a shard here is altered, or nothing can be written;

@@ -1,4 +1,4 @@
-"""python -m hgn.average weights=[a,b] shares=[0.7,0.3] out=…: the mean of several networks' weights.
+"""python -m hgn.average weights=[a,b] coefficients=[0.7,0.3] out=…: the mean of several networks' weights.
 
 Networks that were trained from the same weights on, each in another way, lie in one valley: between them the error is
 no larger, and what each has learned is there in part (model soups, Wortsman et al. 2022). One network as large as each.
@@ -36,7 +36,7 @@ def average(config: AverageConfig) -> None:
 
     Raises: ConfigError when a file is missing, or they are of different networks, data or normalisers.
     """
-    shares = config.shares or (1 / len(config.weights),) * len(config.weights)
+    coefficients = config.coefficients or (1 / len(config.weights),) * len(config.weights)
     files = [find_weights(name, f"weights[{i}]") for i, name in enumerate(config.weights)]
     loaded = [load_weights(file, field=f"weights[{i}]") for i, file in enumerate(files)]
     network, info = loaded[0]
@@ -44,10 +44,12 @@ def average(config: AverageConfig) -> None:
         _require_same(loaded[0], loaded[i], config.weights, i)
     with torch.no_grad():
         for same in zip(*(each.parameters() for each, _ in loaded), strict=True):
-            same[0].copy_(sum(share * parameter for share, parameter in zip(shares, same, strict=True)))
+            same[0].copy_(
+                sum(coefficient * parameter for coefficient, parameter in zip(coefficients, same, strict=True))
+            )
     parts = [
-        {"file": file.name, "share": share, "updates": each.updates, "provenance": each.provenance}
-        for file, share, (_, each) in zip(files, shares, loaded, strict=True)
+        {"file": file.name, "coefficient": coefficient, "updates": each.updates, "provenance": each.provenance}
+        for file, coefficient, (_, each) in zip(files, coefficients, loaded, strict=True)
     ]
     updates = max(each.updates for _, each in loaded)
     made = replace(info, updates=updates, provenance=provenance() | {"average_of": parts})
@@ -71,7 +73,7 @@ def _require_same(
     if any(not torch.equal(normalisers[0][name], normalisers[1][name]) for name in normalisers[0]):
         raise ConfigError(
             f"weights[{i}] must have the normaliser of weights[0] ({names[0]}), got another in {names[i]}; average "
-            "weights whose training began with the same ones (training.weights)"
+            "weights whose training began with the same ones (training.init_weights)"
         )
 
 

@@ -10,7 +10,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hgn.scene.material import MATERIALS, material_index
-from hgn.schema import ConfigError, require, require_non_negative, require_one_of, require_positive
+from hgn.schema import (
+    ConfigError,
+    require,
+    require_below_one,
+    require_fraction,
+    require_non_negative,
+    require_one_of,
+    require_positive,
+)
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
@@ -60,7 +68,7 @@ class SceneConfig:
     particles_per_cell: float = 8.0
     clearance_cells: float = 2.0  # between obstacles, groups and walls, in solver cells
     maximum_initial_speed: float = 0.0  # domain units per second; each group draws one velocity
-    initial_speed_share: float = 1.0  # of the groups, that begin with their velocity; the others begin at rest
+    moving_group_fraction: float = 1.0  # of the groups, that begin with their velocity; the others begin at rest
     lone_particles: int = 0  # far from all others; else a network learns that what is alone lies on the floor
 
     def __post_init__(self) -> None:
@@ -71,7 +79,7 @@ class SceneConfig:
         require_positive(self, "cell_size", "group_size", "particles_per_cell")
         require_non_negative(self, "obstacle_count", "group_count", "clearance_cells", "maximum_initial_speed")
         require_non_negative(self, "lone_particles")
-        require(0 <= self.initial_speed_share <= 1, "initial_speed_share", "from 0 to 1", self.initial_speed_share)
+        require_fraction(self, "moving_group_fraction")
         low, high = self.obstacle_size
         require(0 < low <= high < math.inf, "obstacle_size", "0 < smallest <= largest", list(self.obstacle_size))
         for i, name in enumerate(self.materials):
@@ -341,24 +349,22 @@ class TrainingConfig:
     maximum_minutes: float | None = None  # wall time of this start; none: no limit
     batch_scenes: int = 1  # frames of random scenes in one update, on each device
     optimizer: str = "adam"  # or muon: hidden matrices step along their orthogonalised momentum
-    weight_decay: float = 0.0  # an update, times the learning rate, of what Muon steps; 0: none
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
     warmup_updates: int = 0  # first updates, over which the rate grows linearly to what it is without
-    weights: str | None = None  # what a new run begins with: a file of python -m hgn.export, or a shipped name
+    init_weights: str | None = None  # what a new run begins with: a file of python -m hgn.export, or a shipped name
     ema_decay: float = 0.0  # of the moving average of the weights, an update; 0: none
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
-    huber: float | None = None  # normalised error from which the loss grows linearly, each axis apart; none: squared
-    noise_smooth: float = 0.1  # share of its variance that neighbours have in common; 0: the paper's
-    noise_at_rest: float = 1.0  # smallest share of the noise in frames in which little happens; 1: the same in all
+    noise_correlated_fraction: float = 0.1  # of its variance, which neighbours have in common; 0: the paper's
+    noise_min_scale: float = 1.0  # of the noise where little happens, see hgn.training.noise; 1: the same everywhere
     grid_jitter: bool = True
-    frame_importance: float = 0.0  # share of an episode's samples drawn by how much happens in a frame; weighted
+    frame_importance: float = 0.0  # fraction of an episode's samples drawn by how much happens in a frame; weighted
     symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
-    rollout_share: float = 0.0  # of the scenes, which are taken from the network's own simulations; 0: none are made
-    rollout_every: int = 500  # updates between such simulations
-    rollout_scenes: int = 64  # simulated at once, on each device, from random frames of the training data on …
-    rollout_frames: int = 16  # … for so many frames, each of which can be trained on
-    rollout_pull: float = 0.1  # share of its distance from the truth that the network is to take back in a frame
+    pushforward_fraction: float = 0.0  # of the samples, taken from the network's own simulations; 0: none are made
+    pushforward_every: int = 500  # updates between such simulations
+    pushforward_scenes: int = 64  # simulated at once, on each device, from random frames of the training data on …
+    pushforward_frames: int = 16  # … for so many frames, each of which can be trained on
+    pushforward_pull: float = 0.1  # fraction of its distance from the truth that the network is to undo in a frame
     seed: int = 0
     accelerator: str = "auto"  # or cpu, gpu
     devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
@@ -391,26 +397,16 @@ class TrainingConfig:
             "monitor_scenes",
             "monitor_frame_stride",
             "monitor_particles_per_batch",
-            "rollout_every",
-            "rollout_scenes",
-            "rollout_frames",
+            "pushforward_every",
+            "pushforward_scenes",
+            "pushforward_frames",
         )
-        require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates", "weight_decay")
-        require(0 <= self.rollout_share < 1, "rollout_share", "0 or more and below 1", self.rollout_share)
-        require(0 <= self.rollout_pull <= 1, "rollout_pull", "0 to 1", self.rollout_pull)
-        require(0 <= self.ema_decay < 1, "ema_decay", "0 or more and below 1", self.ema_decay)
-        require(0 <= self.noise_smooth <= 1, "noise_smooth", "0 to 1", self.noise_smooth)
-        require(0 < self.noise_at_rest <= 1, "noise_at_rest", "above 0 and at most 1", self.noise_at_rest)
-        require(0 <= self.frame_importance < 1, "frame_importance", "0 or more and below 1", self.frame_importance)
+        require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates")
+        require_fraction(self, "pushforward_pull", "noise_correlated_fraction")
+        require_below_one(self, "pushforward_fraction", "ema_decay", "frame_importance")
+        require(0 < self.noise_min_scale <= 1, "noise_min_scale", "above 0 and at most 1", self.noise_min_scale)
         require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "optimizer", ("adam", "muon"))
-        require(
-            self.weight_decay == 0 or self.optimizer == "muon",
-            "weight_decay",
-            f"0 where training.optimizer is {self.optimizer}",
-            self.weight_decay,
-            "take training.optimizer=muon",
-        )
         require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
         require_one_of(self, "precision", PRECISIONS)
         require_one_of(self, "backend", TRAINING_BACKENDS)
@@ -420,9 +416,8 @@ class TrainingConfig:
             f"at most learning_rate ({self.learning_rate})",
             self.final_learning_rate,
         )
-        for name in ("maximum_minutes", "huber"):
-            if getattr(self, name) is not None:
-                require_positive(self, name)
+        if self.maximum_minutes is not None:
+            require_positive(self, "maximum_minutes")
         for name in ("devices", "nodes"):
             if getattr(self, name) is not None:
                 require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
@@ -450,10 +445,10 @@ class TrainConfig:
         )
         training, frames = self.training, self.dataset.frames
         require(
-            training.rollout_share == 0 or training.rollout_frames <= frames - 2,
-            "training.rollout_frames",
-            f"at most dataset.frames - 2 = {frames - 2} where rollout_share > 0",
-            training.rollout_frames,
+            training.pushforward_fraction == 0 or training.pushforward_frames <= frames - 2,
+            "training.pushforward_frames",
+            f"at most dataset.frames - 2 = {frames - 2} where pushforward_fraction > 0",
+            training.pushforward_frames,
         )
         unknown = [name for name in self.scene.materials if name not in self.network.materials]
         require(not unknown, "network.materials", "all of scene.materials", list(self.network.materials))
@@ -481,16 +476,16 @@ class AverageConfig:
 
     weights: tuple[str, ...]
     out: str
-    shares: tuple[float, ...] | None = None  # of each, together 1; none: equal ones
+    coefficients: tuple[float, ...] | None = None  # of each, together 1; none: equal ones
     stored_precision: str = "fp32"  # of the learned tensors in the file; or fp16
 
     def __post_init__(self) -> None:
         require_one_of(self, "stored_precision", STORED_PRECISIONS)
         require(len(self.weights) >= 2, "weights", "at least two files", len(self.weights))
-        if self.shares is not None:
+        if self.coefficients is not None:
             count = f"one for each of the {len(self.weights)} files"
-            require(len(self.shares) == len(self.weights), "shares", count, len(self.shares))
-            require(abs(sum(self.shares) - 1) < 1e-6, "shares", "1 together", sum(self.shares))
+            require(len(self.coefficients) == len(self.weights), "coefficients", count, len(self.coefficients))
+            require(abs(sum(self.coefficients) - 1) < 1e-6, "coefficients", "1 together", sum(self.coefficients))
 
 
 @dataclass(frozen=True)

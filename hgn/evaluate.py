@@ -25,12 +25,12 @@ from hgn.system.progress import bar
 from hgn.system.provenance import provenance
 from hgn.training.errors import (
     REPORTED_FRAMES,
+    baselines,
+    format_ratio,
     frame_batches,
     network_predictor,
     one_step_errors,
     rollout_errors,
-    told_gain,
-    trivial_predictors,
 )
 
 
@@ -58,7 +58,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 def one_step_rows(network: ParticleNetwork, episodes: list[Episode], config: EvaluateConfig) -> list[dict[str, Any]]:
     """One row a predictor: {"system", "one_step_mse", "by_material"}."""
-    predictors = {"network": network_predictor(network)} | trivial_predictors(network)
+    predictors = {"network": network_predictor(network)} | baselines(network)
     device = next(network.parameters()).device
     total = sum(-(-(len(episode.position_TN3) - 1) // config.frame_stride) for episode in episodes)
     with bar("one-step errors", total=total, unit="frame") as progress:
@@ -145,7 +145,7 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
     ours = next(row["one_step_mse"] for row in rows if row["system"] == "network")
     best = min(row["one_step_mse"] for row in rows if "one_step_mse" in row and row["system"] != "network")
     ratio = best / ours if ours > 0 else float("inf")
-    lines.append(f"the network's one-step MSE is {told_gain(ratio)} the best trivial predictor's")
+    lines.append(f"the network's one-step MSE is {format_ratio(ratio)} the best trivial predictor's")
     return "\n".join(lines)
 
 

@@ -15,6 +15,17 @@ KEYS = {
     "path": "backend",
     "paths": "backends",
     "training.path": "training.backend",
+    "training.noise_smooth": "training.noise_correlated_fraction",
+    "training.noise_at_rest": "training.noise_min_scale",
+    "training.rollout_share": "training.pushforward_fraction",
+    "training.rollout_every": "training.pushforward_every",
+    "training.rollout_scenes": "training.pushforward_scenes",
+    "training.rollout_frames": "training.pushforward_frames",
+    "training.rollout_pull": "training.pushforward_pull",
+    "training.weights": "training.init_weights",
+    "scene.initial_speed_share": "scene.moving_group_fraction",
+    "shares": "coefficients",  # of hgn.average
+    "cursor": "sampler_state",  # in checkpoints
 }
 # Old value to new value, by the new key's last name.
 _BACKENDS = {"plain": "torch", "fast": "triton"}

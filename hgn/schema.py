@@ -100,6 +100,20 @@ def require_non_negative(owner: object, *names: str) -> None:
         require(value >= 0 and math.isfinite(value), name, "a finite number >= 0", value)
 
 
+def require_fraction(owner: object, *names: str) -> None:
+    """Each named field of `owner` is from 0 to 1 (NaN is refused)."""
+    for name in names:
+        value = getattr(owner, name)
+        require(0 <= value <= 1, name, "from 0 to 1", value)
+
+
+def require_below_one(owner: object, *names: str) -> None:
+    """Each named field of `owner` is at least 0 and below 1 (NaN is refused)."""
+    for name in names:
+        value = getattr(owner, name)
+        require(0 <= value < 1, name, "0 or more and below 1", value)
+
+
 def require_one_of(owner: object, name: str, choices: Sequence[object]) -> None:
     """The named field of `owner` is one of `choices`."""
     value = getattr(owner, name)

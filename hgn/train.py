@@ -21,7 +21,7 @@ from hgn.data.storage import is_remote
 from hgn.network.base import ParticleNetwork
 from hgn.schema import from_mapping
 from hgn.system.extras import require_installed
-from hgn.training.checkpoint import check_checkpoint, cursor_of_checkpoint, network_of_weights, read_checkpoint
+from hgn.training.checkpoint import check_checkpoint, network_of_weights, read_checkpoint, sampler_state_of_checkpoint
 from hgn.training.dataset import PublishedEpisodes, is_complete, wait_for_episodes
 from hgn.training.distributed import default_run, first_rank, layout
 from hgn.training.generator import Generator
@@ -41,7 +41,7 @@ def main(mapping: dict[str, Any]) -> int:
     if EpisodeStore.available(folder):
         require_same_dataset(Manifest.load(folder).config, config.datagen, folder)
     checkpoint = _checkpoint_to_resume(config, run / "checkpoints" / "last.ckpt")
-    begin_with = _weights_to_begin_with(config, checkpoint)
+    initial = _initial_network(config, checkpoint)
     stop = StopRequest()
     stop.listen()
     with ExitStack() as stack:
@@ -57,7 +57,7 @@ def main(mapping: dict[str, Any]) -> int:
             return stop.exit_code
         stop.restart_clock(config.training.maximum_minutes)
         published = PublishedEpisodes(config, generator)
-        return train_network(config, store, checkpoint, begin_with, stop, published, precompilation)
+        return train_network(config, store, checkpoint, initial, stop, published, precompilation)
 
 
 def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, SamplerState] | None:
@@ -66,17 +66,17 @@ def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, Sample
         return None
     checkpoint = read_checkpoint(path)
     check_checkpoint(checkpoint, config, identity_hash(dataset_identity(config.datagen)), path)
-    return path, cursor_of_checkpoint(checkpoint)
+    return path, sampler_state_of_checkpoint(checkpoint)
 
 
-def _weights_to_begin_with(config: TrainConfig, checkpoint: tuple[Path, SamplerState] | None) -> ParticleNetwork | None:
-    """The network of training.weights, for a new run alone: a checkpoint wins."""
-    weights = config.training.weights
+def _initial_network(config: TrainConfig, checkpoint: tuple[Path, SamplerState] | None) -> ParticleNetwork | None:
+    """The network of training.init_weights, for a new run alone: a checkpoint wins."""
+    weights = config.training.init_weights
     if weights is None:
         return None
     if checkpoint is not None:
         if first_rank():
-            print(f"training.weights={weights} is not read: the run goes on from {checkpoint[0]}", file=sys.stderr)
+            print(f"training.init_weights={weights} is not read: the run goes on from {checkpoint[0]}", file=sys.stderr)
         return None
     network = network_of_weights(config)
     if first_rank():

@@ -12,7 +12,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from datagen.generate import KEYS, StopRequest, datagen_config, require_local_folder
+from datagen.generate import KEYS, StopSignal, datagen_config, require_local_folder
 from datagen.pool.progress import PROGRESS_KINDS, make_progress
 from datagen.pool.worker import Backend
 from datagen.service.supervisor import Supervisor
@@ -37,7 +37,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     if (folder / MANIFEST_NAME).exists():
         require_same_dataset(Manifest.load(folder).config, config, folder)
     token = dataset_token()
-    with _listen(service, token) as listener, StopRequest() as stop:
+    with _listen(service, token) as listener, StopSignal() as stop:
         # this loads for a second, and the pool's processes, which import this file, do not need it
         from datagen.service.server import make_app, make_server
 

@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
 
-from datagen.generate import StopRequest, generate
+from datagen.generate import StopSignal, generate
 from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend, error_message
 from hgn.config import DatagenConfig
@@ -147,7 +147,7 @@ class _PipeProgress(Progress):
 
 
 def _generate(connection: Connection, config: DatagenConfig, backend: Backend | None) -> None:
-    with StopRequest() as stop:
+    with StopSignal() as stop:
         die_with_parent(signal.SIGTERM)  # should the service be killed, the pool ends as it would at Ctrl-C
         parent = multiprocessing.parent_process()
         if parent is None or os.getppid() != parent.pid:

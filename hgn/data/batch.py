@@ -34,12 +34,10 @@ class Batch:
     obstacles: ObstacleCells | None
     surface: SurfaceParticles | None  # where the network sees obstacles as particles
     seeds_S: tuple[int, ...]  # of noise, jitter and symmetry
-    cursor: SamplerState | None = None  # the order's state once this batch is trained on
+    sampler_state: SamplerState | None = None  # the sampler's state once this batch is trained on
     symmetries_S: tuple[tuple[Symmetry, ...], ...] = ()  # of each scene: what training may show instead of it
     weight_S: tuple[float, ...] = ()  # of each scene's loss; empty: 1
-    noise_S: tuple[float, ...] = ()  # of each scene, in units of training.noise_std; empty: 1
-    samples_S: tuple[tuple[Episode, int], ...] = ()  # episode and frame n of each scene
-    starts: tuple[tuple[Episode, int], ...] = ()  # where the network is to simulate from before it trains on this batch
+    noise_scale_S: tuple[float, ...] = ()  # of each scene, in units of training.noise_std; empty: 1
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
         names = ("window_WN3", "material_N", "scene_N", "domain_S3", "gravity_S3")
@@ -73,18 +71,51 @@ class Batch:
         """The mean over scenes of each scene's mean over its particles times its weight: a scalar."""
         weight_S = self.weight_S or (1.0,) * len(self.particles_S)
         pairs = zip(weight_S, self.particles_S, strict=True)
-        share_S = torch.tensor([weight / (len(weight_S) * max(count, 1)) for weight, count in pairs])
-        return (value_N * share_S.to(value_N)[self.scene_N]).sum()
+        factor_S = torch.tensor([weight / (len(weight_S) * max(count, 1)) for weight, count in pairs])
+        return (value_N * factor_S.to(value_N)[self.scene_N]).sum()
+
+
+@dataclass(frozen=True, eq=False)
+class BatchSample:
+    """A frame of an episode to train on, as hgn.kernels.update.op.DeviceSample is for the triton backend."""
+
+    episode: Episode
+    frame: int
+    window_WN3: np.ndarray  # the positions that stand for the episode's own around the frame
+    seed: int = 0  # of noise, jitter and symmetry
+    weight: float = 1.0  # of its loss
+    noise_scale: float = 1.0  # of its noise, in units of training.noise_std
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateSamples:
+    """The samples of an update before they are a batch: the pushforward pool may replace some of them."""
+
+    samples: tuple[BatchSample, ...]
+    sampler_state: SamplerState  # the order's state once these are trained on
+    starts: tuple[tuple[Episode, int], ...] = ()  # where the network is to simulate from before this update
+
+    def batch(self, network: NetworkConfig) -> Batch:
+        """The samples as tensors."""
+        return make_batch(
+            [(sample.episode, sample.frame) for sample in self.samples],
+            network,
+            [sample.seed for sample in self.samples],
+            self.sampler_state,
+            [sample.weight for sample in self.samples],
+            [sample.window_WN3 for sample in self.samples],
+            [sample.noise_scale for sample in self.samples],
+        )
 
 
 def make_batch(
     samples: Sequence[tuple[Episode, int]],
     network: NetworkConfig,
     seeds: Sequence[int] | None = None,
-    cursor: SamplerState | None = None,
+    sampler_state: SamplerState | None = None,
     weights: Sequence[float] = (),
     windows: Sequence[np.ndarray] | None = None,
-    noise: Sequence[float] = (),
+    noise_scales: Sequence[float] = (),
 ) -> Batch:
     """Reads the windows of (episode, frame) pairs, where they are not given, and joins them, with what the network sees
     of the obstacles.
@@ -107,9 +138,8 @@ def make_batch(
         obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
         surface=surface,
         seeds_S=tuple(seeds) if seeds is not None else (0,) * len(episodes),
-        cursor=cursor,
+        sampler_state=sampler_state,
         weight_S=tuple(weights),
-        noise_S=tuple(noise),
+        noise_scale_S=tuple(noise_scales),
         symmetries_S=tuple(scene_symmetries(e.gravity, e.domain_size, e.obstacle_grid.cell_size) for e in episodes),
-        samples_S=tuple(samples),
     )

@@ -36,7 +36,7 @@ class UpdateChunk:
 
     samples: tuple[tuple[Sample, ...], ...]
     episodes: dict[int, EpisodeTensors]
-    cursor: SamplerState  # the order's state once these are trained on
+    sampler_state: SamplerState  # the order's state once these are trained on
     starts: tuple[tuple[int, int], ...] = ()  # episodes and frames that the network is to simulate from before it
 
 

@@ -21,14 +21,14 @@ PARTICLES = 512  # of an episode that are looked at, about
 
 @dataclass(frozen=True, eq=False)
 class FrameImportance:
-    """An episode's frames with the share of its samples that each gets, a distribution over F frames."""
+    """An episode's frames with the fraction of its samples that each gets, a distribution over F frames."""
 
     cumulative_F: np.ndarray  # float64, ends with 1
     acceleration_F: np.ndarray  # root mean square over axes and particles
 
     @staticmethod
-    def of(episode: Episode, share: float) -> FrameImportance:
-        """A `share` of the samples in proportion to the frames' root mean square acceleration, the others evenly."""
+    def of(episode: Episode, fraction: float) -> FrameImportance:
+        """A `fraction` of the samples in proportion to the frames' root mean square acceleration, the others evenly."""
         step = max(1, episode.particle_count // PARTICLES)
         past_1N3 = frames_before(episode, -1)[:, ::step]
         position_TN3 = np.concatenate([past_1N3, episode.position_TN3[:, ::step]], dtype=np.float64)
@@ -36,7 +36,7 @@ class FrameImportance:
         size_F = np.sqrt(square_FN3.mean(axis=(1, 2))) if square_FN3.size else np.zeros(len(square_FN3))
         total = size_F.sum()
         even_F = np.full(len(size_F), 1 / len(size_F))
-        chance_F = (1 - share) * even_F + share * (size_F / total if total > 0 else even_F)
+        chance_F = (1 - fraction) * even_F + fraction * (size_F / total if total > 0 else even_F)
         cumulative_F = chance_F.cumsum()
         return FrameImportance(cumulative_F / cumulative_F[-1], size_F)
 

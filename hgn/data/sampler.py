@@ -33,7 +33,7 @@ class Sample(NamedTuple):  # which Python makes faster than other classes: a tho
     frame: int
     seed: int  # of its noise, grid jitter and symmetry
     weight: float = 1.0  # of its loss
-    noise: float = 1.0  # in units of training.noise_std, see hgn.data.rest_noise
+    noise_scale: float = 1.0  # of its noise, in units of training.noise_std, see hgn.training.noise
 
 
 def epoch_permutation(seed: int, epoch: int, sample_count: int) -> np.ndarray:
@@ -42,11 +42,11 @@ def epoch_permutation(seed: int, epoch: int, sample_count: int) -> np.ndarray:
 
 
 class EpisodeSampler:
-    """Walks through epochs in batches and tells each rank its share.
+    """Walks through epochs in batches and tells each rank its part.
 
     `published(epoch)` is asked once when an epoch begins and returns the number of frames of each published
     episode, oldest publication first; it must return the same on every rank, and a list that continues the
-    one of the epoch before. After a resume it may return more than the cursor's epoch knew: the surplus waits
+    one of the epoch before. After a resume it may return more than the state's epoch knew: the surplus waits
     for the next epoch.
     """
 
@@ -55,30 +55,30 @@ class EpisodeSampler:
         seed: int,
         batch_scenes: int,
         published: Callable[[int], Sequence[int]],
-        cursor: SamplerState | None = None,
+        state: SamplerState | None = None,
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
         assert 0 <= rank < world_size and batch_scenes >= 1
         self.seed, self.batch_scenes, self.rank, self.world_size = seed, batch_scenes, rank, world_size
-        self.cursor = cursor or SamplerState()
+        self.state = state or SamplerState()
         self._published = published
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
         self._first_seed = 0  # of an epoch's samples, which have one after the other
-        self._begin_epoch(self.cursor.epoch, self.cursor.position, self.cursor.episodes)
+        self._begin_epoch(self.state.epoch, self.state.position, self.state.episodes)
 
     def next_batch(self) -> list[Sample]:
-        """This rank's `batch_scenes` samples of the next global batch; advances the cursor."""
+        """This rank's `batch_scenes` samples of the next global batch; advances the state."""
         total, mine = self.batch_scenes * self.world_size, self.batch_scenes * self.rank
         samples: list[Sample] = []
         taken = 0  # of the global batch, which may run over the end of an epoch
         while taken < total:
-            if self.cursor.position == len(self._order):
-                self._begin_epoch(self.cursor.epoch + 1, 0, 0)
-            rest = self._order[self.cursor.position :][: total - taken]
+            if self.state.position == len(self._order):
+                self._begin_epoch(self.state.epoch + 1, 0, 0)
+            rest = self._order[self.state.position :][: total - taken]
             samples += self._samples(rest[max(mine - taken, 0) : max(mine + self.batch_scenes - taken, 0)])
-            self.cursor = replace(self.cursor, position=self.cursor.position + len(rest))
+            self.state = replace(self.state, position=self.state.position + len(rest))
             taken += len(rest)
         return samples
 
@@ -95,7 +95,7 @@ class EpisodeSampler:
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_permutation(self.seed, epoch, int(self._first_sample[-1]))
         self._first_seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0])
-        self.cursor = SamplerState(epoch, position, len(frame_counts))
+        self.state = SamplerState(epoch, position, len(frame_counts))
 
     def _samples(self, index_K: np.ndarray) -> list[Sample]:
         episode_K = self._first_sample.searchsorted(index_K, side="right") - 1

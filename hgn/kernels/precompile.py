@@ -48,7 +48,7 @@ class PrecompileJob:
     particles: int  # of an update, about
     cells: tuple[int, ...]  # of each level, about; of a GNS its edges
     capability: int  # of the GPU: 90 for an H100
-    rollout_scenes: tuple[int, ...] = ()  # that the network simulates at once, to train on them and to measure
+    pushforward_scenes: tuple[int, ...] = ()  # that the network simulates at once, to train on them and to measure
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
-    for scenes in job.rollout_scenes:
+    for scenes in job.pushforward_scenes:
         assert isinstance(network, HierarchicalGraphNetwork)
         _rollout_launches(job, scenes, network, device)
 
@@ -169,7 +169,7 @@ def job_of(text: str) -> PrecompileJob | FrameJob:
         return FrameJob(networks, tuple((n, cells) for n, cells in mapping["sizes"]), mapping["capability"])
     network = from_mapping(NetworkConfig, mapping.pop("network"))
     settings = UpdateSettings(**mapping.pop("settings"))
-    tuples = {name: tuple(mapping[name]) for name in ("cells", "rollout_scenes")}
+    tuples = {name: tuple(mapping[name]) for name in ("cells", "pushforward_scenes")}
     return PrecompileJob(network, settings, **{**mapping, **tuples})
 
 

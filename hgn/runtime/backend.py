@@ -29,11 +29,11 @@ def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "
 
 
 def why_not_trained_fast(
-    device: torch.device, config: NetworkConfig, precision: str, own_states: bool = False
+    device: torch.device, config: NetworkConfig, precision: str, pushforward: bool = False
 ) -> str | None:
     """What keeps training from backend triton, which updates GNS too, in words; none if nothing does.
 
-    `own_states`: it is to train on the network's own states.
+    `pushforward`: it is to train on the network's own simulations.
     """
     if config.kind == "hgn":
         return why_not_fast(device, config, precision)
@@ -47,8 +47,8 @@ def why_not_trained_fast(
         return reason
     if config.maximum_neighbours is not None:
         return f"network.maximum_neighbours must be null for it, not {config.maximum_neighbours}"
-    if own_states:
-        return "it trains gns on true states alone (training.rollout_share=0)"
+    if pushforward:
+        return "it trains gns on true states alone (training.pushforward_fraction=0)"
     return None
 
 

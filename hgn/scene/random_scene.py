@@ -221,7 +221,7 @@ def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.
     velocity = np.zeros(3)
     if config.maximum_initial_speed > 0:
         velocity = config.maximum_initial_speed * points_in_ball(1, 3, rng)[0]
-        if config.initial_speed_share < 1 and rng.random() >= config.initial_speed_share:
+        if config.moving_group_fraction < 1 and rng.random() >= config.moving_group_fraction:
             velocity = np.zeros(3)
     count = particle_count(region, config.particles_per_cell, config.cell_size)
     record = {

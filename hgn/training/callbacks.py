@@ -35,11 +35,11 @@ from hgn.training.data_module import EpisodeDataModule, agreed_count
 from hgn.training.errors import (
     REPORTED_FRAMES,
     SquaredError,
+    baselines,
     frame_batches,
     network_predictor,
     one_step_errors,
     rollout_errors,
-    trivial_predictors,
 )
 from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
@@ -61,7 +61,7 @@ class SameStart(Callback):
         if trainer.world_size == 1:
             return
         lightning_compat.skip_sigterm_broadcast(trainer)
-        mine: dict[str, Any] = {"update": trainer.global_step} | to_mapping(self.feed.cursor)
+        mine: dict[str, Any] = {"update": trainer.global_step} | to_mapping(self.feed.sampler_state)
         first = trainer.strategy.broadcast(mine)
         if not trainer.strategy.reduce_boolean_decision(mine == first, all=True):
             raise ConfigError(
@@ -135,7 +135,7 @@ class Monitor(Callback):
             self.measure(trainer, pl_module, PATIENCE_S)
 
     def measure(self, trainer: Trainer, module: TrainingModule, patience_s: float = 0.0) -> None:
-        """All ranks share the one-step frames; rank 0 does the rollouts. Ends early on a stop request.
+        """The one-step frames are divided among the ranks; rank 0 does the rollouts. Ends early on a stop request.
 
         Where a server has scenes that are not here yet and does not answer, measures nothing and says so.
         """
@@ -184,7 +184,7 @@ class Monitor(Callback):
             trainer.global_rank,
             trainer.world_size,
         )
-        predictors = {"network": network_predictor(network)} | trivial_predictors(network)
+        predictors = {"network": network_predictor(network)} | baselines(network)
         materials = network.config.materials
         interrupted: Callable[[], bool] = lambda: trainer.world_size == 1 and self.stop.signal is not None  # noqa: E731
         errors = one_step_errors(predictors, batches, module.device, materials, interrupted)
@@ -193,12 +193,12 @@ class Monitor(Callback):
         values = {f"one_step/{split}": errors["network"].mse}
         best = min(error.mse for name, error in errors.items() if name != "network")
         if values[f"one_step/{split}"] > 0:
-            values[f"one_step_gain/{split}"] = best / values[f"one_step/{split}"]
+            values[f"baseline_ratio/{split}"] = best / values[f"one_step/{split}"]
         for name, mse in errors["network"].by_material().items():
             values[f"one_step/{split}_{name}"] = mse
         for name, error in errors.items():
             if name != "network":
-                values[f"trivial/{split}_{name.replace(' ', '_')}"] = error.mse
+                values[f"baseline/{split}_{name.replace(' ', '_')}"] = error.mse
         return values
 
     def _rollout(
@@ -260,20 +260,20 @@ class LogLines(Callback):
             "learning_rate": float(trainer.optimizers[0].param_groups[0]["lr"]),
             "updates_per_second": speed,
             "scenes_per_second": speed * pl_module.training_config.batch_scenes * trainer.world_size,
-            "data_wait_share": (waited_s - self._waited_s) / seconds,
+            "data_wait_fraction": (waited_s - self._waited_s) / seconds,
             "shards": float(len(self.feed.store.manifest.shards_of("train"))),
-            "episodes": float(pl_module.cursor.episodes),
-            "epoch": float(pl_module.cursor.epoch),
+            "episodes": float(pl_module.sampler_state.episodes),
+            "epoch": float(pl_module.sampler_state.epoch),
         }
         self._time, self._update, self._waited_s = now, trainer.global_step, waited_s
-        values |= pl_module.own_states
+        values |= pl_module.pushforward_figures
         if pl_module.device.type == "cuda":
             values["gpu_memory_gb"] = torch.cuda.max_memory_allocated() / 1e9
         log(trainer, self.run, values)
         if self._bar is not None:
             notes = f"loss {values.get('loss', math.nan):.3f}"
-            if "one_step_gain/validation" in self.monitor.last:
-                notes += f", {self.monitor.last['one_step_gain/validation']:.2f}x below trivial"
+            if "baseline_ratio/validation" in self.monitor.last:
+                notes += f", {self.monitor.last['baseline_ratio/validation']:.2f}x below the best baseline"
             self._bar.set_postfix_str(f"{notes}, {self.published()}", refresh=False)
             self._bar.update(trainer.global_step - self._bar.n)
 

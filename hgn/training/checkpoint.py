@@ -16,6 +16,7 @@ from hgn.config import NetworkConfig, TrainConfig
 from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
+from hgn.renamed import current_names
 from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import ConfigError, from_stored, to_mapping
 
@@ -78,14 +79,14 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
 
 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
-    """The network of training.weights, normaliser included, for a new run to begin with.
+    """The network of training.init_weights, normaliser included, for a new run to begin with.
 
     Raises: ConfigError for a file that is none, and where the run wants another network or has other data.
     """
-    assert config.training.weights is not None
-    path = find_weights(config.training.weights, "training.weights")
-    network, info = load_weights(path, field="training.weights")
-    remedy = "set it so, or take other training.weights"
+    assert config.training.init_weights is not None
+    path = find_weights(config.training.init_weights, "training.init_weights")
+    network, info = load_weights(path, field="training.init_weights")
+    remedy = "set it so, or take other training.init_weights"
     found, wanted = to_mapping(info.network), to_mapping(config.network)
     pairs = [(f"network.{key}", found[key], wanted[key]) for key in sorted(found)]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
@@ -93,7 +94,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
     for name, theirs, ours in pairs:
         if theirs != ours:
-            raise ConfigError(f"{name} must be {theirs!r}, as in training.weights {path}, got {ours!r}; {remedy}")
+            raise ConfigError(f"{name} must be {theirs!r}, as in training.init_weights {path}, got {ours!r}; {remedy}")
     return network
 
 
@@ -107,9 +108,9 @@ def network_of_checkpoint(checkpoint: dict[str, Any]) -> ParticleNetwork:
     return network
 
 
-def cursor_of_checkpoint(checkpoint: dict[str, Any]) -> SamplerState:
+def sampler_state_of_checkpoint(checkpoint: dict[str, Any]) -> SamplerState:
     """Where in the order of samples the run stood."""
-    return from_stored(SamplerState, checkpoint[SECTION]["cursor"], "cursor")
+    return from_stored(SamplerState, current_names(checkpoint[SECTION])["sampler_state"], "sampler_state")
 
 
 def data_of_checkpoint(checkpoint: dict[str, Any]) -> DataInfo:

@@ -6,7 +6,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
@@ -14,17 +13,18 @@ from lightning.pytorch import LightningDataModule, Trainer
 from torch.utils.data import DataLoader, IterableDataset
 
 from hgn.config import NetworkConfig, TrainingConfig
-from hgn.data.batch import Batch, make_batch
+from hgn.data.batch import Batch, BatchSample, UpdateSamples
 from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk, whole_episode
 from hgn.data.importance import FrameImportance
 from hgn.data.reader import EpisodeStore
-from hgn.data.rest_noise import noise_at_rest
 from hgn.data.sampler import EpisodeSampler, Sample, SamplerState
 from hgn.data.storage import without_patience
 from hgn.scene.episode import Episode
+from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.training import lightning_compat
-from hgn.training.pushforward import drawn_starts
+from hgn.training.noise import noise_scale
+from hgn.training.pushforward import Starts, drawn_starts
 
 T = TypeVar("T")
 SHARED_FOLDER_PATIENCE_S = 300.0
@@ -55,37 +55,45 @@ class EpisodeDataModule(LightningDataModule):
         self.batches_ahead = batches_ahead  # read while another is trained on; 0: read when asked for
         self.hands_out_chunks = chunks
         self.interrupted = interrupted
-        self.cursor = SamplerState()  # where to begin; set from the checkpoint on a resume
+        self.sampler_state = SamplerState()  # where to begin; set from the checkpoint on a resume
         self._importance: dict[int, FrameImportance] = {}
         self.waited_s = 0.0  # time that the training has waited for a batch
 
-    def train_dataloader(self) -> DataLoader[Batch | UpdateChunk]:
+    def train_dataloader(self) -> DataLoader[Batch | UpdateSamples | UpdateChunk]:
         # The windows are memory-mapped and small: a worker process would cost more than it saves.
         return DataLoader(_Stream(self), batch_size=None, num_workers=0)
 
     def transfer_batch_to_device(
-        self, batch: Batch | UpdateChunk, device: torch.device, dataloader_idx: int
-    ) -> Batch | UpdateChunk:
+        self, batch: Batch | UpdateSamples | UpdateChunk, device: torch.device, dataloader_idx: int
+    ) -> Batch | UpdateSamples | UpdateChunk:
         return batch.to(device, non_blocking=True) if isinstance(batch, Batch) else batch
 
-    def batches(self) -> Iterator[Batch]:
-        """This rank's batches, without end."""
+    def batches(self) -> Iterator[Batch | UpdateSamples]:
+        """This rank's batches, without end; samples instead where the pushforward pool may replace some of them."""
         order = self._order()
         begun = update = self._update()
 
-        def draw() -> tuple[tuple[list[Sample], tuple[tuple[int, int], ...]], SamplerState]:
+        def draw() -> tuple[tuple[list[Sample], Starts], SamplerState]:
             nonlocal update
             starts = self._starts(order, begun, update)
             update += 1
-            return (order.next_batch(), starts), order.cursor
+            return (order.next_batch(), starts), order.state
 
-        def read(drawn: tuple[Sequence[Sample], tuple[tuple[int, int], ...]], cursor: SamplerState) -> Batch:
-            samples, starts = self._by_importance(drawn[0]), drawn[1]
-            pairs = [(self.store.episodes[sample.episode], sample.frame) for sample in samples]
-            seeds, weights = [sample.seed for sample in samples], [sample.weight for sample in samples]
-            noise = [sample.noise for sample in samples]
-            batch = make_batch(pairs, self.network, seeds, cursor, weights, noise=noise)
-            return replace(batch, starts=tuple((self.store.episodes[index], frame) for index, frame in starts))
+        def read(drawn: tuple[list[Sample], Starts], state: SamplerState) -> Batch | UpdateSamples:
+            episodes = self.store.episodes
+            samples = tuple(
+                BatchSample(
+                    episodes[sample.episode],
+                    sample.frame,
+                    window(episodes[sample.episode], sample.frame, self.network.velocity_history),
+                    sample.seed,
+                    sample.weight,
+                    sample.noise_scale,
+                )
+                for sample in self._weighted(drawn[0])
+            )
+            update_samples = UpdateSamples(samples, state, tuple((episodes[i], frame) for i, frame in drawn[1]))
+            return update_samples if self.training.pushforward_fraction else update_samples.batch(self.network)
 
         yield from self._ahead(draw, read)
 
@@ -93,24 +101,22 @@ class EpisodeDataModule(LightningDataModule):
         """The same samples, those of many updates at once. A chunk ends wherever something is due between updates."""
         order = self._order()
         begun = update = self._update()
-        known: set[int] = set()
+        handed_out: set[int] = set()  # episodes
 
-        def draw() -> tuple[tuple[list[tuple[Sample, ...]], tuple[tuple[int, int], ...]], SamplerState]:
+        def draw() -> tuple[tuple[list[tuple[Sample, ...]], Starts], SamplerState]:
             nonlocal update
             starts = self._starts(order, begun, update)
             count = chunk_length(self.training, begun, update)
             update += count
-            return ([tuple(order.next_batch()) for _ in range(count)], starts), order.cursor
+            return ([tuple(order.next_batch()) for _ in range(count)], starts), order.state
 
-        def read(
-            drawn: tuple[list[tuple[Sample, ...]], tuple[tuple[int, int], ...]], cursor: SamplerState
-        ) -> UpdateChunk:
+        def read(drawn: tuple[list[tuple[Sample, ...]], Starts], state: SamplerState) -> UpdateChunk:
             samples, starts = drawn
-            asked = {sample.episode for batch in samples for sample in batch} | {index for index, _ in starts}
-            new = sorted(asked - known)
-            known.update(new)
+            needed = {sample.episode for batch in samples for sample in batch} | {index for index, _ in starts}
+            new = sorted(needed - handed_out)
+            handed_out.update(new)
             episodes = self._whole(new)
-            return UpdateChunk(tuple(self._by_importance(update) for update in samples), episodes, cursor, starts)
+            return UpdateChunk(tuple(self._weighted(update) for update in samples), episodes, state, starts)
 
         yield from self._ahead(draw, read)
 
@@ -118,52 +124,53 @@ class EpisodeDataModule(LightningDataModule):
         """The number of the next update."""
         return self.trainer.global_step if self.trainer is not None else 0
 
-    def _starts(self, order: EpisodeSampler, begun: int, update: int) -> tuple[tuple[int, int], ...]:
+    def _starts(self, order: EpisodeSampler, begun: int, update: int) -> Starts:
         """Episodes and frames that the network is to simulate from before this update; none where that is not due."""
-        due = update == begun or update % self.training.rollout_every == 0
-        if self.training.rollout_share == 0 or not due:
+        due = update == begun or update % self.training.pushforward_every == 0
+        if self.training.pushforward_fraction == 0 or not due:
             return ()
-        frames = [entry.frames for entry in self.store.entries[: order.cursor.episodes]]
+        frames = [entry.frames for entry in self.store.entries[: order.state.episodes]]
         return drawn_starts(self.training, update, order.rank, frames)
 
     def _whole(self, indices: Sequence[int]) -> dict[int, EpisodeTensors]:
         """Reads episodes, several at once: a data set's first pass is gigabytes, and copies release Python's lock."""
-        share, wanted = self.training.frame_importance, self._asks_what_happens
+        fraction, measured = self.training.frame_importance, self._measures_frames
 
         def read(episode: Episode) -> tuple[EpisodeTensors, FrameImportance | None]:
-            return whole_episode(episode, self.network), FrameImportance.of(episode, share) if wanted else None
+            return whole_episode(episode, self.network), FrameImportance.of(episode, fraction) if measured else None
 
         opened = [self.store.episodes[index] for index in indices]
         with ThreadPoolExecutor(READERS) as readers:
-            found = dict(zip(indices, readers.map(read, opened), strict=True))
-        self._importance.update({index: importance for index, (_, importance) in found.items() if importance})
-        return {index: whole for index, (whole, _) in found.items()}
+            results = dict(zip(indices, readers.map(read, opened), strict=True))
+        self._importance.update({index: importance for index, (_, importance) in results.items() if importance})
+        return {index: whole for index, (whole, _) in results.items()}
 
     @property
-    def _asks_what_happens(self) -> bool:
-        return self.training.frame_importance > 0 or self.training.noise_at_rest < 1
+    def _measures_frames(self) -> bool:
+        """Whether it matters how much happens in a frame."""
+        return self.training.frame_importance > 0 or self.training.noise_min_scale < 1
 
-    def _by_importance(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
-        """The same samples with frames drawn as `training.frame_importance` says and noise as `noise_at_rest` does, and
-        their weights."""
-        share = self.training.frame_importance
-        if not self._asks_what_happens:
+    def _weighted(self, samples: Sequence[Sample]) -> tuple[Sample, ...]:
+        """The same samples with frames drawn as `training.frame_importance` says, the scale of their noise as
+        `noise_min_scale` says, and their weights. For both backends, before windows are read."""
+        fraction = self.training.frame_importance
+        if not self._measures_frames:
             return tuple(samples)
         drawn = []
         for sample in samples:
             if sample.episode not in self._importance:
                 episode = self.store.episodes[sample.episode]
-                self._importance[sample.episode] = FrameImportance.of(episode, share)
+                self._importance[sample.episode] = FrameImportance.of(episode, fraction)
             importance = self._importance[sample.episode]
-            frame, weight = importance.draw(sample.frame, sample.seed) if share > 0 else (sample.frame, 1.0)
-            noise, factor = noise_at_rest(self.training, importance.accelerations[frame], sample.seed)
-            drawn.append(Sample(sample.episode, frame, sample.seed, weight * factor, noise))
+            frame, weight = importance.draw(sample.frame, sample.seed) if fraction > 0 else (sample.frame, 1.0)
+            scale, scale_weight = noise_scale(self.training, importance.accelerations[frame], sample.seed)
+            drawn.append(Sample(sample.episode, frame, sample.seed, weight * scale_weight, scale))
         return tuple(drawn)
 
     def _order(self) -> EpisodeSampler:
         rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         return EpisodeSampler(
-            self.training.seed, self.training.batch_scenes, self._published, self.cursor, rank, world_size
+            self.training.seed, self.training.batch_scenes, self._published, self.sampler_state, rank, world_size
         )
 
     def _ahead(
@@ -211,8 +218,8 @@ def chunk_length(training: TrainingConfig, begun: int, update: int) -> int:
     The first chunks are short: they bring the most episodes that are not in memory yet.
     """
     due = [training.log_every, training.checkpoint_every, training.monitor_every]
-    if training.rollout_share > 0:
-        due.append(training.rollout_every)
+    if training.pushforward_fraction > 0:
+        due.append(training.pushforward_every)
     until_due = min([every - update % every for every in due])
     until_end = max(training.maximum_updates - update, 1)
     return min(until_due, until_end, UPDATES_AT_ONCE, max(1, update - begun))
@@ -239,9 +246,9 @@ def agreed_count(store: EpisodeStore, trainer: Trainer) -> int:
     return count
 
 
-class _Stream(IterableDataset[Batch | UpdateChunk]):
+class _Stream(IterableDataset[Batch | UpdateSamples | UpdateChunk]):
     def __init__(self, feed: EpisodeDataModule) -> None:
         self.feed = feed
 
-    def __iter__(self) -> Iterator[Batch | UpdateChunk]:
+    def __iter__(self) -> Iterator[Batch | UpdateSamples | UpdateChunk]:
         return self.feed.chunks() if self.feed.hands_out_chunks else self.feed.batches()

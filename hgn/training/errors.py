@@ -21,7 +21,7 @@ REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
 Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
 
 
-def told_gain(gain: float) -> str:
+def format_ratio(gain: float) -> str:
     """How many times an error is below another that is `gain` times as large, for people: above, where it is."""
     if not 0 < gain < 1:
         return f"{gain:.2f} times below"
@@ -68,7 +68,7 @@ def mean_acceleration(mean_3: torch.Tensor) -> Predictor:
     return lambda batch: mean_3.to(batch.window_WN3).expand_as(batch.window_WN3[0])
 
 
-def trivial_predictors(network: ParticleNetwork) -> dict[str, Predictor]:
+def baselines(network: ParticleNetwork) -> dict[str, Predictor]:
     """What a network must beat to have learned anything."""
     return {
         "constant velocity": constant_velocity,

@@ -1,4 +1,6 @@
-"""The pool of the network's own states on backend triton: simulated, cut into windows and read on the device.
+"""The pushforward pool of backend triton: simulated, cut into windows and read on the device.
+
+The rule, and the pool of backend torch, are in hgn.training.pushforward.
 
 A window is an episode of W frames with its scene's material and obstacles, so that the kernels of an update read it as
 any other. Buffers and the captured graph are kept from one simulation to the next.
@@ -15,7 +17,6 @@ from dataclasses import replace
 import torch
 
 from hgn.config import TrainingConfig
-from hgn.data.rest_noise import asked_acceleration, noise_at_rest
 from hgn.kernels.grid.op import ObstacleTable
 from hgn.kernels.rollout.kernel import DIVERGED
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
@@ -24,9 +25,16 @@ from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.triton_rollout import CHECKED_PARTICLES, TritonRollout
-from hgn.training.pushforward import drawn_entries, figures_of, frames_kept, lost_scenes, own_windows
+from hgn.training.noise import noise_scale, target_acceleration
+from hgn.training.pushforward import (
+    diverged_scenes,
+    drawn_pool_samples,
+    pool_figures,
+    pushforward_windows,
+    usable_frames,
+)
 
-ROOM = 1.1  # more particles than the scenes of the first simulation have
+SPARE = 1.1  # more particles than the scenes of the first simulation have
 
 
 class GraphPushforwardPool:
@@ -39,48 +47,49 @@ class GraphPushforwardPool:
         self.network, self.training, self.rank = network, training, rank
         self.obstacle_cell_size = obstacle_cell_size
         self._rollout: TritonRollout | None = None
-        self._entries: list[tuple[DeviceEpisode, float]] = []  # with the acceleration that is asked for
+        self._samples: list[tuple[DeviceEpisode, float]] = []  # with the rms of the target acceleration
         self.figures: dict[str, float] = {}
 
-    def mixed(self, samples: list[DeviceSample], update: int) -> list[DeviceSample]:
-        """The samples of an update with their share replaced; seeds stay."""
-        chosen = drawn_entries(self.training, update, self.rank, len(self._entries))
-        own = []
-        for entry, sample in zip(chosen, samples, strict=False):
-            episode, acceleration = self._entries[entry]
-            noise, weight = noise_at_rest(self.training, acceleration, sample.seed)
-            own.append(DeviceSample(episode, 0, sample.seed, weight, noise))
-        return own + samples[len(own) :]
+    def replaced(self, samples: list[DeviceSample], update: int) -> list[DeviceSample]:
+        """The samples of an update with a fraction from the pool; seeds stay."""
+        samples = list(samples)
+        for slot, number in enumerate(drawn_pool_samples(self.training, update, self.rank, len(self._samples))):
+            episode, acceleration = self._samples[number]
+            seed = samples[slot].seed
+            scale, weight = noise_scale(self.training, acceleration, seed)
+            samples[slot] = DeviceSample(episode, 0, seed, weight, scale)
+        return samples
 
     def refresh(self, starts: Sequence[tuple[DeviceEpisode, int]], values: torch.Tensor) -> None:
         """Simulates from these frames with `values`, the parameters in the packed layout, and makes the pool of that.
 
         Raises: ConfigError the first time, when the kernels are wrong here.
         """
-        begun = time.monotonic()
-        self._entries = []  # frees the memory
-        frames, config, device = self.training.rollout_frames, self.network.config, values.device
+        begin_s = time.monotonic()
+        self._samples = []  # frees the memory
+        frames, config, device = self.training.pushforward_frames, self.network.config, values.device
         length = config.velocity_history + frames + 2
         truths = [episode.position_TN3[frame : frame + length].to(device) for episode, frame in starts]
         episodes = [episode for episode, _ in starts]
         path_FN3 = self._simulate(episodes, self._state(episodes, truths), values)
         parts = path_FN3.split([episode.particles for episode in episodes], dim=1)
         domain_S3 = torch.tensor([episode.domain_size for episode in episodes], device=device)
-        found = [
-            torch.stack([x.double() for x in frames_kept(truth, part, domain_3, config.cell_size)])
+        counts_and_squares = [
+            torch.stack([x.double() for x in usable_frames(truth, part, domain_3, config.cell_size)])
             for truth, part, domain_3 in zip(truths, parts, domain_S3, strict=True)
         ]
         squares = []
-        for episode, truth, part, (kept, square) in zip(
-            episodes, truths, parts, torch.stack(found).tolist(), strict=True
+        for episode, truth, part, (count, square) in zip(
+            episodes, truths, parts, torch.stack(counts_and_squares).tolist(), strict=True
         ):
-            windows = own_windows(truth, part, self.training.rollout_pull, config.cell_size)[: int(kept)].contiguous()
-            accelerations = asked_acceleration(windows).tolist()
-            self._entries += [
+            windows = pushforward_windows(truth, part, self.training.pushforward_pull, config.cell_size)
+            windows = windows[: int(count)].contiguous()
+            accelerations = target_acceleration(windows).tolist()
+            self._samples += [
                 (replace(episode, position_TN3=w), a) for w, a in zip(windows, accelerations, strict=True)
             ]
-            squares += [square] if kept == frames else []
-        self.figures = figures_of(self.training, len(self._entries), squares, time.monotonic() - begun)
+            squares += [square] if count == frames else []
+        self.figures = pool_figures(self.training, len(self._samples), squares, time.monotonic() - begin_s)
 
     def _state(self, episodes: Sequence[DeviceEpisode], truths: Sequence[torch.Tensor]) -> ParticleState:
         """The true state that the simulation starts from; obstacles have a table of their own."""
@@ -97,11 +106,11 @@ class GraphPushforwardPool:
         )
 
     def _simulate(self, episodes: Sequence[DeviceEpisode], state: ParticleState, values: torch.Tensor) -> torch.Tensor:
-        """Positions [F, N, 3]; of a scene that was lost, whatever came after."""
+        """Positions [F, N, 3]; of a scene that diverged, whatever came after."""
         rollout = self._begun(episodes, state, values)
         pieces, done = [], 0
-        while done < self.training.rollout_frames:
-            path_TN3, status = rollout.look(self.training.rollout_frames - done)
+        while done < self.training.pushforward_frames:
+            path_TN3, status = rollout.look(self.training.pushforward_frames - done)
             pieces.append(path_TN3.clone())
             done += len(path_TN3)
             if status & DIVERGED.value:
@@ -116,29 +125,29 @@ class GraphPushforwardPool:
         table = None
         if config.obstacle_features:
             table = ObstacleTable([episode.obstacles for episode in episodes], self.obstacle_cell_size, device)
-        known = self._rollout
-        if known is not None and len(state.position_N3) <= known.particles:
+        rollout = self._rollout
+        if rollout is not None and len(state.position_N3) <= rollout.particles:
             if table is not None:
-                assert known.obstacles is not None
-                known.obstacles.take(table)
-            known.use_values(values)
-            known.begin(state)
-            return known
+                assert rollout.obstacles is not None
+                rollout.obstacles.take(table)
+            rollout.use_values(values)
+            rollout.begin(state)
+            return rollout
         capacities = None
-        if known is not None:
-            capacities = known.grid.capacities
-            self._rollout = known = None  # before the new one is allocated
-        room = 16 * math.ceil(ROOM * len(state.position_N3) / 16)
-        made = TritonRollout(self.network, state, self.training.precision, capacities, room, table)
+        if rollout is not None:
+            capacities = rollout.grid.capacities
+            self._rollout = rollout = None  # before the new one is allocated
+        particles = 16 * math.ceil(SPARE * len(state.position_N3) / 16)
+        rollout = TritonRollout(self.network, state, self.training.precision, capacities, particles, table)
         if capacities is None:
             first = self._first_scenes(episodes, state)
             if first is not None:
-                made.require_agreement(self.network, first, "training.backend")
+                rollout.require_agreement(self.network, first, "training.backend")
                 if device.type == "cuda":
                     torch.cuda.empty_cache()  # what is free decides where episodes are kept
-        made.use_values(values)
-        self._rollout = made
-        return made
+        rollout.use_values(values)
+        self._rollout = rollout
+        return rollout
 
     def _first_scenes(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> ParticleState | None:
         """As many of the first scenes as the plain network can check, with their obstacles; none if one is too many."""
@@ -152,9 +161,9 @@ class GraphPushforwardPool:
         obstacles = None
         if seen:
             # a hash has the keys of scene 0
-            key_K = torch.cat([found.key_K + (scene << 3 * COORDINATE_BITS) for scene, found in seen])
+            key_K = torch.cat([cells.key_K + (scene << 3 * COORDINATE_BITS) for scene, cells in seen])
             order_K = torch.argsort(key_K)
-            normal_K3 = torch.cat([found.normal_K3 for _, found in seen])[order_K]
+            normal_K3 = torch.cat([cells.normal_K3 for _, cells in seen])[order_K]
             obstacles = ObstacleCells(key_K[order_K], normal_K3, self.obstacle_cell_size)
         return replace(
             state,
@@ -169,7 +178,7 @@ class GraphPushforwardPool:
     def _set_back(self, rollout: TritonRollout, state: ParticleState) -> None:
         """Scenes that have lost a particle begin again, at rest, where nobody looks: the others go on."""
         count = rollout.live
-        again_N1 = lost_scenes(rollout.position_N3[:count], rollout.scene_N[:count], rollout.domain_S3)[:, None]
+        again_N1 = diverged_scenes(rollout.position_N3[:count], rollout.scene_N[:count], rollout.domain_S3)[:, None]
         rollout.position_N3[:count] = torch.where(again_N1, state.position_N3, rollout.position_N3[:count])
         rollout.velocity_NV[:count] = torch.where(again_N1, 0.0, rollout.velocity_NV[:count])
         rollout.lost.zero_()

@@ -28,7 +28,7 @@ from hgn.training.graph_pushforward import GraphPushforwardPool
 from hgn.training.parity import require_agreement
 
 REPORTED_UPDATES = 256  # the first ones, which take longest
-DATA_SHARE = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
+DATA_FRACTION = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
 
 
 class GraphTrainer:
@@ -63,20 +63,24 @@ class GraphTrainer:
         self._read_moments()
         self._averaged = None if averaged is None else self._take_over_average(averaged)
         self._episodes: dict[int, DeviceEpisode] = {}
-        self.own: GraphPushforwardPool | None = None
-        if training.rollout_share > 0:
+        self.pool: GraphPushforwardPool | None = None
+        if training.pushforward_fraction > 0:
             simulated = averaged or network
             assert isinstance(simulated, HierarchicalGraphNetwork)
-            self.own = GraphPushforwardPool(simulated, training, obstacle_cell_size, rank)
+            self.pool = GraphPushforwardPool(simulated, training, obstacle_cell_size, rank)
         self.agreement: tuple[float, float] | None = None  # with the plain network, see hgn.training.parity
 
     def run(
-        self, chunk: UpdateChunk, rates: list[float], shares: list[float] | None = None, first_update: int = 0
+        self,
+        chunk: UpdateChunk,
+        rates: list[float],
+        average_weights: list[float] | None = None,
+        first_update: int = 0,
     ) -> None:
         """Makes an update for each entry of the chunk, at these learning rates.
 
-        `shares` are those of the new weights in their moving average, where there is one. `first_update` is the number
-        of the first update.
+        `average_weights` are those of the new values in their moving average, where there is one. `first_update` is the
+        number of the first update.
 
         Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong here.
         """
@@ -86,18 +90,18 @@ class GraphTrainer:
         if self.agreement is None:
             with self._timed("checking the kernels"):
                 self._check(chunk)
-        if self.own is not None and chunk.starts:
+        if self.pool is not None and chunk.starts:
             average = self.updates.average
             values = self.updates.values if average is None else average
-            with self._timed("own states"):
-                self.own.refresh([(self._episodes[i], frame) for i, frame in chunk.starts], values)
+            with self._timed("pushforward"):
+                self.pool.refresh([(self._episodes[i], frame) for i, frame in chunk.starts], values)
         samples = [
-            [DeviceSample(self._episodes[s.episode], s.frame, s.seed, s.weight, s.noise) for s in u]
+            [DeviceSample(self._episodes[s.episode], s.frame, s.seed, s.weight, s.noise_scale) for s in u]
             for u in chunk.samples
         ]
-        if self.own is not None:
-            samples = [self.own.mixed(update, first_update + i) for i, update in enumerate(samples)]
-        self.updates.run(samples, rates, shares)
+        if self.pool is not None:
+            samples = [self.pool.replaced(update, first_update + i) for i, update in enumerate(samples)]
+        self.updates.run(samples, rates, average_weights)
         self._write_back()
         self._made += len(chunk.samples)
 
@@ -134,7 +138,7 @@ class GraphTrainer:
         position_TN3 = episode.position_TN3
         if self.device.type == "cuda":
             free, total = torch.cuda.mem_get_info(self.device)
-            fits = free - position_TN3.nbytes > (1 - DATA_SHARE) * total
+            fits = free - position_TN3.nbytes > (1 - DATA_FRACTION) * total
             position_TN3 = position_TN3.to(self.device) if fits else position_TN3.pin_memory()
         cells, normals = episode.obstacle_cell_K3, episode.obstacle_normal_K3
         obstacles = ObstacleHash.of(cells, normals).to(self.device) if len(cells) else None

@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch import LightningModule
 
 from hgn.config import TrainingConfig
-from hgn.data.batch import Batch
+from hgn.data.batch import Batch, UpdateSamples
 from hgn.data.episode_tensors import UpdateChunk
 from hgn.data.sampler import SamplerState
 from hgn.data.statistics import Statistics
@@ -27,7 +27,7 @@ from hgn.training.checkpoint import (
     NETWORK,
     SECTION,
     DataInfo,
-    cursor_of_checkpoint,
+    sampler_state_of_checkpoint,
     updates_of_checkpoint,
 )
 from hgn.training.distributed import sum_over_ranks
@@ -50,7 +50,7 @@ class TrainingModule(LightningModule):
         self.averaged = copy.deepcopy(network).requires_grad_(False) if training.ema_decay else None
         self.training_config = training
         self.data = data
-        self.cursor = SamplerState()
+        self.sampler_state = SamplerState()
         # Sum of finite losses and their number since the last log line, kept on the device: no synchronisation.
         self.loss_sum: torch.Tensor
         self.register_buffer("loss_sum", torch.zeros(2), persistent=False)
@@ -58,7 +58,7 @@ class TrainingModule(LightningModule):
         self.gradient_counters: torch.Tensor
         self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
         self._fast: Any = None
-        self._own: PushforwardPool | None = None
+        self._pool: PushforwardPool | None = None
         self._unchecked = True  # whether kernels compute on this machine what they should
 
     def set_statistics(self, statistics: Statistics) -> None:
@@ -70,7 +70,7 @@ class TrainingModule(LightningModule):
             self.network.normaliser.set(quantity, mean_3, std_3, noise)
         self._begin_average()
 
-    def begin_with(self, network: ParticleNetwork) -> None:
+    def load_weights(self, network: ParticleNetwork) -> None:
         """Takes over weights and normaliser; instead of `set_statistics`, when a run begins."""
         self.network.load_state_dict(network.state_dict())
         self._begin_average()
@@ -84,8 +84,8 @@ class TrainingModule(LightningModule):
         if self.averaged is not None:
             self.averaged.load_state_dict(self.network.state_dict())
 
-    def _average_share(self, update: int) -> float:
-        """Of the new weights in the moving average, after update number `update`, from 0.
+    def _average_weight(self, update: int) -> float:
+        """Weight of the new values in the moving average, after update number `update`, from 0.
 
         First weights are forgotten soon: while there are few updates, the average is over the last tenth of them.
         """
@@ -97,30 +97,29 @@ class TrainingModule(LightningModule):
         if self.averaged is not None:
             averaged = [parameter.detach() for parameter in self.averaged.parameters()]
             weights = [parameter.detach() for parameter in self.network.parameters()]
-            torch._foreach_lerp_(averaged, weights, self._average_share(update))
+            torch._foreach_lerp_(averaged, weights, self._average_weight(update))
 
     def loss(self, batch: Batch) -> torch.Tensor:
-        """Mean squared error of the normalised acceleration: over axes, over particles, over scenes; with
-        `training.huber` large errors count linearly (Huber 1964, twice its loss).
+        """Mean squared error of the normalised acceleration: over axes, over particles, over scenes.
+
+        Noise, jitter and symmetry are drawn here for the torch backend; hgn.kernels.update does so for triton.
         """
         config = self.training_config
         if config.symmetry != "none":
             batch = under_symmetries(batch, drawn_symmetries(batch))
-        window_WN3 = perturbed_window(batch, config.noise_std, config.noise_smooth, self.network.config.cell_size)
+        window_WN3 = perturbed_window(
+            batch, config.noise_std, config.noise_correlated_fraction, self.network.config.cell_size
+        )
         origin_S3 = jittered_origin(batch, self.network.config.cell_size) if config.grid_jitter else None
         target_N3 = self.network.normaliser.normalise_acceleration(batch.acceleration(window_WN3))
         predicted_N3 = self.network.normalised_acceleration(batch.state(window_WN3), origin_S3)
-        error_N3 = predicted_N3 - target_N3
-        if config.huber is None:
-            return batch.mean_over_scenes(error_N3.square().mean(-1))
-        clipped_N3 = error_N3.clamp(-config.huber, config.huber)
-        return batch.mean_over_scenes((clipped_N3 * (2 * error_N3 - clipped_N3)).mean(-1))
+        return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
 
     @property
-    def own_states(self) -> dict[str, float]:
-        """What is to be logged of the network's own states."""
-        own = self._own if self._fast is None else self._fast.own
-        return {} if own is None else dict(own.figures)
+    def pushforward_figures(self) -> dict[str, float]:
+        """What is to be logged of the pushforward pool."""
+        pool = self._pool if self._fast is None else self._fast.pool
+        return {} if pool is None else dict(pool.figures)
 
     def on_fit_start(self) -> None:
         use_edges(self.network, self.training_config.precision)  # by the device that it is on by now
@@ -128,8 +127,8 @@ class TrainingModule(LightningModule):
 
     def on_train_start(self) -> None:
         config = self.training_config
-        if self.automatic_optimization and config.rollout_share > 0:
-            self._own = PushforwardPool(self.result, config, self.data.frame_rate_hz, self.trainer.global_rank)
+        if self.automatic_optimization and config.pushforward_fraction > 0:
+            self._pool = PushforwardPool(self.result, config, self.data.frame_rate_hz, self.trainer.global_rank)
         if not self.automatic_optimization:
             # Triton, which backend torch does without, is loaded here.
             from hgn.training.graph_trainer import GraphTrainer
@@ -149,38 +148,45 @@ class TrainingModule(LightningModule):
                 self.trainer.global_rank,
             )
 
-    def training_step(self, batch: Batch | UpdateChunk, batch_index: int) -> torch.Tensor | None:
+    def training_step(self, batch: Batch | UpdateSamples | UpdateChunk, batch_index: int) -> torch.Tensor | None:
         if isinstance(batch, UpdateChunk):
             self._train_chunk(batch)
             return None
         if self._unchecked:
-            require_agreement(self.network, batch.state(), gradients=True, field="training.precision")
+            first = self._batch_of(batch) if isinstance(batch, UpdateSamples) else batch
+            require_agreement(self.network, first.state(), gradients=True, field="training.precision")
             self._unchecked = False
-        if self._own is not None:
+        if isinstance(batch, UpdateSamples):
+            assert self._pool is not None
             if batch.starts:
-                self._own.refresh(batch.starts)
-            batch = self._own.mixed(batch, self.global_step)
+                self._pool.refresh(batch.starts)
+            batch = self._batch_of(self._pool.replaced(batch, self.global_step))
         loss = self.loss(batch)
-        known = loss.detach()
-        self.loss_sum += torch.where(known.isfinite(), torch.stack([known, torch.ones_like(known)]), 0)
-        assert batch.cursor is not None
-        self.cursor = batch.cursor
+        value = loss.detach()
+        self.loss_sum += torch.where(value.isfinite(), torch.stack([value, torch.ones_like(value)]), 0)
+        assert batch.sampler_state is not None
+        self.sampler_state = batch.sampler_state
         return loss
+
+    def _batch_of(self, samples: UpdateSamples) -> Batch:
+        return samples.batch(self.network.config).to(self.device)
 
     def _train_chunk(self, chunk: UpdateChunk) -> None:
         first, count = self.global_step, len(chunk.samples)
-        new = self._fast.agreement is None
+        first_chunk = self._fast.agreement is None
         updates = range(first, first + count)
-        shares = [self._average_share(update) for update in updates] if self.averaged is not None else None
-        self._fast.run(chunk, [self._rate(update) for update in updates], shares, first)
-        if new and self.trainer.is_global_zero:
+        average_weights = None
+        if self.averaged is not None:
+            average_weights = [self._average_weight(update) for update in updates]
+        self._fast.run(chunk, [self._rate(update) for update in updates], average_weights, first)
+        if first_chunk and self.trainer.is_global_zero:
             outputs, gradients = self._fast.agreement
             text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"
             print(f"backend triton: {text if math.isfinite(outputs) else 'batch too large to check'}", file=sys.stderr)
         report = self._fast.report()
         if report and self.trainer.is_global_zero:
             print(report, file=sys.stderr)
-        self.cursor = chunk.cursor
+        self.sampler_state = chunk.sampler_state
         lightning_compat.count_updates(self.trainer, count)
         scheduler = self.lr_schedulers()
         assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
@@ -199,7 +205,7 @@ class TrainingModule(LightningModule):
     def configure_optimizers(self) -> Any:
         config = self.training_config
         if config.optimizer == "muon":
-            optimizer: torch.optim.Adam = Muon(self.network, config.learning_rate, config.weight_decay)
+            optimizer: torch.optim.Adam = Muon(self.network, config.learning_rate)
         else:
             # One launch instead of several for each group of tensors; only the fused kind can skip a step by itself.
             optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, fused=True)
@@ -211,12 +217,12 @@ class TrainingModule(LightningModule):
             "network": to_mapping(self.network.config),
             "noise_std": self.training_config.noise_std,
             "data": to_mapping(self.data),
-            "cursor": to_mapping(self.cursor),
+            "sampler_state": to_mapping(self.sampler_state),
             "updates": self.global_step,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self.cursor = cursor_of_checkpoint(checkpoint)
+        self.sampler_state = sampler_state_of_checkpoint(checkpoint)
         state = checkpoint["state_dict"]
         if self.averaged is None:
             for name in [name for name in state if name.startswith(AVERAGED)]:

@@ -14,13 +14,11 @@ from hgn.network.orthogonal import MOMENTUM, normalised, orthogonalised, square_
 class Muon(torch.optim.Adam):
     """torch.optim.Adam whose square blocks (hgn.network.orthogonal) take Muon's step instead, with Nesterov's momentum.
 
-    A block's momentum is kept as its `exp_avg`; its `exp_avg_sq` has no use. An update shrinks blocks, and nothing
-    else, by their share lr * block_decay (decoupled weight decay, Loshchilov and Hutter 2019).
+    A block's momentum is kept as its `exp_avg`; its `exp_avg_sq` has no use.
     """
 
-    def __init__(self, network: ParticleNetwork, lr: float, block_decay: float = 0.0) -> None:
+    def __init__(self, network: ParticleNetwork, lr: float) -> None:
         super().__init__(network.parameters(), lr=lr, fused=True)
-        self._decay = block_decay
         device = next(network.parameters()).device
         self._block_KWW = square_blocks(network).to(device)
 
@@ -41,7 +39,7 @@ class Muon(torch.optim.Adam):
         stepped_KWW = torch.lerp(momentum_KWW, gradient_KWW, 1 - MOMENTUM)
         direction_KWW = orthogonalised(normalised(torch.lerp(stepped_KWW, gradient_KWW, 1 - MOMENTUM)))
         rate, size = self.param_groups[0]["lr"], step_size(block_KWW.shape[-1])
-        moved_KWW = value_KWW - rate * (self._decay * value_KWW + size * direction_KWW)
+        moved_KWW = value_KWW - rate * (size * direction_KWW)
         skip = getattr(self, "found_inf", None)  # as fused Adam reads it
         if skip is not None:
             stepped_KWW = torch.where(skip > 0, momentum_KWW, stepped_KWW)

@@ -1,6 +1,9 @@
 """Input noise and grid jitter (paper sec. 3.3), each drawn from the sample's own seed.
 
-Shape legend: W = m + 2 window frames (m velocities), N particles, S scenes, K waves.
+`noise_scale` decides for both backends how much noise a sample gets, before its batch is made. What is then drawn is
+here for torch (`perturbed_window`, which hgn.training.module calls); for triton it is in hgn.kernels.update
+(`Updates._assemble`, with the kernels `draw_waves` and `assemble_batch`).
+Shape legend: W = m + 2 window frames (m velocities), N particles, F windows, S scenes, K waves.
 """
 
 from __future__ import annotations
@@ -9,11 +12,37 @@ import math
 
 import torch
 
-from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES
+from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES, TrainingConfig
 from hgn.data.batch import Batch
+from hgn.system.splitmix import splitmix64
 
 # Of other streams than the particles' own noise: the same seed would tie them to the first particles' noise.
-JITTER_STREAM, SMOOTH_STREAM = 0x5DEECE66D, 0x2545F4914F
+JITTER_STREAM, WAVE_STREAM, SCALE_STREAM = 0x5DEECE66D, 0x2545F4914F, 0x9E6D62D06F6A9A9B
+
+
+def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tuple[float, float]:
+    """Scale of a sample's noise in units of `noise_std`, and the weight of its loss.
+
+    Noise hides from a network what it errs by less: at rest its bias stays at a twentieth of the noise, and over
+    thousands of frames what should lie still creeps. Where little happens, the noise's scale is drawn from a wide range
+    (as the levels of a denoiser are: Song & Ermon 2019), and errors count in units of it, so that each scale weighs the
+    same. `acceleration` is the root mean square of the target, domain units per frame squared. Where it is a fraction
+    r < 1 of `noise_std`, the scale is log-uniform between max(r, training.noise_min_scale) and 1, drawn from the
+    sample's seed alone, and the weight is 1 / scale^2; elsewhere both are 1.
+    """
+    if training.noise_min_scale == 1.0 or training.noise_std == 0.0:
+        return 1.0, 1.0
+    smallest = max(acceleration / training.noise_std, training.noise_min_scale)
+    if not smallest < 1.0:
+        return 1.0, 1.0
+    scale = smallest ** (splitmix64(seed ^ SCALE_STREAM) / 2.0**64)
+    return scale, 1.0 / scale**2
+
+
+def target_acceleration(window_FWN3: torch.Tensor) -> torch.Tensor:
+    """Root mean square of the acceleration in the last three frames of each window, [F]."""
+    acceleration_FN3 = window_FWN3[:, -1] - 2 * window_FWN3[:, -2] + window_FWN3[:, -3]
+    return acceleration_FN3.square().mean((1, 2)).sqrt()
 
 
 def random_walk(shape_MN3: tuple[int, int, int], std_last: float, generator: torch.Generator) -> torch.Tensor:
@@ -22,7 +51,7 @@ def random_walk(shape_MN3: tuple[int, int, int], std_last: float, generator: tor
     return steps_MN3.cumsum(0) * (std_last / math.sqrt(shape_MN3[0]))
 
 
-def smooth_walk(
+def correlated_walk(
     position_N3: torch.Tensor, history: int, std_last: float, cell_size: float, generator: torch.Generator
 ) -> torch.Tensor:
     """Velocity noise [m, N, 3] that neighbours have in common: a sum of plane waves, random Fourier features (Rahimi,
@@ -40,30 +69,30 @@ def smooth_walk(
     return height_NK @ amplitude_MK3
 
 
-def perturbed_window(batch: Batch, std_last: float, smooth: float = 0.0, cell_size: float = 1.0) -> torch.Tensor:
+def perturbed_window(batch: Batch, std_last: float, correlated: float = 0.0, cell_size: float = 1.0) -> torch.Tensor:
     """A copy of the batch's window with noise in its question, [W, N, 3]; the batch stays as it is.
 
     The walk runs through the velocities, positions follow as their sums. The next position moves with the
     last one, so the target becomes v_true^{n+1} - v_noisy^n: the network learns to undo the velocity error
-    (the rule of GNS, Sanchez-Gonzalez et al. 2020). `smooth` is the share of the variance that neighbours have in
-    common: in a rollout a body's particles err together, which independent noise, averaged over them, never shows.
-    Each scene's noise is `batch.noise_S` times that.
+    (the rule of GNS, Sanchez-Gonzalez et al. 2020). `correlated` is the fraction of the variance that neighbours have
+    in common: in a rollout a body's particles err together, which independent noise, averaged over them, never shows.
+    Each scene's noise is `batch.noise_scale_S` times that.
     """
     window_WN3 = batch.window_WN3
     if std_last == 0:
         return window_WN3
     shift = []
     first = 0
-    scales = batch.noise_S or (1.0,) * len(batch.seeds_S)
+    scales = batch.noise_scale_S or (1.0,) * len(batch.seeds_S)
     for count, seed, scale in zip(batch.particles_S, batch.seeds_S, scales, strict=True):
         generator = torch.Generator(window_WN3.device).manual_seed(seed)
         history = len(window_WN3) - 2
-        velocity_MN3 = random_walk((history, count, 3), scale * std_last * math.sqrt(1 - smooth), generator)
-        if smooth > 0:
-            generator.manual_seed(seed ^ SMOOTH_STREAM)
+        velocity_MN3 = random_walk((history, count, 3), scale * std_last * math.sqrt(1 - correlated), generator)
+        if correlated > 0:
+            generator.manual_seed(seed ^ WAVE_STREAM)
             position_N3 = window_WN3[-2, first : first + count]
-            std = scale * std_last * math.sqrt(smooth)
-            velocity_MN3 = velocity_MN3 + smooth_walk(position_N3, history, std, cell_size, generator)
+            std = scale * std_last * math.sqrt(correlated)
+            velocity_MN3 = velocity_MN3 + correlated_walk(position_N3, history, std, cell_size, generator)
         first += count
         position_MN3 = velocity_MN3.cumsum(0)
         shift.append(torch.cat([torch.zeros_like(position_MN3[:1]), position_MN3, position_MN3[-1:]]))

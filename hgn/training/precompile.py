@@ -15,7 +15,7 @@ def job_of_training(config: TrainConfig, capability: tuple[int, int], several_ra
     particles, cells = _sizes(config.scene, network.levels)
     if network.kind == "gns":
         cells = [NEIGHBOURS * particles]
-    own = [training.rollout_scenes] if training.rollout_share > 0 else []
+    own = [training.pushforward_scenes] if training.pushforward_fraction > 0 else []
     monitored = network.kind == "hgn" and training.monitor_rollout_frames >= 2
     return PrecompileJob(
         network,

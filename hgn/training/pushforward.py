@@ -1,11 +1,14 @@
-"""Training on the network's own states: it simulates, and learns to return from where that leads to the truth.
+"""Pushforward: the network simulates, and learns to return from where that leads to the truth.
 
-The pushforward idea of Brandstetter et al. 2022, collected like DAgger (Ross et al. 2011). Every `rollout_every`
-updates the weights of now (their moving average where there is one) simulate `rollout_scenes` scenes, each from a
-random true frame on, and each simulated frame becomes a window; a share of the samples is taken from these until the
-next time. Noise shows a network errors that are drawn; its own are biased, and common to a body. Everything is drawn
-from seed, update and rank. The pool is not part of a checkpoint: a training that goes on makes a new one, which is the
-old one where the checkpoint lies at a multiple of `rollout_every`.
+The idea of Brandstetter et al. 2022, collected like DAgger (Ross et al. 2011). Every `pushforward_every` updates the
+present weights (their moving average where there is one) simulate `pushforward_scenes` scenes, each from a random true
+frame on, and each simulated frame becomes a window in a pool; until the next simulation a fraction of the samples is
+taken from the pool. Noise shows a network errors that are drawn; its own are biased, and common to a body. Everything
+is drawn from seed, update and rank. The pool is not part of a checkpoint: a training that goes on makes a new one,
+which is the old one where the checkpoint lies at a multiple of `pushforward_every`.
+
+The rule is here, and the pool of the torch backend; that of the triton backend is in hgn.training.graph_pushforward.
+Both replace samples before a batch is made of them.
 Shape legend: H velocity history, F simulated frames, W = H + 2 frames of a window, N particles, S scenes.
 """
 
@@ -19,59 +22,60 @@ import numpy as np
 import torch
 
 from hgn.config import TrainingConfig
-from hgn.data.batch import Batch, make_batch
-from hgn.data.rest_noise import asked_acceleration, noise_at_rest
+from hgn.data.batch import BatchSample, UpdateSamples, make_batch
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.divergence import lost
 from hgn.runtime.simulator import Simulator
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.schema import ConfigError
+from hgn.training.noise import noise_scale, target_acceleration
 
-START_STREAM, ENTRY_STREAM = 0x57A7, 0xE217
+Starts = tuple[tuple[int, int], ...]  # episodes and frames that the network simulates from
+START_STREAM, SAMPLE_STREAM = 0x57A7, 0xE217
 # finest cells; farther from the truth (rms over a scene) its motion is no answer any more, and the loss would be made
 # of such frames alone: they are dropped, and with an untrained network most are
 DROPPED_BEYOND = 0.5
 PULLED_WITHIN = 1.0  # finest cells on an axis; no particle is pulled as if it were farther away
 
 
-def drawn_starts(
-    training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]
-) -> tuple[tuple[int, int], ...]:
+def drawn_starts(training: TrainingConfig, update: int, rank: int, frame_counts: Sequence[int]) -> Starts:
     """Episode and frame that each simulation before `update` starts from, of episodes of so many frames.
 
     Every episode once before one comes twice; the truth is known for one frame longer than is simulated.
     Raises: ConfigError when all episodes are too short.
     """
-    last = {i: count - 2 - training.rollout_frames for i, count in enumerate(frame_counts)}
+    last = {i: count - 2 - training.pushforward_frames for i, count in enumerate(frame_counts)}
     long_enough = [i for i, frame in last.items() if frame >= 0]
     if not long_enough:
         raise ConfigError(
-            f"training.rollout_frames must be at most the frames of an episode - 2, got {training.rollout_frames} "
-            f"where episodes have up to {max(frame_counts, default=0)} frames; set it lower"
+            "training.pushforward_frames must be at most the frames of an episode - 2, got "
+            f"{training.pushforward_frames} where episodes have up to {max(frame_counts, default=0)} frames"
         )
     generator = np.random.default_rng([training.seed, START_STREAM, update, rank])
     drawn: list[int] = []
-    while len(drawn) < training.rollout_scenes:
+    while len(drawn) < training.pushforward_scenes:
         drawn += generator.permutation(long_enough).tolist()
-    return tuple((i, int(generator.integers(last[i] + 1))) for i in drawn[: training.rollout_scenes])
+    return tuple((i, int(generator.integers(last[i] + 1))) for i in drawn[: training.pushforward_scenes])
 
 
-def drawn_entries(training: TrainingConfig, update: int, rank: int, pool: int) -> list[int]:
-    """Which of `pool` windows the first samples of an update are replaced by: `rollout_share` of them on average."""
-    if pool == 0:
+def drawn_pool_samples(training: TrainingConfig, update: int, rank: int, pool_size: int) -> list[int]:
+    """Which windows of the pool replace the first samples of an update, `pushforward_fraction` of them on average."""
+    if pool_size == 0:
         return []
-    generator = np.random.default_rng([training.seed, ENTRY_STREAM, update, rank])
-    count = int(training.rollout_share * training.batch_scenes + generator.random())
-    return [int(place * pool) for place in generator.random(count)]
+    generator = np.random.default_rng([training.seed, SAMPLE_STREAM, update, rank])
+    count = int(training.pushforward_fraction * training.batch_scenes + generator.random())
+    return [int(place * pool_size) for place in generator.random(count)]
 
 
-def own_windows(true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, pull: float, cell_size: float) -> torch.Tensor:
+def pushforward_windows(
+    true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, pull: float, cell_size: float
+) -> torch.Tensor:
     """The windows of one scene's simulation, [F, W, N, 3].
 
     true_TN3 holds the frames n - H to n + F + 1 of the truth, simulated_FN3 the frames n + 1 to n + F. The answer after
-    frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k): the network undoes its velocity error, and a share of
-    its position error, which brings back what has crossed a wall.
+    frame k is x_k + (true_{k+1} - true_k) + pull (true_k - x_k): the network undoes its velocity error, and a fraction
+    of its position error, which brings back what has crossed a wall.
     """
     frames = len(simulated_FN3)
     history = len(true_TN3) - frames - 2
@@ -83,7 +87,7 @@ def own_windows(true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, pull: float
     return torch.cat([question, answer[:, None]], dim=1)
 
 
-def frames_kept(
+def usable_frames(
     true_TN3: torch.Tensor, simulated_FN3: torch.Tensor, domain_3: torch.Tensor, cell_size: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How many frames from the first on can be trained on, and the mean squared distance from the truth in the last of
@@ -96,7 +100,7 @@ def frames_kept(
     return count, square_F[(count - 1).clamp(min=0)]
 
 
-def lost_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: torch.Tensor) -> torch.Tensor:
+def diverged_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: torch.Tensor) -> torch.Tensor:
     """Whether each particle belongs to a scene that has lost one, bool [N]."""
     scene_N = scene_N.long()
     lost_S = torch.zeros(len(domain_S3), device=position_N3.device)
@@ -105,61 +109,56 @@ def lost_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: tor
 
 
 class PushforwardPool:
-    """The pool on backend torch, which serves every network."""
+    """The pool on backend torch, which serves every network; see GraphPushforwardPool for triton's."""
 
     def __init__(self, network: ParticleNetwork, training: TrainingConfig, frame_rate_hz: float, rank: int) -> None:
         """`network` simulates."""
         self.network, self.training, self.rank = network, training, rank
         self._simulator = Simulator(network, frame_rate_hz)
-        self._entries: list[tuple[Episode, int, np.ndarray, float]] = []  # with the acceleration that is asked for
+        self._samples: list[tuple[BatchSample, float]] = []  # with the rms of the target acceleration
         self.figures: dict[str, float] = {}
 
     def refresh(self, starts: Sequence[tuple[Episode, int]]) -> None:
         """Simulates from these frames, and makes the pool of that."""
-        begun = time.monotonic()
-        self._entries = []
+        begin_s = time.monotonic()
+        self._samples = []
         squares = []
         for group in self._groups(starts):
             for (episode, frame), simulated_FN3 in zip(group, self._simulate(group), strict=True):
                 squares += self._take(episode, frame, simulated_FN3)
-        self.figures = figures_of(self.training, len(self._entries), squares, time.monotonic() - begun)
+        self.figures = pool_figures(self.training, len(self._samples), squares, time.monotonic() - begin_s)
 
-    def mixed(self, batch: Batch, update: int) -> Batch:
-        """The batch with its share of samples replaced; seeds stay, and with them noise, jitter and symmetry."""
-        chosen = drawn_entries(self.training, update, self.rank, len(self._entries))
-        if not chosen:
-            return batch
-        samples, config = list(batch.samples_S), self.network.config
-        windows = [window(episode, frame, config.velocity_history) for episode, frame in samples]
-        weights, noise = (list(values or (1.0,) * len(samples)) for values in (batch.weight_S, batch.noise_S))
-        for slot, entry in enumerate(chosen):
-            episode, frame, windows[slot], acceleration = self._entries[entry]
-            samples[slot] = episode, frame
-            noise[slot], weights[slot] = noise_at_rest(self.training, acceleration, batch.seeds_S[slot])
-        made = make_batch(samples, config, batch.seeds_S, batch.cursor, weights, windows, noise)
-        return made.to(batch.window_WN3.device)
+    def replaced(self, update_samples: UpdateSamples, update: int) -> UpdateSamples:
+        """The samples of an update with a fraction from the pool; seeds stay, and with them noise, jitter, symmetry."""
+        samples = list(update_samples.samples)
+        for slot, number in enumerate(drawn_pool_samples(self.training, update, self.rank, len(self._samples))):
+            own, acceleration = self._samples[number]
+            seed = samples[slot].seed
+            scale, weight = noise_scale(self.training, acceleration, seed)
+            samples[slot] = replace(own, seed=seed, weight=weight, noise_scale=scale)
+        return replace(update_samples, samples=tuple(samples))
 
     def _groups(self, starts: Sequence[tuple[Episode, int]]) -> list[list[tuple[Episode, int]]]:
         """What fits into memory at once."""
         groups: list[list[tuple[Episode, int]]] = []
-        room = 0
+        left = 0  # particles that the last group may still take
         for start in starts:
-            if room <= 0:
+            if left <= 0:
                 groups.append([])
-                room = self.training.monitor_particles_per_batch
+                left = self.training.monitor_particles_per_batch
             groups[-1].append(start)
-            room -= len(start[0].material_N)
+            left -= len(start[0].material_N)
         return groups
 
     def _simulate(self, starts: Sequence[tuple[Episode, int]]) -> list[torch.Tensor]:
-        """Positions [F, N, 3] of each scene; of a scene that was lost, whatever came after."""
+        """Positions [F, N, 3] of each scene; of a scene that diverged, whatever came after."""
         batch = make_batch(starts, self.network.config).to(self._simulator.device)
         begin = state = batch.state()
         path = []
-        for _ in range(self.training.rollout_frames):
+        for _ in range(self.training.pushforward_frames):
             state = self._simulator.step(state)
             path.append(state.position_N3.cpu().clone())
-            again_N = lost_scenes(state.position_N3, state.scene_N, state.domain_S3)
+            again_N = diverged_scenes(state.position_N3, state.scene_N, state.domain_S3)
             if bool(again_N.any()):
                 position_N3 = torch.where(again_N[:, None], begin.position_N3, state.position_N3)
                 velocity_NM3 = torch.where(again_N[:, None, None], 0.0, state.velocity_NM3)
@@ -170,17 +169,19 @@ class PushforwardPool:
         """Adds a scene's windows; its mean squared distance at the end, where it is there until then."""
         config, frames = self.network.config, len(simulated_FN3)
         true_TN3 = torch.from_numpy(window(episode, frame, config.velocity_history, frames + 1))
-        kept, square = frames_kept(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), config.cell_size)
-        windows = own_windows(true_TN3, simulated_FN3, self.training.rollout_pull, config.cell_size)
-        accelerations = asked_acceleration(windows).tolist()
-        self._entries += [(episode, frame + k + 1, windows[k].numpy(), accelerations[k]) for k in range(int(kept))]
-        return [float(square)] if kept == frames else []
+        count, square = usable_frames(true_TN3, simulated_FN3, torch.tensor(episode.domain_size), config.cell_size)
+        windows = pushforward_windows(true_TN3, simulated_FN3, self.training.pushforward_pull, config.cell_size)
+        accelerations = target_acceleration(windows).tolist()
+        self._samples += [
+            (BatchSample(episode, frame + k + 1, windows[k].numpy()), accelerations[k]) for k in range(int(count))
+        ]
+        return [float(square)] if count == frames else []
 
 
-def figures_of(training: TrainingConfig, windows: int, squares: Sequence[float], seconds: float) -> dict[str, float]:
+def pool_figures(training: TrainingConfig, windows: int, squares: Sequence[float], seconds: float) -> dict[str, float]:
     """What is logged of a pool; `squares` are mean squared distances of whole simulations in their last frame."""
-    dropped = training.rollout_scenes * training.rollout_frames - windows
+    dropped = training.pushforward_scenes * training.pushforward_frames - windows
     values = {"windows": float(windows), "dropped": float(dropped), "seconds": seconds}
     if squares:
         values["mse"] = float(np.mean(squares))
-    return {f"own_states/{name}": value for name, value in values.items()}
+    return {f"pushforward/{name}": value for name, value in values.items()}

@@ -24,7 +24,7 @@ from hgn.system.files import write_atomically
 from hgn.system.provenance import provenance
 from hgn.training.checkpoint import DataInfo
 from hgn.training.distributed import first_on_machine, first_rank, layout
-from hgn.training.errors import told_gain
+from hgn.training.errors import format_ratio
 from hgn.training.stop import StopRequest
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def train_network(
     config: TrainConfig,
     store: EpisodeStore,
     checkpoint: tuple[Path, SamplerState] | None,
-    begin_with: ParticleNetwork | None,
+    initial: ParticleNetwork | None,
     stop: StopRequest,
     published: Callable[[], str],
     precompilation: Precompilation | None,
@@ -70,14 +70,14 @@ def train_network(
     set_matmul_precision(training.precision)
     seed_everything(training.seed, verbose=False)
     module = TrainingModule(build_network(config.network), training, data, backend)
-    if begin_with is None:
+    if initial is None:
         module.set_statistics(store.statistics())
     else:
-        module.begin_with(begin_with)
+        module.load_weights(initial)
     chunks = backend == "triton"
     feed = EpisodeDataModule(store, config.network, training, chunks=chunks, interrupted=lambda: stop.requested)
     if checkpoint is not None:
-        feed.cursor = checkpoint[1]
+        feed.sampler_state = checkpoint[1]
     _write_run_files(config, run)
 
     writer = CheckpointWriter()
@@ -117,8 +117,8 @@ def _backend(config: TrainConfig) -> tuple[str, str]:
     training = config.training
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
-    own_states = training.rollout_share > 0
-    reason = why_not_trained_fast(device, config.network, training.precision, own_states)
+    pushforward = training.pushforward_fraction > 0
+    reason = why_not_trained_fast(device, config.network, training.precision, pushforward)
     torch_has_fp16 = config.network.kind != "hgn"
     return choose_path("training.backend", training.backend, training.precision, reason, torch_has_fp16)
 
@@ -159,7 +159,7 @@ def _report(config: TrainConfig, updates: int, last: dict[str, float], stop: Sto
     if "one_step/validation" in last:
         print(
             f"one-step validation MSE {last['one_step/validation']:.3e}, "
-            f"{told_gain(last['one_step_gain/validation'])} the best trivial predictor's"
+            f"{format_ratio(last['baseline_ratio/validation'])} the best baseline's"
         )
     if stop.requested:
         print("stopped; the same command goes on from here")

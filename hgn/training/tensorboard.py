@@ -17,7 +17,7 @@ from hgn.training.stop import StopRequest
 PICTURES = 4  # frames beside each other
 ANIMATION_PICTURES = 24
 ANIMATION_SIZE = 200  # pixels of a panel
-FINAL_PREFIXES = ("one_step/", "one_step_gain/", "rollout/")
+FINAL_PREFIXES = ("one_step/", "baseline_ratio/", "rollout/")
 
 
 def show_rollout(trainer: Trainer, folder: Path, rollout: Rollout, error_T: dict[str, np.ndarray]) -> None:

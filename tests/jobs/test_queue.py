@@ -347,13 +347,13 @@ def test_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert reported == set(exported) and set(shipped_weights()) <= {Path(file).stem for file in exported}
 
 
-def test_own_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """jobs/own_states.txt: it begins with weights that jobs/networks.txt exports; each training goes on from weights
+def test_pushforward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """jobs/pushforward.txt: it begins with weights that jobs/networks.txt exports; each training goes on from weights
     that are there, on data that an earlier line makes; means are of weights that are there, and the last one ships."""
     data: dict[str, DatagenConfig] = {}
     there = {"runs/obstacles/obstacles.safetensors"}
     trained: set[str] = set()
-    for name, lines in calls(tmp_path, "own_states.txt").items():
+    for name, lines in calls(tmp_path, "pushforward.txt").items():
         mappings = settings(lines, monkeypatch)
         if list(mappings) == ["datagen"]:
             made = datagen_config(mappings["datagen"])
@@ -364,7 +364,7 @@ def test_own_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             there.add(mean.out)
         else:
             config, score = trained_and_scored(name, mappings, data)
-            assert config.training.weights in there and score.data == "data/obstacles"
+            assert config.training.init_weights in there and score.data == "data/obstacles"
             trained.add(config.dataset.folder)
             there.add(score.weights)
     assert trained == set(data) and name == "shipped"
@@ -372,9 +372,9 @@ def test_own_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Path(mean.out).stem in shipped_weights()
 
 
-def test_trial_of_own_states(tmp_path: Path) -> None:
+def test_trial_of_pushforward(tmp_path: Path) -> None:
     """SCENES and SHARE shorten data and trainings."""
-    lines = calls(tmp_path, "own_states.txt", SCENES="2", SHARE="1")
+    lines = calls(tmp_path, "pushforward.txt", SCENES="2", SHARE="1")
     used = [argument for line in lines.values() for call in line for argument in call]
     assert {argument for argument in used if "training_scenes" in argument} == {"dataset.training_scenes=2"}
     updates = [int(argument.partition("=")[2]) for argument in used if argument.startswith("training.maximum_updates")]

@@ -68,14 +68,14 @@ def test_a_pass_without_room_stays_within_memory(training: bool) -> None:
 
 
 @cpu_only
-def test_own_states_stay_within_memory() -> None:
+def test_pushforward_stays_within_memory() -> None:
     """Simulation after simulation, larger and smaller ones, scenes that are lost among them: every address that an
     update is given holds a whole window (or all materials and obstacles) of a living tensor, and each simulation in the
     same buffers launches what was captured, on the same memory."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     scenes = [scene_with_obstacles(0, 4), falling_episode(3, seed=1), scene_with_obstacles(3, 14)]
     own = GraphPushforwardPool(
-        network, training_of(precision="fp32", rollout_frames=2, rollout_share=0.9), CELL_SIZE, 0
+        network, training_of(precision="fp32", pushforward_frames=2, pushforward_fraction=0.9), CELL_SIZE, 0
     )
     episodes = [placed(scene, network) for scene in scenes]
     updates = updates_of(network, 4)

@@ -20,7 +20,6 @@ from training.test_symmetry import scene_with_obstacles
 from hgn import train
 from hgn.config import DatagenConfig
 from hgn.data.episode_tensors import whole_episode
-from hgn.data.rest_noise import noise_at_rest
 from hgn.data.statistics import Statistics
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.packing import pack_network
@@ -31,6 +30,7 @@ from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.graph_pushforward import GraphPushforwardPool
 from hgn.training.module import TrainingModule
+from hgn.training.noise import noise_scale
 from hgn.training.pushforward import PushforwardPool
 
 CELL_SIZE = 1 / 64
@@ -49,11 +49,11 @@ def values_of(network: HierarchicalGraphNetwork) -> torch.Tensor:
 
 def assert_same_pools(fast: GraphPushforwardPool, plain: PushforwardPool) -> None:
     for name, value in plain.figures.items():
-        if name != "own_states/seconds":
+        if name != "pushforward/seconds":
             assert fast.figures[name] == pytest.approx(value, rel=1e-3), name
-    for (found, asked), (made, _, expected, acceleration) in zip(fast._entries, plain._entries, strict=True):
-        np.testing.assert_allclose(found.position_TN3.cpu().numpy(), expected, rtol=0, atol=1e-6)
-        assert found.particles == made.particle_count and found.position_TN3.is_contiguous()
+    for (found, asked), (sample, acceleration) in zip(fast._samples, plain._samples, strict=True):
+        np.testing.assert_allclose(found.position_TN3.cpu().numpy(), sample.window_WN3, rtol=0, atol=1e-6)
+        assert found.particles == sample.episode.particle_count and found.position_TN3.is_contiguous()
         assert asked == pytest.approx(acceleration, abs=1e-6)
 
 
@@ -62,7 +62,7 @@ def test_the_pool_is_that_of_the_plain_path() -> None:
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
-    training = training_of(precision="fp32", rollout_frames=2, noise_std=0.5, noise_at_rest=0.1)
+    training = training_of(precision="fp32", pushforward_frames=2, noise_std=0.5, noise_min_scale=0.1)
     fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 60.0, 0)
     rollouts = []
     for starts in ([(0, 0), (1, 4)], [(1, 0), (2, 6)], [(0, 5), (3, 2)]):
@@ -75,13 +75,13 @@ def test_the_pool_is_that_of_the_plain_path() -> None:
                 parameter.mul_(1.05)
     assert rollouts[0] is rollouts[1] is not rollouts[2]
     samples = [DeviceSample(placed(scenes[0], network), 2, seed, 0.5) for seed in (5, 6, 7, 8)]
-    mixed = fast.mixed(samples, 11)
+    mixed = fast.replaced(samples, 11)
     assert [sample.seed for sample in mixed] == [5, 6, 7, 8] and mixed[2:] == samples[2:]
-    asked = dict(fast._entries)
+    asked = dict(fast._samples)
     for sample in mixed[:2]:
-        weight, noise = sample.weight, sample.noise
-        assert (noise, weight) == noise_at_rest(training, asked[sample.episode], sample.seed) and sample.frame == 0
-    assert len({sample.noise for sample in mixed[:2]} | {1.0}) == 3
+        drawn = sample.noise_scale, sample.weight
+        assert drawn == noise_scale(training, asked[sample.episode], sample.seed) and sample.frame == 0
+    assert len({sample.noise_scale for sample in mixed[:2]} | {1.0}) == 3
 
 
 def test_lost_scenes_are_dropped() -> None:
@@ -97,7 +97,7 @@ def test_lost_scenes_are_dropped() -> None:
         fast.refresh([(placed(made, network), frame) for made, frame in starts], values_of(network))
         plain.refresh(starts)
         assert_same_pools(fast, plain)
-        assert len(fast._entries) == kept
+        assert len(fast._samples) == kept
 
 
 def test_wrong_kernels_are_refused() -> None:
@@ -126,7 +126,7 @@ def test_fast_training_is_the_plain_one(
     monkeypatch.setattr("hgn.training.graph_trainer.REPORTED_UPDATES", 2)
     monkeypatch.setattr("hgn.runtime.backend.why_not_fast", lambda *_: None)  # in float32, which it is not offered in
     same = {"noise_std": 0.0, "grid_jitter": False, "ema_decay": 0.7, "symmetry": "gravity"}
-    own = {"rollout_share": 0.5, "rollout_every": 1, "rollout_scenes": 2, "rollout_frames": 2}
+    own = {"pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_scenes": 2, "pushforward_frames": 2}
     counts = {"maximum_updates": 2, "log_every": 2, "checkpoint_every": 2, "monitor_every": 2}
     original = TrainingModule.set_statistics
 
@@ -141,7 +141,7 @@ def test_fast_training_is_the_plain_one(
         assert train.main(run_mapping(data, tmp_path / backend, backend=backend, **same, **own, **counts)) == 0
         ends[backend] = read_checkpoint(tmp_path / backend / "checkpoints" / "last.ckpt")
         lines[backend] = next(line for line in metrics(tmp_path / backend) if "loss" in line)
-    assert re.findall(r"the first 2 updates took .* s own states, .* capturing \d+ times", capsys.readouterr().err)
+    assert re.findall(r"the first 2 updates took .* s pushforward, .* capturing \d+ times", capsys.readouterr().err)
     # Adam's first steps are signs of gradients: where those are next to nothing, rounding decides
     for key, value in ends["torch"]["state_dict"].items():
         assert float((ends["triton"]["state_dict"][key] - value).double().abs().mean()) < 1e-5, key
@@ -151,6 +151,6 @@ def test_fast_training_is_the_plain_one(
     ]
     assert float((moments[0] - moments[1]).norm() / moments[1].norm()) < 1e-4
     assert ends["triton"]["hgn"] == ends["torch"]["hgn"]
-    assert lines["triton"]["own_states/windows"] == lines["torch"]["own_states/windows"] == 4
-    for name in ("loss", "own_states/mse"):
+    assert lines["triton"]["pushforward/windows"] == lines["torch"]["pushforward/windows"] == 4
+    for name in ("loss", "pushforward/mse"):
         assert lines["triton"][name] == pytest.approx(lines["torch"][name], rel=1e-3)

@@ -133,7 +133,12 @@ def test_chunks_end_where_something_is_due() -> None:
     """Chunks meet every multiple of the log, checkpoint, monitor and rollout intervals and the last update, whatever
     update a training begins at, and the first ones are short."""
     training = TrainingConfig(
-        maximum_updates=1000, log_every=50, checkpoint_every=70, monitor_every=300, rollout_share=0.2, rollout_every=32
+        maximum_updates=1000,
+        log_every=50,
+        checkpoint_every=70,
+        monitor_every=300,
+        pushforward_fraction=0.2,
+        pushforward_every=32,
     )
     for begun in (0, 37, 999):
         update, ends = begun, []
@@ -183,7 +188,7 @@ def test_why_gns_is_not_trained_on_backend_triton() -> None:
     assert "not tf32" in str(why_not_trained_fast(gpu, gns, "tf32"))
     assert "not 48" in str(why_not_trained_fast(gpu, replace(gns, width=48), "fp16"))
     assert "not 128" in str(why_not_trained_fast(gpu, replace(gns, maximum_neighbours=128), "fp16"))
-    assert "true states" in str(why_not_trained_fast(gpu, gns, "fp16", own_states=True))
+    assert "true states" in str(why_not_trained_fast(gpu, gns, "fp16", pushforward=True))
     static = NetworkConfig(kind="gns_particles", levels=1, obstacle_features=False)
     assert "not gns_particles" in str(why_not_trained_fast(gpu, static, "fp16"))
 

@@ -28,9 +28,9 @@ def moved(path: Path, by: float, updates: int = 7, normaliser: float = 0.0, stor
     return path
 
 
-@pytest.mark.parametrize(("shares", "expected"), [(None, (0.5, 0.5)), ((0.7, 0.3), (0.7, 0.3))])
-def test_the_mean(tmp_path: Path, shares: tuple[float, ...] | None, expected: tuple[float, ...]) -> None:
-    """Each tensor is the mean of the files' by their shares, in float16 where asked; the normaliser stays bit by bit,
+@pytest.mark.parametrize(("coefficients", "expected"), [(None, (0.5, 0.5)), ((0.7, 0.3), (0.7, 0.3))])
+def test_the_mean(tmp_path: Path, coefficients: tuple[float, ...] | None, expected: tuple[float, ...]) -> None:
+    """Each tensor is the mean of the files' by their coefficients, in float16 where asked; the normaliser stays bit by bit,
     and the file says what it was made of."""
     files = [
         moved(tmp_path / "a.safetensors", 0.1, 5, stored_precision="fp16"),
@@ -38,7 +38,7 @@ def test_the_mean(tmp_path: Path, shares: tuple[float, ...] | None, expected: tu
     ]
     for stored in ("fp32", "fp16"):
         out = tmp_path / "mean.safetensors"
-        options = {"shares": shares, "out": str(out), "stored_precision": stored}
+        options = {"coefficients": coefficients, "out": str(out), "stored_precision": stored}
         assert main({"weights": [str(f) for f in files], **options}) == 0
         (first, _), (second, _), (mean, info) = (load_weights(file) for file in (*files, out))
         for name, tensor in mean.state_dict().items():
@@ -50,7 +50,7 @@ def test_the_mean(tmp_path: Path, shares: tuple[float, ...] | None, expected: tu
             assert not name.startswith("normaliser.") or torch.equal(tensor, a)
         assert info.updates == 9
         parts = info.provenance["average_of"]
-        assert [(p["file"], p["share"], p["updates"]) for p in parts] == [
+        assert [(p["file"], p["coefficient"], p["updates"]) for p in parts] == [
             ("a.safetensors", expected[0], 5),
             ("b.safetensors", expected[1], 9),
         ]
@@ -77,18 +77,18 @@ def test_others_are_refused(tmp_path: Path, changes: dict[str, Any], rule: str) 
 def test_other_normalisers_are_refused(tmp_path: Path) -> None:
     """Their latents have other units: trainings from nothing on data of their own."""
     files = [moved(tmp_path / "a.safetensors", 0.1), moved(tmp_path / "b.safetensors", 0.1, normaliser=0.5)]
-    with pytest.raises(ConfigError, match=r"weights\[1\] must have the normaliser of weights\[0\] .*training.weights"):
+    with pytest.raises(ConfigError, match=r"weights\[1\] must have the normaliser of weights\[0\] .*init_weights"):
         average(AverageConfig(tuple(map(str, files)), str(tmp_path / "mean.safetensors")))
 
 
 @pytest.mark.parametrize(
-    ("count", "shares", "rule"),
+    ("count", "coefficients", "rule"),
     [
         (1, None, "weights must be at least two files, got 1"),
-        (2, (0.5, 0.3, 0.2), "shares must be one for each of the 2 files, got 3"),
-        (2, (0.7, 0.4), "shares must be 1 together, got 1.1"),
+        (2, (0.5, 0.3, 0.2), "coefficients must be one for each of the 2 files, got 3"),
+        (2, (0.7, 0.4), "coefficients must be 1 together, got 1.1"),
     ],
 )
-def test_bad_options(count: int, shares: tuple[float, ...] | None, rule: str) -> None:
+def test_bad_options(count: int, coefficients: tuple[float, ...] | None, rule: str) -> None:
     with pytest.raises(ConfigError, match=rule):
-        AverageConfig(("a.safetensors",) * count, "out.safetensors", shares)
+        AverageConfig(("a.safetensors",) * count, "out.safetensors", coefficients)

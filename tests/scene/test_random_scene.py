@@ -160,12 +160,12 @@ def test_scenes_at_rest_have_no_velocity():
 
 
 def test_a_share_of_the_groups_begins_with_a_velocity():
-    """With initial_speed_share 0.25 about a quarter of 240 groups moves, the others are exactly at rest."""
-    config = SceneConfig(obstacle_count=0, maximum_initial_speed=3.0, initial_speed_share=0.25)
+    """With moving_group_fraction 0.25 about a quarter of 240 groups moves, the others are exactly at rest."""
+    config = SceneConfig(obstacle_count=0, maximum_initial_speed=3.0, moving_group_fraction=0.25)
     groups = [group for seed in range(60) for group in generate_scene(config, seed).specification["groups"]]
     moving = [group for group in groups if any(group["velocity"])]
     assert 0.17 < len(moving) / len(groups) < 0.33
-    assert not any(generate_scene(replace(config, initial_speed_share=0.0), 1).velocity_N3.flat)
+    assert not any(generate_scene(replace(config, moving_group_fraction=0.0), 1).velocity_N3.flat)
 
 
 def test_draws_cover_their_ranges():

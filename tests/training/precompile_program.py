@@ -17,7 +17,7 @@ job = PrecompileJob(network, settings, "fp16", True, True, 300, (200, 60), 90)
 expected = set(launches_of(job, "cpu"))
 assert set(launches_of(job)) == expected and len(expected) > 30, len(expected)
 last = len(expected) - 1
-rolling = replace(job, rollout_scenes=(3,))
+rolling = replace(job, pushforward_scenes=(3,))
 with_frames = set(launches_of(rolling, "cpu"))
 assert set(launches_of(rolling)) == with_frames > expected, len(with_frames)
 assert compile_share(job, last, len(expected)) == 1

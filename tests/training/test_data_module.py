@@ -36,7 +36,7 @@ def streamed(folder: Path | str, training: TrainingConfig = SETTINGS[1]) -> list
 def test_resident_feeding_equals_streaming(folder: Path, importance: float, at_rest: float) -> None:
     """Whole episodes, which stay in a GPU's memory, hold the windows that streaming reads, bitwise, for samples of the
     same order, seeds, weights and noise; each episode comes once, and the cursors agree wherever a chunk ends."""
-    changes = {"frame_importance": importance, "noise_at_rest": at_rest, "noise_std": 1.0}  # nothing moves as much
+    changes = {"frame_importance": importance, "noise_min_scale": at_rest, "noise_std": 1.0}  # nothing moves as much
     network, training = SETTINGS[0], replace(SETTINGS[1], **changes)
     expected = streamed(folder, training)
     resident: dict[int, EpisodeTensors] = {}
@@ -54,15 +54,15 @@ def test_resident_feeding_equals_streaming(folder: Path, importance: float, at_r
             assert torch.equal(torch.cat([resident[s.episode].material_N for s in samples]).long(), batch.material_N)
             assert tuple(sample.seed for sample in samples) == batch.seeds_S
             assert tuple(sample.weight for sample in samples) == batch.weight_S
-            assert tuple(sample.noise for sample in samples) == batch.noise_S
+            assert tuple(sample.noise_scale for sample in samples) == batch.noise_scale_S
             assert (batch.weight_S == (1.0, 1.0)) == (importance == 0 and at_rest == 1)
-            assert all(noise == 1 if at_rest == 1 else at_rest < noise < 1 for noise in batch.noise_S)
+            assert all(noise == 1 if at_rest == 1 else at_rest < noise < 1 for noise in batch.noise_scale_S)
             if importance == 0:
-                assert batch.weight_S == pytest.approx([1 / noise**2 for noise in batch.noise_S])
+                assert batch.weight_S == pytest.approx([1 / noise**2 for noise in batch.noise_scale_S])
             update += 1
         if update == UPDATES:
             break
-        assert chunk.cursor == expected[update - 1].cursor
+        assert chunk.sampler_state == expected[update - 1].sampler_state
     assert len(resident) == 5
 
 
@@ -76,4 +76,4 @@ def test_feeding_from_a_url_equals_feeding_from_a_folder(
         files.pipe(f"/feeding/{path.name}", path.read_bytes())
     for here, there in zip(streamed(folder), streamed("memory://feeding"), strict=True):
         assert torch.equal(here.window_WN3, there.window_WN3)
-        assert (here.seeds_S, here.cursor) == (there.seeds_S, there.cursor)
+        assert (here.seeds_S, here.sampler_state) == (there.seeds_S, there.sampler_state)

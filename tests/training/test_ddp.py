@@ -101,8 +101,10 @@ class Reference:
         assert [end["exit_code"] for end in ends] == [exit_code] * 2
         stored = read_checkpoint(folder / "run" / "checkpoints" / "last.ckpt")
         assert stored["hgn"]["updates"] == 20
-        cursor = stored["hgn"]["cursor"]
-        assert 25 * cursor["epoch"] + cursor["position"] == 2 * 20  # two samples an update, of 5 episodes with 5 steps
+        sampler_state = stored["hgn"]["sampler_state"]
+        assert (
+            25 * sampler_state["epoch"] + sampler_state["position"] == 2 * 20
+        )  # two samples an update, of 5 episodes with 5 steps
         for name, tensor in stored["state_dict"].items():
             assert torch.equal(ends[0]["weights"][name], tensor), name
             assert torch.equal(ends[1]["weights"][name], tensor), name
@@ -167,7 +169,7 @@ def test_two_ranks_train_as_one(reference: Reference, warm_python: Path, tmp_pat
     order = EpisodeSampler(alone["training"].get("seed", 0), 2, lambda _: [6] * 5)
     for _ in range(20):
         order.next_batch()
-    rest = EpisodeSampler(order.seed, 1, lambda _: [6] * 5, order.cursor)
+    rest = EpisodeSampler(order.seed, 1, lambda _: [6] * 5, order.state)
     assert seen == [tuple(sample.seed for sample in rest.next_batch()) for _ in range(20)]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hgn.training.errors import mean_so_far, told_gain
+from hgn.training.errors import format_ratio, mean_so_far
 
 
 @pytest.mark.parametrize(
@@ -14,7 +14,7 @@ from hgn.training.errors import mean_so_far, told_gain
 )
 def test_gain_in_words(gain: float, text: str) -> None:
     """An error that is larger than the other is not said to be below it."""
-    assert told_gain(gain) == text
+    assert format_ratio(gain) == text
 
 
 def test_mean_over_the_scenes_that_came_so_far() -> None:

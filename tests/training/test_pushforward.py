@@ -20,20 +20,27 @@ from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
 from hgn.config import DatagenConfig, DatasetConfig, NetworkConfig, TrainConfig, TrainingConfig
-from hgn.data.batch import make_batch
+from hgn.data.batch import BatchSample, UpdateSamples, make_batch
+from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.simulator import Simulator
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.pushforward import PushforwardPool, drawn_entries, drawn_starts, own_windows
+from hgn.training.pushforward import PushforwardPool, drawn_pool_samples, drawn_starts, pushforward_windows
 
 HISTORY, CELL = 5, 0.1
 
 
 def training_of(**changes: Any) -> TrainingConfig:
-    values = {"batch_scenes": 4, "rollout_share": 0.5, "rollout_frames": 3, "rollout_scenes": 2, "rollout_pull": 0.25}
+    values = {
+        "batch_scenes": 4,
+        "pushforward_fraction": 0.5,
+        "pushforward_frames": 3,
+        "pushforward_scenes": 2,
+        "pushforward_pull": 0.25,
+    }
     return TrainingConfig(**values | changes)
 
 
@@ -47,7 +54,7 @@ def test_windows_are_those_of_the_simulation() -> None:
     simulated[:, 0] += 3 * CELL
     places = [*true[: HISTORY + 1], *simulated]
     for pull in (0.0, 0.25, 1.0):
-        windows = own_windows(true, simulated, pull, CELL)
+        windows = pushforward_windows(true, simulated, pull, CELL)
         assert windows.shape == (4, HISTORY + 2, 7, 3)
         for k, found in enumerate(windows):
             for i in range(HISTORY + 1):
@@ -63,7 +70,7 @@ def test_windows_are_those_of_the_simulation() -> None:
 def test_what_is_simulated_is_drawn_from_seed_and_update() -> None:
     """Every episode long enough comes once before one comes twice, from any frame whose truth is known long enough, the
     first included; the same for the same update and rank, another for another. Without any it is refused."""
-    training = training_of(rollout_scenes=5)
+    training = training_of(pushforward_scenes=5)
     frames = [10, 4, 12, 6]  # 4: no frame 5 ahead of any start
     drawn = [drawn_starts(training, update, 0, frames) for update in range(200)]
     for starts in drawn:
@@ -72,7 +79,7 @@ def test_what_is_simulated_is_drawn_from_seed_and_update() -> None:
         assert {frame for starts in drawn for i, frame in starts if i == index} == set(range(frames[index] - 4))
     assert drawn_starts(training, 7, 0, frames) == drawn[7] != drawn[8]
     assert drawn_starts(training, 7, 1, frames) != drawn[7]
-    with pytest.raises(ConfigError, match="rollout_frames must be at most the frames of an episode - 2, got 3 where"):
+    with pytest.raises(ConfigError, match="pushforward_frames must be at most the frames of an episode - 2, got 3"):
         drawn_starts(training, 0, 0, [4, 4])
 
 
@@ -80,17 +87,24 @@ def test_what_is_simulated_is_drawn_from_seed_and_update() -> None:
 def test_the_share_is_kept(share: float, scenes: int) -> None:
     """On average this share of the samples is replaced, at most one sample more or less in an update, by windows of the
     whole pool; with an empty pool none is."""
-    training = training_of(rollout_share=share, batch_scenes=scenes)
-    drawn = [drawn_entries(training, update, 0, 10) for update in range(2000)]
+    training = training_of(pushforward_fraction=share, batch_scenes=scenes)
+    drawn = [drawn_pool_samples(training, update, 0, 10) for update in range(2000)]
     counts = [len(entries) for entries in drawn]
     assert np.mean(counts) == pytest.approx(share * scenes, abs=0.03)
     assert all(abs(count - share * scenes) < 1 for count in counts)
     if share:
         assert {entry for entries in drawn for entry in entries} == set(range(10))
-    assert drawn_entries(training, 3, 0, 0) == []
+    assert drawn_pool_samples(training, 3, 0, 0) == []
 
 
-def own_states(network: ParticleNetwork, training: TrainingConfig | None = None) -> PushforwardPool:
+def samples_of(episodes: list[Episode], frame: int, seeds: tuple[int, ...]) -> UpdateSamples:
+    pairs = zip(episodes, seeds, strict=True)
+    return UpdateSamples(
+        tuple(BatchSample(e, frame, window(e, frame, HISTORY), seed) for e, seed in pairs), SamplerState()
+    )
+
+
+def pool_of(network: ParticleNetwork, training: TrainingConfig | None = None) -> PushforwardPool:
     return PushforwardPool(network, training or training_of(), 60.0, 0)
 
 
@@ -108,9 +122,9 @@ def test_the_pool_is_what_the_network_does(network: ParticleNetwork) -> None:
     by itself; a batch gets them in place of its first samples, with its seeds, and the others stay."""
     episodes = [scene_with_obstacles(i, 5 + i, cells=200) for i in range(2)]
     starts = [(episodes[0], 0), (episodes[1], 6)]
-    own = own_states(network)
+    own = pool_of(network)
     own.refresh(starts)
-    assert own.figures["own_states/windows"] == 6 and own.figures["own_states/dropped"] == 0
+    assert own.figures["pushforward/windows"] == 6 and own.figures["pushforward/dropped"] == 0
     expected = []
     for made, frame in starts:
         state = make_batch([(made, frame)], network.config).state()
@@ -119,19 +133,20 @@ def test_the_pool_is_what_the_network_does(network: ParticleNetwork) -> None:
             state = Simulator(network, 60.0).step(state)
             path.append(state.position_N3)
         true = torch.from_numpy(window(made, frame, HISTORY, 4))
-        expected += list(own_windows(true, torch.stack(path), 0.25, network.config.cell_size))
-    for (made, _, found, _), wanted, origin in zip(own._entries, expected, [0, 0, 0, 1, 1, 1], strict=True):
-        assert made is episodes[origin]
-        np.testing.assert_allclose(found, wanted.numpy(), rtol=0, atol=1e-7)
-    batch = make_batch([(e, 3) for e in [*episodes, *episodes]], network.config, (5, 6, 7, 8))
-    mixed = own.mixed(batch, 11)
-    chosen = drawn_entries(own.training, 11, 0, 6)
-    assert len(chosen) == 2 and mixed.seeds_S == batch.seeds_S
-    by_scene = mixed.window_WN3.split(list(mixed.particles_S), dim=1)
-    for slot, entry in enumerate(chosen):
-        np.testing.assert_array_equal(by_scene[slot].numpy(), own._entries[entry][2])
-    kept = batch.window_WN3.split(list(batch.particles_S), dim=1)
-    assert torch.equal(by_scene[2], kept[2]) and torch.equal(by_scene[3], kept[3])
+        expected += list(pushforward_windows(true, torch.stack(path), 0.25, network.config.cell_size))
+    for (sample, _), wanted, origin in zip(own._samples, expected, [0, 0, 0, 1, 1, 1], strict=True):
+        assert sample.episode is episodes[origin]
+        np.testing.assert_allclose(sample.window_WN3, wanted.numpy(), rtol=0, atol=1e-7)
+    samples = samples_of([*episodes, *episodes], 3, seeds=(5, 6, 7, 8))
+    replaced = own.replaced(samples, 11).samples
+    chosen = drawn_pool_samples(own.training, 11, 0, 6)
+    assert len(chosen) == 2 and [sample.seed for sample in replaced] == [5, 6, 7, 8]
+    for slot, number in enumerate(chosen):
+        assert replaced[slot].window_WN3 is own._samples[number][0].window_WN3
+    assert replaced[2:] == samples.samples[2:]
+    batch = own.replaced(samples, 11).batch(network.config)
+    by_scene = batch.window_WN3.split(list(batch.particles_S), dim=1)
+    assert all(np.array_equal(scene, sample.window_WN3) for scene, sample in zip(by_scene, replaced, strict=True))
 
 
 def falling(episode: Episode, domain: float) -> Episode:
@@ -152,28 +167,31 @@ def test_lost_scenes_are_dropped() -> None:
     before that and none after; the others give all, and one too far from the truth none from there on."""
     network = wild_network()
     small, large = falling(episode(4, seed=1), 0.27), episode(4, seed=2)  # both around 0.5: 0.02, 0.06, 0.12 on
-    own = own_states(network)
+    own = pool_of(network)
     own.refresh([(small, 2), (large, 2)])
-    assert [made is small for made, *_ in own._entries] == [True, False, False, False]
-    assert own.figures["own_states/dropped"] == 2
+    assert [sample.episode is small for sample, _ in own._samples] == [True, False, False, False]
+    assert own.figures["pushforward/dropped"] == 2
     network.config = replace(network.config, cell_size=0.1)  # 0.02 sqrt(3) < 0.05 < 0.06 sqrt(3)
     own.refresh([(small, 2), (large, 2)])
-    assert [made is small for made, *_ in own._entries] == [True, False]
+    assert [sample.episode is small for sample, _ in own._samples] == [True, False]
     with torch.no_grad():
         network.normaliser.acceleration_mean.fill_(torch.nan)
     own.refresh([(small, 2), (large, 2)])
-    assert own._entries == [] and own.figures["own_states/windows"] == 0 and "own_states/mse" not in own.figures
-    batch = make_batch([(small, 2)] * 4, network.config)
-    assert own.mixed(batch, 0) is batch
+    assert own._samples == [] and own.figures["pushforward/windows"] == 0 and "pushforward/mse" not in own.figures
+    samples = samples_of([small] * 4, 2, seeds=(5, 6, 7, 8))
+    assert own.replaced(samples, 0).samples == samples.samples
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rollout_share": 1.0}, "rollout_share must be 0 or more and below 1, got 1.0"),
-        ({"rollout_pull": 1.5}, "rollout_pull must be 0 to 1, got 1.5"),
-        ({"rollout_every": 0}, "rollout_every must be .*got 0"),
-        ({"rollout_share": 0.5, "rollout_frames": 5}, "rollout_frames must be at most dataset.frames - 2 = 4 .*got 5"),
+        ({"pushforward_fraction": 1.0}, "pushforward_fraction must be 0 or more and below 1, got 1.0"),
+        ({"pushforward_pull": 1.5}, "pushforward_pull must be 0 to 1, got 1.5"),
+        ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
+        (
+            {"pushforward_fraction": 0.5, "pushforward_frames": 5},
+            "pushforward_frames must be at most dataset.frames - 2 = 4 .*got 5",
+        ),
     ],
 )
 def test_wrong_values_are_refused(changes: dict[str, Any], message: str) -> None:
@@ -185,9 +203,15 @@ def test_wrong_values_are_refused(changes: dict[str, Any], message: str) -> None
 def test_a_resume_where_the_pool_is_made_anew_changes_nothing(
     data: DatagenConfig, tmp_path: Path, stop_at: Callable[[int | None], None]
 ) -> None:
-    """Interrupted at a multiple of rollout_every, a training ends where an uninterrupted one does, bit by bit, and it
-    tells how many windows it has; interrupted elsewhere it goes on with a pool of its own."""
-    own = {"rollout_share": 0.5, "rollout_every": 4, "rollout_scenes": 3, "rollout_frames": 2, "ema_decay": 0.8}
+    """Interrupted at a multiple of pushforward_every, a training ends where an uninterrupted one does, bit by bit, and
+    it tells how many windows it has; interrupted elsewhere it goes on with a pool of its own."""
+    own = {
+        "pushforward_fraction": 0.5,
+        "pushforward_every": 4,
+        "pushforward_scenes": 3,
+        "pushforward_frames": 2,
+        "ema_decay": 0.8,
+    }
 
     def trained(name: str, stops: list[int], **changes: Any) -> dict[str, Any]:
         for stop in (*stops, None):
@@ -198,10 +222,10 @@ def test_a_resume_where_the_pool_is_made_anew_changes_nothing(
     whole, again, elsewhere = trained("whole", []), trained("again", [4, 8]), trained("elsewhere", [6])
     for part in ("state_dict", "optimizer_states", "lr_schedulers", "hgn"):
         assert_same(again[part], whole[part], part)
-    without = trained("without", [], rollout_share=0.0)
+    without = trained("without", [], pushforward_fraction=0.0)
     for other in (elsewhere, without):
         assert other["hgn"] == whole["hgn"]
         assert any(not torch.equal(other["state_dict"][name], value) for name, value in whole["state_dict"].items())
     lines = [line for line in metrics(tmp_path / "whole") if "loss" in line]
-    assert all(line["own_states/windows"] == 6 and line["own_states/dropped"] == 0 for line in lines)
-    assert not any("own_states/windows" in line for line in metrics(tmp_path / "without"))
+    assert all(line["pushforward/windows"] == 6 and line["pushforward/dropped"] == 0 for line in lines)
+    assert not any("pushforward/windows" in line for line in metrics(tmp_path / "without"))

@@ -38,26 +38,26 @@ class Samples:
 
     def take(self, orders: Sequence[EpisodeSampler]) -> None:
         """One global batch: the ranks' shares follow each other, and may run over the end of an epoch."""
-        cursor = orders[0].cursor
-        left = len(orders[0]._order) - cursor.position
+        sampler_state = orders[0].state
+        left = len(orders[0]._order) - sampler_state.position
         for number, sample in enumerate(sample for order in orders for sample in order.next_batch()):
-            self.epochs.setdefault(cursor.epoch + (number >= left), []).append((sample.episode, sample.frame))
-        assert all(order.cursor == orders[0].cursor for order in orders)
+            self.epochs.setdefault(sampler_state.epoch + (number >= left), []).append((sample.episode, sample.frame))
+        assert all(order.state == orders[0].state for order in orders)
 
-    def require_each_once(self, cursor: SamplerState, frames: Callable[[int], Sequence[int]]) -> None:
-        """Every epoch before the cursor's has each sample of episodes of `frames` frames once, its own none twice."""
+    def require_each_once(self, sampler_state: SamplerState, frames: Callable[[int], Sequence[int]]) -> None:
+        """Every epoch before that state's has each sample of episodes of `frames` frames once, its own none twice."""
         for epoch, samples in self.epochs.items():
             expected = [(e, n) for e, count in enumerate(frames(epoch)) for n in range(count - 1)]
-            if epoch < cursor.epoch:
+            if epoch < sampler_state.epoch:
                 assert sorted(samples) == expected
             else:
                 assert len(set(samples)) == len(samples) and set(samples) <= set(expected)
 
 
 def ranks_of(
-    world_size: int, batch: int, published: Callable[[int], Sequence[int]], cursor: SamplerState | None = None
+    world_size: int, batch: int, published: Callable[[int], Sequence[int]], sampler_state: SamplerState | None = None
 ) -> list[EpisodeSampler]:
-    return [EpisodeSampler(5, batch, published, cursor, rank, world_size) for rank in range(world_size)]
+    return [EpisodeSampler(5, batch, published, sampler_state, rank, world_size) for rank in range(world_size)]
 
 
 @settings(max_examples=80, deadline=None)
@@ -67,15 +67,15 @@ def test_each_sample_once_an_epoch_through_any_interruptions(
 ) -> None:
     """However often a training is interrupted, and on whatever number of ranks and batch size it goes on, each epoch
     has every sample exactly once."""
-    total, seen, cursor = sum(frames) - len(frames), Samples(), SamplerState()
+    total, seen, sampler_state = sum(frames) - len(frames), Samples(), SamplerState()
     for world_size, batch, batches in starts:
-        orders = ranks_of(world_size, min(batch, max(1, total // world_size)), lambda _: frames, cursor)
+        orders = ranks_of(world_size, min(batch, max(1, total // world_size)), lambda _: frames, sampler_state)
         if world_size * orders[0].batch_scenes > total:
             continue  # a batch of more than an epoch has its own test
         for _ in range(batches):
             seen.take(orders)
-        cursor = orders[0].cursor
-    seen.require_each_once(cursor, lambda _: frames)
+        sampler_state = orders[0].state
+    seen.require_each_once(sampler_state, lambda _: frames)
 
 
 @settings(max_examples=80, deadline=None)
@@ -99,16 +99,16 @@ def test_an_epoch_keeps_the_revision_it_began_with(
             begun[epoch] = len(published)
         return list(published)
 
-    seen, cursor = Samples(), SamplerState()
+    seen, sampler_state = Samples(), SamplerState()
     for batches, grown_meanwhile in starts:
         published.extend([2] * grown_meanwhile)
-        orders = ranks_of(world_size, 1, look, cursor)
+        orders = ranks_of(world_size, 1, look, sampler_state)
         for _ in range(batches):
             seen.take(orders)
             published.extend([2] * grown_meanwhile)
-        cursor = orders[0].cursor
-    assert cursor.episodes == begun[cursor.epoch]
-    seen.require_each_once(cursor, lambda epoch: published[: begun[epoch]])
+        sampler_state = orders[0].state
+    assert sampler_state.episodes == begun[sampler_state.epoch]
+    seen.require_each_once(sampler_state, lambda epoch: published[: begun[epoch]])
 
 
 @pytest.fixture
@@ -119,23 +119,23 @@ def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[Data
 
 
 def test_reading_ahead_changes_nothing(data: DatagenConfig) -> None:
-    """With 0 to 3 batches read ahead the batches are the same, bit by bit, and each carries the cursor after it, from
-    which a feed goes on with the next one."""
+    """With 0 to 3 batches read ahead the batches are the same, bit by bit, and each carries the sampler's state after
+    it, from which a feed goes on with the next one."""
     network, training = NetworkConfig(**NETWORK), TrainingConfig(**TRAINING)
     store = EpisodeStore(data.dataset.folder, "train")
 
-    def batches(ahead: int, count: int, cursor: SamplerState | None = None) -> list[Batch]:
+    def batches(ahead: int, count: int, sampler_state: SamplerState | None = None) -> list[Batch]:
         feed = EpisodeDataModule(store, network, training, batches_ahead=ahead)
-        feed.cursor = cursor or SamplerState()
+        feed.sampler_state = sampler_state or SamplerState()
         return list(islice(feed.batches(), count))
 
     expected = batches(0, 30)
     for ahead in (1, 2, 3):
         for batch, other in zip(expected, batches(ahead, 30), strict=True):
             assert torch.equal(batch.window_WN3, other.window_WN3)
-            assert (batch.seeds_S, batch.cursor) == (other.seeds_S, other.cursor)
+            assert (batch.seeds_S, batch.sampler_state) == (other.seeds_S, other.state)
     for ahead in range(4):
-        again = batches(ahead, 5, expected[16].cursor)
+        again = batches(ahead, 5, expected[16].sampler_state)
         for batch, other in zip(expected[17:22], again, strict=True):
             assert torch.equal(batch.window_WN3, other.window_WN3) and batch.seeds_S == other.seeds_S
 
@@ -168,18 +168,18 @@ def test_feeds_of_all_ranks_resume_anywhere(data: DatagenConfig) -> None:
     )
     def interrupted(starts: list[tuple[int, int, int, int]]) -> None:
         seen: list[int] = []
-        cursor = SamplerState()
+        sampler_state = SamplerState()
         for world_size, batch_scenes, ahead, count in starts:
             training = TrainingConfig(**TRAINING | {"batch_scenes": batch_scenes})
             ranks = []
             for rank in range(world_size):
                 feed = EpisodeDataModule(store, network, training, batches_ahead=ahead)
-                feed.cursor, feed.trainer = cursor, Shared(rank, world_size)
+                feed.sampler_state, feed.trainer = sampler_state, Shared(rank, world_size)
                 ranks.append(list(islice(feed.batches(), count)))
             for batches in zip(*ranks, strict=True):
                 seen += [seed for batch in batches for seed in batch.seeds_S]
-                assert len({batch.cursor for batch in batches}) == 1
-            cursor = ranks[0][-1].cursor
+                assert len({batch.sampler_state for batch in batches}) == 1
+            sampler_state = ranks[0][-1].sampler_state
         assert seen == expected[: len(seen)]
 
     interrupted()
@@ -236,7 +236,7 @@ def test_resume_equals_no_interruption(data: DatagenConfig, stop_at: Callable[[i
 
     with tempfile.TemporaryDirectory() as folder:
         whole = trained(Path(folder) / "whole", [])
-    assert dataclasses.asdict(SamplerState(1, 7, 5)) == whole["hgn"]["cursor"]
+    assert dataclasses.asdict(SamplerState(1, 7, 5)) == whole["hgn"]["sampler_state"]
 
     @settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
     @given(st.lists(st.integers(1, UPDATES - 1), min_size=1, max_size=2, unique=True).map(sorted))

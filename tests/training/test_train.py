@@ -53,14 +53,14 @@ def test_a_run_leaves_what_it_promises(data, tmp_path):
     materials = [key.removeprefix("one_step/validation_") for key in keys if key.startswith("one_step/validation_")]
     assert materials and set(materials) <= {"water", "sand", "snow"}
     for split in ("training", "validation"):
-        assert {f"one_step/{split}", f"trivial/{split}_ballistic_motion", f"one_step_gain/{split}"} <= keys
-    scalars = {"loss", "learning_rate", "gradient_norm", "skipped_updates", "scenes_per_second", "data_wait_share"}
+        assert {f"one_step/{split}", f"trivial/{split}_ballistic_motion", f"baseline_ratio/{split}"} <= keys
+    scalars = {"loss", "learning_rate", "gradient_norm", "skipped_updates", "scenes_per_second", "data_wait_fraction"}
     scalars |= {"shards", "episodes", "updates_per_second", "rollout/finished", "rollout/mse"}
     scalars |= {f"rollout/mse_{name}" for name in materials}
     assert scalars <= keys
     lines = [record for record in records if "loss" in record]
     assert [line["learning_rate"] for line in lines] == pytest.approx([1e-3 * 0.1 ** (n / 12) for n in (4, 8, 12)])
-    assert all(0 < line["gradient_norm"] < 1e3 and 0 <= line["data_wait_share"] <= 1 for line in lines)
+    assert all(0 < line["gradient_norm"] < 1e3 and 0 <= line["data_wait_fraction"] <= 1 for line in lines)
     assert all(line["shards"] == 4 and line["skipped_updates"] == 0 for line in lines)
     stored = yaml.safe_load((run / "config.yaml").read_text())
     assert stored["training"]["maximum_updates"] == 12 and stored["provenance"]["data_schema_version"] == 1

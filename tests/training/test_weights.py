@@ -43,7 +43,7 @@ def weights_file(
 
 
 def evaluate(data: DatagenConfig, weights: Path) -> float:
-    mapping = {"weights": str(weights), "data": data.dataset.folder, "rollout_frames": 0, "device": "cpu"}
+    mapping = {"weights": str(weights), "data": data.dataset.folder, "pushforward_frames": 0, "device": "cpu"}
     config = EvaluateConfig(**mapping)
     rows = one_step_rows(load_weights(weights)[0], first_episodes(EpisodeStore(config.data, config.split), 5), config)
     return next(row["one_step_mse"] for row in rows if row["system"] == "network")
@@ -76,11 +76,11 @@ def test_a_run_begins_with_weights(
 @pytest.mark.parametrize(
     ("file", "message"),
     [
-        ({"width": 16}, r"network.width must be 16, as in training.weights .*, got 8; set it so, or take other"),
-        ({"materials": ("water",)}, r"network.materials must be \['water'\], as in training.weights"),
-        ({"rate": 30.0}, r"dataset.frame_rate_hz must be 30.0, as in training.weights .*, got 60.0; set"),
-        ({"cell_size": 0.02}, r"scene.cell_size must be 0.02, as in training.weights .*, got 0.015625; set"),
-        (None, r"training.weights must be an existing file, got .*; write one with python -m hgn.export"),
+        ({"width": 16}, r"network.width must be 16, as in training.init_weights .*, got 8; set it so, or take other"),
+        ({"materials": ("water",)}, r"network.materials must be \['water'\], as in training.init_weights"),
+        ({"rate": 30.0}, r"dataset.frame_rate_hz must be 30.0, as in training.init_weights .*, got 60.0; set"),
+        ({"cell_size": 0.02}, r"scene.cell_size must be 0.02, as in training.init_weights .*, got 0.015625; set"),
+        (None, r"training.init_weights must be an existing file, got .*; write one with python -m hgn.export"),
     ],
 )
 def test_other_weights_are_refused(data: DatagenConfig, tmp_path: Path, file: Any, message: str) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hgn.config import NETWORK_KINDS
-from hgn.training.errors import told_gain
+from hgn.training.errors import format_ratio
 from tools.error_vs_time.score import label
 
 Row = Mapping[str, Any]
@@ -100,7 +100,7 @@ def _fastest(networks: Sequence[Row]) -> list[Row]:
 
 
 def _gain(other: float, mse: float) -> str:
-    return told_gain(other / mse) if mse > 0 else "no error"
+    return format_ratio(other / mse) if mse > 0 else "no error"
 
 
 def _speed(times: float) -> str:

@@ -58,12 +58,11 @@ def step_blocks(
     status,
     norm,
     step_size,
-    decay,
     PRECISION: tl.constexpr,
     WIDTH: tl.constexpr,
 ):
-    """Moves square blocks against their directions by rate times `step_size`, and shrinks them by rate times `decay`.
-    Values and weights are written as `adam` does.
+    """Moves square blocks against their directions by rate times `step_size`; values and weights are written as `adam`
+    does.
 
     Reference: hgn.training.muon.Muon; test: tests/kernels/test_update.py.
     """
@@ -78,7 +77,7 @@ def step_blocks(
     along = tl.load(direction + block * WIDTH * WIDTH + place).to(tl.float32)
     rate = tl.load(rates + tl.load(update))
     x = tl.load(value + at)
-    x -= rate * (decay * x + step_size * along)
+    x -= rate * (step_size * along)
     tl.store(value + at, x)
     if PRECISION == "fp16":
         tl.store(weight + at, x)

@@ -20,11 +20,8 @@ def direction_dtype(device: torch.device) -> torch.dtype:
 class SquareBlocks:
     """The weights that Muon steps, in the packed layout: of each block the rows are pieces, equally far apart."""
 
-    def __init__(
-        self, network: ParticleNetwork, index: torch.Tensor, device: torch.device, weight_decay: float
-    ) -> None:
+    def __init__(self, network: ParticleNetwork, index: torch.Tensor, device: torch.device) -> None:
         """`index` maps packed elements to the concatenated parameters, -1 for padding."""
-        self._decay = weight_decay
         block_KWW = square_blocks(network)
         place = torch.empty(int(index.max()) + 1, dtype=torch.int64)
         used = index >= 0
@@ -81,7 +78,6 @@ class SquareBlocks:
             status=status,
             norm=norm,
             step_size=step_size(width),
-            decay=self._decay,
             PRECISION=precision,
             WIDTH=width,
             num_warps=WARPS,

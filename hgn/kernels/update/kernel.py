@@ -191,12 +191,11 @@ def assemble_batch(
 
 @triton.jit
 def loss_gradient(
-    output, target, share_of, particle_count, gradient, loss, scale, huber, OUT: tl.constexpr, BLOCK: tl.constexpr
+    output, target, share_of, particle_count, gradient, loss, scale, OUT: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Mean squared error of the normalised acceleration over axes, particles, scenes; its gradient times `scale`.
-    Errors above `huber` count linearly.
 
-    Reference: torch's huber_loss and autograd; test: tests/kernels/test_update.py.
+    Reference: torch's autograd; test: tests/kernels/test_update.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -208,9 +207,8 @@ def loss_gradient(
     error = tl.load(output + at, mask=live, other=0.0)
     error -= tl.load(target + row[:, None] * 3 + column[None, :], mask=live, other=0.0)
     share = tl.load(share_of + row, mask=row < count, other=0.0)[:, None] / 3
-    clipped = tl.where(error > huber, huber, tl.where(error < -huber, -huber, error))  # what is not finite stays so
-    tl.store(gradient + at, 2 * scale * share * clipped, mask=(row < count)[:, None])
-    tl.atomic_add(loss, tl.sum(tl.sum(share * clipped * (2 * error - clipped), 1), 0))
+    tl.store(gradient + at, 2 * scale * share * error, mask=(row < count)[:, None])
+    tl.atomic_add(loss, tl.sum(tl.sum(share * error * error, 1), 0))
 
 
 @triton.jit

@@ -83,7 +83,7 @@ class DeviceSample(NamedTuple):
     frame: int
     seed: int  # of noise, jitter and symmetry
     weight: float = 1.0  # of the loss
-    noise: float = 1.0  # of it, in units of the noise that the settings say
+    noise_scale: float = 1.0  # of the noise, in units of what the settings say
 
 
 AnySample = DeviceSample | tuple[DeviceEpisode, int, int]
@@ -98,10 +98,8 @@ class UpdateSettings:
     grid_jitter: bool
     obstacle_cell_size: float
     symmetry: bool = False
-    noise_smooth: float = 0.0
-    huber: float = math.inf  # normalised error from which the loss grows linearly
+    noise_correlated_fraction: float = 0.0
     optimizer: str = "adam"
-    weight_decay: float = 0.0
 
     @staticmethod
     def of(training: TrainingConfig, obstacle_cell_size: float) -> UpdateSettings:
@@ -111,10 +109,8 @@ class UpdateSettings:
             training.grid_jitter,
             obstacle_cell_size,
             training.symmetry != "none",
-            training.noise_smooth,
-            math.inf if training.huber is None else training.huber,
-            training.optimizer,
-            training.weight_decay,
+            training.noise_correlated_fraction,
+            optimizer=training.optimizer,
         )
 
 
@@ -193,7 +189,7 @@ class Updates:
         self.first_moment, self.second_moment = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self.average: torch.Tensor | None = None  # of the values over the updates; set it before the first one
         muon = settings.optimizer == "muon"
-        self.blocks = SquareBlocks(network, self.packed.index, device, settings.weight_decay) if muon else None
+        self.blocks = SquareBlocks(network, self.packed.index, device) if muon else None
         self.step = torch.zeros(1, dtype=torch.float64, device=device)
         self.update = torch.zeros(1, dtype=torch.int32, device=device)
         self.particle_count = torch.zeros(1, dtype=torch.int32, device=device)
@@ -274,7 +270,7 @@ class Updates:
         table[..., 0] += np.array([sample.frame for sample in flat]).reshape(count.shape) * count * 12
         table[..., 2] = count.cumsum(1) - count  # the first particle
         table[..., 3] = np.array([sample.seed for sample in flat]).reshape(count.shape)
-        real = np.array([(sample.weight, sample.noise) for sample in flat], np.float64)
+        real = np.array([(sample.weight, sample.noise_scale) for sample in flat], np.float64)
         table[..., 5:7] = real.view(np.int64).reshape(*count.shape, 2)
         if self.settings.symmetry:
             drawn = [drawn_symmetry(sample.episode.symmetries, sample.seed).code for sample in flat]
@@ -336,7 +332,6 @@ class Updates:
             gradient=engine.output_gradient,
             loss=self.loss,
             scale=1.0 / engine.unscale,
-            huber=self.settings.huber,
             OUT=engine.output.shape[1],
             BLOCK=BLOCK,
         )
@@ -409,16 +404,18 @@ class Updates:
         )
 
     def _assemble(self) -> None:
+        """Windows, symmetry, noise and jitter of the update's samples; see hgn.training.noise for the torch backend."""
         settings, config = self.settings, self.config
-        smooth_step = settings.noise_std * math.sqrt(2 / SMOOTH_WAVES * settings.noise_smooth / config.velocity_history)
-        own_step = settings.noise_std * math.sqrt((1 - settings.noise_smooth) / config.velocity_history)
-        if smooth_step > 0:
+        correlated, steps = settings.noise_correlated_fraction, config.velocity_history
+        wave_step = settings.noise_std * math.sqrt(2 / SMOOTH_WAVES * correlated / steps)
+        own_step = settings.noise_std * math.sqrt((1 - correlated) / steps)
+        if wave_step > 0:
             shortest, longest = (cells * config.cell_size for cells in SMOOTH_CELLS)
             kernel.draw_waves[(settings.scenes,)](
                 samples=self._samples,
                 update=self.update,
                 waves=self.waves_SKC,
-                amplitude_step=smooth_step,
+                amplitude_step=wave_step,
                 largest_number=2 * math.pi / shortest,
                 log_range=math.log(longest / shortest),
                 scenes=settings.scenes,
@@ -449,7 +446,7 @@ class Updates:
             HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry,
             NOISE=own_step > 0,
-            WAVES=SMOOTH_WAVES if smooth_step > 0 else 0,
+            WAVES=SMOOTH_WAVES if wave_step > 0 else 0,
             SCENES=triton.next_power_of_2(settings.scenes),
             BLOCK=BLOCK,
         )

@@ -7,16 +7,16 @@ import pytest
 import torch
 
 from hgn.config import TrainingConfig
-from hgn.data.rest_noise import asked_acceleration, noise_at_rest
+from hgn.training.noise import noise_scale, target_acceleration
 
 
 @pytest.mark.parametrize(("acceleration", "smallest"), [(0.0, 0.02), (1e-5, 0.02), (1e-4, 0.1), (5e-4, 0.5)])
 def test_scales_are_log_uniform_down_to_what_happens(acceleration: float, smallest: float) -> None:
     """From the larger of the least scale and the frame's own acceleration up to 1, each seed its own; errors count in
     units of the noise."""
-    training = TrainingConfig(noise_std=1e-3, noise_at_rest=0.02)
-    drawn = [noise_at_rest(training, acceleration, seed) for seed in range(4000)]
-    assert drawn[7] == noise_at_rest(training, acceleration, 7)
+    training = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02)
+    drawn = [noise_scale(training, acceleration, seed) for seed in range(4000)]
+    assert drawn[7] == noise_scale(training, acceleration, 7)
     scales = np.array([scale for scale, _ in drawn])
     assert smallest <= scales.min() < smallest * 1.01 and 0.99 < scales.max() <= 1
     share = np.sort(np.log(scales) / np.log(smallest))
@@ -26,11 +26,11 @@ def test_scales_are_log_uniform_down_to_what_happens(acceleration: float, smalle
 
 def test_elsewhere_noise_is_as_asked() -> None:
     """Where more happens than the noise, where no other scale is asked for, and without noise."""
-    training = TrainingConfig(noise_std=1e-3, noise_at_rest=0.02)
-    assert noise_at_rest(training, 1e-3, 5) == noise_at_rest(training, 0.1, 5) == (1.0, 1.0)
-    assert noise_at_rest(TrainingConfig(noise_std=1e-3), 0.0, 5) == (1.0, 1.0)
-    assert noise_at_rest(TrainingConfig(noise_std=0.0, noise_at_rest=0.02), 0.0, 5) == (1.0, 1.0)
-    assert noise_at_rest(training, float("nan"), 5) == (1.0, 1.0)
+    training = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02)
+    assert noise_scale(training, 1e-3, 5) == noise_scale(training, 0.1, 5) == (1.0, 1.0)
+    assert noise_scale(TrainingConfig(noise_std=1e-3), 0.0, 5) == (1.0, 1.0)
+    assert noise_scale(TrainingConfig(noise_std=0.0, noise_min_scale=0.02), 0.0, 5) == (1.0, 1.0)
+    assert noise_scale(training, float("nan"), 5) == (1.0, 1.0)
 
 
 def test_what_is_asked_for() -> None:
@@ -39,5 +39,5 @@ def test_what_is_asked_for() -> None:
     window_7N3 = torch.zeros(7, 4, 3)
     window_7N3[:, 0, 1] = 0.3 * time**2  # 0.6 a frame squared, of one of 12 coordinates
     still_7N3 = window_7N3[:, [1, 1, 1, 1]] + time[:, None, None]
-    found = asked_acceleration(torch.stack([window_7N3, still_7N3]))
+    found = target_acceleration(torch.stack([window_7N3, still_7N3]))
     torch.testing.assert_close(found, torch.tensor([0.6 / 12**0.5, 0.0]))
