@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import itertools
 import os
-import re
 import select
 import sys
 from collections.abc import Callable, Mapping
@@ -22,19 +21,6 @@ from hgn.system.extras import missing_extra
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
 
-_HYDRA_OPTIONS = (
-    *("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--resolve", "--package", "-p", "--run", "-r"),
-    *("--multirun", "-m", "--shell-completion", "-sc", "--config-path", "-cp", "--config-name", "-cn", "--config-dir"),
-    *("-cd", "--experimental-rerun", "--info", "-i"),
-)
-
-# Hydra makes no folder and no log file of its own; the commands say where they write
-_QUIET = (
-    "hydra.run.dir=.",
-    "hydra.output_subdir=null",
-    "hydra/job_logging=none",
-    "hydra/hydra_logging=none",
-)
 _MACHINE_ERRORS = {
     errno.ENOSPC: "free some space",
     errno.EDQUOT: "free some space",
@@ -55,8 +41,8 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
     A command without config groups has its file in `conf/command/`: beside the groups Hydra would take its keys
     (`scene=my_scene.yaml`) for choices of a group.
 
-    Hydra's own options (--cfg, --config-path, --config-name, --multirun) work as ever, and --help shows such a file
-    with its comments. `main` returns an exit code or None for 0. ConfigError, an unknown key and a full disk are
+    Hydra's own options (--cfg, --config-path, --config-name, --multirun) work as ever; --help shows the keys with their
+    values and comments. `main` returns an exit code or None for 0. ConfigError, an unknown key and a full disk are
     printed as one line, `error: ...`.
     """
     for name in ("stdout", "stderr"):
@@ -80,12 +66,11 @@ def run_command(main: Callable[[dict[str, Any]], int | None], config_name: str) 
 
 
 def _exit_code(main: Callable[[dict[str, Any]], int | None], config_name: str) -> int:
-    file = config_directory() / "command" / f"{config_name}.yaml"
-    if sys.argv[1:] in (["--help"], ["-h"]) and file.is_file():
-        print(_described(), "", file.read_text(encoding="utf-8"), sep="\n", end="")
-        return 0
     try:
         code = 0
+        if {"--help", "-h"} & set(sys.argv[1:]):
+            _print_help(config_name)
+            return 0
         for mapping in _compose(config_name):
             code = main(mapping) or 0
             if code:
@@ -139,120 +124,38 @@ def section(mapping: Mapping[str, Any], known: Mapping[str, str | None]) -> dict
     return picked
 
 
-def _compose(config_name: str) -> list[dict[str, Any]]:
-    import hydra
-    from hydra.errors import HydraException
-    from omegaconf import OmegaConf
-    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+def _compose(config_name: str, complete: bool = True) -> list[dict[str, Any]]:
+    """The configurations that the command line asks for; not `complete`: keys that must be given may lack."""
+    from hgn.hydra_compat import compose
 
+    arguments = _with_json_as_override(sys.argv)
+    _require_options(arguments)
+    return compose(_folder(config_name), config_name, [a for a in arguments if a not in ("--help", "-h")], complete)
+
+
+def _folder(config_name: str) -> Path:
     folder = config_directory()
-    if (folder / "command" / f"{config_name}.yaml").is_file():
-        folder = folder / "command"
-    composed: list[Any] = []  # one config, or several with --multirun
-    arguments, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    quiet = _QUIET + (_help() if "--help" in arguments else ())
-    given = _with_json_as_override(arguments)
-    _require_options(given)
-    sys.argv = _with(quiet, given)
-    # Hydra would print and exit itself otherwise
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        run = hydra.main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)
-        once = not any(argument.lstrip("+~").startswith(("-", "hydra")) for argument in given[1:])
-        while True:
-            try:
-                if once:
-                    composed.append(_composed_once(folder, config_name, sys.argv[1:]))
-                else:
-                    run()
-                break
-            except HydraException as error:
-                if not _appended(sys.argv, str(error)) and not _quoted(sys.argv):
-                    raise
-        plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=True) for config in composed]
-    except MissingMandatoryValue as error:
-        raise ConfigError(f"{error.full_key} is missing; it must be given, as in {error.full_key}=…") from error
-    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra raises plain ValueErrors too
-        raise ConfigError(_one_line(str(error))) from error
-    finally:
-        sys.argv = arguments
-        if full_error is None:
-            del os.environ["HYDRA_FULL_ERROR"]
-        else:
-            os.environ["HYDRA_FULL_ERROR"] = full_error
-    return [{str(key): value for key, value in dict(mapping).items()} for mapping in plain]  # type: ignore[arg-type]
+    return folder / "command" if (folder / "command" / f"{config_name}.yaml").is_file() else folder
 
 
-def _composed_once(folder: Path, config_name: str, overrides: list[str]) -> Any:
-    """What `hydra.main` hands over where no option asks for more; it composes everything twice, first to see whether
-    several configs are wanted, and reads the sources of all its callers: a third of a second."""
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.types import RunMode
-    from omegaconf import open_dict
+def _print_help(config_name: str) -> None:
+    from hgn.command_help import help_lines
 
-    with initialize_config_dir(str(folder), version_base="1.3"):
-        hydra = GlobalHydra.instance().hydra
-        assert hydra is not None
-        config = hydra.compose_config(config_name, overrides, RunMode.RUN)
-    with open_dict(config):
-        del config["hydra"]
-    return config
-
-
-def _appended(arguments: list[str], message: str) -> bool:
-    """Puts a + before the key that Hydra does not find, so that the command itself refuses it, with the keys that it
-    knows; and so that experiment=… is as good as +experiment=…. False where Hydra complains of something else."""
-    unknown = re.match(r"Could not override '([^']+)'", message)
-    for place, argument in enumerate(arguments):
-        if place and unknown is not None and argument.startswith(f"{unknown[1]}="):
-            arguments[place] = f"+{argument}"
-            return True
-    return False
-
-
-def _quoted(arguments: list[str]) -> bool:
-    """Puts quotes around values that Hydra's grammar refuses as they are: names with ü, &, # or (1) in them, say, and
-    ~/, which is the home folder. False where that is no help."""
-    changed = False
-    for place, argument in enumerate(arguments):
-        key, _, value = argument.partition("=")
-        if place and value and not argument.startswith("-") and not _understood(value):
-            quoted = _in_quotes(value)
-            changed |= quoted != value
-            arguments[place] = f"{key}={quoted}"
-    return changed
-
-
-def _in_quotes(value: str) -> str:
-    """A value that is not understood, or such values of a flat list, in quotes; unchanged where they are no help."""
-    if value[0] == "[" and value[-1] == "]" and not re.search("[\"'{}[\\]]", value[1:-1]):
-        items = [item.strip() for item in value[1:-1].split(",")]
-        return f"[{','.join(_in_quotes(item) if item and not _understood(item) else item for item in items)}]"
-    meant = str(Path(value).expanduser()) if value.startswith("~/") else value
-    quoted = "'" + re.sub(r"(\\*)('|$)", lambda end: end[1] * 2 + end[2].replace("'", "\\'"), meant) + "'"
-    return quoted if value[0] not in "\"'[{" and _understood(quoted) == [meant] else value
-
-
-def _understood(value: str) -> list[Any]:
-    """What Hydra takes a value for, alone in a list; an empty one for what its grammar refuses."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    try:
-        return [OverridesParser.create().parse_override(f"key={value}").value()]
-    except HydraException:
-        return []
+    (mapping,) = _compose(config_name, complete=False)
+    print((sys.modules["__main__"].__doc__ or config_name).strip(), "", sep="\n")
+    print(*help_lines(mapping, _folder(config_name), config_name), sep="\n")
 
 
 def _require_options(arguments: list[str]) -> None:
     """Refuses options that Hydra would answer with pages, and words that are no key=value."""
+    from hgn.hydra_compat import OPTIONS
+
     for before, argument in itertools.pairwise(arguments):
         name, _, value = argument.partition("=")
-        if name.startswith("-") and name not in _HYDRA_OPTIONS:
+        if name.startswith("-") and name not in OPTIONS:
             key = name.strip("-") or "KEY"
             raise ConfigError(f"{argument} is not an option; settings are given as {key}={value or 'VALUE'}")
-        if "=" not in argument and not argument.startswith(("-", "~")) and before not in _HYDRA_OPTIONS:
+        if "=" not in argument and not argument.startswith(("-", "~")) and before not in OPTIONS:
             raise ConfigError(f"settings are given as KEY=VALUE, got {argument!r}; --help shows the keys")
 
 
@@ -268,34 +171,6 @@ def _with_json_as_override(arguments: list[str]) -> list[str]:
         else:
             result.append(argument.removeprefix("--") if argument.startswith("--json=") else argument)
     return result
-
-
-def _with(ours: tuple[str, ...], arguments: list[str]) -> list[str]:
-    # before the person's own overrides, so that theirs win, and beside them, because argparse takes overrides in one
-    # run only
-    for place, argument in enumerate(arguments):
-        if place and "=" in argument and not argument.startswith("-") and not arguments[place - 1].startswith("--conf"):
-            return [*arguments[:place], *ours, *arguments[place:]]
-    return [*arguments, *ours]
-
-
-def _help() -> tuple[str, ...]:
-    """What --help says before the keys: the command's own description, which is its module's."""
-    text = _described().replace("\\", "\\\\").replace("'", "\\'")
-    return f"hydra.help.app_name='python -m {_module()}'", f"hydra.help.header='{text}'"
-
-
-def _described() -> str:
-    return (sys.modules["__main__"].__doc__ or _module()).strip()
-
-
-def _module() -> str:
-    spec = sys.modules["__main__"].__spec__
-    return spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).name
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split("Config search path:")[0].split())
 
 
 def _fail(message: str, code: int) -> int:

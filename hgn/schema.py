@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import inspect
 import math
+import re
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -77,6 +79,34 @@ def to_mapping(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [to_mapping(item) for item in value]
     return value
+
+
+def default_mapping(cls: type) -> dict[str, Any]:
+    """A dataclass's defaults as plain containers; `???`, which Hydra asks for, where a field has none."""
+    result: dict[str, Any] = {}
+    for field in dataclasses.fields(cls):
+        if field.default is not dataclasses.MISSING:
+            result[field.name] = to_mapping(field.default)
+        elif field.default_factory is not dataclasses.MISSING:
+            result[field.name] = to_mapping(field.default_factory())
+        else:
+            result[field.name] = "???"
+    return result
+
+
+def field_comments(cls: type) -> dict[str, str]:
+    """What the source says of each field of a dataclass: the lines above it, and the comment beside it."""
+    comments: dict[str, str] = {}
+    above: list[str] = []
+    for line in inspect.getsource(cls).splitlines():
+        text = line.strip()
+        if text.startswith("def "):
+            break
+        field = re.match(r"(\w+): [^#]*(?:# (.*))?$", text)
+        if field and not text.startswith("#"):
+            comments[field[1]] = "; ".join(part for part in (" ".join(above), field[2]) if part)
+        above = [*above, text.lstrip("# ")] if text.startswith("#") else []
+    return comments
 
 
 def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str = "") -> None:

@@ -207,7 +207,7 @@ def test_smooth_noise() -> None:
     torch.testing.assert_close(walks[1.0], torch.cat(expected), rtol=0, atol=2e-6)
     assert 3e-4 < float(walks[1.0][:, 0].std()) < 3e-3
     torch.testing.assert_close(walks[0.5], (walks[0.0] + walks[1.0]) / 2**0.5, rtol=0, atol=2e-6)
-    updates._upload([[DeviceSample(made, 1, 5), DeviceSample(still, 0, 6, noise=0.5)]], [1e-3])
+    updates._upload([[DeviceSample(made, 1, 5), DeviceSample(still, 0, 6, noise_scale=0.5)]], [1e-3])
     updates._assemble()
     walk = updates.velocity_NV[:700].cpu().view(700, HISTORY, 3) - clean
     torch.testing.assert_close(walk[:400], walks[1.0][:400], rtol=0, atol=0)

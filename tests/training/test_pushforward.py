@@ -186,7 +186,7 @@ def test_lost_scenes_are_dropped() -> None:
     ("changes", "message"),
     [
         ({"pushforward_fraction": 1.0}, "pushforward_fraction must be 0 or more and below 1, got 1.0"),
-        ({"pushforward_pull": 1.5}, "pushforward_pull must be 0 to 1, got 1.5"),
+        ({"pushforward_pull": 1.5}, "pushforward_pull must be from 0 to 1, got 1.5"),
         ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
         (
             {"pushforward_fraction": 0.5, "pushforward_frames": 5},

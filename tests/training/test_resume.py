@@ -133,7 +133,7 @@ def test_reading_ahead_changes_nothing(data: DatagenConfig) -> None:
     for ahead in (1, 2, 3):
         for batch, other in zip(expected, batches(ahead, 30), strict=True):
             assert torch.equal(batch.window_WN3, other.window_WN3)
-            assert (batch.seeds_S, batch.sampler_state) == (other.seeds_S, other.state)
+            assert (batch.seeds_S, batch.sampler_state) == (other.seeds_S, other.sampler_state)
     for ahead in range(4):
         again = batches(ahead, 5, expected[16].sampler_state)
         for batch, other in zip(expected[17:22], again, strict=True):

@@ -53,7 +53,7 @@ def test_a_run_leaves_what_it_promises(data, tmp_path):
     materials = [key.removeprefix("one_step/validation_") for key in keys if key.startswith("one_step/validation_")]
     assert materials and set(materials) <= {"water", "sand", "snow"}
     for split in ("training", "validation"):
-        assert {f"one_step/{split}", f"trivial/{split}_ballistic_motion", f"baseline_ratio/{split}"} <= keys
+        assert {f"one_step/{split}", f"baseline/{split}_ballistic_motion", f"baseline_ratio/{split}"} <= keys
     scalars = {"loss", "learning_rate", "gradient_norm", "skipped_updates", "scenes_per_second", "data_wait_fraction"}
     scalars |= {"shards", "episodes", "updates_per_second", "rollout/finished", "rollout/mse"}
     scalars |= {f"rollout/mse_{name}" for name in materials}

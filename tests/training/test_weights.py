@@ -43,7 +43,7 @@ def weights_file(
 
 
 def evaluate(data: DatagenConfig, weights: Path) -> float:
-    mapping = {"weights": str(weights), "data": data.dataset.folder, "pushforward_frames": 0, "device": "cpu"}
+    mapping = {"weights": str(weights), "data": data.dataset.folder, "rollout_frames": 0, "device": "cpu"}
     config = EvaluateConfig(**mapping)
     rows = one_step_rows(load_weights(weights)[0], first_episodes(EpisodeStore(config.data, config.split), 5), config)
     return next(row["one_step_mse"] for row in rows if row["system"] == "network")
@@ -61,14 +61,15 @@ def test_a_run_begins_with_weights(
     checkpoint's, even where the file is gone, and says so."""
     file = weights_file(tmp_path / "begin.safetensors", stored_precision)
     tiny = {"learning_rate": 1e-12, "final_learning_rate": 1e-12, "maximum_updates": 1}
-    mapping = train_mapping(data, tmp_path / "run", weights=str(file), **tiny)
+    mapping = train_mapping(data, tmp_path / "run", init_weights=str(file), **tiny)
     assert train.main(mapping) == 0
     assert "begins with the weights" in capsys.readouterr().err
     begun, _ = load_weights(file)
     for name, tensor in network_of_checkpoint(last(tmp_path / "run")).state_dict().items():
         torch.testing.assert_close(tensor, begun.state_dict()[name], rtol=0, atol=1e-10)
     file.unlink()
-    assert train.main(train_mapping(data, tmp_path / "run", weights=str(file), **tiny | {"maximum_updates": 2})) == 0
+    again = train_mapping(data, tmp_path / "run", init_weights=str(file), **tiny | {"maximum_updates": 2})
+    assert train.main(again) == 0
     assert "is not read: the run goes on from" in capsys.readouterr().err
     assert last(tmp_path / "run")["hgn"]["updates"] == 2
 
@@ -89,7 +90,7 @@ def test_other_weights_are_refused(data: DatagenConfig, tmp_path: Path, file: An
     if file is not None:
         weights_file(path, **file)
     with pytest.raises(ConfigError, match=message):
-        train.main(train_mapping(data, tmp_path / "run", weights=str(path)))
+        train.main(train_mapping(data, tmp_path / "run", init_weights=str(path)))
     assert not (tmp_path / "run").exists()
 
 

@@ -1,0 +1,29 @@
+"""What hgn.hydra_compat takes for granted of Hydra."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hgn.hydra_compat import compose
+from hgn.schema import ConfigError
+
+
+def test_canary(tmp_path: Path) -> None:
+    """Dataclasses are bases under their dotted names, in groups too; what its grammar refuses is quoted, what it does
+    not find is added; its own entry point composes the same; a key that must be given is named."""
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "wide.yaml").write_text("defaults:\n  - hgn.config.SceneConfig\ngroup_size: 0.5\n")
+    (tmp_path / "made.yaml").write_text("defaults:\n  - hgn.config.ExportConfig\n  - scene: wide\n  - _self_\nout: x\n")
+    arguments = ["made", "checkpoint=my data (1)/ü", "scene.group_count=3", "invented.key=1"]
+    (composed,) = compose(tmp_path, "made", arguments)
+    assert (composed["checkpoint"], composed["out"], composed["half"]) == ("my data (1)/ü", "x", False)
+    assert composed["scene"]["group_size"] == 0.5 and composed["scene"]["group_count"] == 3
+    assert composed["scene"]["materials"] == ["water", "sand", "snow"] and composed["invented"] == {"key": 1}
+    assert compose(tmp_path, "made", [*arguments, "hydra.job.name=x"]) == [composed]
+    twice = compose(tmp_path, "made", ["made", "--multirun", *arguments[1:], "out=a,b"])
+    assert [each["out"] for each in twice] == ["a", "b"]
+    with pytest.raises(ConfigError, match="checkpoint is missing; it must be given, as in checkpoint=…"):
+        compose(tmp_path, "made", ["made"])
+    assert compose(tmp_path, "made", ["made"], complete=False)[0]["checkpoint"] == "???"
