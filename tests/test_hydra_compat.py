@@ -18,7 +18,7 @@ def test_canary(tmp_path: Path) -> None:
     (tmp_path / "made.yaml").write_text("defaults:\n  - hgn.config.ExportConfig\n  - scene: wide\n  - _self_\nout: x\n")
     arguments = ["made", "checkpoint=my data (1)/ü", "scene.group_count=3", "invented.key=1"]
     (composed,) = compose(tmp_path, "made", arguments)
-    assert (composed["checkpoint"], composed["out"], composed["half"]) == ("my data (1)/ü", "x", False)
+    assert (composed["checkpoint"], composed["out"], composed["stored_precision"]) == ("my data (1)/ü", "x", "fp32")
     assert composed["scene"]["group_size"] == 0.5 and composed["scene"]["group_count"] == 3
     assert composed["scene"]["materials"] == ["water", "sand", "snow"] and composed["invented"] == {"key": 1}
     assert compose(tmp_path, "made", [*arguments, "hydra.job.name=x"]) == [composed]

@@ -180,8 +180,8 @@ def test_noise_and_jitter() -> None:
 
 
 def test_smooth_noise() -> None:
-    """With noise_correlated_fraction=1 a scene gets the sum of its waves for noise, as in backend torch, of the asked spread; other
-    scenes have other waves; half of the variance leaves the other half to each particle."""
+    """With noise_correlated_fraction=1 a scene gets the sum of its waves for noise, as in backend torch, of the asked
+    spread; other scenes have other waves; half of the variance leaves the other half to each particle."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.01)
     made, _ = episode(1, 400, False, spread=0.3)
     still, _ = episode(2, 300, False, spread=0.3)

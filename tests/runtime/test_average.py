@@ -30,8 +30,8 @@ def moved(path: Path, by: float, updates: int = 7, normaliser: float = 0.0, stor
 
 @pytest.mark.parametrize(("coefficients", "expected"), [(None, (0.5, 0.5)), ((0.7, 0.3), (0.7, 0.3))])
 def test_the_mean(tmp_path: Path, coefficients: tuple[float, ...] | None, expected: tuple[float, ...]) -> None:
-    """Each tensor is the mean of the files' by their coefficients, in float16 where asked; the normaliser stays bit by bit,
-    and the file says what it was made of."""
+    """Each tensor is the mean of the files' by their coefficients, in float16 where asked; the normaliser stays bit by
+    bit, and the file says what it was made of."""
     files = [
         moved(tmp_path / "a.safetensors", 0.1, 5, stored_precision="fp16"),
         moved(tmp_path / "b.safetensors", 0.1, 9),
