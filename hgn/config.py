@@ -56,19 +56,20 @@ class SceneConfig:
     """The distribution that random scenes are drawn from (paper sec. 3.3). Lengths in domain units."""
 
     domain_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    cell_size: float = 1 / 64
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
+    cell_size: float = 1 / 64  # of the solver
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
     obstacle_count: int = 5
-    obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, whose longest side is taken for 1
+    obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, scaled so that the longest side is the size
     obstacle_size: tuple[float, float] = (0.1, 0.5)
     group_count: int = 4
     group_shapes: tuple[str, ...] = GROUP_SHAPES
-    group_size: float = 0.08
+    group_size: float = 0.08  # side or diameter
     materials: tuple[str, ...] = MATERIALS
     particles_per_cell: float = 8.0
     clearance_cells: float = 2.0  # between obstacles, groups and walls, in solver cells
     maximum_initial_speed: float = 0.0  # domain units per second; each group draws one velocity
-    moving_group_fraction: float = 1.0  # of the groups, that begin with their velocity; the others begin at rest
+    # of the groups, that begin with a velocity where maximum_initial_speed is above 0
+    moving_group_fraction: float = 1.0
     lone_particles: int = 0  # far from all others; else a network learns that what is alone lies on the floor
 
     def __post_init__(self) -> None:
@@ -132,7 +133,7 @@ class MpmConfig:
     collider_friction: float = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
     device: str = "auto"  # or cpu, gpu
-    scenes_per_launch: int | None = None  # none: 1 on a CPU, 832 on a GPU
+    scenes_per_launch: int | None = None  # null: 1 on a CPU, 832 on a GPU
     maximum_substeps_per_frame: int = 20_000  # beyond it a scene is stopped and reported
 
     def __post_init__(self) -> None:
@@ -187,16 +188,19 @@ class DatasetConfig:
     training_scenes: int = 800
     validation_scenes: int = 5
     test_scenes: int = 20
-    frames: int = 300
+    frames: int = 300  # frame 0 is the initial state
     frame_rate_hz: float = 60.0
     seed: int = 0
-    early_episodes: bool = False  # a GPU begins with few scenes, because training waits for them
+    # true: a GPU begins with few scenes, which takes longer in all; training and the service set it
+    early_episodes: bool = False
     episodes_per_shard: int = 8  # the first training shards are smaller, so that training can start early
-    workers: int | None = None  # none: one for each GPU, or for two cores of a CPU
+    workers: int | None = None  # null: one for each GPU, or for two cores of a CPU; 1 leaves other GPUs alone
     maximum_attempts: int = 3  # per scene before it is quarantined and replaced
     pool: str = "local"  # processes of this machine; or ray: of a Ray cluster
-    ray_address: str | None = None  # of the cluster; none: what RAY_ADDRESS says, else the one of this machine
-    array_task: int | None = None  # of array_tasks generators, each of which makes its own shards alone
+    # of the cluster, as in 10.0.0.1:6379; null: $RAY_ADDRESS, else the cluster that this machine is in
+    ray_address: str | None = None
+    # 0 to array_tasks - 1: of so many generators on one folder, each makes its own shards alone
+    array_task: int | None = None
     array_tasks: int | None = None
 
     def __post_init__(self) -> None:
@@ -249,8 +253,8 @@ class ServiceConfig:
 class SolveConfig:
     """`python -m datagen.solve`: a scene file, simulated by the solver."""
 
-    scene: str
-    out: str | None = None  # none: rollout/NAME_solver.vtkhdf
+    scene: str  # a scene file, or the name of one in conf/example, for example funnel
+    out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
     frames: int = 300
     frame_rate_hz: float = 60.0
     mpm: MpmConfig = field(default_factory=MpmConfig)
@@ -266,7 +270,7 @@ class UploadConfig:
     """`python -m datagen.upload`: what is copied where."""
 
     data: str  # folder of a data set
-    to: str  # URL
+    to: str  # URL; training reads it with dataset.folder=URL
     follow: bool = False  # go on while the data set grows, until it is complete
     poll_s: float = 5.0  # between looks at it then
 
@@ -288,8 +292,9 @@ class NetworkConfig:
     wall_distance_cells: float = 8.0  # d_max / R
     obstacle_features: bool = True
     materials: tuple[str, ...] = MATERIALS
-    maximum_neighbours: int | None = None  # of a particle of GNS, the nearest; none: all within R
-    static_spacing_cells: float = 0.25  # of gns_particles: the least distance of static particles, in obstacle cells
+    maximum_neighbours: int | None = None  # of a particle of GNS, the nearest; null: all within R
+    # of gns_particles: how far apart static particles are, at least, in obstacle cells
+    static_spacing_cells: float = 0.25
 
     def __post_init__(self) -> None:
         require_one_of(self, "kind", NETWORK_KINDS)
@@ -346,29 +351,39 @@ class TrainingConfig:
     """How a network is trained (paper sec. 3.3)."""
 
     maximum_updates: int = 20_000_000
-    maximum_minutes: float | None = None  # wall time of this start; none: no limit
+    maximum_minutes: float | None = None  # wall time of this start; null: no limit
     batch_scenes: int = 1  # frames of random scenes in one update, on each device
-    optimizer: str = "adam"  # or muon: hidden matrices step along their orthogonalised momentum
+    # or muon (Jordan 2024): hidden matrices step along their orthogonalised momentum, everything else as in Adam
+    optimizer: str = "adam"
     learning_rate: float = 1e-4
     final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
     warmup_updates: int = 0  # first updates, over which the rate grows linearly to what it is without
-    init_weights: str | None = None  # what a new run begins with: a file of python -m hgn.export, or a shipped name
-    ema_decay: float = 0.0  # of the moving average of the weights, an update; 0: none
+    # what a new run begins with: a file of python -m hgn.export, or shipped weights by name; a run that goes on
+    # takes its checkpoint
+    init_weights: str | None = None
+    # of a moving average of the weights, an update, for example 0.9999; monitored and exported; 0: none
+    ema_decay: float = 0.0
     noise_std: float = 0.000848528  # of the last velocity, domain units per frame
-    noise_correlated_fraction: float = 0.1  # of its variance, which neighbours have in common; 0: the paper's
-    noise_min_scale: float = 1.0  # of the noise where little happens, see hgn.training.noise; 1: the same everywhere
+    # fraction of the noise's variance that neighbours have in common, in waves of 4 to 64 cells; the paper's: 0
+    noise_correlated_fraction: float = 0.1
+    # in a frame whose rms acceleration is a below noise_std, the noise's scale is drawn down to max(a /
+    # noise_std, this), and errors count by it; 1: the same noise everywhere
+    noise_min_scale: float = 1.0
     grid_jitter: bool = True
-    frame_importance: float = 0.0  # fraction of an episode's samples drawn by how much happens in a frame; weighted
-    symmetry: str = "none"  # gravity: a sample is shown as a random symmetry that keeps gravity and domain
-    pushforward_fraction: float = 0.0  # of the samples, taken from the network's own simulations; 0: none are made
+    # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
+    # all frames alike
+    frame_importance: float = 0.0
+    symmetry: str = "none"  # gravity: a sample is turned and mirrored at random, by what keeps gravity and domain
+    # of the scenes of an update, taken from the network's own simulations, for example 0.25; 0: none are made
+    pushforward_fraction: float = 0.0
     pushforward_every: int = 500  # updates between such simulations
     pushforward_scenes: int = 64  # simulated at once, on each device, from random frames of the training data on …
     pushforward_frames: int = 16  # … for so many frames, each of which can be trained on
-    pushforward_pull: float = 0.1  # fraction of its distance from the truth that the network is to undo in a frame
+    pushforward_pull: float = 0.1  # fraction of its distance from the truth that the network is to take back in a frame
     seed: int = 0
     accelerator: str = "auto"  # or cpu, gpu
-    devices: int | None = None  # on each machine; none: as launched, without a launcher all GPUs, or one CPU
-    nodes: int | None = None  # machines; none: as launched, without a launcher one
+    devices: int | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
+    nodes: int | None = None  # machines; null: as launched, without a launcher one
     precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
     backend: str = "auto"  # torch, triton (kernels in CUDA graphs); auto: triton where it runs
     minimum_episodes: int = 1  # training starts once that many training episodes are published
@@ -464,7 +479,7 @@ class ExportConfig:
 
     checkpoint: str
     out: str
-    stored_precision: str = "fp32"  # of the learned tensors in the file; or fp16
+    stored_precision: str = "fp32"  # of the learned tensors; fp16: files half as large
 
     def __post_init__(self) -> None:
         require_one_of(self, "stored_precision", STORED_PRECISIONS)
@@ -474,10 +489,11 @@ class ExportConfig:
 class AverageConfig:
     """`python -m hgn.average`."""
 
+    # files of python -m hgn.export or names of shipped weights, as in [a.safetensors,b.safetensors]
     weights: tuple[str, ...]
     out: str
-    coefficients: tuple[float, ...] | None = None  # of each, together 1; none: equal ones
-    stored_precision: str = "fp32"  # of the learned tensors in the file; or fp16
+    coefficients: tuple[float, ...] | None = None  # of each, together 1, as in [0.7,0.3]; null: equal ones
+    stored_precision: str = "fp32"  # of the learned tensors; fp16: files half as large
 
     def __post_init__(self) -> None:
         require_one_of(self, "stored_precision", STORED_PRECISIONS)
@@ -492,13 +508,14 @@ class AverageConfig:
 class RolloutConfig:
     """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
 
-    weights: str = "obstacles"  # a file, or the name of shipped weights
-    out: str | None = None  # none: rollout/NAME.vtkhdf
-    render: bool | None = None  # also a PNG and a GIF beside it; none: where out is none
-    scene: str | None = None  # a scene file, or the name of an example; none: a random scene …
-    seed: int = 0  # … of this seed
+    weights: str = "obstacles"  # a file of python -m hgn.export, or the name of shipped weights
+    out: str | None = None  # the file to write; null: rollout/NAME.vtkhdf
+    render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
+    # a scene file, or the name of one in conf/example, for example funnel; null: a random scene …
+    scene: str | None = None
+    seed: int = 0  # … drawn with this number, as the training's scenes are
     data: str | None = None  # or a data set …
-    episode: str | None = None  # … and the key of one of its episodes
+    episode: str | None = None  # … and an episode of it, for example validation-000000
     frames: int = 300
     device: str = "auto"  # or cpu, cuda, cuda:1, …
     backend: str = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest that runs
@@ -524,14 +541,14 @@ class RolloutConfig:
 class EvaluateConfig:
     """`python -m hgn.evaluate`: one-step and rollout errors on a split of a data set."""
 
-    weights: str
+    weights: str  # a file of python -m hgn.export, or the name of shipped weights
     data: str
-    split: str = "validation"
+    split: str = "validation"  # or train, test
     scenes: int = 5
     frame_stride: int = 1
     rollout_frames: int = 300  # 0: none
     particles_per_batch: int = 32_768
-    device: str = "auto"
+    device: str = "auto"  # or cpu, cuda, cuda:1
     backend: str = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
     precision: str = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
     json: str | None = None  # also write the figures to this file

@@ -9,6 +9,8 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,6 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
     from omegaconf import OmegaConf
     from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-    _register_dataclasses(folder, config_name)
     arguments = [arguments[0], *(_override(argument, folder) for argument in arguments[1:])]
     given, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     composed: list[Any] = []
@@ -52,9 +53,10 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         if any(argument.lstrip("+~").startswith(("-", "hydra")) for argument in arguments[1:]):
             sys.argv = _with_quiet(arguments)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra would print and exit itself otherwise
-            hydra_main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
+            with _registered_dataclasses(folder, config_name):
+                hydra_main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
         else:
-            with initialize_config_dir(str(folder), version_base="1.3"):
+            with _registered_dataclasses(folder, config_name), initialize_config_dir(str(folder), version_base="1.3"):
                 composed.append(compose_once(config_name, arguments[1:]))
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
     except MissingMandatoryValue as error:
@@ -87,15 +89,25 @@ def _load(name: str) -> type:
     return loaded
 
 
-def _register_dataclasses(folder: Path, config_name: str) -> None:
-    """Makes the defaults of the dataclasses that config files name known to Hydra, under those names."""
+@contextmanager
+def _registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
+    """While entered, Hydra knows the defaults of the dataclasses that config files name, under those names.
+
+    Hydra's store is one for the process, and a group that another command has would be a group here.
+    """
     from hydra.core.config_store import ConfigStore
 
+    store = ConfigStore.instance()
+    before = dict(store.repo)
     primary = folder / f"{config_name}.yaml"
-    for file in [*([primary] if primary.is_file() else []), *folder.glob("*/*.yaml")]:
+    choices = [file for file in folder.glob("*/*.yaml") if file.parent.name != "command"]
+    for file in [*([primary] if primary.is_file() else []), *choices]:
         for name in _dataclasses_in(file):
-            group = None if file == primary else file.parent.name
-            ConfigStore.instance().store(name=name, group=group, node=default_mapping(_load(name)))
+            store.store(name, default_mapping(_load(name)), None if file == primary else file.parent.name)
+    try:
+        yield
+    finally:
+        store.repo = before
 
 
 def _override(argument: str, folder: Path) -> str:

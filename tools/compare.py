@@ -37,9 +37,12 @@ WORK = ("case", "particles", "scenes", "precision")  # what is the same work in 
 class CompareConfig:
     """`python -m tools.compare`: which trees are timed, and on what."""
 
+    # folders with this project's sources, or commits and branches of the repository here (quoted:
+    # ["HEAD~1",.]); the first is what the others are compared with
     trees: tuple[str, ...]
-    out: str
-    rounds: int = 3
+    out: str  # the JSON file, written after each run
+    rounds: int = 3  # runs of each tree
+    # options of each run, as python -m tools.bench takes them: ["cases=[frame,train]","scenes=[1,8]"]
     bench: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -44,11 +44,11 @@ BREAKS = 10  # times the usual time between two records: there the training was 
 
 @dataclass(frozen=True)
 class CurvesConfig:
-    """The options of `python -m tools.curves`. See conf/command/curves.yaml."""
+    """The options of `python -m tools.curves`."""
 
-    runs: tuple[str, ...]
-    out: str
-    names: tuple[str, ...] | None = None
+    runs: tuple[str, ...]  # folders of python -m hgn.train, for example [runs/obstacles,runs/gns]
+    out: str  # without ending: OUT.png and OUT.json
+    names: tuple[str, ...] | None = None  # of the runs in the figure; null: those of the folders
 
     def __post_init__(self) -> None:
         require(len(self.runs) > 0, "runs", "at least one folder of python -m hgn.train", self.runs)

@@ -35,19 +35,20 @@ ANIMATIONS = (".gif", ".webp")
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """The options of `python -m tools.render`. See conf/command/render.yaml."""
+    """The options of `python -m tools.render`."""
 
-    out: str
-    rollout: str | None = None
-    others: tuple[str, ...] = ()
+    out: str  # a folder, or one file that ends in .png, .gif or .webp (animated, half as large as GIF)
+    rollout: str | None = None  # file that python -m hgn.rollout wrote
+    others: tuple[str, ...] = ()  # more rollouts of the same scene, drawn beside it or beside the episode
+    # of rollout (or the episode) and of each of others; null: prediction (ground truth), and the files' names
     names: tuple[str, ...] | None = None
-    data: str | None = None
-    episode: str | None = None
-    frames: tuple[int, ...] | None = None
+    data: str | None = None  # or: folder of a data set
+    episode: str | None = None  # and the key of an episode in it, as in validation-000000
+    frames: tuple[int, ...] | None = None  # in the PNG, as in [0,50,100]; null: four, evenly spread
     gif: bool = True
-    every: int = 3
-    fps: float | None = None
-    size: int = 360
+    every: int = 3  # frames of the rollout for one picture of the animation
+    fps: float | None = None  # pictures per second of the animation; null: real time
+    size: int = 360  # width of one panel, pixels
 
     def __post_init__(self) -> None:
         require(self.out != "", "out", "a folder or a file name", self.out)

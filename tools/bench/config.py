@@ -1,4 +1,4 @@
-"""The options of `python -m tools.bench`. See conf/command/bench.yaml."""
+"""The options of `python -m tools.bench`."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ def _bench_gns() -> NetworkConfig:
 class BenchConfig:
     """`python -m tools.bench`: what is timed."""
 
-    # none: all that differ here, the naive network on a CPU alone, the public GNS where there is a copy of it
+    # of frame, train (backend triton where it runs), plain_frame, plain_train, naive_frame, gns_frame,
+    # gns_train, public_gns_frame, public_gns_train, mpm_frame; null: all that differ here
     cases: tuple[str, ...] | None = None
-    particles: tuple[int, ...] | None = None  # of one scene; none: by the device
-    scenes: tuple[int, ...] | None = None  # side by side, of the smallest number of particles; none: by the device
-    precisions: tuple[str, ...] | None = None  # none: TF32 and half on a GPU, float32 on a CPU
+    particles: tuple[int, ...] | None = None  # of one scene; null: 4296, 40000, 400000 on a GPU, 4296 on a CPU
+    # side by side, of the smallest number of particles; null: 1, 8, 32 on a GPU, 1 on a CPU
+    scenes: tuple[int, ...] | None = None
+    # fp32, tf32, fp16 (backend triton and our GNS); null: tf32 and fp16 on a GPU, fp32 on a CPU
+    precisions: tuple[str, ...] | None = None
     network: NetworkConfig = field(default_factory=NetworkConfig)
     gns: NetworkConfig = field(default_factory=_bench_gns)
-    public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns
+    public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns, which needs PyTorch Geometric
     rounds: int = 50  # samples of each contender
     seconds: float = 20.0  # at most for contenders that take turns, once five rounds are done
     mpm_frames: int = 20  # of the solver in one sample
-    device: str = "auto"
-    json: str | None = None
+    device: str = "auto"  # or cpu, cuda, cuda:1
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_positive(self, "rounds", "seconds")

@@ -14,40 +14,55 @@ UNTIMED = ("trivial", "chaos")  # rows without run times
 
 @dataclass(frozen=True)
 class ErrorVsTimeConfig:
-    """What is compared, on what, and how long. See conf/command/error_vs_time.yaml."""
+    """What is compared, on what, and how long."""
 
+    # writes OUT.json, OUT.png (error against run time), OUT_batched.png (side by side), OUT_frames.png (over
+    # the frames)
     out: str
+    # a data set; its scenes are simulated again with a finer step, which is the reference. null: only draws
+    # `earlier` again
     data: str | None = None
+    # JSON of reports on the same scenes: what they hold is not measured again, and drawn beside what is. A
+    # report that was cut off goes on with its own file
     earlier: tuple[str, ...] = ()
+    # files of python -m hgn.export or names of shipped weights, of this data; null: all shipped that fit the
+    # data
     weights: tuple[str, ...] | None = None
     split: str = "test"
     scenes: int = 20
     frames: int = 300
-    frame_stride: int = 10
+    frame_stride: int = 10  # every tenth frame for the one-step error
+    # fp32, tf32, fp16 where a network's backend knows it; null: all on a GPU (tf32 and fp16 of GNS), fp32 on a
+    # CPU
     precisions: tuple[str, ...] | None = None
-    backend: str = "auto"
-    mpm_grids: tuple[int, ...] = (32, 48, 64)
-    mpm_steps: tuple[float, ...] = (1.0, 0.5)
-    reference_step: float = 0.25
+    backend: str = "auto"  # of the networks: torch, triton; auto: triton wherever it runs
+    mpm_grids: tuple[int, ...] = (32, 48, 64)  # cells along a length of 1
+    mpm_steps: tuple[float, ...] = (1.0, 0.5)  # shares of the limit of stability
+    reference_step: float = 0.25  # share of the limit of stability of the reference, on the data's own grid
+    # of rollouts of a network's further precisions on backend torch (GNS in tf32, HGN in fp32), which take
+    # minutes
     repeated_frames: int = 51
-    mpm_frames: int = 300
-    mpm_timed_frames: int = 12
-    resimulate: bool = True
+    mpm_frames: int = 300  # of the solver's rollouts, which take most of the time
+    mpm_timed_frames: int = 12  # of the solver, where networks are timed over timed_frames
+    resimulate: bool = True  # false: the data itself is the reference; with mpm_grids=[] perturbation=0 no solver runs
+    # domain units, at most, of each coordinate: how far the solver departs from itself; 0: not asked
     perturbation: float = 1e-6
-    batch_scenes: int = 8
+    batch_scenes: int = 8  # simulated side by side for the second run time
     timed_scenes: int = 3
-    timed_frames: int = 100
-    timed_seconds: float = 0.5
-    rounds: int = 2
-    sinkhorn_points: int = 1024
-    sinkhorn_scenes: int = 20
-    sinkhorn_blur: float = 0.01
-    rest_speed: float = 1e-4
+    timed_frames: int = 100  # at most
+    timed_seconds: float = 0.5  # of each timed rollout, about: slow contenders take fewer frames, six at the least
+    rounds: int = 2  # of each timed scene
+    sinkhorn_points: int = 1024  # of each material at most
+    sinkhorn_scenes: int = 20  # of the test scenes
+    sinkhorn_blur: float = 0.01  # domain units
+    rest_speed: float = 1e-4  # domain units a frame; what is slower is at rest
+    # of each weights file, for the number of rollouts that pay for it; null: not told
     training_hours: tuple[float, ...] | None = None
-    generation_hours: float | None = None
+    generation_hours: float | None = None  # of the data set
+    # when they are over, what has not begun is left out, and said; the most important comes first
     seconds: float | None = None
     device: str = "auto"
-    json: str | None = None
+    json: str | None = None  # another name for OUT.json; --json FILE does the same
 
     def __post_init__(self) -> None:
         require(self.out != "", "out", "a file name without its ending", self.out)

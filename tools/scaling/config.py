@@ -1,4 +1,4 @@
-"""The options of `python -m tools.scaling`. See conf/command/scaling.yaml."""
+"""The options of `python -m tools.scaling`."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ class ScalingConfig:
     devices: int | None = None  # at most; none: all GPUs, or two processes on a CPU
     scenes: int = 8  # on each device
     particles: int = 4_296  # of a scene
-    particle_spread: float = 0.17  # standard deviation of a scene's particles, as a share of their mean
+    # of a scene's particles, standard deviation as a share of the mean; the paper's random scenes: 0.17
+    particle_spread: float = 0.17
     batches: int = 8  # of each device; one sample is an update on each of them
-    backends: tuple[str, ...] = ("torch", "triton")  # triton where there are GPUs
-    precision: str = "tf32"  # as for training; backend torch takes tf32 for fp16
-    message_mb: tuple[float, ...] = (25.0,)  # sizes of messages that are timed beside the one that training uses
+    backends: tuple[str, ...] = ("torch", "triton")  # of training; triton where there are GPUs
+    precision: str = "tf32"  # as for training; or fp32, fp16 (where backend torch takes tf32)
+    message_mb: tuple[float, ...] = (25.0,)  # sizes of messages that are timed beside the one that backend torch uses
     network: NetworkConfig = field(default_factory=NetworkConfig)
     node_devices: int = 8  # of the clusters that the model tells of
-    update_ms: float | None = None  # of one device alone: the model of that, and nothing is measured
+    update_ms: float | None = None  # of one device alone: prints the model of such an update, and measures nothing
     backward_ms: float = 0.0  # of these; 0: all gradients leave at the end, as on backend triton
     rounds: int = 20  # samples of each contender
     seconds: float = 30.0  # at most for all contenders, once three rounds are done
-    device: str = "auto"
-    json: str | None = None
+    device: str = "auto"  # or cpu, cuda
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_positive(self, "rounds", "seconds")

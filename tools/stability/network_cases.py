@@ -29,24 +29,27 @@ ATTEMPTS = 20  # at scenes that turn out to be too full
 
 @dataclass(frozen=True)
 class StabilityNetworkConfig:
-    """The options of `python -m tools.stability network`. See conf/command/stability_network.yaml."""
+    """The options of `python -m tools.stability network`."""
 
-    weights: str
+    weights: str  # a file of python -m hgn.export, or the name of shipped weights
+    # of free_fall, long, particles, domain, speed, single, slope, material, far, guard; null: all
     cases: tuple[str, ...] | None = None
     frames: int = 300
-    long_frames: int = 3000
+    long_frames: int = 3000  # of the case long
     particle_factor: float = 10.0
+    # times the floor area, with as many more obstacles and groups; squares
     domain_factors: tuple[int, ...] = (4, 9, 16)
-    speed_factor: float = 3.0
-    far_cells: int = 64_000
-    seeds: int = 1
-    energy_bound: float = 0.02
+    speed_factor: float = 3.0  # times the speed of a fall through the domain
+    far_cells: int = 64_000  # how long the domain is that particles lie at the far end of, in obstacle cells
+    seeds: int = 1  # scenes of each case
+    energy_bound: float = 0.02  # how much energy may come from nowhere, of a fall through the domain
+    # the scenes as they are in training; obstacles only where the network sees them
     scene: SceneConfig = field(default_factory=SceneConfig)
-    backend: str = "auto"
-    precision: str = "tf32"
+    backend: str = "auto"  # torch, triton, cpu; auto: the fastest that runs
+    precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
     device: str = "auto"
-    picture: str | None = None
-    json: str | None = None
+    picture: str | None = None  # also draw the first scene of each case, as far as it came, into this PNG
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_positive(self, "particle_factor", "speed_factor", "far_cells", "seeds", "energy_bound")

@@ -32,14 +32,14 @@ CASES = ("steps", "stiffness", "impact", "convergence", "leak", "long", "validat
 class StabilitySolverConfig:
     """`python -m tools.stability solver`: what is tried."""
 
-    cases: tuple[str, ...] | None = None
-    device: str = "auto"
-    leak_seconds: float = 5.0
-    leak_block_cells: float = 4.0
-    leak_offsets: int = len(OFFSETS)
-    leak_band_cells: float | None = None
-    picture: str | None = None
-    json: str | None = None
+    cases: tuple[str, ...] | None = None  # steps, stiffness, impact, convergence, leak, long, validation; null: all
+    device: str = "auto"  # or cpu, gpu
+    leak_seconds: float = 5.0  # simulated, for each row of the table of leaks
+    leak_block_cells: float = 4.0  # side of the blocks that hit the obstacles, eight particles a cell
+    leak_offsets: int = len(OFFSETS)  # of an obstacle within a cell, at most 8; 54 scenes each
+    leak_band_cells: float | None = None  # mpm.collider_band_cells for the table of leaks; null: the solver's own
+    picture: str | None = None  # also draw stable and unstable steps against the formula, as PNG
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_positive(self, "leak_seconds", "leak_block_cells")

@@ -41,18 +41,19 @@ WHAT = "position MSE: sum over axes, mean over particles, domain lengths squared
 
 @dataclass(frozen=True)
 class DriftConfig:
-    """The options of `python -m tools.studies.drift`. See conf/command/drift.yaml."""
+    """The options of `python -m tools.studies.drift`."""
 
-    data: str
-    out: str
-    weights: str = "obstacles"
+    data: str  # a data set
+    out: str  # writes OUT.json after each row, and OUT.png
+    weights: str = "obstacles"  # a file of python -m hgn.export, or the name of shipped weights
     split: str = "test"
-    scenes: int = 20
+    scenes: int = 20  # simulated side by side
     frames: int = 300
+    # domain units, at most, of each coordinate at the start: the chaos floors
     displacements: tuple[float, ...] = (1e-6, 1e-5)
-    solver: bool = True
-    device: str = "auto"
-    json: str | None = None
+    solver: bool = True  # also how far the solver departs from itself; on a CPU that takes minutes for each scene
+    device: str = "auto"  # backend triton and precisions other than float32 are there on a GPU alone
+    json: str | None = None  # another name for OUT.json; --json FILE does the same
 
     def __post_init__(self) -> None:
         require(self.out != "", "out", "a file name without its ending", self.out)

@@ -44,14 +44,14 @@ HISTORY = 3  # positions that the velocity is guessed from
 
 @dataclass(frozen=True)
 class HiddenStateConfig:
-    """The options of `python -m tools.studies.hidden_state`. See conf/command/hidden_state.yaml."""
+    """The options of `python -m tools.studies.hidden_state`."""
 
-    scenes: int = 2
+    scenes: int = 2  # random scenes
     frames: int = 300
-    every: int = 10
-    scene: SceneConfig = field(default_factory=SceneConfig)
+    every: int = 10  # frames are looked at
+    scene: SceneConfig = field(default_factory=SceneConfig)  # the scenes as they are in training
     mpm: MpmConfig = field(default_factory=MpmConfig)
-    json: str | None = None
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_positive(self, "scenes", "every")

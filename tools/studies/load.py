@@ -47,7 +47,7 @@ class LoadConfig:
     files: int = 4
     file_mb: int = 64
     rounds: int = 9  # each reader takes all files once a round, from each server in turn
-    json: str | None = None
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_positive(self, "readers", "files", "file_mb", "rounds")

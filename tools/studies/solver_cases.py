@@ -40,10 +40,10 @@ class SolverCasesConfig:
     """`python -m tools.studies.solver_cases`: what is timed."""
 
     frames: int = 13
-    size: float = 0.08
+    size: float = 0.08  # of the cubes of particles, in domain units
     rounds: int = 3
-    device: str = "auto"
-    json: str | None = None
+    device: str = "auto"  # or cpu, gpu
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_positive(self, "rounds", "size")

@@ -44,13 +44,14 @@ EXIT_RED = 1
 class SolverTimesConfig:
     """`python -m tools.studies.solver_times`: what is timed."""
 
-    scenes: tuple[int, ...] = (1, 64, 256)
-    particles: tuple[int, ...] = (4_296, 40_000, 400_000, 1_000_000)
-    scene_frames: int = 60
+    scenes: tuple[int, ...] = (1, 64, 256)  # random scenes with obstacles, side by side
+    particles: tuple[int, ...] = (4_296, 40_000, 400_000, 1_000_000)  # of one scene
+    scene_frames: int = 60  # of the random scenes; the second half is timed
     particle_frames: int = 6
+    # a folder with a copy of github.com/taichi-dev/taichi_elements, to time beside ours
     taichi_elements: str | None = None
-    device: str = "auto"
-    json: str | None = None
+    device: str = "auto"  # or cpu, gpu
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         for name in ("scenes", "particles"):

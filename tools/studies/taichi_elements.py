@@ -41,12 +41,12 @@ WARM_FRAMES = 3
 class TaichiElementsConfig:
     """`python -m tools.studies.taichi_elements`: what is compared."""
 
-    folder: str
+    folder: str  # a checkout of github.com/taichi-dev/taichi_elements
     frames: int = 100
-    threads: int = 2
-    size: float = 0.08
-    seeds: int = 3
-    json: str | None = None
+    threads: int = 2  # of the CPU, for both
+    size: float = 0.08  # of the cubes of particles, in domain units
+    seeds: int = 3  # random fillings of each case
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_positive(self, "threads", "size", "seeds")
