@@ -17,6 +17,7 @@ from datagen.mpm.mls_mpm import (
     choose_time_step,
     initial_stiffness,
     interpolate,
+    is_fluid,
     mark,
     move,
     node_places,
@@ -25,7 +26,7 @@ from datagen.mpm.mls_mpm import (
     respond,
     weights,
 )
-from hgn.scene.material import SAND, WATER
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND
 
 
 @ti.func
@@ -55,13 +56,13 @@ def _particle_to_grid(
     """
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
-    material = label[p] & 3
+    material = label[p] & MATERIAL_MASK
     row = 0
     if ti.static(bool(variant & VARIANT.several_laws)):
         row = law_row[p]
     F = ti.Matrix.identity(ti.f32, 3)
     if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
-        if ti.static(not variant & VARIANT.water) or material != WATER:
+        if ti.static(not variant & VARIANT.water) or not is_fluid(material):
             F = deformation[p]
     begins = scene_value[scene, VALUE.begins]
     C = affine[p]
@@ -80,7 +81,7 @@ def _particle_to_grid(
         affine[p] = new_stretch
     volume[p] = new_volume
     if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
-        if ti.static(not variant & VARIANT.water) or material != WATER:
+        if ti.static(not variant & VARIANT.water) or not is_fluid(material):
             deformation[p] = new_F
     raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
 
@@ -166,7 +167,7 @@ def substep(
     """Advances every scene that has time left by one substep of its own length.
 
     Order: time step; in the first substep of an interval mark blocks; particles to grid (deformation, plasticity,
-    stress), gravity, colliders, walls; in the last grid to particles, advection. `label` holds scene * 4 + material of
+    stress), gravity, colliders, walls; in the last grid to particles, advection. `label` holds scene and material of
     each particle, `node` [scenes * blocks * 64] velocity and mass of nodes, `gain` [parts * scenes * blocks * 64] what
     comes to them, a copy of the grid for each part. `block` ends with the length of the list of touched blocks, and
     whether it is made anew, for all scenes, because an interval begins in one. `contact` begins with twice the index of
@@ -181,14 +182,14 @@ def substep(
             block[3 * shape[SHAPE.all_blocks] + 1] = 1
 
     for p in range(position.shape[0]):
-        scene = label[p] >> 2
+        scene = label[p] >> MATERIAL_BITS
         if block[3 * shape[SHAPE.all_blocks] + 1] == 1 and scene_value[scene, VALUE.time_step] > 0.0:
             blocks = shape[SHAPE.all_blocks]
             mark(position[p], scene, setting[SETTING.inverse_cell_size], shape, block, blocks, block, 3 * blocks)
 
     if ti.static(bool(variant & VARIANT.atomic)):
         for p in range(position.shape[0]):
-            scene = label[p] >> 2
+            scene = label[p] >> MATERIAL_BITS
             step = scene_value[scene, VALUE.time_step]
             if step > 0.0:
                 _particle_to_grid(
@@ -233,7 +234,7 @@ def substep(
             node[place] = ti.Vector([v[0], v[1], v[2], mass])
 
     for p in range(position.shape[0]):
-        scene = label[p] >> 2
+        scene = label[p] >> MATERIAL_BITS
         if scene_value[scene, VALUE.time_step] > 0.0 and scene_value[scene, VALUE.interval_remaining] == 0.0:
             _grid_to_particle(
                 p, scene, position, velocity, affine, node, scene_value, counter, setting, shape, contact,
@@ -254,8 +255,8 @@ def start(
 ):
     """Particles at rest shape, and the maxima that the first time step needs."""
     for p in range(velocity.shape[0]):
-        scene = label[p] >> 2
-        material = label[p] & 3
+        scene = label[p] >> MATERIAL_BITS
+        material = label[p] & MATERIAL_MASK
         affine[p] = ti.Matrix.zero(ti.f32, 3, 3)
         if p < deformation.shape[0]:
             deformation[p] = ti.Matrix.identity(ti.f32, 3)

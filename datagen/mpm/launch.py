@@ -29,7 +29,7 @@ from datagen.mpm.layout import (
     constants,
 )
 from hgn.config import MpmConfig
-from hgn.scene.material import MATERIAL_PARAMETERS, SAND, SNOW, WATER
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS, SAND, SNOW, WATER
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
@@ -155,10 +155,10 @@ class Launch(ABC):
                 f"nodes of {len(scenes)} scenes and {self.particles} particles; lower scenes_per_launch"
             )
         label = np.concatenate(
-            [4 * index + np.asarray(scene.material_N, np.int32) for index, scene in enumerate(scenes)]
+            [(index << MATERIAL_BITS) + np.asarray(scene.material_N, np.int32) for index, scene in enumerate(scenes)]
         )
         laws, row = material_laws(scenes, config)
-        self.present = [bool((label % 4 == kind).any()) for kind in (WATER, SAND, SNOW)]
+        self.present = [bool((label & MATERIAL_MASK == kind).any()) for kind in (WATER, SAND, SNOW)]
         has_contact = any(len(collider.node_K3) for collider in colliders)
         has_sweep = config.collider_projection and any(len(collider.sweep.cell_K3) for collider in colliders)
         self.variant = (

@@ -36,7 +36,7 @@ from datagen.mpm.layout import (
     VARIANT,
 )
 from datagen.mpm.surface_kernel import meet_collider, stop_at_surface
-from hgn.scene.material import SNOW, WATER
+from hgn.scene.material import FLUIDS, SNOW
 
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 SPEED_MARGIN = 1.25  # times the way planned for an interval, which a particle that gains speed may go
@@ -273,7 +273,7 @@ def respond(
     new_volume = volume
     stiffness = 0.0
     if ti.static(has_water):
-        if ti.static(not has_solid) or material == WATER:
+        if ti.static(not has_solid) or is_fluid(material):
             expansion = step * C.trace()
             if ti.static(bool(variant & VARIANT.taichi_elements_water)):
                 expansion = (ti.Matrix.identity(ti.f32, 3) + step * C).determinant() - 1.0
@@ -285,7 +285,7 @@ def respond(
             for i in ti.static(range(3)):
                 A[i, i] += scale * pressure
     if ti.static(has_solid):
-        if ti.static(not has_water) or material != WATER:
+        if ti.static(not has_water) or not is_fluid(material):
             rate = 0.5 * (C + C.transpose())
             new_stretch = stretch + step * rate
             gradient = C - rate @ stretch
@@ -461,10 +461,20 @@ def move(
 
 
 @ti.func
+def is_fluid(material: ti.i32) -> ti.i32:
+    """Whether a material has no deformation gradient."""
+    result = 0
+    for fluid in ti.static(FLUIDS):
+        if material == fluid:
+            result = 1
+    return result
+
+
+@ti.func
 def initial_stiffness(material: ti.i32, law: ti.template(), row: ti.i32) -> ti.f32:
     """(3 lambda + 2 mu) / density of a particle at rest shape."""
     stiffness = 3.0 * law[row + CONSTANT.bulk]
-    if material != WATER:
+    if not is_fluid(material):
         stiffness += 2.0 * law[row + CONSTANT.shear]
         if material == SNOW:
             stiffness *= hardening(1.0, law, row)

@@ -51,7 +51,7 @@ from datagen.mpm.mls_mpm import (
     respond,
     spline,
 )
-from hgn.scene.material import SAND
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND
 
 LANES = 9  # threads that share a cell; each holds the three nodes of one y and z
 # Components of a node: what comes to its momentum in a step, from 0 on; its mass; its velocity, from VELOCITY on. The
@@ -507,8 +507,8 @@ def start_team(
     """Particles at rest shape in the first copy, and the maxima that the first time step needs."""
     for p in range(label.shape[0]):
         stride = label.shape[0]
-        scene = label[p] >> 2
-        material = label[p] & 3
+        scene = label[p] >> MATERIAL_BITS
+        material = label[p] & MATERIAL_MASK
         speed_square = 0.0
         for field in range(fields):
             state[p + field * stride] = 0.0

@@ -1,4 +1,10 @@
-"""The materials that scenes are made of; an episode stores the index into `MATERIALS`."""
+"""The materials that scenes are made of; an episode stores the index into `MATERIALS`.
+
+To add a material: its name at the end here (old episodes keep their indices), in `FLUIDS` if it is one; its colour in
+`hgn.render.renderer.MATERIAL_COLORS`; its law in `datagen.mpm.constitutive`, switched on by a bit of
+`datagen.mpm.layout.Variant` that `datagen.mpm.launch` sets where a scene has it; its parameters, if it has any, in
+`hgn.config.MpmConfig`, in `datagen.mpm.layout.law_of` and below. Data, networks, training and reports go by the index.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +12,10 @@ from hgn.schema import ConfigError
 
 MATERIALS: tuple[str, ...] = ("water", "sand", "snow")
 WATER, SAND, SNOW = range(3)
+FLUIDS: tuple[int, ...] = (WATER,)  # without a deformation gradient: all that they remember is their volume
+MATERIAL_BITS = 4  # of the solver's label of a particle, which holds its material in these and its scene above
+MATERIAL_MASK = (1 << MATERIAL_BITS) - 1
+assert len(MATERIALS) <= 1 << MATERIAL_BITS
 # what particles of one material may differ in, by the names that MpmConfig gives the defaults
 MATERIAL_PARAMETERS: tuple[str, ...] = (
     "youngs_modulus_pa",

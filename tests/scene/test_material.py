@@ -1,0 +1,19 @@
+"""What adding a material relies on; hgn.scene.material lists the files."""
+
+from __future__ import annotations
+
+from hgn.render.renderer import MATERIAL_COLORS
+from hgn.scene.material import FLUIDS, MATERIAL_BITS, MATERIAL_MASK, MATERIALS
+
+
+def test_labels_keep_scene_and_material() -> None:
+    """A fifth material does not spill into the scene of the solver's labels, nor do a million scenes into it."""
+    assert len(MATERIALS) < MATERIAL_MASK  # one more fits
+    for scene in (0, 1, 10**6):
+        for material in range(MATERIAL_MASK + 1):
+            label = (scene << MATERIAL_BITS) + material
+            assert (label >> MATERIAL_BITS, label & MATERIAL_MASK) == (scene, material) and label < 2**31
+
+
+def test_each_material_has_its_look() -> None:
+    assert len(MATERIAL_COLORS) == len(MATERIALS) and set(FLUIDS) <= set(range(len(MATERIALS)))
