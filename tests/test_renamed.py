@@ -90,6 +90,6 @@ def test_identity_keeps_its_names(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(KEYS, "scene.obstacles", "scene.obstacle_count")
     scene = dataset_identity(config)["scene"]
     assert scene["obstacles"] == 3 and "obstacle_count" not in scene
-    assert current_names(scene, "scene") == before["scene"]
+    assert current_names(scene, "scene") == current_names(before["scene"], "scene")
     assert from_stored(SceneConfig, scene, "scene") == config.scene
     assert stored_names(to_mapping(config.mpm), "mpm") == to_mapping(config.mpm)
