@@ -1,24 +1,21 @@
 """Files over HTTP without their bytes passing through Python: the kernel sends them.
 
 `FileRange` answers a request for a file or one range of it, in any ASGI server. In one that knows the ASGI extension
-`http.response.zerocopysend` it asks for that; `SendfileProtocol` teaches it to Uvicorn on asyncio's own loop. On two
-cores and eight readers this carries half as much again as sending pieces, and holds none of them in memory.
+`http.response.zerocopysend` it asks for that; datagen.service.uvicorn_compat teaches it to Uvicorn. On two cores and
+eight readers this carries half as much again as sending pieces, and holds none of them in memory.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import BinaryIO
 
-import h11
 from anyio import to_thread
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse, Response
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
+from starlette.types import Receive, Scope, Send
 
 EXTENSION = "http.response.zerocopysend"
 _PIECE_BYTES = 2**20
@@ -83,43 +80,3 @@ async def _send_pieces(file: BinaryIO, start: int, stop: int, send: Send) -> Non
             raise OSError(f"{file.name} became shorter while it was sent")
         start += len(piece)
         await send({"type": "http.response.body", "body": piece, "more_body": True})
-
-
-class _Length:
-    """Stands for bytes that h11 counts and does not see."""
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-
-    def __len__(self) -> int:
-        return self._count
-
-
-class SendfileProtocol(H11Protocol):
-    """Uvicorn's HTTP with `http.response.zerocopysend`."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.app = cast(Any, partial(self._with_extension, self.app))
-
-    async def _with_extension(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-        async def send_all(message: Message) -> None:
-            if message["type"] != EXTENSION:
-                await send(message)
-            elif not await self._send_file(message["file"], message["offset"], message["count"]):
-                self.transport.abort()
-                while (await receive())["type"] != "http.disconnect":
-                    pass
-
-        extensions = {**(scope.get("extensions") or {}), EXTENSION: {}}
-        await app({**scope, "extensions": extensions}, receive, send_all)
-
-    async def _send_file(self, file: BinaryIO, offset: int, count: int) -> bool:
-        """Whether the bytes are on their way; not so when the reader has gone, or the file is too short."""
-        if self.transport.is_closing():
-            return False
-        self.conn.send_with_data_passthrough(h11.Data(data=cast(bytes, _Length(count))))
-        try:
-            return await self.loop.sendfile(self.transport, file, offset, count) == count
-        except ConnectionError:
-            return False

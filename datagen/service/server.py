@@ -30,8 +30,9 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from datagen.service.sendfile import FileRange, SendfileProtocol
+from datagen.service.sendfile import FileRange
 from datagen.service.supervisor import PoolState
+from datagen.service.uvicorn_compat import SendfileProtocol
 from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
 from hgn.data.storage import verify_file
 from hgn.schema import ConfigError
