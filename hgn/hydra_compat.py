@@ -53,10 +53,10 @@ def compose(folder: Path, config_name: str, arguments: list[str], complete: bool
         if any(argument.lstrip("+~").startswith(("-", "hydra")) for argument in arguments[1:]):
             sys.argv = _with_quiet(arguments)
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra would print and exit itself otherwise
-            with _registered_dataclasses(folder, config_name):
+            with registered_dataclasses(folder, config_name):
                 hydra_main(version_base="1.3", config_path=str(folder), config_name=config_name)(composed.append)()
         else:
-            with _registered_dataclasses(folder, config_name), initialize_config_dir(str(folder), version_base="1.3"):
+            with registered_dataclasses(folder, config_name), initialize_config_dir(str(folder), version_base="1.3"):
                 composed.append(compose_once(config_name, arguments[1:]))
         plain = [OmegaConf.to_container(config, resolve=True, throw_on_missing=complete) for config in composed]
     except MissingMandatoryValue as error:
@@ -90,7 +90,7 @@ def _load(name: str) -> type:
 
 
 @contextmanager
-def _registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
+def registered_dataclasses(folder: Path, config_name: str) -> Iterator[None]:
     """While entered, Hydra knows the defaults of the dataclasses that config files name, under those names.
 
     Hydra's store is one for the process, and a group that another command has would be a group here.

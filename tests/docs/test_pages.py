@@ -14,6 +14,7 @@ from docs.pages import ROOT, Block, blocks_of, markdown_files, prose_lines, shel
 from hydra import compose, initialize_config_dir
 
 from hgn import config
+from hgn.hydra_compat import registered_dataclasses
 
 COLUMNS = 100
 README_LINES, README_COMMANDS, ENTRY_LINES = 130, 12, 2
@@ -127,7 +128,7 @@ def test_commands_compose() -> None:
         if "--json" in arguments:
             at = arguments.index("--json")
             arguments[at : at + 2] = [f"json={arguments[at + 1]}"]
-        with initialize_config_dir(str(folder), version_base="1.3"):
+        with registered_dataclasses(folder, name), initialize_config_dir(str(folder), version_base="1.3"):
             compose(name, arguments)
 
 
