@@ -115,8 +115,8 @@ class MpmConfig:
     snow_hardening: float = 10.0
     snow_critical_compression: float = 0.025
     snow_critical_stretch: float = 0.0045
-    snow_maximum_hardening: float = 20.0  # bound on exp(hardening * (1 - Jp)); hits are counted
-    water_equation: str = "linear"  # pressure lambda (1 - J); or stiffening: lambda / 7 (J^-7 - 1)
+    snow_maximum_hardening: float = 20.0  # bound on exp(hardening * (1 - Jp)), counted; beyond 5 m/s raise it
+    water_equation: str = "linear"  # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
     water_volume_update: str = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
     water_minimum_volume_ratio: float = 0.1  # floor on J; hits are counted
     minimum_singular_value: float = 0.05  # floor on the singular values of F; hits are counted
@@ -125,11 +125,13 @@ class MpmConfig:
     fixed_time_step_s: float = 0.02 / 64
     stability_fraction: float = 0.5  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
     speed_fraction: float = 0.3  # of a cell that the fastest particle may cross between two transfers
-    # particles and grid exchange velocities every cell_size / this, in the adaptive mode; none: at every step
+    # particles and grid exchange velocities every cell_size / this: 32 times a frame of 1/60 s at 64 cells,
+    # whatever the materials, with as many steps of stress between as they need; null: at every step. Fewer
+    # transfers smooth less.
     transfer_speed_m_s: float | None = 30.0
     wall_cells: int = 3  # grid nodes at each face of the domain that stop outgoing motion
     wall_contact: str = "slip"  # or stick
-    collider_band_cells: float = 0.5  # from a sheet, where nodes stop motion
+    collider_band_cells: float = 0.5  # from a sheet, where nodes stop motion; more keeps material further off
     collider_friction: float = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
     device: str = "auto"  # or cpu, gpu
