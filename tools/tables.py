@@ -1,7 +1,8 @@
 """python -m tools.tables [check=true]: writes the tables and figures of Markdown pages from the JSON beside them.
 
-A folder of pages has a `tables.yaml`; its pages hold `<!-- table: NAME -->` … `<!-- end -->` for a table and
-`<!--=NAME-->0.302<!--/-->` for a figure within a sentence, and what stands between is written by this command:
+A folder of pages has a `tables.yaml`, for its own pages or for those that its `pages` names. A page holds
+`<!-- table: NAME -->` … `<!-- end -->` for a table and `<!--=NAME-->0.302<!--/-->` for a figure within a sentence. What
+stands between is written by this command:
 
     files: {bench: bench_h100.json}     # sources by name, relative to the folder: .json, or .safetensors (the header)
     values:
@@ -73,7 +74,7 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(TablesConfig, mapping)
     differing = [page for path in specifications(ROOT) for page in pages(path) if page.differences]
     for page in differing:
-        name = page.path.relative_to(ROOT)
+        name = page.path.resolve().relative_to(ROOT)
         print("\n".join(f"{name}: {difference}" for difference in page.differences) if config.check else name)
         if not config.check:
             write_atomically(page.path, page.text.encode())
@@ -91,7 +92,7 @@ def specifications(root: Path) -> list[Path]:
 
 
 def pages(specification: Path) -> list[Page]:
-    """The Markdown pages beside a specification.
+    """The Markdown pages beside a specification, or those of its `pages`.
 
     Raises: ConfigError for a marker without a definition or an end, a definition without a marker, and an expression
     that finds nothing; it names file and definition.
@@ -129,7 +130,8 @@ def pages(specification: Path) -> list[Page]:
         text = VALUE.sub(lambda match: filled(match, "figure"), text)
         return Page(path, text, tuple(differences))
 
-    written = [page(path) for path in sorted(folder.glob("*.md"))]
+    named = [folder / name for name in definitions.get("pages") or []]
+    written = [page(path) for path in named or sorted(folder.glob("*.md"))]
     unused = (kinds["table"].keys() | kinds["figure"].keys()) - used
     if unused:
         raise ConfigError(f"{specification}: no page has a marker for {', '.join(sorted(unused))}")

@@ -178,3 +178,11 @@ def test_safetensors_header(tmp_path: Path) -> None:
     (page,) = pages(specification)
     assert f"| 7 | {len(header) + 8} | 6 |" in page.text
     assert page.differences == ("table files is not what weights.safetensors says; run python -m tools.tables",)
+
+
+def test_pages_elsewhere(tmp_path: Path) -> None:
+    """A specification may name the pages that it writes; others beside it are left alone."""
+    specification = folder(tmp_path, "pages: [../../READ.md]\n" + SPECIFICATION, "<!--=unknown-->1<!--/-->")
+    (tmp_path / "READ.md").write_text(PAGE)
+    (page,) = pages(specification)
+    assert page.path.resolve() == tmp_path / "READ.md" and page.differences == ()
