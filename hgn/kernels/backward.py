@@ -14,11 +14,12 @@ from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT, Block
 from hgn.kernels.cell_mlp.kernel import cell_mlp_backward
 from hgn.kernels.edges.kernel import edge_backward
-from hgn.kernels.forward import FusedNetwork, Tuning
+from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.mlp.kernel import gather_project_backward, mlp_backward
 from hgn.kernels.packing import PackedMLP, PackedNetwork
 from hgn.kernels.particle_cell.kernel import particle_cell_backward, particle_cell_weight_gradient
+from hgn.kernels.tuning import Tuning, many
 from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
 
 CHUNK_ROWS = (512, 2048)  # of a program of the weights' products: where there are few rows, and many
@@ -314,7 +315,7 @@ class FusedTrainingNetwork(FusedNetwork):
         following: tuple[int, ...] = (),
         products: tuple[torch.Tensor, ...] = (),
     ) -> None:
-        block, warps = self._row_block(len(hidden), True)
+        block, warps = self.tuning.row_tile(len(hidden), True)
         at, given = (*following, 0, 0), (*products, hidden, hidden)
         mlp_backward[self._blocks(len(hidden), block)](
             gradient=gradient,
@@ -365,7 +366,7 @@ class FusedTrainingNetwork(FusedNetwork):
         to_cell: bool,
     ) -> None:
         grid = self.grid
-        programs = self._programs(grid.particles, self.tuning.pair_particles)
+        programs = self.tuning.programs(grid.particles, self.tuning.pair_particles)
         particle_cell_backward[programs](
             gradient=gradient,
             by_particle=by_particle,
@@ -429,9 +430,9 @@ class FusedTrainingNetwork(FusedNetwork):
     ) -> None:
         """With `received`, x are gradients of edges, and what came with it through other weights is added too."""
         rows = self.grid.capacities[level]
-        size, warps = self._row_block(rows)
+        size, warps = self.tuning.row_tile(rows)
         other, other_at = received or (summed, at)
-        if summands > 0 and self._gathers(rows):
+        if summands > 0 and self.tuning.gathers(rows):
             self._gather(level, x, table, summed, received is not None)
             x, summands = summed, 0
         gather_project_backward[self._blocks(rows, size)](
@@ -461,15 +462,15 @@ class FusedTrainingNetwork(FusedNetwork):
         edge_gradient, sum_gradient = self.edge_gradient[:rows], self.sum_gradient[:rows]
         table = grid.neighbour(level)
         tuning = self.tuning
-        size, warps = self._row_block(rows)
-        if tuning.cell_backward_block > 0 and self._many(rows):
+        size, warps = self.tuning.row_tile(rows)
+        if tuning.cell_backward_block > 0 and many(rows):
             size, warps = tuning.cell_backward_block, tuning.cell_backward_warps
-        edge_size, edge_warps = self._edge_block(rows)
+        edge_size, edge_warps = self.tuning.edge_tile(rows)
         overlap = self.overlaps()
         for m in reversed(range(steps)):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             later = m if last else m + 1
-            gathers = self._gathers(rows) and not last
+            gathers = self.tuning.gathers(rows) and not last
             if gathers:
                 self._gather(level, g[f"{name}{later}_eh"], table, g[f"{name}{later}_s"], True)
             cell_mlp_backward[self._blocks(rows, size)](
@@ -502,12 +503,12 @@ class FusedTrainingNetwork(FusedNetwork):
                 WIDTH=self.width,
                 BLOCK=size,
                 PRECISION=self.precision,
-                RESIDENT=overlap and not self._many(rows),
-                OVERLAP=overlap and not self._many(rows),
+                RESIDENT=overlap and not many(rows),
+                OVERLAP=overlap and not many(rows),
                 num_warps=warps,
-                launch_pdl=overlap and not self._many(rows),
+                launch_pdl=overlap and not many(rows),
             )
-            edge_backward[self._programs(rows, self._edge_cells(edge_size))](
+            edge_backward[self.tuning.programs(rows, self.tuning.edge_cells(edge_size))](
                 sum_gradient=sum_gradient,
                 edge_gradient=edge_gradient,
                 count_ptr=grid.count(level),

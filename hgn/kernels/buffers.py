@@ -6,16 +6,13 @@ Shape legend: N particles, C cells, W width.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import torch
 
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.packing import PackedMessagePassing, PackedNetwork
-
-if TYPE_CHECKING:
-    from hgn.kernels.forward import Tuning
+from hgn.kernels.tuning import Tuning
 
 OUT = 16  # the decoder's three outputs, padded
 

@@ -6,8 +6,6 @@ paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import torch
 import triton
 
@@ -19,66 +17,11 @@ from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.mlp.kernel import clear_rows, gather_project, gather_sums, mlp_forward
 from hgn.kernels.packing import PackedMLP, PackedNetwork, rounded_to_tf32
 from hgn.kernels.particle_cell.kernel import particle_cell_forward
+from hgn.kernels.tuning import LIGHT_BLOCK, Tuning, many
 
 PRECISIONS = ("fp32", "tf32", "fp16")
-PROCESSORS = 132  # an H100's
-RESIDENT_PROGRAMS = 2 * PROCESSORS
-FEW_ROWS = 64 * PROCESSORS
 CLEAR_ROWS = 64
-LIGHT_BLOCK = (64, 4)  # rows and warps of a program that keeps two weights, of which two fit on a processor
 NONE = -1  # where a product has no bias
-
-
-@dataclass(frozen=True)
-class Tuning:
-    """Rows and warps of a program. They change how fast, never what."""
-
-    cell_block: int  # cells of a tile of edges, eight rows each
-    cell_warps: int
-    few_cell_block: int  # the same on a level of few cells
-    few_cell_warps: int
-    row_block: int
-    row_warps: int
-    row_backward_warps: int
-    pair_particles: int  # eight rows each, at most 13
-    pair_warps: int
-    few_cells: int = 0  # up to which a level's cells are few
-    small_block: int = 16  # where there are few rows
-    small_warps: int = 8
-    dense: bool = False  # six rows a cell in the tiles of edges, not eight
-    overlap: bool = False  # kernels of a message step read their weights before their turn
-    prefetch: bool = False  # where there are many rows, the next tile's are brought to the L2 cache on the way forward
-    loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
-    gather_block: int = 0  # of a kernel for the sums of many rows' neighbours; 0: whoever needs them makes them
-    cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
-    cell_backward_warps: int = 8
-    half_cells: bool = False  # cells too are rounded between kernels, as edges are
-    # And particles are added to them rounded, half the traffic of the L2 cache: in training only the pairs' gradients.
-    half_sums: bool = False
-    light_programs: int = 2  # on a processor, of kernels with one weight: pairs forward, edges of a first iteration
-    light_registers: int | None = None  # of a thread, so that as many fit
-    weight_registers: int | None = None  # of a thread of the weights' products: 128 for two programs on a processor
-
-    @staticmethod
-    def of(precision: str) -> Tuning:
-        """What was fastest on an H100 at width 128."""
-        if precision == "fp32":
-            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
-        if precision == "tf32":  # operands of twice the size
-            return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8, 528)
-        half = Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, 1056, dense=True, overlap=True, loops=True)
-        return replace(
-            half,
-            light_programs=3,
-            light_registers=168,
-            gather_block=16,
-            cell_backward_block=64,
-            cell_backward_warps=4,
-            weight_registers=128,
-            prefetch=True,
-            half_cells=True,
-            half_sums=True,
-        )
 
 
 def feature_columns(config: NetworkConfig) -> int:
@@ -234,31 +177,6 @@ class FusedNetwork(Buffers):
     def _blocks(self, rows: int, block: int) -> tuple[int]:
         return (triton.cdiv(rows, block),)
 
-    def _many(self, rows: int) -> bool:
-        return rows >= FEW_ROWS
-
-    def _row_block(self, rows: int, backward: bool = False) -> tuple[int, int]:
-        """Rows and warps of a program over so many rows."""
-        tuning = self.tuning
-        if not self._many(rows):
-            return tuning.small_block, tuning.small_warps
-        return tuning.row_block, tuning.row_backward_warps if backward else tuning.row_warps
-
-    def _edge_block(self, cells: int) -> tuple[int, int]:
-        """Cells and warps of a tile of edges: small tiles where there would be few."""
-        tuning = self.tuning
-        few = cells <= tuning.few_cells
-        return (tuning.few_cell_block, tuning.few_cell_warps) if few else (tuning.cell_block, tuning.cell_warps)
-
-    def _loops(self, rows: int, block: int, least: int = 1) -> bool:
-        """Whether a program keeps all its weights and takes one block after the other, where each has `least`."""
-        return self.tuning.loops and self._many(rows) and rows >= (least - 1) * PROCESSORS * block
-
-    def _row_programs(self, rows: int, block: int, loops: bool, at_once: int = 1) -> tuple[int]:
-        """Those that keep their weights fill a processor's shared memory each, or an `at_once`-th of it."""
-        programs = triton.cdiv(rows, block)
-        return (min(programs, PROCESSORS * at_once) if loops else programs,)
-
     def overlaps(self) -> bool:
         """Whether the kernels of a message step start before the one before has ended."""
         if not self.tuning.overlap or triton.knobs.runtime.interpret:
@@ -269,18 +187,6 @@ class FusedNetwork(Buffers):
     def keeps_pair_hidden(self) -> bool:
         """Whether the hidden layer of the pairs is kept for the backward pass (see particle_cell_forward)."""
         return self.precision == "tf32"
-
-    def _edge_cells(self, block: int) -> int:
-        """Cells that a tile of edges takes where it has rows for `block` of eight each."""
-        return 8 * block // 6 if self.tuning.dense else block
-
-    def prefetches(self, rows: int) -> bool:
-        """Whether the kernels on so many rows bring the next tile's to the L2 cache: an instruction of the GPU's."""
-        return self.tuning.prefetch and self._many(rows) and not triton.knobs.runtime.interpret
-
-    def _programs(self, rows: int, block: int, at_once: int = 2) -> tuple[int]:
-        """Programs that take one block after the other: as many as run at once, `at_once` on a processor."""
-        return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS * at_once // 2),)
 
     def _mlp(
         self,
@@ -304,11 +210,11 @@ class FusedNetwork(Buffers):
         fine: bool = False,
     ) -> None:
         first = first or (self.weights, mlp.parts[0])
-        block, warps = self._row_block(len(x))
+        block, warps = self.tuning.row_tile(len(x))
         at, bias_at = (*following, 0, 0), (*following_bias, NONE, NONE)
         into = (*products, hidden, hidden)
-        loops = self._loops(len(x), block, 4)
-        mlp_forward[self._row_programs(len(x), block, loops, 1 if norm else 2)](
+        loops = self.tuning.loops_over(len(x), block, 4)
+        mlp_forward[self.tuning.row_programs(len(x), block, loops, 1 if norm else 2)](
             x=x,
             count_ptr=count,
             weights=self.weights,
@@ -364,7 +270,7 @@ class FusedNetwork(Buffers):
     ) -> None:
         grid, tuning = self.grid, self.tuning
         at_once, registers = tuning.light_programs, tuning.light_registers
-        particle_cell_forward[self._programs(grid.particles, tuning.pair_particles, at_once)](
+        particle_cell_forward[self.tuning.programs(grid.particles, tuning.pair_particles, at_once)](
             by_particle=by_particle,
             by_cell=by_cell,
             particle=self.latent,
@@ -391,10 +297,6 @@ class FusedNetwork(Buffers):
             maxnreg=registers,
         )
 
-    def _gathers(self, rows: int) -> bool:
-        """Whether sums of so many rows' neighbours have a kernel of their own."""
-        return self.tuning.gather_block > 0 and self._many(rows)
-
     def _gather(self, level: int, x: torch.Tensor, table: torch.Tensor, y: torch.Tensor, edges: bool = False) -> None:
         """y = the sums of x's rows that the table lists."""
         rows, size = self.grid.capacities[level], self.tuning.gather_block
@@ -415,14 +317,14 @@ class FusedNetwork(Buffers):
         """The block's input and its products for the first iteration."""
         grid, level, edge = self.grid, block.level, block.packed.edge[0]
         rows = grid.capacities[level]
-        size, warps = self._row_block(rows)
-        if from_children and self._gathers(rows):
+        size, warps = self.tuning.row_tile(rows)
+        if from_children and self.tuning.gathers(rows):
             self._gather(level, self.message[level - 1], grid.children(level), block.cell[0])
             from_children = False
-        loops = not from_children and self._loops(rows, size)
+        loops = not from_children and self.tuning.loops_over(rows, size)
         if loops:
             size, warps = LIGHT_BLOCK
-        gather_project[self._row_programs(rows, size, loops, 2)](
+        gather_project[self.tuning.row_programs(rows, size, loops, 2)](
             x=self.message[level - 1] if from_children else block.cell[0],
             table=grid.children(level),
             count_ptr=grid.count(level),
@@ -446,9 +348,9 @@ class FusedNetwork(Buffers):
     def _passing(self, block: Block) -> None:
         grid, level, steps = self.grid, block.level, self.config.message_passing_steps
         rows = grid.capacities[level]
-        size, warps = self._row_block(rows)
-        edge_size, edge_warps = self._edge_block(rows)
-        overlap, loops = self.overlaps(), self._loops(rows, size)
+        size, warps = self.tuning.row_tile(rows)
+        edge_size, edge_warps = self.tuning.edge_tile(rows)
+        overlap, loops = self.overlaps(), self.tuning.loops_over(rows, size)
         for m in range(steps):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
             if not last:
@@ -459,9 +361,9 @@ class FusedNetwork(Buffers):
                 product = block.product if block.product is not None else block.send[(m + 1) % 2]
                 next_at, into, products = (block.next_at, 0), (product, product), int(block.product is not None)
                 next_bias = 0
-            light = m == 0 and self._many(rows)
+            light = m == 0 and many(rows)
             at_once = self.tuning.light_programs if light else 2
-            edge_forward[self._programs(rows, self._edge_cells(edge_size), at_once)](
+            edge_forward[self.tuning.programs(rows, self.tuning.edge_cells(edge_size), at_once)](
                 send=block.send[m % 2],
                 receive=block.receive[m % 2],
                 edge_in=block.edge[m - 1] if m > 0 else block.cell[m],
@@ -488,13 +390,13 @@ class FusedNetwork(Buffers):
                 DENSE=self.tuning.dense,
                 PRECISION=self.precision,
                 OVERLAP=overlap,
-                PREFETCH=self.prefetches(rows),
-                AHEAD=self.tuning.dense and self._many(rows),
+                PREFETCH=self.tuning.prefetches(rows),
+                AHEAD=self.tuning.dense and many(rows),
                 num_warps=edge_warps,
                 maxnreg=self.tuning.light_registers if light else None,
                 launch_pdl=overlap,
             )
-            cell_mlp_forward[self._row_programs(rows, size, loops)](
+            cell_mlp_forward[self.tuning.row_programs(rows, size, loops)](
                 cell=block.cell[m],
                 total=block.sum[m],
                 count_ptr=grid.count(level),
@@ -524,7 +426,7 @@ class FusedNetwork(Buffers):
                 RESIDENT=overlap or loops,
                 LOOP=loops,
                 OVERLAP=overlap,
-                PREFETCH=self.prefetches(rows),
+                PREFETCH=self.tuning.prefetches(rows),
                 num_warps=warps,
                 launch_pdl=overlap,
             )

@@ -7,9 +7,10 @@ from dataclasses import replace
 import torch
 
 from hgn.kernels.backward import FusedTrainingNetwork
-from hgn.kernels.forward import FusedNetwork, Tuning, feature_columns
+from hgn.kernels.forward import FusedNetwork, feature_columns
 from hgn.kernels.grid.op import DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
+from hgn.kernels.tuning import Tuning
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 

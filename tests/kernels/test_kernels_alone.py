@@ -28,8 +28,9 @@ from triton.runtime.jit import KernelInterface
 
 import hgn.kernels
 from hgn.kernels.backward import FusedTrainingNetwork
-from hgn.kernels.forward import FusedNetwork, Tuning
+from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.gns.op import FusedEdges
+from hgn.kernels.tuning import Tuning
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import relative_error
@@ -143,9 +144,9 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every level is one of many rows, and so few programs run that each takes several tiles."""
-    monkeypatch.setattr("hgn.kernels.forward.FEW_ROWS", 0)
-    monkeypatch.setattr("hgn.kernels.forward.PROCESSORS", 2)
-    monkeypatch.setattr("hgn.kernels.forward.RESIDENT_PROGRAMS", 2)
+    monkeypatch.setattr("hgn.kernels.tuning.FEW_ROWS", 0)
+    monkeypatch.setattr("hgn.kernels.tuning.PROCESSORS", 2)
+    monkeypatch.setattr("hgn.kernels.tuning.RESIDENT_PROGRAMS", 2)
 
 
 def width_for(precision: str) -> int:

@@ -81,10 +81,10 @@ def test_outputs_and_gradients(
     """In float32 several scenes in one batch, a single particle, and a single level, with odd numbers of particles and
     cells, give the outputs and every gradient of the plain network to 1e-5. So few programs run that each takes several
     tiles, and the last has one fewer."""
-    monkeypatch.setattr("hgn.kernels.forward.RESIDENT_PROGRAMS", 2)
+    monkeypatch.setattr("hgn.kernels.tuning.RESIDENT_PROGRAMS", 2)
     if len(counts) > 1:
-        monkeypatch.setattr("hgn.kernels.forward.PROCESSORS", 2)
-        monkeypatch.setattr("hgn.kernels.forward.FEW_ROWS", 0)  # every level is one of many rows
+        monkeypatch.setattr("hgn.kernels.tuning.PROCESSORS", 2)
+        monkeypatch.setattr("hgn.kernels.tuning.FEW_ROWS", 0)  # every level is one of many rows
     network = network_of(width=16, **changes)
     state = float32_state(counts, network.config.obstacle_features, spread)
     precision = "fp32"
@@ -118,7 +118,7 @@ def test_inference_alone(
     """Where nothing is kept for gradients, operands of TF32 and float16 change the output by less than 5e-3, also with
     the cells in float16 between kernels and so summed, and with the kernels for many rows."""
     if few_rows is not None:
-        monkeypatch.setattr("hgn.kernels.forward.FEW_ROWS", few_rows)
+        monkeypatch.setattr("hgn.kernels.tuning.FEW_ROWS", few_rows)
     network = network_of(width=16, levels=1, message_passing_steps=2)
     state = float32_state((5, 2), spread=0.1)
     origin_S3 = torch.zeros(2, 3, dtype=torch.float64)
