@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 
 import torch
-import triton
 
 from hgn.config import NetworkConfig
 from hgn.kernels.buffers import OUT, Block
@@ -19,6 +18,7 @@ from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.mlp.kernel import gather_project_backward, mlp_backward
 from hgn.kernels.packing import PackedMLP, PackedNetwork
 from hgn.kernels.particle_cell.kernel import particle_cell_backward, particle_cell_weight_gradient
+from hgn.kernels.triton_compat import interpreting
 from hgn.kernels.tuning import Tuning, many
 from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
 
@@ -266,7 +266,7 @@ class FusedTrainingNetwork(FusedNetwork):
                 CHUNK=chunk,
                 STEP=self._rows_at_once(),
                 PRECISION=self.precision,
-                PIPELINED=not triton.knobs.runtime.interpret,
+                PIPELINED=not interpreting(),
                 num_warps=8,
                 maxnreg=self.tuning.weight_registers,
             )
@@ -274,7 +274,7 @@ class FusedTrainingNetwork(FusedNetwork):
 
     def _rows_at_once(self) -> int:
         """Of a weight's product; in the interpreter, whose time goes by operations, more."""
-        if triton.knobs.runtime.interpret:
+        if interpreting():
             return 128
         return 64 if self.precision == "fp16" else 32
 
@@ -412,7 +412,7 @@ class FusedTrainingNetwork(FusedNetwork):
                 WIDTH=self.width,
                 PARTICLES=self.tuning.pair_particles,
                 PRECISION=self.precision,
-                PIPELINED=not triton.knobs.runtime.interpret,
+                PIPELINED=not interpreting(),
                 num_warps=self.tuning.pair_warps,
             )
 

@@ -17,6 +17,7 @@ from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.mlp.kernel import clear_rows, gather_project, gather_sums, mlp_forward
 from hgn.kernels.packing import PackedMLP, PackedNetwork, rounded_to_tf32
 from hgn.kernels.particle_cell.kernel import particle_cell_forward
+from hgn.kernels.triton_compat import capability, interpreting
 from hgn.kernels.tuning import LIGHT_BLOCK, Tuning, many
 
 PRECISIONS = ("fp32", "tf32", "fp16")
@@ -179,10 +180,7 @@ class FusedNetwork(Buffers):
 
     def overlaps(self) -> bool:
         """Whether the kernels of a message step start before the one before has ended."""
-        if not self.tuning.overlap or triton.knobs.runtime.interpret:
-            return False
-        target = triton.runtime.driver.active.get_current_target()
-        return target.backend == "cuda" and target.arch >= 90
+        return self.tuning.overlap and not interpreting() and capability() >= 90
 
     def keeps_pair_hidden(self) -> bool:
         """Whether the hidden layer of the pairs is kept for the backward pass (see particle_cell_forward)."""

@@ -12,19 +12,15 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import torch
-import triton
-from triton.backends.compiler import GPUTarget
 
 from hgn.config import NetworkConfig
 from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.grid.op import ObstacleTable, Window
-from hgn.kernels.triton_compat import preload
+from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, preload, use_target
 from hgn.kernels.update.op import Updates, UpdateSettings
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
@@ -60,34 +56,15 @@ class FrameJob:
     capability: int  # of the GPU: 90 for an H100
 
 
-Launches = dict[str, tuple[Any, str]]
-
-
 def launches_of(job: PrecompileJob | FrameJob, device: str = "meta") -> Launches:
     """Every kernel of a job with what it is specialised for, by a key of both; Triton's driver needs a target."""
-    with _noted() as found:
+    with noted_launches() as launches:
         if isinstance(job, PrecompileJob):
             _update_launches(job, device)
         else:
             for config, precision in job.networks:
                 _frame_launches(config, precision, job.sizes, device)
-    return found
-
-
-@contextmanager
-def _noted() -> Iterator[Launches]:
-    found: Launches = {}
-
-    def note(*, fn: Any, compile: dict[str, Any], **_: Any) -> bool:
-        data = compile["specialization_data"]
-        found.setdefault(data, (fn.jit_function, data))
-        return True  # neither compiled nor launched
-
-    triton.knobs.runtime.jit_cache_hook = note
-    try:
-        yield found
-    finally:
-        triton.knobs.runtime.jit_cache_hook = None
+    return launches
 
 
 def _update_launches(job: PrecompileJob, device: str) -> None:
@@ -151,8 +128,7 @@ def compile_share(job: PrecompileJob | FrameJob, share: int, shares: int) -> int
     """Compiles every `shares`-th kernel from number `share` on; how many those are."""
     mine = list(launches_of(job).values())[share::shares]
     for function, data in mine:
-        kernel = preload(function, data)
-        triton.runtime.driver.active.launcher_cls(kernel.src, kernel.metadata)  # C, compiled as well
+        build_launcher(preload(function, data))
     return len(mine)
 
 
@@ -171,14 +147,6 @@ def job_of(text: str) -> PrecompileJob | FrameJob:
     settings = UpdateSettings(**mapping.pop("settings"))
     tuples = {name: tuple(mapping[name]) for name in ("cells", "pushforward_scenes")}
     return PrecompileJob(network, settings, **{**mapping, **tuples})
-
-
-def use_target(capability: int) -> None:
-    """Lets Triton compile for a GPU without a context on it, which would take memory from those who train."""
-    driver = triton.runtime.driver.active
-    driver.get_current_device = lambda: 0
-    driver.get_current_stream = lambda device: 0
-    driver.get_current_target = lambda: GPUTarget("cuda", capability, 32)
 
 
 def main() -> None:

@@ -18,6 +18,11 @@ def why_no_triton() -> str | None:
     """
     if importlib.util.find_spec("triton") is None:
         return "it needs the package triton"
+    if torch.cuda.is_available():
+        from hgn.kernels.triton_compat import unsupported_reason  # loads Triton
+
+        if reason := unsupported_reason():
+            return reason
     if not torch.cuda.is_available() or any(_cache().glob("*/cuda_utils*")):  # built already, perhaps elsewhere
         return None
     if not (os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")):

@@ -17,7 +17,7 @@ from hgn.config import TrainingConfig
 from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk
 from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.grid.op import ObstacleHash
-from hgn.kernels.jit_misses import JitMisses
+from hgn.kernels.triton_compat import JitMisses
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.base import ParticleNetwork
 from hgn.network.gns import GraphNetworkSimulator

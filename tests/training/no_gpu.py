@@ -6,7 +6,7 @@ from typing import Any
 
 import triton
 
-from hgn.kernels.precompile import use_target
+from hgn.kernels.triton_compat import use_target
 
 
 class NoGpu:

@@ -115,7 +115,7 @@ def late_kernels(backend: str) -> Callable[[], int]:
     """How many kernels were compiled in this process by now: each holds a simulation up for a second or more."""
     if backend != "triton":
         return lambda: 0
-    from hgn.kernels.jit_misses import JitMisses
+    from hgn.kernels.triton_compat import JitMisses
 
     late = JitMisses()
     return lambda: late.count

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import triton
 import triton.language as tl
-from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 
 from hgn.kernels.blocks import (
     LAST_TILE,
@@ -29,7 +28,7 @@ from hgn.kernels.blocks import (
     vectors,
     weighted_sums,
 )
-from hgn.kernels.triton_compat import settle_keys
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import triton
 import triton.language as tl
-from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 
 from hgn.kernels.blocks import (
     added,
@@ -39,7 +38,7 @@ from hgn.kernels.blocks import (
     transposed,
     weighted_sums,
 )
-from hgn.kernels.triton_compat import settle_keys
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 
 
 @triton.jit

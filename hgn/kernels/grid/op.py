@@ -13,11 +13,12 @@ import torch
 import triton
 
 from hgn.kernels.grid import kernel
+from hgn.kernels.triton_compat import interpreting
 from hgn.network.cell_keys import SCENE_LIMIT, unpack
 from hgn.network.obstacles import ObstacleCells
 
 MARK_BLOCK = 128
-FILL_BLOCK = 4096 if triton.knobs.runtime.interpret else 512  # slots; the interpreter's time goes by programs
+FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
 MARGIN_CELLS = 4  # of a window, around what it must hold
 OBSTACLE_COLUMNS = 5
 OVERFLOW = 1
