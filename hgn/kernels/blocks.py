@@ -1,8 +1,8 @@
 """What the kernels share: matrix products at a chosen precision, layer normalisation and its gradient.
 
 Precision is a compile-time name: "tf32" rounds operands to 10 bits of mantissa with float32's range (weights come
-rounded, see nearest_tf32), "fp16" to 10 bits with float16's range, "fp32" not at all: for tests, as compiling it
-takes minutes at a network's width. Sums are float32 always.
+rounded, see nearest_tf32), "fp16" to 10 bits with float16's range, "fp32" not at all, for tests.
+Sums are float32 always.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.triton_compat import settle_keys
+from hgn.kernels.triton_compat import interpreting, settle_keys
 
+# In tests: Triton takes minutes to compile float32's own product natively, or fails at it.
+FP32_PRODUCT = tl.constexpr("ieee" if interpreting() else "tf32x3")
 LEAKY = tl.constexpr(0.01)  # hgn.network.mlp.LEAKY_SLOPE
 LAST_TILE = tl.constexpr(1 << 20)  # beyond all: elements are addressed in int32
 EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
@@ -36,7 +38,7 @@ def product(x, w, PRECISION: tl.constexpr, total=None):
     elif PRECISION == "tf32":
         result = tl.dot(nearest_tf32(x.to(tl.float32)), w, total, input_precision="tf32")
     else:
-        result = tl.dot(x.to(tl.float32), w.to(tl.float32), total, input_precision="ieee")
+        result = tl.dot(x.to(tl.float32), w.to(tl.float32), total, input_precision=FP32_PRODUCT)
     return result
 
 
@@ -69,7 +71,7 @@ def weighted_sums(w, x, PRECISION: tl.constexpr):
     elif PRECISION == "tf32":
         result = tl.dot(nearest_tf32(w), nearest_tf32(x), input_precision="tf32")
     else:
-        result = tl.dot(w, x, input_precision="ieee")
+        result = tl.dot(w, x, input_precision=FP32_PRODUCT)
     return result
 
 

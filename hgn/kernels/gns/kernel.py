@@ -15,6 +15,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import (
+    FP32_PRODUCT,
     column_sums,
     inside,
     matrix,
@@ -416,7 +417,7 @@ def _weight_product(left, right, count, partial, WIDTH: tl.constexpr, STEP: tl.c
         elif PRECISION == "tf32":
             total = tl.dot(tl.trans(nearest_tf32(a)), nearest_tf32(b), total, input_precision="tf32")
         else:
-            total = tl.dot(tl.trans(a), b, total, input_precision="ieee")
+            total = tl.dot(tl.trans(a), b, total, input_precision=FP32_PRODUCT)
         block += tl.num_programs(0) * STEP
     tl.store(partial + tl.arange(0, WIDTH)[:, None] * WIDTH + column[None, :], total)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.blocks import column_sums, settled
+from hgn.kernels.blocks import FP32_PRODUCT, column_sums, settled
 from hgn.kernels.triton_compat import settle_keys
 
 JOB_COLUMNS = 8
@@ -65,7 +65,7 @@ def weight_gradient(
         elif PRECISION == "tf32":
             total = tl.dot(tl.trans(a), b, total, input_precision="tf32")
         else:
-            total = tl.dot(tl.trans(a), b, total, input_precision="ieee")
+            total = tl.dot(tl.trans(a), b, total, input_precision=FP32_PRODUCT)
         if PIPELINED:
             total = settled(total)
     bias_at = tl.load(job + 7)

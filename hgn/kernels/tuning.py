@@ -1,0 +1,110 @@
+"""How many rows and warps the programs of HGN's kernels have, and how many programs run at once on an H100.
+
+They change how fast, never what.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import triton
+
+from hgn.kernels.triton_compat import interpreting
+
+PROCESSORS = 132  # an H100's
+RESIDENT_PROGRAMS = 2 * PROCESSORS
+FEW_ROWS = 64 * PROCESSORS
+LIGHT_BLOCK = (64, 4)  # rows and warps of a program that keeps two weights, of which two fit on a processor
+
+
+def many(rows: int) -> bool:
+    """Whether so many rows keep all processors busy with large tiles."""
+    return rows >= FEW_ROWS
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Rows and warps of a program."""
+
+    cell_block: int  # cells of a tile of edges, eight rows each
+    cell_warps: int
+    few_cell_block: int  # the same on a level of few cells
+    few_cell_warps: int
+    row_block: int
+    row_warps: int
+    row_backward_warps: int
+    pair_particles: int  # eight rows each, at most 13
+    pair_warps: int
+    few_cells: int = 0  # up to which a level's cells are few
+    small_block: int = 16  # where there are few rows
+    small_warps: int = 8
+    dense: bool = False  # six rows a cell in the tiles of edges, not eight
+    overlap: bool = False  # kernels of a message step read their weights before their turn
+    prefetch: bool = False  # where there are many rows, the next tile's are brought to the L2 cache on the way forward
+    loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
+    gather_block: int = 0  # of a kernel for the sums of many rows' neighbours; 0: whoever needs them makes them
+    cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
+    cell_backward_warps: int = 8
+    half_cells: bool = False  # cells too are rounded between kernels, as edges are
+    # And particles are added to them rounded, half the traffic of the L2 cache: in training only the pairs' gradients.
+    half_sums: bool = False
+    light_programs: int = 2  # on a processor, of kernels with one weight: pairs forward, edges of a first iteration
+    light_registers: int | None = None  # of a thread, so that as many fit
+    weight_registers: int | None = None  # of a thread of the weights' products: 128 for two programs on a processor
+
+    @staticmethod
+    def of(precision: str) -> Tuning:
+        """What was fastest on an H100 at width 128."""
+        if precision == "fp32":
+            return Tuning(8, 4, 8, 4, 16, 4, 4, 2, 4, 1056, dense=True, loops=True, gather_block=16)
+        if precision == "tf32":  # operands of twice the size
+            return Tuning(8, 8, 4, 8, 64, 8, 8, 8, 8, 528)
+        half = Tuning(8, 4, 2, 4, 128, 8, 8, 8, 4, 1056, dense=True, overlap=True, loops=True)
+        return replace(
+            half,
+            light_programs=3,
+            light_registers=168,
+            gather_block=16,
+            cell_backward_block=64,
+            cell_backward_warps=4,
+            weight_registers=128,
+            prefetch=True,
+            half_cells=True,
+            half_sums=True,
+        )
+
+    def row_tile(self, rows: int, backward: bool = False) -> tuple[int, int]:
+        """Rows and warps of a program over so many rows."""
+        if not many(rows):
+            return self.small_block, self.small_warps
+        return self.row_block, self.row_backward_warps if backward else self.row_warps
+
+    def edge_tile(self, cells: int) -> tuple[int, int]:
+        """Cells and warps of a tile of edges: small tiles where there would be few."""
+        few = cells <= self.few_cells
+        return (self.few_cell_block, self.few_cell_warps) if few else (self.cell_block, self.cell_warps)
+
+    def edge_cells(self, block: int) -> int:
+        """Cells that a tile of edges takes where it has rows for `block` of eight each."""
+        return 8 * block // 6 if self.dense else block
+
+    def gathers(self, rows: int) -> bool:
+        """Whether sums of so many rows' neighbours have a kernel of their own."""
+        return self.gather_block > 0 and many(rows)
+
+    def prefetches(self, rows: int) -> bool:
+        """Whether the kernels on so many rows bring the next tile's to the L2 cache: an instruction of the GPU's."""
+        return self.prefetch and many(rows) and not interpreting()
+
+    def loops_over(self, rows: int, block: int, least: int = 1) -> bool:
+        """Whether a program keeps all its weights and takes one block after the other, where each has `least`."""
+        return self.loops and many(rows) and rows >= (least - 1) * PROCESSORS * block
+
+    def row_programs(self, rows: int, block: int, loops: bool, at_once: int = 1) -> tuple[int]:
+        """Those that keep their weights fill a processor's shared memory each, or an `at_once`-th of it."""
+        programs = triton.cdiv(rows, block)
+        return (min(programs, PROCESSORS * at_once) if loops else programs,)
+
+    def programs(self, rows: int, block: int, at_once: int = 2) -> tuple[int]:
+        """Programs that take one block after the other: as many as run at once, `at_once` on a processor."""
+        return (min(triton.cdiv(rows, block), RESIDENT_PROGRAMS * at_once // 2),)

@@ -1,0 +1,57 @@
+"""What Triton makes of a small training's kernels for an H100, a line each: CANARY and what of Triton's interface held,
+PRODUCT, kernel, tiles copied ahead and products under way meanwhile, HAZARDS, kernel, precision and their number."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import torch
+import triton
+import triton.language as tl
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "training"))
+
+from no_gpu import use_h100
+from ptx import hazards, overwritten_tiles
+
+from hgn.config import NetworkConfig
+from hgn.kernels import triton_compat
+from hgn.kernels.precompile import PrecompileJob, launches_of
+from hgn.kernels.update.op import UpdateSettings
+
+
+@triton.jit
+def _copy(x, y, SIZE: tl.constexpr, PRECISION: tl.constexpr):
+    tl.store(y + tl.arange(0, SIZE), tl.load(x + tl.arange(0, SIZE)))
+
+
+use_h100()
+misses = triton_compat.JitMisses()
+with triton_compat.noted_launches() as launches:
+    _copy[(1,)](x=torch.zeros(16, device="meta"), y=torch.zeros(16, device="meta"), SIZE=16, PRECISION="fp16")
+((function, data),) = launches.values()
+assert misses.count == 0 and triton_compat.capability() == 90 and not triton_compat.interpreting()
+kernel = triton_compat.preload(function, data)
+assert misses.count == 1 and misses.seconds > 0, "Triton tells of no compilation"
+triton_compat.build_launcher(kernel)
+assert "st.global" in kernel.asm["ptx"] and kernel.metadata.target.arch == 90
+print("CANARY", function.__name__, flush=True)
+
+settings = UpdateSettings(2, 1e-3, True, 1 / 64)
+network = NetworkConfig(levels=1, message_passing_steps=1)
+for precision in ("fp16", "tf32"):
+    seen = set()
+    job = PrecompileJob(network, settings, precision, False, False, 9000, (9000,), 90)
+    for function, data in launches_of(job).values():
+        name = function.__name__
+        many_warps = json.loads(data)["options"]["num_warps"] > 4
+        if name.endswith("weight_gradient") if precision == "fp16" else many_warps and name not in seen:
+            seen.add(name)
+            asm = triton_compat.preload(function, data).asm
+            if "wgmma" not in asm["ptx"]:
+                continue
+            if name.endswith("weight_gradient") and precision == "fp16":
+                print("PRODUCT", name, *overwritten_tiles(asm["ttgir"]))
+            print("HAZARDS", name, precision, len(hazards(asm["ptx"])), flush=True)

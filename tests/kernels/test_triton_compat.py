@@ -1,0 +1,81 @@
+"""Triton beyond its documented interface: the versions that are taken, and what this one makes of the kernels."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from kernels.ptx import hazards
+
+from hgn.kernels.triton_compat import TESTED_VERSIONS, unsupported_reason
+
+CHECKOUT = Path(__file__).parents[2]
+# Read: what is written there is not what a product reads, which lies 32 KB below.
+SAFE = {("particle_cell_backward", "tf32")}
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
+    """Of compiled_program.py, by words."""
+    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
+    environment |= {"TRITON_CACHE_DIR": str(tmp_path_factory.mktemp("triton")), "PYTHONPATH": str(CHECKOUT)}
+    command = [sys.executable, str(Path(__file__).with_name("compiled_program.py"))]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return [line.split() for line in done.stdout.splitlines()]
+
+
+def test_versions_that_were_not_read_are_refused() -> None:
+    """The installed Triton is taken; older and newer ones, and AMD's GPUs, are named as the reason; the ceiling in
+    pyproject.toml is the list's."""
+    assert unsupported_reason() is None and unsupported_reason("3.6.0") is None
+    assert unsupported_reason("3.10.0") == "Triton must be 3.6 to 3.9 for it, not 3.10.0"
+    assert "not 3.5.1" in str(unsupported_reason("3.5.1")) and "NVIDIA" in str(unsupported_reason(hip="6.2"))
+    (ceiling,) = re.findall(r'"triton>=3\.(\d+),<3\.(\d+);', (CHECKOUT / "pyproject.toml").read_text())
+    assert [f"3.{minor}" for minor in range(int(ceiling[0]), int(ceiling[1]))] == list(TESTED_VERSIONS)
+
+
+def test_the_interface_is_as_it_was(lines: list[list[str]]) -> None:
+    """Launches can be noted without being made, compiled by what was noted, and the compilation is told of."""
+    assert ["CANARY", "_copy"] in lines
+
+
+def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines: list[list[str]]) -> None:
+    """Of the weights' products tiles are copied to shared memory ahead, and each product is over before the next copy:
+    the compiler keeps too few buffers for one that is under way meanwhile."""
+    products = [line[1:] for line in lines if line[0] == "PRODUCT"]
+    assert {kernel for kernel, _, _ in products} == {"weight_gradient", "particle_cell_weight_gradient"}
+    assert all(int(ahead) >= 2 and int(pending) == 0 for _, ahead, pending in products), products
+
+
+def test_no_group_overwrites_what_another_still_multiplies(lines: list[list[str]]) -> None:
+    """Kernels of eight warps have a barrier between a product and the next write to shared memory, for Triton's wait
+    for products holds four warps alone; but where what is written is nothing that is multiplied."""
+    scanned = [line[1:] for line in lines if line[0] == "HAZARDS"]
+    assert {kernel for kernel, _, _ in scanned} >= {
+        "weight_gradient",
+        "mlp_forward",
+        "edge_forward",
+        "edge_backward",
+        "cell_mlp_backward",
+    }
+    assert {(kernel, precision) for kernel, precision, count in scanned if int(count)} <= SAFE, scanned
+
+
+@pytest.mark.parametrize(("between", "count"), [("bar.sync 0;", 0), ("add.s32 %r1, %r1, 1;", 1)])
+def test_a_missing_barrier_is_seen(between: str, count: int) -> None:
+    """Also behind a branch back, where the write stands before the wait."""
+    ptx = f""".reqntid 256
+    $L__BB0_1:
+    st.shared.b32 [%r1], %r2;
+    bar.sync 0;
+    wgmma.wait_group.sync.aligned 0;
+    {between}
+    @%p1 bra $L__BB0_1;
+    ret;
+    """
+    assert len(hazards(ptx)) == count and not hazards(ptx.replace("256", "128"))
