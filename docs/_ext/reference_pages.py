@@ -13,29 +13,34 @@ import tokenize
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 ROOT = Path(__file__).resolve().parents[2]
-SOURCE = ROOT / "hgn" / "config.py"
+CONF = ROOT / "conf"
+CONFIG = ROOT / "hgn" / "config.py"
 GENERATED = ROOT / "docs" / "_generated"
 
 
-def configuration_page(source: str) -> str:
-    """Markdown: a section and a table for each dataclass, its fields in order, with the comments beside them."""
-    tree = ast.parse(source)
-    lines, comments = source.splitlines(), _comments(source)
+def configuration_page() -> str:
+    """Markdown: a section and a table for each dataclass of hgn/config.py."""
     parts = []
-    for node in tree.body:
-        if not isinstance(node, ast.ClassDef) or not any("dataclass" in ast.unparse(d) for d in node.decorator_list):
-            continue
-        rows = [
-            "| field | type | default | what |",
-            "|---|---|---|---|",
-        ]
-        for item in node.body:
-            if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name):
-                rows.append(_row(item, _comment_of(item, lines, comments)))
-        text = " ".join((ast.get_docstring(node) or "").split("\n\n")[0].split())
-        parts.append(f"## {node.name}\n\n{text}\n\n" + "\n".join(rows) + "\n")
+    for node in ast.parse(CONFIG.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ClassDef) and any("dataclass" in ast.unparse(d) for d in node.decorator_list):
+            text = " ".join((ast.get_docstring(node) or "").split("\n\n")[0].split())
+            parts.append(f"## {node.name}\n\n{text}\n\n{fields_table(CONFIG, node.name)}")
     return "\n".join(parts)
+
+
+def fields_table(path: Path, name: str) -> str:
+    """The fields of a dataclass in a file, in order: types, defaults, and the comments beside them."""
+    source = path.read_text(encoding="utf-8")
+    lines, comments = source.splitlines(), _comments(source)
+    (node,) = [n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == name]
+    rows = ["| field | type | default | what |", "|---|---|---|---|"]
+    for item in node.body:
+        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name):
+            rows.append(_row(item, _comment_of(item, lines, comments)))
+    return "\n".join(rows) + "\n"
 
 
 def _row(item: ast.AnnAssign, comment: str) -> str:
@@ -75,22 +80,40 @@ def command_names() -> dict[str, tuple[Path, list[str]]]:
 
 
 def commands_page() -> str:
-    """Markdown: a section for each command, with its module's docstring and the file of its settings."""
+    """Markdown: a section for each command, with its module's docstring and its settings."""
     parts = []
     for name, (path, configurations) in command_names().items():
         text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
         parts.append(f"## {name}\n\n```text\n{text}\n```\n")
-        for configuration in configurations:
-            file = ROOT / "conf" / "command" / f"{configuration}.yaml"
-            if file.is_file():
-                parts.append(f"```yaml\n{file.read_text(encoding='utf-8')}```\n")
+        parts += [_settings(configuration) for configuration in configurations]
     return "\n".join(parts)
+
+
+def _settings(configuration: str) -> str:
+    """The settings of a command: the fields of its dataclass, or where they stand, and what its own file changes."""
+    (file,) = [
+        path for path in (CONF / f"{configuration}.yaml", CONF / "command" / f"{configuration}.yaml") if path.is_file()
+    ]
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    parts = []
+    for default in content.pop("defaults", []):
+        if isinstance(default, dict):
+            ((group, choice),) = default.items()
+            parts.append(f"- `{group}`: {choice}, of `conf/{group}`")
+        elif "." in default:
+            module, _, name = default.rpartition(".")
+            source = ROOT / f"{module.replace('.', '/')}.py"
+            linked = source == CONFIG
+            parts.append(f"[{name}](configuration.md#{name.lower()})" if linked else fields_table(source, name))
+    if content:
+        parts.append(f"\n```yaml\n{yaml.safe_dump(content, sort_keys=False, allow_unicode=True)}```")
+    return "Settings:\n\n" + "\n".join(parts) + "\n"
 
 
 def _write(_: Any) -> None:
     GENERATED.mkdir(exist_ok=True)
     pages = {
-        "configuration.md": configuration_page(SOURCE.read_text(encoding="utf-8")),
+        "configuration.md": configuration_page(),
         "commands.md": commands_page(),
     }
     for name, page in pages.items():

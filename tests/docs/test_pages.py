@@ -18,6 +18,10 @@ from hgn.hydra_compat import registered_dataclasses
 COLUMNS = 100
 README_LINES, README_COMMANDS, ENTRY_LINES = 130, 12, 2
 PAGES = markdown_files()
+_PLACES = {page: page.relative_to(ROOT).parts for page in PAGES}
+# README and docs/ but for the pages of what was: they keep the names of their day
+OWN_PAGES = [page for page, place in _PLACES.items() if place[0] == "README.md"]
+OWN_PAGES += [page for page, place in _PLACES.items() if place[0] == "docs" and place[1] not in ("log", "results")]
 CODE = re.compile(r"`[^`]+`")
 LINK = re.compile(r"!?\[(?:[^\]\\]|\\.)*\]\(([^)\s]+)\)")
 ADDRESS = re.compile(r"\S*(?:https?://|s3://)\S*")
@@ -65,7 +69,7 @@ def test_links_lead_somewhere(page: Path) -> None:
                 assert anchor in anchors(file), f"{page.relative_to(ROOT)}:{number}: {target}, of {anchors(file)}"
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.is_relative_to(ROOT / "docs")] + [ROOT / "README.md"])
+@pytest.mark.parametrize("page", OWN_PAGES)
 def test_paths_exist(page: Path) -> None:
     """Each path of the checkout that a page names in code is there."""
     for number, line in prose_lines(page):
@@ -76,9 +80,7 @@ def test_paths_exist(page: Path) -> None:
 def test_names_exist() -> None:
     """What a page says to be in a file is there: "`NAME` in `FILE`", and names in brackets behind a file of tests."""
     checked = 0
-    for page in (
-        page for page in PAGES if page.is_relative_to(ROOT / "docs") and "log" not in page.relative_to(ROOT).parts
-    ):
+    for page in OWN_PAGES:
         text = "\n".join(line for _, line in prose_lines(page))
         pairs = [(name, file) for names, file in NAMES_IN.findall(text) for name in re.findall(r"`([\w.]+)`", names)]
         pairs += [(name, file) for file, names in TESTS_IN.findall(text) for name in re.findall(r"`(\w+)`", names)]
@@ -93,13 +95,30 @@ def test_names_exist() -> None:
         assert all(f"def {name}(" in sources for name in re.findall(r"`(\w+)`", kernels)), row
 
 
+def test_settings_exist() -> None:
+    """Each setting that README and docs/ name by its group is a field of it."""
+    groups = {
+        "scene": config.SceneConfig,
+        "mpm": config.MpmConfig,
+        "dataset": config.DatasetConfig,
+        "network": config.NetworkConfig,
+        "training": config.TrainingConfig,
+    }
+    checked = 0
+    for page in OWN_PAGES:
+        for code in CODE.findall("\n".join(line for _, line in prose_lines(page))):
+            for group, name in re.findall(r"(?<![\w./])(scene|mpm|dataset|network|training)\.([a-z]\w*)", code):
+                if name not in ("py", "md", "yaml"):
+                    fields = [field.name for field in dataclasses.fields(groups[group])]
+                    assert name in fields, f"{page.relative_to(ROOT)}: {group}.{name}"
+                    checked += 1
+    assert checked > 20
+
+
 def commands() -> list[tuple[str, str]]:
     """Each `python -m` line of README and docs/, in blocks and in code within lines, with its place."""
     found = []
-    for page in PAGES:
-        folders = page.relative_to(ROOT).parts
-        if folders[0] not in ("README.md", "docs") or {"log", "results"} & set(folders):
-            continue
+    for page in OWN_PAGES:
         for block in blocks_of(page):
             found += [(str(block), line) for line in _commands_of(block)]
         for number, line in prose_lines(page):
@@ -168,7 +187,7 @@ def test_every_command_is_listed() -> None:
     parents = {name.removesuffix(".network") for name in reference_pages.command_names()}  # tools.stability network
     assert listed == parents
 
-    text = reference_pages.configuration_page((ROOT / "hgn" / "config.py").read_text())
+    text = reference_pages.configuration_page()
     for cls in (config.SceneConfig, config.MpmConfig, config.TrainingConfig, config.EvaluateConfig):
         section = text.split(f"## {cls.__name__}\n")[1].split("\n## ")[0]
         assert re.findall(r"^\| `(\w+)`", section, re.MULTILINE) == [field.name for field in dataclasses.fields(cls)]
