@@ -106,7 +106,8 @@ def _settings(configuration: str) -> str:
             linked = source == CONFIG
             parts.append(f"[{name}](configuration.md#{name.lower()})" if linked else fields_table(source, name))
     if content:
-        parts.append(f"\nIn its own file:\n\n```yaml\n{yaml.safe_dump(content, sort_keys=False, allow_unicode=True)}```")
+        text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        parts.append(f"\nIn its own file:\n\n```yaml\n{text}```")
     return "Settings:\n\n" + "\n".join(parts) + "\n"
 
 
