@@ -1,1 +1,42 @@
-"""Hierarchical graph networks for learned particle physics."""
+"""Hierarchical graph networks for learned particle physics.
+
+What a program of one's own needs is here by name (`from hgn import Simulator, load_scene`) and loads when it is first
+asked for: `import hgn` alone loads neither torch nor NumPy.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hgn.runtime.simulator import DivergenceError as DivergenceError
+    from hgn.runtime.simulator import Simulator as Simulator
+    from hgn.scene.mesh import load_mesh as load_mesh
+    from hgn.scene.rollout_file import Rollout as Rollout
+    from hgn.scene.rollout_file import read_rollout as read_rollout
+    from hgn.scene.rollout_file import write_rollout as write_rollout
+    from hgn.scene.scene import Obstacle as Obstacle
+    from hgn.scene.scene import Scene as Scene
+    from hgn.scene.scene_file import load_scene as load_scene
+    from hgn.schema import ConfigError as ConfigError
+
+_MODULES = {
+    "ConfigError": "hgn.schema",
+    "DivergenceError": "hgn.runtime.simulator",
+    "Obstacle": "hgn.scene.scene",
+    "Rollout": "hgn.scene.rollout_file",
+    "Scene": "hgn.scene.scene",
+    "Simulator": "hgn.runtime.simulator",
+    "load_mesh": "hgn.scene.mesh",
+    "load_scene": "hgn.scene.scene_file",
+    "read_rollout": "hgn.scene.rollout_file",
+    "write_rollout": "hgn.scene.rollout_file",
+}
+__all__ = list(_MODULES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

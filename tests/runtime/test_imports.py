@@ -8,9 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 from network.states import network_of
 
+import hgn
 from hgn.runtime.weights import WeightsInfo, save_weights
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,13 +31,23 @@ TRAINING_STACK = (
 )
 PROGRAM = """
 import json, sys
-from pathlib import Path
-from hgn.runtime.simulator import Simulator
-from hgn.scene.scene_file import load_scene
+import hgn
+assert not {"torch", "numpy"} & sys.modules.keys()
+from hgn import Simulator, load_scene
 
 (path,) = Simulator.load(sys.argv[1]).rollout([load_scene(sys.argv[2])], 3)
 print(json.dumps({"shape": path.shape, "modules": sorted(sys.modules)}))
 """
+
+
+def test_public_names() -> None:
+    """What the package offers by name is what its modules have, told to type checkers too; another name is refused."""
+    text = Path(hgn.__file__).read_text()
+    for name in hgn.__all__:
+        value = getattr(hgn, name)
+        assert value.__name__ == name and f"from {value.__module__} import {name} as {name}\n" in text
+    with pytest.raises(AttributeError, match="no attribute 'simulator'"):
+        hgn.simulator  # noqa: B018
 
 
 def test_simulating_loads_no_training_stack(tmp_path: Path) -> None:
