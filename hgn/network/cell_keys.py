@@ -11,6 +11,7 @@ import torch
 COORDINATE_BITS = 17
 COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1)  # cells run from -limit to limit - 1 on each axis
 SCENE_LIMIT = 1 << (63 - 3 * COORDINATE_BITS)
+HASH_PRIMES = (73856093, 19349663, 83492791)  # of x, y, z (Teschner et al. 2003); products stay far below 2^63
 AXIS_STRIDE = (1 << (2 * COORDINATE_BITS), 1 << COORDINATE_BITS, 1)  # key difference of neighbours in x, y, z
 
 

@@ -14,12 +14,17 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.triton_compat import settle_keys
+from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES
+from hgn.scene.symmetry import CELL_BITS
 
 GEOMETRY_COLUMNS = tl.constexpr(8)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 OVERFLOW = tl.constexpr(1)  # more active cells than capacity
 OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
-CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
+CODE_BITS = tl.constexpr(3 + CELL_BITS)  # of an axis in a symmetry's code: where it comes from, whether mirrored, cells
+CODE_MASK = tl.constexpr((1 << CELL_BITS) - 1)  # of the cells
+LIMIT = tl.constexpr(COORDINATE_LIMIT)
+PRIME_X, PRIME_Y, PRIME_Z = (tl.constexpr(prime) for prime in HASH_PRIMES)
 
 
 @triton.jit
@@ -224,9 +229,8 @@ def fill_tables(
 @triton.jit
 def _find_obstacle(x, y, z, line, live):
     """Row of the obstacle cell (x, y, z) in its scene's hash table, -1 where there is none."""
-    key = ((x + 65536) * 131072 + y + 65536) * 131072 + z + 65536
-    # products stay far below 2^63
-    mixed = (x + 65536) * 73856093 ^ (y + 65536) * 19349663 ^ (z + 65536) * 83492791
+    key = ((x + LIMIT) * (2 * LIMIT) + y + LIMIT) * (2 * LIMIT) + z + LIMIT
+    mixed = (x + LIMIT) * PRIME_X ^ (y + LIMIT) * PRIME_Y ^ (z + LIMIT) * PRIME_Z
     place = (mixed ^ mixed >> 15) & tl.load(line + 3, mask=live, other=0)
     bucket = tl.load(line, mask=live, other=0).to(tl.pointer_type(tl.int32))
     entry_key = tl.load(line + 1, mask=live, other=0).to(tl.pointer_type(tl.int64))
@@ -246,7 +250,7 @@ def _find_obstacle(x, y, z, line, live):
 def _before_mirror(cell, symmetry, axis: tl.constexpr):
     """A cell's coordinate, in floats, from before the symmetry mirrored this axis."""
     part = symmetry >> CODE_BITS * axis
-    last = (part >> 3 & 131071).to(tl.float32) - 1
+    last = (part >> 3 & CODE_MASK).to(tl.float32) - 1
     return tl.where((part >> 2 & 1) == 1, last - cell, cell)
 
 
@@ -308,7 +312,7 @@ def _store_features(
             ox = _from_axis(ix, iy, iz, symmetry, 0)
             oy = _from_axis(ix, iy, iz, symmetry, 1)
             oz = _from_axis(ix, iy, iz, symmetry, 2)
-        near = live & (tl.abs(ox) < 65536.0) & (tl.abs(oy) < 65536.0) & (tl.abs(oz) < 65536.0)
+        near = live & (tl.abs(ox) < LIMIT) & (tl.abs(oy) < LIMIT) & (tl.abs(oz) < LIMIT)
         ox = tl.where(near, ox, 0.0).to(tl.int64)
         oy = tl.where(near, oy, 0.0).to(tl.int64)
         oz = tl.where(near, oz, 0.0).to(tl.int64)

@@ -14,16 +14,14 @@ import triton
 
 from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting
-from hgn.network.cell_keys import SCENE_LIMIT, unpack
+from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES, SCENE_LIMIT, pack, unpack
 from hgn.network.obstacles import ObstacleCells
 
 MARK_BLOCK = 128
 FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
 MARGIN_CELLS = 4  # of a window, around what it must hold
-OBSTACLE_COLUMNS = 5
-OVERFLOW = 1
-OUT_OF_WINDOW = 2
-NOT_FINITE = 4  # set by whoever integrates or updates
+OBSTACLE_COLUMNS = kernel.OBSTACLE_COLUMNS.value
+OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
 
 
 @dataclass(frozen=True)
@@ -68,13 +66,14 @@ class ObstacleHash:
         """Of cells int [K, 3] with normals [K, 3], on their device."""
         count = len(cell_K3)
         mask = (1 << max(4, math.ceil(math.log2(2 * max(count, 1))))) - 1
-        x, y, z = (cell_K3.long() + 65536).unbind(-1)
-        mixed = x * 73856093 ^ y * 19349663 ^ z * 83492791
+        shifted_K3 = cell_K3.long() + COORDINATE_LIMIT
+        x, y, z = (shifted_K3 * torch.tensor(HASH_PRIMES, device=shifted_K3.device)).unbind(-1)
+        mixed = x ^ y ^ z
         place_K = (mixed ^ mixed >> 15) & mask
         order = torch.argsort(place_K, stable=True)
         size_B = torch.bincount(place_K, minlength=mask + 1)
         bucket_B = torch.cat([size_B.new_zeros(1), size_B.cumsum(0)]).int()
-        key_K = (x * 131072 + y) * 131072 + z
+        key_K = pack(torch.zeros_like(place_K), cell_K3.long())
         return ObstacleHash(bucket_B, key_K[order].contiguous(), normal_K3[order].float().contiguous())
 
     def to(self, device: torch.device) -> ObstacleHash:

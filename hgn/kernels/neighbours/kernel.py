@@ -11,10 +11,11 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.triton_compat import settle_keys
+from hgn.network import cell_keys, neighbours
 
-COORDINATE_BITS = tl.constexpr(17)
-COORDINATE_LIMIT = tl.constexpr(65536)
-REACH = tl.constexpr(2)  # hgn.network.neighbours.REACH
+COORDINATE_BITS = tl.constexpr(cell_keys.COORDINATE_BITS)
+COORDINATE_LIMIT = tl.constexpr(cell_keys.COORDINATE_LIMIT)
+REACH = tl.constexpr(neighbours.REACH)
 RUNS = tl.constexpr(25)
 BEHIND = tl.constexpr(0x7FFFFFFFFFFFFFFF)  # the key of rows without a particle
 OVERFLOW = tl.constexpr(1)  # more edges than there is room for
@@ -22,7 +23,7 @@ OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or too far from the 
 
 
 @triton.jit
-def cell_keys(position, scene_of, particle_count, key, status, size, particles, BLOCK: tl.constexpr):
+def pack_cells(position, scene_of, particle_count, key, status, size, particles, BLOCK: tl.constexpr):
     """key [N], int64, of each particle's cell; rows beyond particle_count come behind all.
 
     Reference: hgn.network.neighbours.neighbour_list; test: tests/kernels/test_neighbours.py.

@@ -49,7 +49,7 @@ class DeviceNeighbours:
     ) -> None:
         """Of the first `count` particles, int32 [1]. There is no grid for an origin to move."""
         list_, receivers, capacity = self.neighbours, self.neighbours.receivers, self.capacity
-        kernel.cell_keys[(triton.cdiv(self.particles, KEY_BLOCK),)](
+        kernel.pack_cells[(triton.cdiv(self.particles, KEY_BLOCK),)](
             position=position_N3,
             scene_of=scene_N,
             particle_count=count,

@@ -13,11 +13,10 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import nearest_tf32
+from hgn.kernels.grid.kernel import CODE_BITS, CODE_MASK, OBSTACLE_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
 
 SAMPLE_COLUMNS = tl.constexpr(12)
-OBSTACLE_COLUMNS = tl.constexpr(5)
-CODE_BITS = tl.constexpr(20)  # of an axis in a symmetry's code
 JITTER_OFFSET = tl.constexpr(0x7FFFFFF0)  # in the seed's stream, far from the noise
 WAVES_OFFSET = tl.constexpr(0x7FFFF000)  # of the smooth noise
 REPEAT = tl.constexpr(8)  # another rank must repeat the update
@@ -181,7 +180,7 @@ def assemble_batch(
         step = tl.load(column + (HISTORY + 1) * frame, mask=live, other=0.0) - before
         if SYMMETRY:
             step = tl.where(mirrored, -step, step)
-            mirror_sum = (part >> 3 & 131071).to(tl.float32) * obstacle_cell_size
+            mirror_sum = (part >> 3 & CODE_MASK).to(tl.float32) * obstacle_cell_size
             before = tl.where(mirrored, mirror_sum - before, before)
         tl.store(position + row * 3 + axis, before + moved, mask=live)
         acceleration = step - v
