@@ -6,6 +6,8 @@ Shape legend: N particles, C cells, W width.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 
@@ -24,6 +26,47 @@ from hgn.kernels.weight_gradient.kernel import JOB_COLUMNS, weight_gradient
 
 CHUNK_ROWS = (512, 2048)  # of a program of the weights' products: where there are few rows, and many
 MANY_ROWS = 16384
+
+
+@dataclass(frozen=True)
+class MLPGradients:
+    """Of an MLP's hidden layer before its activation, and of its second layer's output."""
+
+    hidden: torch.Tensor
+    output: torch.Tensor
+
+
+@dataclass(frozen=True)
+class PairGradients:
+    """Of the pairs' second layer's output [8 N, W], and of what the particles give to the first [N, W]."""
+
+    output: torch.Tensor
+    by_particle: torch.Tensor
+
+
+@dataclass(frozen=True)
+class StepGradients:
+    """Of a message-passing iteration: its edges' MLP [C, 6, W], its cells', and their products for the edges [C, W]."""
+
+    edge: MLPGradients
+    cell: MLPGradients
+    send: torch.Tensor
+    receive: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """What the weights' products read of the backward pass; lists are over levels, finest first, and iterations."""
+
+    encode: MLPGradients
+    decode: MLPGradients
+    particle_to_cell: PairGradients
+    cell_to_particle: PairGradients
+    down: list[list[StepGradients]]
+    up: list[list[StepGradients]]
+    product: list[torch.Tensor]  # what each level's last block gives to who follows [C, W]
+    fine_to_coarse: list[MLPGradients]
+    coarse_to_fine: list[MLPGradients]
 
 
 class FusedTrainingNetwork(FusedNetwork):
@@ -50,7 +93,7 @@ class FusedTrainingNetwork(FusedNetwork):
         self._allocate_gradients(tail)
 
     def _allocate_gradients(self, tail: int) -> None:
-        width, grid, steps = self.width, self.grid, self.config.message_passing_steps
+        width, grid = self.width, self.grid
         particles, capacities = grid.particles, grid.capacities
         self.totals = self._float(self.packed.size + width * grid.features + tail)
         self.output_gradient = self._float(particles, OUT)
@@ -61,36 +104,51 @@ class FusedTrainingNetwork(FusedNetwork):
         self.cell_gradient_down = [self._float(c, width) for c in capacities]
         self.edge_gradient = self._operand(capacities[0], 6, width)
         self.sum_gradient = self._operand(capacities[0], width)
-        # what the weight products read: the gradients in one arena, so that one launch can reach them all
-        shapes: dict[str, tuple[int, ...]] = {
-            "encode_h": (particles, width),
-            "encode_z": (particles, width),
-            "decode_h": (particles, width),
-            "decode_z": (particles, OUT),
-            "down_z": (8 * particles, width),
-            "up_z": (8 * particles, width),
-            "down_p": (particles, width),
-            "up_p": (particles, width),
-        }
-        for block, name in self._named_blocks():
-            capacity = capacities[block.level]
-            for m in range(steps):
-                shapes |= {f"{name}{m}_eh": (capacity, 6, width), f"{name}{m}_ez": (capacity, 6, width)}
-                shapes |= {f"{name}{m}_{key}": (capacity, width) for key in ("ch", "cz", "s", "r")}
-        for i in range(self.config.levels):
-            shapes |= {f"product{i}": (capacities[i], width)}
-        for i in range(self.config.levels - 1):
-            shapes |= {f"{key}{i}": (capacities[i], width) for key in ("fc_h", "fc_z", "cf_h", "cf_z")}
-        self.left = self._operand(sum(torch.Size(shape).numel() for shape in shapes.values()))
-        views = self.left.split([torch.Size(shape).numel() for shape in shapes.values()])
-        self.g = {name: view.view(shape) for (name, shape), view in zip(shapes.items(), views, strict=True)}
+        # what the weights' products read lies in one arena, so that one launch can reach it all
+        sizes: list[int] = []
+        self._gradients(lambda *shape: self._sized(sizes, shape))
+        self.left = self._operand(sum(sizes))
+        views = iter(self.left.split(sizes))
+        self.g = self._gradients(lambda *shape: next(views).view(shape))
         self._plan_weight_gradients()
 
-    def _named_blocks(self) -> list[tuple[Block, str]]:
-        return [(b, f"down{b.level}_") for b in self.down] + [(b, f"up{b.level}_") for b in self.up]
+    @staticmethod
+    def _sized(sizes: list[int], shape: tuple[int, ...]) -> torch.Tensor:
+        sizes.append(torch.Size(shape).numel())
+        return torch.empty(0)
+
+    def _gradients(self, take: Callable[..., torch.Tensor]) -> Gradients:
+        """All gradients that the weights' products read, each a piece that `take` makes of a shape."""
+        width, grid, steps = self.width, self.grid, self.config.message_passing_steps
+        particles, capacities = grid.particles, grid.capacities
+
+        def mlp(count: int, out: int = width) -> MLPGradients:
+            return MLPGradients(take(count, width), take(count, out))
+
+        def pairs() -> PairGradients:
+            return PairGradients(take(8 * particles, width), take(particles, width))
+
+        def step(count: int) -> StepGradients:
+            edge = MLPGradients(take(count, 6, width), take(count, 6, width))
+            return StepGradients(edge, mlp(count), take(count, width), take(count, width))
+
+        return Gradients(
+            encode=mlp(particles),
+            decode=mlp(particles, OUT),
+            particle_to_cell=pairs(),
+            cell_to_particle=pairs(),
+            down=[[step(count) for _ in range(steps)] for count in capacities],
+            up=[[step(count) for _ in range(steps)] for count in capacities[:-1]],
+            product=[take(count, width) for count in capacities],
+            fine_to_coarse=[mlp(count) for count in capacities[:-1]],
+            coarse_to_fine=[mlp(count) for count in capacities[:-1]],
+        )
+
+    def _blocks_of_steps(self) -> list[tuple[Block, list[StepGradients]]]:
+        return [*zip(self.down, self.g.down, strict=True), *zip(self.up, self.g.up, strict=True)]
 
     def _plan_weight_gradients(self) -> None:
-        packed, grid, steps = self.packed, self.grid, self.config.message_passing_steps
+        packed, grid = self.packed, self.grid
         particles = grid.levels  # row of the counts table
         self.counts = torch.zeros(grid.levels + 1, dtype=torch.int32, device=self.device)
         jobs: list[tuple[torch.Tensor, torch.Tensor, int, int, int, int]] = []
@@ -102,35 +160,35 @@ class FusedTrainingNetwork(FusedNetwork):
 
         g = self.g
         pair, back = packed.particle_to_cell, packed.cell_to_particle
-        job(g["encode_h"], grid.feature_NF, packed.size, particles)
-        job(g["encode_z"], self.encode_hidden, packed.encode.second, particles, packed.encode.second_bias)
-        job(g["decode_h"], self.decoder_input, packed.decode.parts[0], particles, packed.decode.first_bias)
-        job(g["decode_z"], self.decode_hidden, packed.decode.second, particles, packed.decode.second_bias)
-        job(g["down_p"], self.latent, pair.parts[0], particles, pair.first_bias)
-        job(g["up_p"], self.latent, back.parts[1], particles, back.first_bias)
+        job(g.encode.hidden, grid.feature_NF, packed.size, particles)
+        job(g.encode.output, self.encode_hidden, packed.encode.second, particles, packed.encode.second_bias)
+        job(g.decode.hidden, self.decoder_input, packed.decode.parts[0], particles, packed.decode.first_bias)
+        job(g.decode.output, self.decode_hidden, packed.decode.second, particles, packed.decode.second_bias)
+        job(g.particle_to_cell.by_particle, self.latent, pair.parts[0], particles, pair.first_bias)
+        job(g.cell_to_particle.by_particle, self.latent, back.parts[1], particles, back.first_bias)
         if self.keeps_pair_hidden():
-            job(g["down_z"], self.kept_down[0], pair.second, particles, pair.second_bias, 8)
-            job(g["up_z"], self.kept_up[0], back.second, particles, back.second_bias, 8)
-        for block, name in self._named_blocks():
-            for m in range(steps):
+            job(g.particle_to_cell.output, self.kept_down[0], pair.second, particles, pair.second_bias, 8)
+            job(g.cell_to_particle.output, self.kept_up[0], back.second, particles, back.second_bias, 8)
+        for block, gradients in self._blocks_of_steps():
+            for m, step in enumerate(gradients):
                 edge, cell = block.packed.edge[m], block.packed.cell[m]
-                job(g[f"{name}{m}_ez"], block.edge_hidden[m], edge.second, block.level, edge.second_bias)
+                job(step.edge.output, block.edge_hidden[m], edge.second, block.level, edge.second_bias)
                 if m > 0:
-                    job(g[f"{name}{m}_eh"], block.edge[m - 1], edge.parts[2], block.level)
-                job(g[f"{name}{m}_s"], block.cell[m], edge.parts[0], block.level)
-                job(g[f"{name}{m}_r"], block.cell[m], edge.parts[1], block.level, edge.first_bias)
-                job(g[f"{name}{m}_ch"], block.cell[m], cell.parts[0], block.level, cell.first_bias)
-                job(g[f"{name}{m}_ch"], block.sum[m], cell.parts[1], block.level)
-                job(g[f"{name}{m}_cz"], block.cell_hidden[m], cell.second, block.level, cell.second_bias)
+                    job(step.edge.hidden, block.edge[m - 1], edge.parts[2], block.level)
+                job(step.send, block.cell[m], edge.parts[0], block.level)
+                job(step.receive, block.cell[m], edge.parts[1], block.level, edge.first_bias)
+                job(step.cell.hidden, block.cell[m], cell.parts[0], block.level, cell.first_bias)
+                job(step.cell.hidden, block.sum[m], cell.parts[1], block.level)
+                job(step.cell.output, block.cell_hidden[m], cell.second, block.level, cell.second_bias)
         for i in range(grid.levels):
             block = self.down[i] if i == grid.levels - 1 else self.up[i]
-            job(g[f"product{i}"], block.cell[-1], block.next_at, i)
+            job(g.product[i], block.cell[-1], block.next_at, i)
         for i in range(grid.levels - 1):
             down, up = packed.fine_to_coarse[i], packed.coarse_to_fine[i]
-            job(g[f"fc_h{i}"], self.down[i].cell[-1], down.parts[0], i, down.first_bias)
-            job(g[f"fc_z{i}"], self.transfer_hidden_down[i], down.second, i, down.second_bias)
-            job(g[f"cf_h{i}"], self.down[i].cell[-1], up.parts[1], i, up.first_bias)
-            job(g[f"cf_z{i}"], self.transfer_hidden_up[i], up.second, i, up.second_bias)
+            job(g.fine_to_coarse[i].hidden, self.down[i].cell[-1], down.parts[0], i, down.first_bias)
+            job(g.fine_to_coarse[i].output, self.transfer_hidden_down[i], down.second, i, down.second_bias)
+            job(g.coarse_to_fine[i].hidden, self.down[i].cell[-1], up.parts[1], i, up.first_bias)
+            job(g.coarse_to_fine[i].output, self.transfer_hidden_up[i], up.second, i, up.second_bias)
         self._weight_jobs = []
         for dtype, chunk in itertools.product(dict.fromkeys((torch.float32, self.operand)), CHUNK_ROWS):
             mine = [entry for entry in jobs if entry[1].dtype == dtype and chunk == _chunk_rows(entry[0])]
@@ -168,8 +226,8 @@ class FusedTrainingNetwork(FusedNetwork):
             self.output_gradient,
             self.particle_count,
             self.decode_hidden,
-            g["decode_h"],
-            g["decode_z"],
+            g.decode.hidden,
+            g.decode.output,
             into=(self.latent_gradient, 1),
             norm=False,
         )
@@ -181,24 +239,24 @@ class FusedTrainingNetwork(FusedNetwork):
             self.by_particle_up,
             top.product,
             self.kept_up,
-            g["up_z"],
-            g["up_p"],
+            g.cell_to_particle.output,
+            g.cell_to_particle.by_particle,
             self.product_gradient,
             False,
         )
         self._gather_backward(
-            0, self.product_gradient, grid.children(0), 0, top.next_at, g["product0"], self._gradient_of(top)
+            0, self.product_gradient, grid.children(0), 0, top.next_at, g.product[0], self._gradient_of(top)
         )
         for i in range(levels - 1):
             block, mlp = self.up[i], packed.coarse_to_fine[i]
-            self._passing_backward(block, f"up{i}_")
+            self._passing_backward(block, g.up[i])
             self._mlp_backward(
                 mlp,
                 self.cell_gradient_up[i],
                 grid.count(i),
                 self.transfer_hidden_up[i],
-                g[f"cf_h{i}"],
-                g[f"cf_z{i}"],
+                g.coarse_to_fine[i].hidden,
+                g.coarse_to_fine[i].output,
                 first_at=mlp.parts[1],
                 offset=(mlp.parts[2], -1),
                 octant=grid.octant(i),
@@ -208,11 +266,11 @@ class FusedTrainingNetwork(FusedNetwork):
             coarse = self.up[i + 1] if i + 1 < levels - 1 else self.down[-1]
             self._gather_backward(
                 i + 1,
-                g[f"cf_h{i}"],
+                g.coarse_to_fine[i].hidden,
                 grid.children(i + 1),
                 8,
                 coarse.next_at,
-                g[f"product{i + 1}"],
+                g.product[i + 1],
                 self._gradient_of(coarse),
             )
         for i in reversed(range(levels)):
@@ -223,22 +281,22 @@ class FusedTrainingNetwork(FusedNetwork):
                     self.cell_gradient_down[i + 1],
                     grid.count(i),
                     self.transfer_hidden_down[i],
-                    g[f"fc_h{i}"],
-                    g[f"fc_z{i}"],
+                    g.fine_to_coarse[i].hidden,
+                    g.fine_to_coarse[i].output,
                     gradient_index=grid.parent(i),
                     offset=(mlp.parts[1], 1),
                     octant=grid.octant(i),
                     into=(self.cell_gradient_down[i], 2),
                 )
-            self._passing_backward(self.down[i], f"down{i}_")
+            self._passing_backward(self.down[i], g.down[i])
         self._particle_cell_backward(
             packed.particle_to_cell,
             self.cell_gradient_down[0],
             self.by_particle_down,
             self.by_particle_down,
             self.kept_down,
-            g["down_z"],
-            g["down_p"],
+            g.particle_to_cell.output,
+            g.particle_to_cell.by_particle,
             self.product_gradient,
             True,
         )
@@ -247,10 +305,10 @@ class FusedTrainingNetwork(FusedNetwork):
             self.latent_gradient,
             self.particle_count,
             self.encode_hidden,
-            g["encode_h"],
-            g["encode_z"],
+            g.encode.hidden,
+            g.encode.output,
             following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
-            products=(g["down_p"], g["up_p"]),
+            products=(g.particle_to_cell.by_particle, g.cell_to_particle.by_particle),
         )
         for chunk, base, jobs, chunk_job, chunk_first in self._weight_jobs:
             weight_gradient[(len(chunk_job),)](
@@ -455,8 +513,8 @@ class FusedTrainingNetwork(FusedNetwork):
             num_warps=warps,
         )
 
-    def _passing_backward(self, block: Block, name: str) -> None:
-        grid, level, steps, g = self.grid, block.level, self.config.message_passing_steps, self.g
+    def _passing_backward(self, block: Block, gradients: list[StepGradients]) -> None:
+        grid, level, steps = self.grid, block.level, self.config.message_passing_steps
         rows = grid.capacities[level]
         gradient = self._gradient_of(block)
         edge_gradient, sum_gradient = self.edge_gradient[:rows], self.sum_gradient[:rows]
@@ -469,21 +527,22 @@ class FusedTrainingNetwork(FusedNetwork):
         overlap = self.overlaps()
         for m in reversed(range(steps)):
             edge, cell, last = block.packed.edge[m], block.packed.cell[m], m == steps - 1
-            later = m if last else m + 1
+            step, later = gradients[m], gradients[m if last else m + 1]
+            later_edge = block.packed.edge[m if last else m + 1]
             gathers = self.tuning.gathers(rows) and not last
             if gathers:
-                self._gather(level, g[f"{name}{later}_eh"], table, g[f"{name}{later}_s"], True)
+                self._gather(level, later.edge.hidden, table, later.send, True)
             cell_mlp_backward[self._blocks(rows, size)](
                 gradient=gradient,
-                later_hidden_gradient=g[f"{name}{later}_eh"],
-                later_receive_gradient=g[f"{name}{later}_r"],
+                later_hidden_gradient=later.edge.hidden,
+                later_receive_gradient=later.receive,
                 neighbour=table,
                 count_ptr=grid.count(level),
                 weights=self.weights,
                 values=self.values,
                 totals=self.totals,
-                later_send_at=block.packed.edge[later].parts[0],
-                later_receive_at=block.packed.edge[later].parts[1],
+                later_send_at=later_edge.parts[0],
+                later_receive_at=later_edge.parts[1],
                 first_at=cell.parts[0],
                 sum_first_at=cell.parts[1],
                 second_at=cell.second,
@@ -492,9 +551,9 @@ class FusedTrainingNetwork(FusedNetwork):
                 hidden=block.cell_hidden[m],
                 normalised=block.cell_normalised[m],
                 rstd=block.cell_rstd[m],
-                send_gradient=g[f"{name}{later}_s"],
-                hidden_gradient=g[f"{name}{m}_ch"],
-                second_gradient=g[f"{name}{m}_cz"],
+                send_gradient=later.send,
+                hidden_gradient=step.cell.hidden,
+                second_gradient=step.cell.output,
                 sum_gradient=sum_gradient,
                 capacity=rows,
                 unscale=self.unscale,
@@ -522,9 +581,9 @@ class FusedTrainingNetwork(FusedNetwork):
                 hidden=block.edge_hidden[m],
                 normalised=block.edge_normalised[m],
                 rstd=block.edge_rstd[m],
-                hidden_gradient=g[f"{name}{m}_eh"],
-                second_gradient=g[f"{name}{m}_ez"],
-                receive_gradient=g[f"{name}{m}_r"],
+                hidden_gradient=step.edge.hidden,
+                second_gradient=step.edge.output,
+                receive_gradient=step.receive,
                 unscale=self.unscale,
                 FIRST=m == 0,
                 LAST=last,
@@ -537,8 +596,8 @@ class FusedTrainingNetwork(FusedNetwork):
                 launch_pdl=overlap,
             )
         first = block.packed.edge[0]
-        into, received = g[f"{name}0_s"], (g[f"{name}0_r"], first.parts[1])
-        self._gather_backward(level, g[f"{name}0_eh"], table, 6, first.parts[0], into, gradient, True, received)
+        into, received = gradients[0].send, (gradients[0].receive, first.parts[1])
+        self._gather_backward(level, gradients[0].edge.hidden, table, 6, first.parts[0], into, gradient, True, received)
 
 
 def _mlp(table: torch.Tensor) -> int:
