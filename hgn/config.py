@@ -118,6 +118,8 @@ class MpmConfig:
     snow_maximum_hardening: float = 20.0  # bound on exp(hardening * (1 - Jp)), counted; beyond 5 m/s raise it
     water_equation: str = "linear"  # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
     water_volume_update: str = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
+    water_tension: float = 1.0  # share of the tension that stretched water bears, as Taichi Elements' does; 0: none
+    water_viscosity_pa_s: float = 0.0  # beside that of the grid, which is larger than real water's
     water_minimum_volume_ratio: float = 0.1  # floor on J; hits are counted
     minimum_singular_value: float = 0.05  # floor on the singular values of F; hits are counted
     time_integration: str = "leapfrog"  # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
@@ -159,12 +161,17 @@ class MpmConfig:
             "collider_band_cells",
             "collider_friction",
             "sand_friction_angle_deg",
+            "water_tension",
+            "water_viscosity_pa_s",
         )
         speed = self.transfer_speed_m_s
         require(speed is None or 0 < speed < math.inf, "transfer_speed_m_s", "> 0 or none", speed)
         require(self.stability_fraction <= 1, "stability_fraction", "at most 1", self.stability_fraction)
         require(self.speed_fraction <= 1, "speed_fraction", "at most 1", self.speed_fraction)
         require(0 <= self.poisson_ratio < 0.5, "poisson_ratio", "in [0, 0.5)", self.poisson_ratio)
+        require(self.water_tension <= 1, "water_tension", "at most 1", self.water_tension)
+        compression = self.snow_critical_compression
+        require(compression < 1, "snow_critical_compression", "< 1", compression)
         require(self.sand_friction_angle_deg < 90, "sand_friction_angle_deg", "< 90", self.sand_friction_angle_deg)
         require(self.wall_cells >= 2, "wall_cells", "at least 2, the reach of a particle", self.wall_cells)
         require_one_of(self, "sand_friction_law", ("matsuoka_nakai", "compression", "plane_strain"))

@@ -45,7 +45,8 @@ def water(
 
     The expansion of a step is dt tr C; Taichi Elements' det(1 + dt C) - 1 swells what turns and shrinks what is purely
     sheared, in second order of the step. The term is lambda J (J - 1), as in Taichi Elements, or with `stiffening`
-    that of the pressure lambda / 7 (J^-7 - 1) (Cole 1948), which withstands any compression.
+    that of the pressure lambda / 7 (J^-7 - 1) (Cole 1948), which withstands any compression. Stretched water bears as
+    much of the tension as the law says; with none it has no pressure until it is pressed together again.
     """
     bulk = law[row + CONSTANT.bulk]
     smallest = law[row + CONSTANT.water_smallest_volume]
@@ -61,6 +62,8 @@ def water(
         power *= power
         stress = bulk * (J - power) / 7.0
         stiffness = (J + 6.0 * power) / 7.0
+    if J > 1.0:
+        stress *= law[row + CONSTANT.water_tension]
     return J, stress, 3.0 * bulk * ti.max(1.0, stiffness)
 
 

@@ -218,7 +218,9 @@ class Launch(ABC):
         value[:, VALUE.stability_fraction] = stability_fractions or self.config.stability_fraction
         shear, bulk = laws[:, CONSTANT.shear], laws[:, CONSTANT.bulk]
         # per kind and row; hardening may take all stiffness from snow
-        least = np.stack([3 * bulk, 3 * bulk + 2 * shear, 0 * bulk]) / laws[:, CONSTANT.density]
+        density = laws[:, CONSTANT.density]
+        viscous = 4 * laws[:, CONSTANT.viscosity] / (density * self.scenes[0].cell_size)
+        least = np.stack([(np.sqrt(3 * bulk / density) + viscous) ** 2, (3 * bulk + 2 * shear) / density, 0 * bulk])
         for index, scene in enumerate(self.scenes):
             own = slice(self.particle_begin[index], self.particle_begin[index + 1])
             value[index, VALUE.gravity : VALUE.gravity + 3] = scene.gravity

@@ -30,7 +30,9 @@ class Constant(NamedTuple):
     smallest_singular_value: int = 9
     mass: int = 10  # of a particle, in units of the config's
     sand_sine: int = 11  # of the friction angle, where sand yields as Matsuoka and Nakai have it; else 0
-    length: int = 12
+    water_tension: int = 12  # share of the tension that stretched water bears
+    viscosity: int = 13  # of water, Pa s
+    length: int = 14
 
 
 class Count(NamedTuple):
@@ -203,4 +205,6 @@ def constants(config: MpmConfig, unit_density: float | None = None) -> np.ndarra
     out[CONSTANT.maximum_hardening] = config.snow_maximum_hardening
     out[CONSTANT.water_smallest_volume] = config.water_minimum_volume_ratio
     out[CONSTANT.smallest_singular_value] = config.minimum_singular_value
+    out[CONSTANT.water_tension] = config.water_tension
+    out[CONSTANT.viscosity] = config.water_viscosity_pa_s
     return out

@@ -282,6 +282,13 @@ def respond(
             )
             new_volume = J
             stiffness = water_stiffness
+            viscosity = law[row + CONSTANT.viscosity]
+            if viscosity > 0.0:
+                rate = 0.5 * (C + C.transpose())
+                A += scale * 2.0 * viscosity * J * (rate - C.trace() / 3.0 * ti.Matrix.identity(ti.f32, 3))
+                # the shear of a lone particle is reversed, no smaller, by a step of rho dx² / (4 viscosity)
+                rough = ti.sqrt(water_stiffness) + 4.0 * viscosity * inverse_dx / ti.sqrt(density)
+                stiffness = rough * rough
             for i in ti.static(range(3)):
                 A[i, i] += scale * pressure
     if ti.static(has_solid):

@@ -23,6 +23,10 @@ MATERIAL_PARAMETERS: tuple[str, ...] = (
     "density_kg_m3",
     "sand_friction_angle_deg",
     "snow_hardening",
+    "snow_critical_compression",
+    "snow_critical_stretch",
+    "water_tension",
+    "water_viscosity_pa_s",
 )
 
 

@@ -53,6 +53,20 @@ def update_volumes(
         volume[n] = v
 
 
+@ti.kernel
+def update_momenta(
+    C: Matrices, gain: Matrices, stiffness: Scalars, volume: Scalars, step: ti.f32, setting: Scalars,
+    constant: Scalars, counter: ti.types.ndarray(dtype=ti.i64, ndim=2), variant: ti.template(),
+):  # fmt: skip
+    for n in range(volume.shape[0]):
+        A, _, _, _, k = respond(
+            C[n], ti.Matrix.zero(ti.f32, 3, 3), ti.Matrix.identity(ti.f32, 3), volume[n], WATER, 0, step, 0.0, 0,
+            counter, setting, constant, variant,
+        )  # fmt: skip
+        gain[n] = A
+        stiffness[n] = k
+
+
 def scalars(values) -> ti.ScalarNdarray:
     out = ti.ndarray(ti.f32, len(values))
     out.from_numpy(np.asarray(values, np.float32))
@@ -204,6 +218,48 @@ def test_volume_updates_of_water() -> None:
             C, volume, step, scalars(setting), scalars(constants(MpmConfig())), counters(), VARIANT.water + bit
         )
         close(volume.to_numpy(), 0.9 * factor, 1e-6)
+
+
+@pytest.mark.parametrize("stiffening", [False, True])
+def test_water_without_tension(stiffening: bool) -> None:
+    """Stretched water bears the share of the tension that it is given, none with 0; J grows, and pressure is back as
+    soon as J is below 1. Water under pressure does not know of it.
+    """
+    J = np.array([1.2, 1.001, 1.0, 0.9])
+    pressure = {}
+    for share in (1.0, 0.5, 0.0):
+        volume, out = scalars(J), scalars(np.zeros(4))
+        law = scalars(constants(MpmConfig(water_tension=share)))
+        update_water(volume, scalars(np.zeros(4)), out, law, counters(), scalars(J), stiffening)
+        close(volume.to_numpy(), J, 1e-6)
+        pressure[share] = out.to_numpy()
+    assert (pressure[1.0][:2] > 0).all()
+    assert (pressure[0.0][:2] == 0).all()
+    assert pressure[0.5][:2] == pytest.approx(0.5 * pressure[1.0][:2])
+    assert (pressure[0.0][2:] == pressure[1.0][2:]).all()
+
+
+def test_viscous_stress() -> None:
+    """Sheared at a rate, viscous water bears the rate times its viscosity across the shear, and no other stress."""
+    rate, step, viscosity, dx = 50.0, 1e-4, 3.0, 0.1
+    C = ti.Matrix.ndarray(3, 3, ti.f32, 1)
+    C.from_numpy(np.array([[[0.0, rate, 0], [0, 0, 0], [0, 0, 0]]], np.float32))
+    gain = ti.Matrix.ndarray(3, 3, ti.f32, 1)
+    setting = np.ones(SETTING.length)
+    setting[SETTING.inverse_cell_size] = 1 / dx
+    config = MpmConfig(water_viscosity_pa_s=viscosity)
+    stiffness = scalars([0.0])
+    update_momenta(
+        C, gain, stiffness, scalars([1.0]), step, scalars(setting), scalars(constants(config)), counters(),
+        VARIANT.water,
+    )  # fmt: skip
+    stress = gain.to_numpy()[0] / (-step * 4 / dx**2 / config.density_kg_m3)
+    expected = np.zeros((3, 3))
+    expected[0, 1] = expected[1, 0] = viscosity * rate
+    assert stress == pytest.approx(expected, rel=1e-5, abs=0.05)
+    bulk = lame_parameters(config)[1]
+    rough = np.sqrt(3 * bulk / 1000) + 4 * viscosity / (1000 * dx)
+    assert stiffness.to_numpy()[0] == pytest.approx(rough**2, rel=1e-4)
 
 
 def test_stiffening_water() -> None:
