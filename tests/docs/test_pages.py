@@ -14,6 +14,7 @@ from hydra import compose, initialize_config_dir
 
 from hgn import config
 from hgn.hydra_compat import registered_dataclasses
+from hgn.scene.scene_file import GroupEntry, ObstacleEntry, SceneFile
 
 COLUMNS = 100
 README_LINES, README_COMMANDS, ENTRY_LINES = 130, 12, 2
@@ -192,3 +193,11 @@ def test_every_command_is_listed() -> None:
         section = text.split(f"## {cls.__name__}\n")[1].split("\n## ")[0]
         assert re.findall(r"^\| `(\w+)`", section, re.MULTILINE) == [field.name for field in dataclasses.fields(cls)]
     assert "| `seed` | `int` | `0` |" in text and "domain units per frame |" in text
+
+
+def test_scene_files_are_described_whole() -> None:
+    """The page on scene files has each field that the file, a group and an obstacle may have, and each shape."""
+    text = (ROOT / "docs" / "how_to" / "scene_files.md").read_text()
+    rows = {cell for line in text.splitlines() if line.startswith("| `") for cell in CODE.findall(line.split("|")[1])}
+    fields = {f"`{field.name}`" for cls in (SceneFile, GroupEntry, ObstacleEntry) for field in dataclasses.fields(cls)}
+    assert rows == fields | {f"`{shape}`" for shape in config.OBSTACLE_SHAPES}
