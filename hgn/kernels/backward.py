@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.kernels.buffers import OUT, Block
+from hgn.kernels.buffers import OUT, Block, StoredPairs
 from hgn.kernels.cell_mlp.kernel import cell_mlp_backward
 from hgn.kernels.edges.kernel import edge_backward
 from hgn.kernels.forward import FusedNetwork
@@ -166,9 +166,9 @@ class FusedTrainingNetwork(FusedNetwork):
         job(g.decode.output, self.decode_hidden, packed.decode.second, particles, packed.decode.second_bias)
         job(g.particle_to_cell.by_particle, self.latent, pair.parts[0], particles, pair.first_bias)
         job(g.cell_to_particle.by_particle, self.latent, back.parts[1], particles, back.first_bias)
-        if self.keeps_pair_hidden():
-            job(g.particle_to_cell.output, self.kept_down[0], pair.second, particles, pair.second_bias, 8)
-            job(g.cell_to_particle.output, self.kept_up[0], back.second, particles, back.second_bias, 8)
+        if self.stores_pair_hidden():
+            job(g.particle_to_cell.output, self.pairs_down.hidden, pair.second, particles, pair.second_bias, 8)
+            job(g.cell_to_particle.output, self.pairs_up.hidden, back.second, particles, back.second_bias, 8)
         for block, gradients in self._blocks_of_steps():
             for m, step in enumerate(gradients):
                 edge, cell = block.packed.edge[m], block.packed.cell[m]
@@ -238,7 +238,7 @@ class FusedTrainingNetwork(FusedNetwork):
             self.latent_gradient,
             self.by_particle_up,
             top.product,
-            self.kept_up,
+            self.pairs_up,
             g.cell_to_particle.output,
             g.cell_to_particle.by_particle,
             self.product_gradient,
@@ -294,7 +294,7 @@ class FusedTrainingNetwork(FusedNetwork):
             self.cell_gradient_down[0],
             self.by_particle_down,
             self.by_particle_down,
-            self.kept_down,
+            self.pairs_down,
             g.particle_to_cell.output,
             g.particle_to_cell.by_particle,
             self.product_gradient,
@@ -417,7 +417,7 @@ class FusedTrainingNetwork(FusedNetwork):
         gradient: torch.Tensor,
         by_particle: torch.Tensor,
         by_cell: torch.Tensor,
-        kept: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+        stored: StoredPairs,
         second_gradient: torch.Tensor,
         by_particle_gradient: torch.Tensor,
         by_cell_gradient: torch.Tensor,
@@ -440,9 +440,7 @@ class FusedTrainingNetwork(FusedNetwork):
             second_at=mlp.second,
             norm_weight_at=mlp.norm_weight,
             norm_bias_at=mlp.norm_bias,
-            hidden=kept[0],
-            normalised=kept[1],
-            rstd=kept[2],
+            **stored._asdict(),
             second_gradient=second_gradient,
             by_particle_gradient=by_particle_gradient,
             by_cell_gradient=by_cell_gradient,
@@ -453,7 +451,7 @@ class FusedTrainingNetwork(FusedNetwork):
             PRECISION=self.precision,
             num_warps=self.tuning.pair_warps,
         )
-        if not self.keeps_pair_hidden():
+        if not self.stores_pair_hidden():
             particle_cell_weight_gradient[programs](
                 second_gradient=second_gradient,
                 by_particle=by_particle,

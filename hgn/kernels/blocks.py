@@ -251,25 +251,25 @@ def listed(table, row, count, capacity, SUM: tl.constexpr, EDGES: tl.constexpr):
 
     With EDGES they are rows of [capacity, SUM, W]: of the row listed for a direction the opposite direction's part.
     """
-    found = ()
+    summands = ()
     for i in tl.static_range(SUM):
         where = tl.load(table + i * capacity + row, mask=row < count, other=-1)
         if EDGES:
             where = where * SUM + (i ^ 1)
-        found = found + (where,)  # noqa: RUF005 - Triton knows no unpacking here
-    return found
+        summands = summands + (where,)  # noqa: RUF005 - Triton knows no unpacking here
+    return summands
 
 
 @triton.jit
-def gathered_sum(x, found, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
-    """The sums [BLOCK, W] of x's rows `found` by `listed`."""
+def gathered_sum(x, summands, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+    """The sums [BLOCK, W] of x's rows `summands` by `listed`."""
     column = tl.arange(0, WIDTH)
     # so many reads begin before the first is waited for
     TOGETHER: tl.constexpr = SUM if BLOCK <= 16 else 2
     for start in tl.static_range(0, SUM, TOGETHER):
         parts = ()
         for i in tl.static_range(start, start + TOGETHER):
-            where = found[i]
+            where = summands[i]
             part = tl.load(x + where[:, None] * WIDTH + column[None, :], mask=(where >= 0)[:, None], other=0.0)
             parts = parts + (part,)  # noqa: RUF005
         for i in tl.static_range(0, TOGETHER, 2):

@@ -6,6 +6,7 @@ Shape legend: N particles, C cells, W width.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 
@@ -38,6 +39,14 @@ class Block:
     next_at: int = 0  # weights of that product
 
 
+class StoredPairs(NamedTuple):
+    """What particle_cell_forward stores for the backward pass, by its names; one row where it stores nothing."""
+
+    hidden: torch.Tensor  # [8 N, W]
+    normalised: torch.Tensor  # [8 N, W]
+    rstd: torch.Tensor  # one over the deviation, float32 [8 N]
+
+
 class Buffers:
     """`down` and `up` are the blocks; messages to parents and hidden layers of the steps between levels are lists over
     the finer level.
@@ -65,6 +74,8 @@ class Buffers:
     decode_hidden: torch.Tensor
     transfer_hidden_down: list[torch.Tensor]
     transfer_hidden_up: list[torch.Tensor]
+    pairs_down: StoredPairs
+    pairs_up: StoredPairs
     down: list[Block]
     up: list[Block]
 
@@ -81,7 +92,7 @@ class Buffers:
         """Of the first block, which particles are added to by atomics: rounded sums cost the gradients precision."""
         return self._cell(*shape) if self.tuning.half_sums and not self.training else self._float(*shape)
 
-    def _allocate(self, keeps_pair_hidden: bool) -> None:
+    def _allocate(self, stores_pair_hidden: bool) -> None:
         packed, levels = self.packed, self.config.levels
         self.down = [Block(i, packed.passing_down[i]) for i in range(levels)]
         self.up = [Block(i, packed.passing_up[i]) for i in range(levels - 1)]
@@ -91,10 +102,10 @@ class Buffers:
         self.latent = self._operand(self.grid.particles, self.width)
         self.by_particle_up = self._operand(self.grid.particles, self.width)
         pairs = 8 * self.grid.particles if self.training else 1
-        hidden = pairs if keeps_pair_hidden else 1
-        # hidden layer, normalised output, one over its rstd
-        self.kept_down, self.kept_up = (
-            (self._operand(hidden, self.width), self._operand(pairs, self.width), self._float(pairs)) for _ in range(2)
+        hidden = pairs if stores_pair_hidden else 1
+        self.pairs_down, self.pairs_up = (
+            StoredPairs(self._operand(hidden, self.width), self._operand(pairs, self.width), self._float(pairs))
+            for _ in range(2)
         )
         if self.training:
             self._allocate_training()

@@ -10,7 +10,7 @@ import torch
 import triton
 
 from hgn.config import NetworkConfig
-from hgn.kernels.buffers import Block, Buffers
+from hgn.kernels.buffers import Block, Buffers, StoredPairs
 from hgn.kernels.cell_mlp.kernel import cell_mlp_forward
 from hgn.kernels.edges.kernel import edge_forward
 from hgn.kernels.grid.op import DeviceGrid
@@ -64,7 +64,7 @@ class FusedNetwork(Buffers):
         self.fine = rounded and not training
         self.encode_weights = torch.zeros(self.width, grid.features, device=self.device)
         self.tuning = tuning or Tuning.of(precision)
-        self._allocate(self.keeps_pair_hidden())
+        self._allocate(self.stores_pair_hidden())
         self.refresh()
 
     # parameters
@@ -123,7 +123,7 @@ class FusedNetwork(Buffers):
             packed.particle_to_cell,
             self.by_particle_down,
             self.by_particle_down,
-            self.kept_down,
+            self.pairs_down,
             self.down[0].cell[0],
             True,
         )
@@ -165,7 +165,7 @@ class FusedNetwork(Buffers):
             coarse = block
         assert coarse.product is not None
         self._particle_cell(
-            packed.cell_to_particle, self.by_particle_up, coarse.product, self.kept_up, self.decoder_input, False
+            packed.cell_to_particle, self.by_particle_up, coarse.product, self.pairs_up, self.decoder_input, False
         )
         self._mlp(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
 
@@ -182,8 +182,8 @@ class FusedNetwork(Buffers):
         """Whether the kernels of a message step start before the one before has ended."""
         return self.tuning.overlap and not interpreting() and capability() >= 90
 
-    def keeps_pair_hidden(self) -> bool:
-        """Whether the hidden layer of the pairs is kept for the backward pass (see particle_cell_forward)."""
+    def stores_pair_hidden(self) -> bool:
+        """Whether the hidden layer of the pairs is stored for the backward pass (see particle_cell_forward)."""
         return self.precision == "tf32"
 
     def _mlp(
@@ -262,7 +262,7 @@ class FusedNetwork(Buffers):
         mlp: PackedMLP,
         by_particle: torch.Tensor,
         by_cell: torch.Tensor,
-        kept: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+        stored: StoredPairs,
         out: torch.Tensor,
         to_cell: bool,
     ) -> None:
@@ -282,9 +282,7 @@ class FusedNetwork(Buffers):
             second_bias_at=mlp.second_bias,
             norm_weight_at=mlp.norm_weight,
             norm_bias_at=mlp.norm_bias,
-            hidden=kept[0],
-            normalised=kept[1],
-            rstd=kept[2],
+            **stored._asdict(),
             out=out,
             TO_CELL=to_cell,
             SAVE=self.training,

@@ -87,8 +87,8 @@ def test_pushforward_stays_within_memory() -> None:
         last = max(i for i, (name, _) in enumerate(checked.launches) if name == "mark_cells")
         frames.setdefault(own._rollout, set()).add(tuple(checked.launches[last:]))
         samples = [DeviceSample(episodes[i % 3], i, 7 * i + turn) for i in range(4)]
-        mixed = [own.mixed(samples, 5 * turn + i) for i in range(3)]
-        assert any(sample.episode in dict(own._entries) for update in mixed for sample in update) or not own._entries
+        mixed = [own.replaced(samples, 5 * turn + i) for i in range(3)]
+        assert any(sample.episode in dict(own._samples) for update in mixed for sample in update) or not own._samples
         updates._upload(mixed, [0.0] * 3)
         alive = Alive()
         for row in updates._samples[:3].flatten(0, 1).tolist():

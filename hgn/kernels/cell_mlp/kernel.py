@@ -220,7 +220,7 @@ def cell_mlp_backward(
         here = (row < count)[:, None]
         at = row[:, None] * WIDTH + column[None, :]
         if not LAST and GATHER:
-            found = listed(neighbour, row, count, capacity, 6, True)
+            summands = listed(neighbour, row, count, capacity, 6, True)
         if OVERLAP:
             gdc_wait()
         df = tl.load(gradient + at, mask=here, other=0.0)
@@ -233,7 +233,7 @@ def cell_mlp_backward(
         if not LAST:
             if GATHER:
                 # the edges that start here: each in its receiver's row, seen from there in the opposite direction
-                sent = gathered_sum(later_hidden_gradient, found, 6, WIDTH, BLOCK)
+                sent = gathered_sum(later_hidden_gradient, summands, 6, WIDTH, BLOCK)
                 tl.store(send_gradient + at, sent, mask=here)
             else:
                 sent = tl.load(send_gradient + at, mask=here, other=0.0)

@@ -106,8 +106,8 @@ class FusedEdges(Edges):
         )
         total_8W = partial_P8W.sum(0) / graph.scale
         (second_WW,) = self._weight_products(graph, second_EW, activation_EW, None)
-        found = Weights(total_8W[3:7].T.contiguous(), second_WW, total_8W[2], total_8W[0], total_8W[1])
-        return total_8W[7], found
+        gradients = Weights(total_8W[3:7].T.contiguous(), second_WW, total_8W[2], total_8W[0], total_8W[1])
+        return total_8W[7], gradients
 
     def step(
         self, graph: Graph, ends: Ends, weights: Weights, edge_EW: torch.Tensor, last: bool, in_place: bool

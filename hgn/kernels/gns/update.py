@@ -106,11 +106,11 @@ class GnsEngine:
         assert self._decoded_N3 is not None
         gradient_N3 = self.output_gradient[self.tables.neighbours.order_N, :3]
         gradient_N3 = torch.where(self._live(), gradient_N3, 0.0)
-        found = torch.autograd.grad(self._decoded_N3, self.parameters, gradient_N3, allow_unused=True)
+        gradients = torch.autograd.grad(self._decoded_N3, self.parameters, gradient_N3, allow_unused=True)
         self._decoded_N3 = None
         flat = [
             (torch.zeros_like(parameter) if gradient is None else gradient).reshape(-1)
-            for parameter, gradient in zip(self.parameters, found, strict=True)
+            for parameter, gradient in zip(self.parameters, gradients, strict=True)
         ]
         torch.cat(flat, out=self.totals[: len(self.weights)])
 

@@ -136,11 +136,11 @@ def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity
     there = ()
     for i in tl.static_range(COUNT):
         there = there + (_marked(occupied, slots[i], live),)  # noqa: RUF005 - Triton knows no unpacking here
-    found = ()
+    numbers = ()
     for i in tl.static_range(COUNT):
-        found = found + (_number(prefix_sum, slots[i], first, capacity, there[i]),)  # noqa: RUF005
+        numbers = numbers + (_number(prefix_sum, slots[i], first, capacity, there[i]),)  # noqa: RUF005
     for i in tl.static_range(COUNT):
-        tl.store(table + i * own_capacity + cell, found[i], mask=live)
+        tl.store(table + i * own_capacity + cell, numbers[i], mask=live)
 
 
 @triton.jit
@@ -210,8 +210,8 @@ def fill_tables(
         above_slot = tl.load(above) + scene * tl.load(above + 4)
         above_slot += (((x >> 1) + 1) * above_y + (y >> 1) + 1) * above_z + (z >> 1) + 1
         above_first = tl.load(prefix_sum + tl.load(above) - 1)
-        found = _cell(occupied, prefix_sum, above_slot, above_first, tl.load(above + 5), live)
-        tl.store(parent + at + cell, found, mask=live)
+        above_cell = _cell(occupied, prefix_sum, above_slot, above_first, tl.load(above + 5), live)
+        tl.store(parent + at + cell, above_cell, mask=live)
     if level > 0:
         below = line - GEOMETRY_COLUMNS
         below_y, below_z = tl.load(below + 2), tl.load(below + 3)
@@ -236,14 +236,14 @@ def _find_obstacle(x, y, z, line, live):
     entry_key = tl.load(line + 1, mask=live, other=0).to(tl.pointer_type(tl.int64))
     start = tl.load(bucket + place, mask=live, other=0)
     end = tl.load(bucket + place + 1, mask=live, other=0)
-    found = tl.zeros_like(start) - 1
+    entry = tl.zeros_like(start) - 1
     ask = live & (start < end)
     while tl.max(ask.to(tl.int32), 0) > 0:
         here = tl.load(entry_key + start, mask=ask, other=-1)
-        found = tl.where(ask & (here == key), start, found)
+        entry = tl.where(ask & (here == key), start, entry)
         start += 1
         ask = ask & (start < end)
-    return found
+    return entry
 
 
 @triton.jit
@@ -317,7 +317,7 @@ def _store_features(
         oy = tl.where(near, oy, 0.0).to(tl.int64)
         oz = tl.where(near, oz, 0.0).to(tl.int64)
         near = near & (tl.load(line, mask=near, other=0) != 0)
-        found = _find_obstacle(ox, oy, oz, line, near)
+        entry = _find_obstacle(ox, oy, oz, line, near)
         is_normal = (column >= 3 * HISTORY) & (column < WALLS)
         entry_normal = tl.load(line + 2, mask=near, other=0).to(tl.pointer_type(tl.float32))
         if SYMMETRY:
@@ -326,8 +326,8 @@ def _store_features(
         else:
             normal_axis = axis[None, :]
         normal = tl.load(
-            (entry_normal + found * 3)[:, None] + normal_axis,
-            mask=(found >= 0)[:, None] & is_normal[None, :],
+            (entry_normal + entry * 3)[:, None] + normal_axis,
+            mask=(entry >= 0)[:, None] & is_normal[None, :],
             other=0.0,
         )
         if SYMMETRY:

@@ -343,8 +343,8 @@ def gather_sums(
         return
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     column = tl.arange(0, WIDTH)
-    found = listed(table, row, count, capacity, SUM, EDGES)
-    tile = gathered_sum(x, found, SUM, WIDTH, BLOCK)
+    summands = listed(table, row, count, capacity, SUM, EDGES)
+    tile = gathered_sum(x, summands, SUM, WIDTH, BLOCK)
     tl.store(y + row[:, None] * WIDTH + column[None, :], tile, mask=(row < count)[:, None])
 
 

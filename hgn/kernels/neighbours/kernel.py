@@ -112,7 +112,7 @@ def walk_neighbours(
     x = tl.load(position + place * 3, mask=live, other=0.0)
     y = tl.load(position + place * 3 + 1, mask=live, other=0.0)
     z = tl.load(position + place * 3 + 2, mask=live, other=0.0)
-    found = tl.zeros((BLOCK,), tl.int32)
+    neighbours_before = tl.zeros((BLOCK,), tl.int32)
     if FILL:
         first = tl.load(offset + place, mask=live, other=0)
     begun = most * 0
@@ -126,16 +126,16 @@ def walk_neighbours(
         dy = tl.load(position + sender * 3 + 1, mask=there, other=0.0) - y[:, None]
         dz = tl.load(position + sender * 3 + 2, mask=there, other=0.0) - z[:, None]
         near = there & (dx * dx + dy * dy + dz * dz < square_radius)
-        kept = near.to(tl.int32)
+        counted = near.to(tl.int32)
         if FILL:
-            row = first[:, None] + (found[:, None] + tl.cumsum(kept, 1) - kept).to(tl.int64)
-            room = near & (row < capacity)
-            tl.store(sender_of + row, sender.to(tl.int64), mask=room)
-            tl.store(receiver_of + row, tl.zeros_like(row) + place[:, None], mask=room)
-        found += tl.sum(kept, 1)
+            row = first[:, None] + (neighbours_before[:, None] + tl.cumsum(counted, 1) - counted).to(tl.int64)
+            fits = near & (row < capacity)
+            tl.store(sender_of + row, sender.to(tl.int64), mask=fits)
+            tl.store(receiver_of + row, tl.zeros_like(row) + place[:, None], mask=fits)
+        neighbours_before += tl.sum(counted, 1)
         begun += CANDIDATES
     if not FILL:
-        tl.store(counts + place, found.to(tl.int64), mask=live)
+        tl.store(counts + place, neighbours_before.to(tl.int64), mask=live)
 
 
 @triton.jit
