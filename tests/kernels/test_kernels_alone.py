@@ -134,13 +134,6 @@ def made(network: HierarchicalGraphNetwork, state: ParticleState, precision: str
     return engine_of(network, state, precision, capacities, loss_scale=scale, tuning=tuning)
 
 
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the weights' products: the interpreter takes as long for rows that are not there."""
-    if not NATIVE:
-        monkeypatch.setattr("hgn.kernels.backward.CHUNK_ROWS", (64, 128))
-
-
 @pytest.fixture
 def many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every level is one of many rows, and so few programs run that each takes several tiles."""

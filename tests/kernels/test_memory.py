@@ -21,6 +21,8 @@ from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW
 from hgn.kernels.update.op import DeviceSample
 from hgn.training.graph_pushforward import GraphPushforwardPool
 
+pytestmark = pytest.mark.usefixtures("large_tiles")
+
 cpu_only = pytest.mark.skipif(device().type != "cpu", reason="the checker sees what the interpreter does")
 
 

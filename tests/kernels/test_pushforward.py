@@ -33,6 +33,8 @@ from hgn.training.module import TrainingModule
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import PushforwardPool
 
+pytestmark = pytest.mark.usefixtures("large_tiles")
+
 CELL_SIZE = 1 / 64
 
 

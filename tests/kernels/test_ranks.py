@@ -5,11 +5,14 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+import pytest
 import torch
 from kernels.test_update import episode, updates_of
 from network.states import network_of
 
 from hgn.kernels.update.op import Updates
+
+pytestmark = pytest.mark.usefixtures("large_tiles")
 
 
 def run_together(ranks: list[Updates], chunks: list[list[Any]], rates: list[float]) -> list[int]:

@@ -22,6 +22,8 @@ from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
 from hgn.runtime.triton_rollout import LeftDomainError, TritonRollout, first_capacities
 from hgn.schema import ConfigError
 
+pytestmark = pytest.mark.usefixtures("large_tiles")
+
 GRAVITY = (0.0, -9.8, 0.0)
 
 

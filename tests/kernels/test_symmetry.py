@@ -30,6 +30,8 @@ from hgn.scene.symmetry import scene_symmetries
 from hgn.training.graph_trainer import GraphTrainer
 from hgn.training.symmetry import under_symmetries
 
+pytestmark = pytest.mark.usefixtures("large_tiles")
+
 FRAME = 6
 
 

@@ -19,6 +19,8 @@ from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.data_module import UPDATES_AT_ONCE, chunk_length
 
+pytestmark = pytest.mark.usefixtures("large_tiles")
+
 NETWORK = {"width": 16, "levels": 1, "message_passing_steps": 1, "material_embedding": 2, "cell_size": 0.2}
 
 

@@ -21,6 +21,8 @@ from hgn.schema import ConfigError
 from hgn.training.muon import Muon
 from hgn.training.parity import require_agreement
 
+pytestmark = pytest.mark.usefixtures("large_tiles")
+
 HISTORY = 5
 CELL_SIZE = 1 / 64
 
