@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = ("conf", "datagen", "docs", "hgn", "jobs", "results", "tests", "tools")
 _FENCE = re.compile(r"^( *)(`{3,})([^`\n]*)$")
 _FILE_MARK = re.compile(r"<!-- file: (\S+) -->")
 
@@ -35,14 +36,9 @@ class Block:
 
 def markdown_files() -> list[Path]:
     """All Markdown files that are part of the project."""
-    listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.md"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return [ROOT / name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
+    found = [*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))]
+    made = {"_build", "_generated"}
+    return sorted(page for page in found if not made & set(page.relative_to(ROOT).parts))
 
 
 def blocks_of(page: Path) -> list[Block]:
