@@ -1,4 +1,5 @@
-"""The engine with its backward pass: the forward pass's list of launches from behind, then all weights at once.
+"""The fused network's backward pass: its launches in the reverse order of the forward pass, then all weight gradients
+in one launch for each type of operand.
 
 Shape legend: N particles, C cells, W width.
 """
@@ -70,7 +71,7 @@ class Gradients:
 
 
 class FusedTrainingNetwork(FusedNetwork):
-    """An engine whose `backward` leaves the gradients in `totals`, float32, laid out as `values`."""
+    """A fused network whose `backward` leaves the gradients in `totals`, float32, laid out as `values`."""
 
     def __init__(
         self,

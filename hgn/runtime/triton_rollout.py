@@ -162,7 +162,7 @@ class TritonRollout:
     def use_values(self, values: torch.Tensor) -> None:
         """Takes over parameters in the packed layout."""
         self.values.copy_(values)
-        self.engine.refresh()
+        self.fused.refresh()
 
     def _first_capacities(self) -> tuple[int, ...]:
         position_N3, scene_N = self.position_N3[: self.live], self.scene_N[: self.live].long()
@@ -187,7 +187,7 @@ class TritonRollout:
         self.grid = DeviceGrid(
             window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size, self.device
         )
-        self.engine = FusedNetwork(config, self.packed, self.values, self.grid, self.count, self.precision)
+        self.fused = FusedNetwork(config, self.packed, self.values, self.grid, self.count, self.precision)
         if self.device.type == "cuda":
             self.graph = self._capture()
 
@@ -211,7 +211,7 @@ class TritonRollout:
         """
         if self.graph is None:
             self._network_pass()
-        found_N3 = self.engine.output[: len(state.position_N3), :3]
+        found_N3 = self.fused.output[: len(state.position_N3), :3]
         with torch.no_grad():
             error = relative_error(found_N3, network.normalised_acceleration(state))
         if not error <= OUTPUT_BOUND:  # NaN fails
@@ -243,11 +243,11 @@ class TritonRollout:
             config.obstacle_features,
             config.wall_distance_cells * config.cell_size,
         )
-        self.engine.forward()
+        self.fused.forward()
 
     def _integrate(self) -> None:
         integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
-            output=self.engine.output,
+            output=self.fused.output,
             position=self.position_N3,
             velocity=self.velocity_NV,
             scene_of=self.scene_N,
@@ -367,7 +367,7 @@ class TritonRollout:
         self.growths += 1
         # Particles are kept elsewhere: what there is goes first, so that there is never room for both.
         self.graph = None
-        del self.engine, self.grid
+        del self.fused, self.grid
         try:
             self._build(capacities)
             return

@@ -36,7 +36,7 @@ def require_agreement(
 
     Too large a batch is not checked: NaN. Raises: ConfigError when one of them exceeds its bound.
     """
-    network, engine, count = updates.network, updates.engine, int(updates.particle_count)
+    network, fused, count = updates.network, updates.fused, int(updates.particle_count)
     if count > CHECKED_PARTICLES.get(network.config.kind, 0):
         return math.nan, math.nan
     state, origin_S3 = _state(updates, episodes, symmetries, count)
@@ -46,12 +46,12 @@ def require_agreement(
     with _plain(network):
         output_N3 = network.normalised_acceleration(state, origin_S3)
         expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
-    output_error = relative_error(engine.output[:count, :3], output_N3.detach())
-    engine.output_gradient[:count].zero_()
-    engine.output_gradient[:count, :3] = weight_N3 / engine.unscale
-    engine.backward()
+    output_error = relative_error(fused.output[:count, :3], output_N3.detach())
+    fused.output_gradient[:count].zero_()
+    fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
+    fused.backward()
     found = [torch.zeros_like(parameter) for parameter in parameters]
-    updates.packed.scatter(engine.totals[: updates.packed.size], found)
+    updates.packed.scatter(fused.totals[: updates.packed.size], found)
     gradient_error = relative_error(
         torch.cat([tensor.flatten() for tensor in found]),
         torch.cat(

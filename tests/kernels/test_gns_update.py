@@ -100,7 +100,7 @@ def test_what_is_left_of_other_updates_does_no_harm() -> None:
     for rest in (0.0, float("nan")):
         updates = updates_of(network, 1, edges=64)
         updates.predict([(made, 0, 1)])
-        for tensor in (updates.position_N3, updates.velocity_NV, updates.engine.output_gradient, updates.feature_NF):
+        for tensor in (updates.position_N3, updates.velocity_NV, updates.fused.output_gradient, updates.feature_NF):
             tensor[5:] = rest
         updates.run([[(made, 0, 1)]], [1e-3])
         found.append((updates.loss_sum.tolist(), parameters_of(updates)))

@@ -138,7 +138,7 @@ def test_memory_of_a_simulation(particles: int, side: int, most: float, monkeypa
     gc.collect()
     held = sum(size for storage, size in on_meta().items() if storage not in before)
     assert 0.8 * most < held <= most
-    assert rollout.engine.precision == "fp16"
+    assert rollout.fused.precision == "fp16"
 
 
 def on_meta() -> dict[int, int]:
@@ -156,7 +156,7 @@ def test_growing_gives_back_first(monkeypatch: pytest.MonkeyPatch) -> None:
     state = Simulator(spreading, 60.0).start([scene(5)])
     expected = TritonRollout(spreading, state, "fp32", (64,)).run(3)
     tight = TritonRollout(spreading, state, "fp32", (16,))
-    old = [weakref.ref(tight.grid), weakref.ref(tight.engine)]
+    old = [weakref.ref(tight.grid), weakref.ref(tight.fused)]
     build, asked = DeviceGrid.__init__, []
 
     def refuse(grid: DeviceGrid, window: Window, scenes: int, capacities: tuple[int, ...], *rest: object) -> None:

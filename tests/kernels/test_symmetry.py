@@ -90,7 +90,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind: str) -> None:
     assert torch.equal(feature_NF[:count, width : width + 3].cpu().double(), normal)
     assert float(loss_sum[0]) == pytest.approx(float(loss.detach()), rel=1e-5)
     found = [torch.zeros_like(parameter) for parameter in network.parameters()]
-    updates.packed.scatter(updates.engine.totals[: updates.packed.size].cpu(), found)
+    updates.packed.scatter(updates.fused.totals[: updates.packed.size].cpu(), found)
     assert relative_error(flat(found), expected) < 1e-4
 
 

@@ -233,7 +233,7 @@ def test_wrong_kernels_are_refused() -> None:
     updates.predict(samples)
     assert max(require_agreement(updates, episodes)) < 1e-3
     updates.values.mul_(1.3)
-    updates.engine.refresh()
+    updates.fused.refresh()
     updates.predict(samples)
     with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
         require_agreement(updates, episodes)

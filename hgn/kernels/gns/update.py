@@ -20,7 +20,7 @@ from hgn.kernels.gns.op import FusedEdges
 from hgn.kernels.grid.kernel import prepare_features
 from hgn.kernels.grid.op import OUT_OF_WINDOW
 from hgn.kernels.neighbours.op import DeviceNeighbours
-from hgn.kernels.update.op import TAIL, Layout, Tables, TrainedEngine, Updates
+from hgn.kernels.update.op import TAIL, Layout, Tables, TrainedNetwork, Updates
 from hgn.network.cell_keys import COORDINATE_LIMIT
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.schema import ConfigError
@@ -57,7 +57,7 @@ def views_of(network: GraphNetworkSimulator, values: torch.Tensor) -> GraphNetwo
     return result
 
 
-class GnsEngine:
+class FusedGns:
     """Forward and backward passes of a network on a neighbour list of fixed capacity."""
 
     copy_precision = "fp32"  # products read the values themselves
@@ -146,10 +146,10 @@ class GnsUpdates(Updates):
         (edges,) = capacities
         return DeviceNeighbours(self.particles, edges, self.config.cell_size, self.device)
 
-    def _engine(self) -> TrainedEngine:
+    def _fused_network(self) -> TrainedNetwork:
         assert isinstance(self.grid, DeviceNeighbours)
         self.feature_NF = torch.zeros(self.particles, feature_columns(self.config), device=self.device)
-        return GnsEngine(
+        return FusedGns(
             self.network, self.values, self.grid, self.feature_NF, self.particle_count, self.precision, tail=TAIL
         )
 

@@ -139,7 +139,7 @@ class Tables(Protocol):
     ) -> None: ...
 
 
-class TrainedEngine(Protocol):
+class TrainedNetwork(Protocol):
     """A network's forward and backward pass; `totals` are gradients laid out as the values, and a tail."""
 
     output: torch.Tensor
@@ -167,7 +167,7 @@ class Updates:
 
     growth = GROWTH  # of capacities over what was needed
     grid: Tables
-    engine: TrainedEngine
+    fused: TrainedNetwork
 
     def __init__(
         self,
@@ -238,12 +238,12 @@ class Updates:
             self._make_room(status, needed)
 
     def predict(self, samples: Sequence[AnySample]) -> None:
-        """Assembles the batch of one update and leaves the network's output of it in `engine.output`."""
+        """Assembles the batch of one update and leaves the network's output of it in `fused.output`."""
         self._prepare([samples], [0.0])
         while True:
             self._assemble()
             self._grid()
-            self.engine.forward()
+            self.fused.forward()
             status, *needed = torch.cat([self.grid.status, self.grid.needed_L]).tolist()
             if status == 0:
                 return
@@ -302,7 +302,7 @@ class Updates:
             self._graphs[0].replay() if self._graphs else self.launches()
             return
         self._graphs[0].replay() if self._graphs else self.launches_before_reduction()
-        self.reduce(self.engine.totals)
+        self.reduce(self.fused.totals)
         self._graphs[1].replay() if self._graphs else self.launches_after_reduction()
 
     # launches
@@ -322,40 +322,40 @@ class Updates:
         """From the sample table to this rank's gradients."""
         self._assemble()
         self._grid()
-        engine = self.engine
-        engine.forward()
+        fused = self.fused
+        fused.forward()
         kernel.loss_gradient[(triton.cdiv(self.particles, BLOCK),)](
-            output=engine.output,
+            output=fused.output,
             target=self.target_N3,
             share_of=self.share_N,
             particle_count=self.particle_count,
-            gradient=engine.output_gradient,
+            gradient=fused.output_gradient,
             loss=self.loss,
-            scale=1.0 / engine.unscale,
-            OUT=engine.output.shape[1],
+            scale=1.0 / fused.unscale,
+            OUT=fused.output.shape[1],
             BLOCK=BLOCK,
         )
-        engine.backward()
+        fused.backward()
         if self.reduce is not None:
-            kernel.tell_overflow[(1,)](status=self.grid.status, flag=engine.totals[-TAIL:])
+            kernel.tell_overflow[(1,)](status=self.grid.status, flag=fused.totals[-TAIL:])
 
     def launches_after_reduction(self) -> None:
         """From the gradients to new parameters."""
-        engine, size, share = self.engine, self.packed.size, 1.0 / self.ranks
+        fused, size, share = self.fused, self.packed.size, 1.0 / self.ranks
         blocks = (triton.cdiv(size, FLAT_BLOCK),)
         kernel.square_norm[blocks](
-            gradient=engine.totals,
+            gradient=fused.totals,
             size=size,
             share=share,
-            flag=engine.totals[-TAIL:],
+            flag=fused.totals[-TAIL:],
             status=self.grid.status,
             norm=self.norm,
             BLOCK=FLAT_BLOCK,
         )
         kernel.adam[blocks](
             value=self.values,
-            weight=engine.weights,
-            gradient=engine.totals,
+            weight=fused.weights,
+            gradient=fused.totals,
             share=share,
             first_moment=self.first_moment,
             second_moment=self.second_moment,
@@ -366,21 +366,21 @@ class Updates:
             norm=self.norm,
             size=size,
             others=self.blocks.member if self.blocks else None,
-            PRECISION=engine.copy_precision,
+            PRECISION=fused.copy_precision,
             BLOCK=FLAT_BLOCK,
         )
         if self.blocks is not None:
             self.blocks.step(
                 self.values,
-                engine.weights,
+                fused.weights,
                 self.first_moment,
-                engine.totals,
+                fused.totals,
                 share,
                 self._rates,
                 self.update,
                 self.grid.status,
                 self.norm,
-                engine.copy_precision,
+                fused.copy_precision,
             )
         if self.average is not None:
             kernel.average_values[blocks](
@@ -392,7 +392,7 @@ class Updates:
                 size=size,
                 BLOCK=FLAT_BLOCK,
             )
-        engine.refresh_encoder()
+        fused.refresh_encoder()
         kernel.finish_update[(1,)](
             status=self.grid.status,
             update=self.update,
@@ -486,8 +486,8 @@ class Updates:
         """Buffers for `particles` particles and `capacities` cells, which are measured first where unknown."""
         config, device, particles = self.config, self.device, self.particles
         self._graphs = []
-        if hasattr(self, "engine"):
-            del self.engine, self.grid  # before the new ones are allocated
+        if hasattr(self, "fused"):
+            del self.fused, self.grid  # before the new ones are allocated
         self._built_reach = self._reach
         self.position_N3 = torch.zeros(particles, 3, device=device)
         self.velocity_NV = torch.zeros(particles, 3 * config.velocity_history, device=device)
@@ -501,7 +501,7 @@ class Updates:
             self.grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
             self.capacities = self._rounded(self.grid.needed_L.tolist())
         self.grid = self._device_grid(self.capacities)
-        self.engine = self._engine()
+        self.fused = self._fused_network()
 
     # what the kind of network decides
 
@@ -509,7 +509,7 @@ class Updates:
         assert isinstance(self.network, HierarchicalGraphNetwork)
         return pack_network(self.network)
 
-    def _engine(self) -> TrainedEngine:
+    def _fused_network(self) -> TrainedNetwork:
         assert isinstance(self.grid, DeviceGrid) and isinstance(self.packed, PackedNetwork)
         # gradients of the mean over particles are small: float16 would lose them
         scale = 2.0 ** round(math.log2(max(self.particles, 2))) if self.precision == "fp16" else 1.0
