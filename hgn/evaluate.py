@@ -1,4 +1,4 @@
-"""python -m hgn.evaluate weights=… data=…: one-step and rollout errors beside the trivial predictors'."""
+"""python -m hgn.evaluate weights=… data=…: one-step and rollout errors beside the baselines'."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
     ours = next(row["one_step_mse"] for row in rows if row["system"] == "network")
     best = min(row["one_step_mse"] for row in rows if "one_step_mse" in row and row["system"] != "network")
     ratio = best / ours if ours > 0 else float("inf")
-    lines.append(f"the network's one-step MSE is {format_ratio(ratio)} the best trivial predictor's")
+    lines.append(f"the network's one-step MSE is {format_ratio(ratio)} the best baseline's")
     return "\n".join(lines)
 
 

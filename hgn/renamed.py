@@ -39,6 +39,19 @@ VALUES: dict[str, dict[Any, str]] = {
 }
 
 
+# Prefixes of logged metrics, old to new: metrics.jsonl of earlier runs stays as it is.
+METRICS = {"trivial/": "baseline/", "one_step_gain/": "baseline_ratio/", "own_states/": "pushforward/"}
+
+
+def current_metrics(record: Mapping[str, float]) -> dict[str, float]:
+    """A record of metrics.jsonl under today's names."""
+    result = {}
+    for name, value in record.items():
+        old = next((prefix for prefix in METRICS if name.startswith(prefix)), "")
+        result[METRICS.get(old, "") + name.removeprefix(old)] = value
+    return result
+
+
 def current_value(key: str, value: Any) -> Any:
     """A value as it is called today; `key` may be dotted, and of an item of a list."""
     values = VALUES.get(key.rpartition(".")[2].partition("[")[0], {})

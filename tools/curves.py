@@ -1,6 +1,6 @@
 """python -m tools.curves runs=[runs/obstacles] out=results/NAME: learning curves of runs as PNG and JSON.
 
-One run: loss, one-step errors beside the trivial predictors, and rollout errors, over updates. Several: loss and
+One run: loss, one-step errors beside the baselines, and rollout errors, over updates. Several: loss and
 one-step validation error over updates, and the latter over minutes of training, in one panel each.
 
 The JSON holds {"meta": provenance of the figure, "runs": [{"name", "meta": provenance and settings of the run,
@@ -20,6 +20,7 @@ from typing import Any
 import yaml
 
 from hgn.command import run_command
+from hgn.renamed import current_metrics
 from hgn.schema import ConfigError, from_mapping, require
 from hgn.system.files import write_atomically, write_json
 from hgn.system.provenance import provenance
@@ -34,7 +35,7 @@ ROW_KEYS = (
     "scenes_per_second",
     "gpu_memory_gb",
 )
-ROW_PREFIXES = ("one_step", "trivial", "rollout", "monitor")
+ROW_PREFIXES = ("one_step", "baseline", "rollout", "monitor")
 TRIVIAL_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
 LOSS = "MSE of normalised acceleration"
 ONE_STEP = "one-step MSE (sum over axes, frame units)"
@@ -102,7 +103,7 @@ def read_run(folder: Path, name: str) -> Run:
         raise ConfigError(
             f"runs must be folders of python -m hgn.train, got {folder} without {error.filename}"
         ) from None
-    records = [json.loads(line) for line in lines]
+    records = [current_metrics(json.loads(line)) for line in lines]
     _add_minutes(records)
     # A run that was stopped and resumed may have repeated some updates: the later record holds.
     latest = {(record["update"], "loss" in record): record for record in records}
@@ -133,7 +134,7 @@ def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
 
 
 def draw(run: Run) -> bytes:
-    """Loss and one-step errors over updates, the trivial predictors as lines, and rollout errors; PNG bytes."""
+    """Loss and one-step errors over updates, the baselines as lines, and rollout errors; PNG bytes."""
     figure, ((left, middle, right),) = new_figure(1, 3, (15, 4.5))
     records = run.records
     _plot(left, records, "loss", "training loss (noisy input)", "0.4")
@@ -141,7 +142,7 @@ def draw(run: Run) -> bytes:
     for split, color in (("training", "tab:blue"), ("validation", "tab:orange")):
         _plot(middle, records, f"one_step/{split}", f"network, {split}", color, marker="o")
     last = _last(records)
-    _trivial_lines(middle, last)
+    _baseline_lines(middle, last)
     middle.set_ylabel(ONE_STEP)
     for frame in (10, 50, 150, 299):
         _plot(right, records, f"rollout/mse_frame_{frame}", f"frame {frame}", None, marker="o")
@@ -167,7 +168,7 @@ def draw_several(runs: list[Run]) -> bytes:
         for axes, against in ((middle, "update"), (right, "minutes")):
             _plot(axes, run.records, "one_step/validation", "", color, marker="o", against=against)
     for axes in (middle, right):
-        _trivial_lines(axes, _last(runs[0].records))
+        _baseline_lines(axes, _last(runs[0].records))
         axes.set_ylabel(ONE_STEP + ", validation")
     left.set_ylabel(LOSS)
     for axes, label in ((left, "updates"), (middle, "updates"), (right, "minutes of training")):
@@ -196,11 +197,11 @@ def _origin(run: Run) -> str:
     return f"{where.get('device', '')}, commit {where.get('commit', '')}, {str(where.get('date', ''))[:10]}"
 
 
-def _trivial_lines(axes: Any, last: dict[str, float]) -> None:
+def _baseline_lines(axes: Any, last: dict[str, float]) -> None:
     for name, style in TRIVIAL_STYLES.items():
-        if f"trivial/validation_{name}" in last:
+        if f"baseline/validation_{name}" in last:
             label = f"{name.replace('_', ' ')}, validation"
-            axes.axhline(last[f"trivial/validation_{name}"], color="0.3", linestyle=style, label=label)
+            axes.axhline(last[f"baseline/validation_{name}"], color="0.3", linestyle=style, label=label)
 
 
 def _finish(axes: Any, label: str) -> None:

@@ -1,4 +1,4 @@
-"""The network's own states on backend triton against the plain one."""
+"""The pushforward pool on backend triton against that on torch."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
             assert picture.width > 500
     printed = capsys.readouterr().out
     assert all(
-        name in printed for name in ("HGN L = 3, M = 2", "GNS M = 3, plain fp32", "MPM 32³, step 1", "chaos floor")
+        name in printed for name in ("HGN L = 3, M = 2", "GNS M = 3, torch fp32", "MPM 32³, step 1", "chaos floor")
     )
 
 
@@ -228,11 +228,11 @@ def test_what_counts_most_comes_first(
     assert [name.split(" (")[0] for name in order] == [
         *["constant velocity", "ballistic motion", "mean acceleration"],
         *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
-        "HGN L = 3, M = 2, plain tf32",
-        "GNS M = 3, plain fp32",
+        "HGN L = 3, M = 2, torch tf32",
+        "GNS M = 3, torch fp32",
         "MPM 48³, step 0.5",
-        "HGN L = 3, M = 2, plain fp32",
-        "GNS M = 3, plain tf32",
+        "HGN L = 3, M = 2, torch fp32",
+        "GNS M = 3, torch tf32",
     ]
     report = json.loads((tmp_path / "report.json").read_text())
     (left,) = report["meta"]["not_run"]
@@ -553,12 +553,12 @@ def report_rows() -> list[dict[str, Any]]:
 
 
 def test_comparisons_in_words() -> None:
-    """Each network beside the best trivial predictor, by material too; HGN beside GNS and the solver, each at its
+    """Each network beside the best baseline, by material too; HGN beside GNS and the solver, each at its
     fastest; penetration in the worst scene beside the solver's own."""
     told = "\n".join(comparisons(report_rows()))
-    hgn = "HGN L = 3, M = 4, fast fp16 (hgn.safetensors)"
+    hgn = "HGN L = 3, M = 4, triton fp16 (hgn.safetensors)"
     assert f"{hgn}: 1.00e-07, 100.00 times below (water 2.00e-07, 100.00 times below)" in told
-    assert f"beside GNS M = 4, fast fp16 (gns.safetensors)\n  {hgn}: one-step MSE 2.00 times below" in told
+    assert f"beside GNS M = 4, triton fp16 (gns.safetensors)\n  {hgn}: one-step MSE 2.00 times below" in told
     assert "after 299 frames 2.00 times below, 10.0 times as fast" in told
     assert f"{hgn}: 40.0 times as fast as MPM 32³, step 1" in told
     assert "for the error after 50 frames 200.0 times as fast as MPM 64³, step 0.5" in told

@@ -1,4 +1,4 @@
-"""Training on the network's own states, on backend torch."""
+"""Pushforward on backend torch."""
 
 from __future__ import annotations
 

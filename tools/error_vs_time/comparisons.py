@@ -29,7 +29,7 @@ def _one_step(networks: Sequence[Row], trivial: Sequence[Row]) -> list[str]:
     if not networks or not trivial:
         return []
     best = min(trivial, key=lambda row: row["one_step_mse"])
-    lines = ["", f"one-step MSE beside the best trivial predictor ({best['predictor']}, {best['one_step_mse']:.2e})"]
+    lines = ["", f"one-step MSE beside the best baseline ({best['predictor']}, {best['one_step_mse']:.2e})"]
     for row in networks:
         parts = []
         for material, mse in row["one_step_by_material"].items():
