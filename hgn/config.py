@@ -120,6 +120,8 @@ class MpmConfig:
     water_volume_update: str = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
     water_tension: float = 1.0  # share of the tension that stretched water bears, as Taichi Elements' does; 0: none
     water_viscosity_pa_s: float = 0.0  # beside that of the grid, which is larger than real water's
+    # to be as its particles lie, below a free surface: else water at rest sinks in a random filling; null: never
+    water_density_relaxation_s: float | None = 1.0
     water_minimum_volume_ratio: float = 0.1  # floor on J; hits are counted
     minimum_singular_value: float = 0.05  # floor on the singular values of F; hits are counted
     time_integration: str = "leapfrog"  # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
@@ -169,6 +171,9 @@ class MpmConfig:
         require(self.stability_fraction <= 1, "stability_fraction", "at most 1", self.stability_fraction)
         require(self.speed_fraction <= 1, "speed_fraction", "at most 1", self.speed_fraction)
         require(0 <= self.poisson_ratio < 0.5, "poisson_ratio", "in [0, 0.5)", self.poisson_ratio)
+        relaxation = self.water_density_relaxation_s
+        rule = "> 0 or none"
+        require(relaxation is None or 0 < relaxation < math.inf, "water_density_relaxation_s", rule, relaxation)
         require(self.water_tension <= 1, "water_tension", "at most 1", self.water_tension)
         compression = self.snow_critical_compression
         require(compression < 1, "snow_critical_compression", "< 1", compression)

@@ -39,13 +39,16 @@ class FrameClock:
 
 def solver_scene(episode: Episode, cell_size: float | None = None) -> Scene:
     """An episode's initial state for the solver, on its own grid or another."""
+    own = episode.obstacle_grid.cell_size
+    density = episode.specification.get("particles_per_cell")  # none in data made before it was kept
     return Scene(
         position_N3=np.array(episode.position_TN3[0]),
         velocity_N3=episode.initial_velocity_N3,
         material_N=episode.material_N,
         obstacles=obstacles_of_episode(episode),
         domain_size=episode.domain_size,
-        cell_size=episode.obstacle_grid.cell_size if cell_size is None else cell_size,
+        cell_size=own if cell_size is None else cell_size,
+        particles_per_cell=density if density is None or cell_size is None else density * (cell_size / own) ** 3,
         gravity=episode.gravity,
         seed=episode.seed,
     )

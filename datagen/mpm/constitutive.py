@@ -68,6 +68,18 @@ def water(
 
 
 @ti.func
+def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
+    """Water's J, moved by a share towards the volume that its density tells; density is 1 at rest.
+
+    J is integrated along the way of each particle, which samples a flow between the others, so that J and density part
+    company. Below a free surface alone: density is that of a kernel, and falls where it reaches out of the water.
+    """
+    inside = ti.min(ti.max(10.0 * (density - 0.85), 0.0), 1.0)
+    told = 1.0 / ti.min(ti.max(density, 0.8), 1.25)
+    return volume + inside * share * (told - volume)
+
+
+@ti.func
 def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, taichi_elements_sand: ti.template()):
     """Return mapping of the principal log strains: new ones, and the new volume correction.
 

@@ -24,9 +24,10 @@ from datagen.mpm.mls_mpm import (
     node_velocity,
     raise_maximum,
     respond,
+    settle,
     weights,
 )
-from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
 
 @ti.func
@@ -121,6 +122,8 @@ def _grid_to_particle(
     position: ti.template(),
     velocity: ti.template(),
     affine: ti.template(),
+    volume: ti.template(),
+    is_water: ti.i32,
     node: ti.template(),
     scene_value: ti.template(),
     counter: ti.template(),
@@ -138,6 +141,9 @@ def _grid_to_particle(
         x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
     )
     raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
+    if ti.static(bool(variant & VARIANT.water)):
+        if is_water:
+            volume[p] = settle(x, volume[p], first_node, scene, node, 3, scene_value, setting, shape, 1)
     position[p] = moved
     velocity[p] = speed
     affine[p] = C
@@ -237,8 +243,8 @@ def substep(
         scene = label[p] >> MATERIAL_BITS
         if scene_value[scene, VALUE.time_step] > 0.0 and scene_value[scene, VALUE.interval_remaining] == 0.0:
             _grid_to_particle(
-                p, scene, position, velocity, affine, node, scene_value, counter, setting, shape, contact,
-                contact_normal, variant,
+                p, scene, position, velocity, affine, volume, label[p] & MATERIAL_MASK == WATER, node, scene_value,
+                counter, setting, shape, contact, contact_normal, variant,
             )  # fmt: skip
 
 

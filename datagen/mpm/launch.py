@@ -224,6 +224,9 @@ class Launch(ABC):
         for index, scene in enumerate(self.scenes):
             own = slice(self.particle_begin[index], self.particle_begin[index + 1])
             value[index, VALUE.gravity : VALUE.gravity + 3] = scene.gravity
+            # what is heavier beside it would pass for water that is pressed together
+            alike = (laws[row[own], CONSTANT.mass] == 1).all()
+            value[index, VALUE.water_density] = (scene.particles_per_cell or 0.0) if alike else 0.0
             value[index, VALUE.least_stiffness] = least[scene.material_N, row[own]].max()
         return value
 
@@ -256,6 +259,8 @@ class Launch(ABC):
         setting[SETTING.speed_fraction] = config.speed_fraction
         setting[SETTING.transfer_interval] = cell_size / config.transfer_speed_m_s if config.transfer_speed_m_s else 0
         setting[SETTING.leapfrog] = config.time_integration == "leapfrog"
+        if config.water_density_relaxation_s is not None:
+            setting[SETTING.density_relaxation] = 1 / config.water_density_relaxation_s
         setting[SETTING.friction] = config.collider_friction
         setting[SETTING.low : SETTING.low + 3] = low
         setting[SETTING.high : SETTING.high + 3] = high

@@ -74,7 +74,8 @@ class SceneValue(NamedTuple):
     begins: int = 12  # 1 where the present substep is the first of its interval, else 0
     stability_fraction: int = 13  # of the limit of stability: the longest step of stress
     gravity_time: int = 14  # for which gravity acts in the present substep, s: see mls_mpm
-    length: int = 15
+    water_density: int = 15  # at rest, in masses of a particle a cell; 0 where it is not known
+    length: int = 16
 
 
 class Status(NamedTuple):
@@ -98,7 +99,8 @@ class Setting(NamedTuple):
     size: int = 12  # 12, 13, 14: of the domain
     transfer_interval: int = 15  # s; 0 where every substep is a transfer
     leapfrog: int = 16  # 1 where velocities belong to the middle of an interval, 0 to its end
-    length: int = 17
+    density_relaxation: int = 17  # in a second, of water's J to its density
+    length: int = 18
 
 
 class Shape(NamedTuple):

@@ -23,7 +23,7 @@ Everything is per scene: time step, interval, remaining time, state, counters. A
 
 import taichi as ti
 
-from datagen.mpm.constitutive import count_event, hardening, solid, water
+from datagen.mpm.constitutive import count_event, hardening, settled, solid, water
 from datagen.mpm.layout import (
     BLOCK,
     BLOCK_NODES,
@@ -410,6 +410,68 @@ def interpolate(
         gradient_y += w[i][0] * plane_y
         gradient_z += w[i][0] * plane_z
     return v, ti.Matrix.cols([gradient_x, gradient_y, gradient_z]) * (4.0 * inverse_dx)
+
+
+@ti.func
+def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32:
+    """The share of a particle's nodes, by weight, that lies between the walls of an axis."""
+    w0, w1, w2 = weights(fx)
+    wall = shape[SHAPE.wall_cells]
+    room = 0.0
+    for offset, w in ti.static(((0, w0), (1, w1), (2, w2))):
+        # in cells within the wall; a node's own spline reaches 1.5 cells
+        depth = ti.min(base + offset - (wall - 1), shape[SHAPE.nodes + axis] - wall - base - offset)
+        share = 1.0
+        if depth == 1:
+            share = 47.0 / 48.0
+        elif depth == 0:
+            share = 0.5
+        elif depth == -1:
+            share = 1.0 / 48.0
+        elif depth < -1:
+            share = 0.0
+        room += share * w
+    return room
+
+
+@ti.func
+def settle(
+    x,
+    volume: ti.f32,
+    first_node: ti.i32,
+    scene: ti.i32,
+    node: ti.template(),
+    mass_at: ti.template(),
+    scene_value: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    components: ti.template(),
+) -> ti.f32:
+    """J of a particle of water after an interval, nearer to what the masses of the nodes around tell.
+
+    Masses are the fourth of a node's vector with components=1, or lie at `mass_at` (see node_places).
+    """
+    out = volume
+    rest = scene_value[scene, VALUE.water_density]
+    if rest > 0.0 and setting[SETTING.density_relaxation] > 0.0:
+        scaled = x * setting[SETTING.inverse_cell_size]
+        base = ti.floor(scaled - 0.5, ti.i32)
+        fx = scaled - ti.cast(base, ti.f32)
+        w0, w1, w2 = weights(fx)
+        w = ti.static((w0, w1, w2))
+        index_x, index_y, index_z = node_places(base, first_node, shape, components)
+        mass = 0.0
+        for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
+            place = index_x[i] + index_y[j] + index_z[k]
+            weight = w[i][0] * w[j][1] * w[k][2]
+            if ti.static(components == 1):
+                mass += weight * node[place][3]
+            else:
+                mass += weight * node[place + mass_at * BLOCK_NODES]
+        room = _room(fx[0], base[0], 0, shape) * _room(fx[1], base[1], 1, shape) * _room(fx[2], base[2], 2, shape)
+        share = scene_value[scene, VALUE.interval_elapsed] * setting[SETTING.density_relaxation]
+        out = settled(volume, mass / (rest * ti.max(room, 0.1)), ti.min(share, 1.0))
+    return out
 
 
 @ti.func

@@ -49,16 +49,18 @@ from datagen.mpm.mls_mpm import (
     node_velocity,
     raise_maximum,
     respond,
+    settle,
     spline,
 )
-from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
 LANES = 9  # threads that share a cell; each holds the three nodes of one y and z
 # Components of a node: what comes to its momentum in a step, from 0 on; its mass; its velocity, from VELOCITY on. The
 # first are zero between steps, the mass between intervals.
 MASS = 3
 VELOCITY = 4
-COMPONENTS = 7
+SETTLING = 7  # the mass, for the end of an interval
+COMPONENTS = 8
 
 
 @ti.func
@@ -312,8 +314,10 @@ def _gather(
     first: ti.i32,
     count: ti.i32,
     particles: ti.i32,
+    tags: ti.i32,
     stride: ti.i32,
     state: ti.template(),
+    tag: ti.template(),
     order: ti.template(),
     node: ti.template(),
     scene_value: ti.template(),
@@ -330,12 +334,20 @@ def _gather(
     largest = 0.0
     s = lane
     while s < count:
-        place = particles + order[first + s]
+        p = order[first + s]
+        place = particles + p
         x = _vector(state, place, stride, FIELD.position)
         v, C = interpolate(x, velocities, node, setting[SETTING.inverse_cell_size], shape, COMPONENTS)
         moved, speed, speed_square = move(
             x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
         )
+        if ti.static(bool(variant & VARIANT.water)):  # noqa: SIM102 (this one is the compiler's)
+            if tag[tags + TAG.material * stride + p] == WATER:
+                volume = place + FIELD.volume * stride
+                state[volume] = settle(
+                    x, state[volume], _first_node(scene, shape), scene, node, SETTLING, scene_value, setting, shape,
+                    COMPONENTS,
+                )  # fmt: skip
         _put_vector(state, place, stride, FIELD.position, moved)
         _put_vector(state, place, stride, FIELD.velocity, speed)
         _put_matrix(state, place, stride, FIELD.affine, C)
@@ -465,6 +477,7 @@ def advance(
                             node[place + c * BLOCK_NODES] = 0.0
                             node[place + (VELOCITY + c) * BLOCK_NODES] = v[c]
                         if ends:
+                            node[place + SETTLING * BLOCK_NODES] = node[place + MASS * BLOCK_NODES]
                             node[place + MASS * BLOCK_NODES] = 0.0
                         n += threads
                     if begins:
@@ -475,8 +488,8 @@ def advance(
                     _wait(threads)
                     if ends:
                         _gather(
-                            lane, scene, first, count, particles, stride, state, order, node, scene_value, counter,
-                            setting, shape, contact, contact_normal, variant, threads,
+                            lane, scene, first, count, particles, tags, stride, state, tag, order, node, scene_value,
+                            counter, setting, shape, contact, contact_normal, variant, threads,
                         )  # fmt: skip
                         _wait(threads)
                 else:

@@ -249,9 +249,11 @@ def _assemble(config: SceneConfig, seed: int, obstacles: list[_Placed], bodies: 
         cell_size=config.cell_size,
         gravity=config.gravity,
         seed=seed,
+        particles_per_cell=config.particles_per_cell,
         specification={
             "kind": "random",
             "seed": seed,
+            "particles_per_cell": config.particles_per_cell,
             "obstacles": [item.record for item in obstacles],
             "groups": [body.record for body in bodies],
         },

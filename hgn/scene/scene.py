@@ -44,6 +44,8 @@ class Scene:
     # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS), where they differ from the solver's settings;
     # NaN where they do not
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
+    # of material at rest, where its filling is known: the solver then holds water to it
+    particles_per_cell: float | None = None
 
     def __post_init__(self) -> None:
         count = len(self.position_N3)

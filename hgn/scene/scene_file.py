@@ -203,6 +203,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         cell_size=file.cell_size,
         gravity=file.gravity,
         seed=file.seed,
+        particles_per_cell=file.particles_per_cell,
         material_parameters=_material_parameters(file.groups, counts),
         specification={"kind": "file", **to_mapping(file), "particle_counts": counts},
     )

@@ -22,10 +22,10 @@ from tools.stability.row import Row, table
 from tools.stability.solver_leak import OFFSETS, leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
 from tools.stability.solver_steps import Point, draw, largest_steps
-from tools.stability.solver_validation import validation
+from tools.stability.solver_validation import grids, validation
 
 PART = "solver"
-CASES = ("steps", "stiffness", "impact", "convergence", "leak", "long", "validation")
+CASES = ("steps", "stiffness", "impact", "convergence", "leak", "long", "validation", "grid")
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ def main(mapping: dict[str, Any]) -> int:
         ),
         "long": lambda: long_run(mpm),
         "validation": lambda: validation(mpm),
+        "grid": lambda: grids(mpm),
     }
     rows: list[Row] = []
     wanted = [name for name in CASES if name in (config.cases or CASES)]

@@ -37,6 +37,17 @@ DAM_DEPTH = 1 / 16  # of the width: where water is as deep, there is the front
 DAM_LEADS, DAM_RESOLVED = 0.18, 0.05
 DAM_RATE_HZ = 200.0
 
+# water that stands from wall to wall
+REST_CELLS, REST_DEPTH = 6, 0.375  # m
+REST_S, REST_RATE_HZ, REST_WITHIN = 20.0, 4.0, 0.005
+SETTLED_S = 2.5  # until its first waves are gone
+
+# one scene on three grids
+GRID_CELLS = (8, 16, 32)  # in the width of the dam and the radius of the column
+GRID_ASPECT = 1.5
+GRID_DAM_S = 0.25
+GRID_WITHIN = 0.05
+
 # quarters of round columns on a rough floor: run-out beside Lube et al. 2004, height beside Lajeunesse et al. 2004
 COLUMN_RADIUS = 0.5  # m; the tallest column's own weight presses it by 2 %
 COLUMN_CELLS = 24  # in radius
@@ -66,8 +77,8 @@ AT_REST = 1e-2  # m/s, root mean square
 
 
 def validation(base: MpmConfig) -> list[Row]:
-    """Rows of the dam break, of columns by each friction law, and of angles of repose."""
-    return [*dam_breaks(base), *columns(base), *reposes(base)]
+    """Rows of water at rest, of the dam break, of columns by each friction law, and of angles of repose."""
+    return [*rest(base), *dam_breaks(base), *columns(base), *reposes(base)]
 
 
 def dam_breaks(base: MpmConfig) -> list[Row]:
@@ -100,6 +111,45 @@ def dam_front(position_N3: np.ndarray, cells: int) -> float:
     place = position_N3[:, 0] * cells / DAM_WIDTH - WALL
     depth = np.bincount(np.maximum(np.floor(place).astype(int), 0)) / (SLAB * PARTICLES_PER_CELL)
     return edge(depth, DAM_DEPTH * cells) / cells
+
+
+def rest(base: MpmConfig) -> list[Row]:
+    """The level of water that stands in a random filling."""
+    scene = basin(WATER, (REST_CELLS,) * 3, (REST_CELLS, REST_CELLS + 3, REST_CELLS), REST_DEPTH / REST_CELLS)
+    path = _path(scene, base, 1 + round(REST_S * REST_RATE_HZ), REST_RATE_HZ)
+    level = 2 * (path[:, :, 1].mean(axis=1) / scene.cell_size - WALL) / REST_CELLS
+    change = level[round(SETTLED_S * REST_RATE_HZ) :] / level[0] - 1
+    worst = float(change[np.abs(change).argmax()])
+    beyond = f"{change[0]:+.2%} after {SETTLED_S:g} s, {change[-1]:+.2%} after {REST_S:g} s"
+    return [Row("level of water at rest, random filling", REST_WITHIN, worst, abs(worst) <= REST_WITHIN, beyond)]
+
+
+def grids(base: MpmConfig) -> list[Row]:
+    """What a grid twice and four times as fine changes in fronts, run-outs and heights, and the order of it."""
+    rows = []
+    sand = base.sand_friction_law, base.sand_friction_angle_deg
+    measured: dict[str, list[float]] = {
+        "front of the dam break, in widths": [], "run-out of a sand column": [], "height of a sand column": [],
+    }  # fmt: skip
+    fronts, run_outs, heights = measured.values()
+    for cells in GRID_CELLS:
+        path = _path(dam(cells), base, 2 + math.ceil(GRID_DAM_S * DAM_RATE_HZ))
+        fronts.append(dam_front(path[-1], cells))
+        run_out, height = column_rows(GRID_ASPECT, *sand, base, cells)
+        run_outs.append(float(run_out.measured))
+        heights.append(float(height.measured))
+    for name, values in measured.items():
+        coarse, fine = values[1] - values[0], values[2] - values[1]
+        rate = math.log2(abs(coarse / fine)) if coarse and fine else math.inf
+        limit = values[2] + fine / (2**rate - 1) if rate > 0.1 else math.nan
+        change = abs(values[2] / values[1] - 1)
+        beyond = (
+            f"{', '.join(f'{value:.3f} at {cells}' for value, cells in zip(values, GRID_CELLS, strict=True))} cells; "
+            f"order {rate:.2f}" + (f", towards {limit:.3f}" if math.isfinite(limit) else "")
+        )
+        more = {"cells": list(GRID_CELLS), "values": values, "order": rate if math.isfinite(rate) else None}
+        rows.append(Row(f"grid twice as fine: {name}", GRID_WITHIN, change, change <= GRID_WITHIN, beyond, more))
+    return rows
 
 
 def columns(base: MpmConfig) -> list[Row]:
@@ -222,7 +272,7 @@ def basin(
     return Scene(
         (place * cell).astype(np.float32), np.zeros((count, 3), np.float32), np.full(count, material, np.uint8),
         obstacles, domain_size=(nodes[0] * cell, nodes[1] * cell, nodes[2] * cell), cell_size=cell,
-        gravity=(0.0, -GRAVITY, 0.0),
+        gravity=(0.0, -GRAVITY, 0.0), particles_per_cell=PARTICLES_PER_CELL,
     )  # fmt: skip
 
 

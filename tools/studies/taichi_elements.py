@@ -99,7 +99,7 @@ def faithful_mode(device: str) -> tuple[MpmConfig, float]:
     mpm = MpmConfig(
         device=device, time_step="fixed", fixed_time_step_s=step, sand_volume_correction="taichi_elements",
         sand_friction_law="compression", sand_friction_angle_deg=45.0, time_integration="symplectic_euler",
-        water_volume_update="taichi_elements", snow_maximum_hardening=100.0,
+        water_volume_update="taichi_elements", water_density_relaxation_s=None, snow_maximum_hardening=100.0,
     )  # fmt: skip
     return mpm, 1 / (taichi_elements_substeps() * step)
 
