@@ -40,7 +40,7 @@ class FrameClock:
 def solver_scene(episode: Episode, cell_size: float | None = None) -> Scene:
     """An episode's initial state for the solver, on its own grid or another."""
     own = episode.obstacle_grid.cell_size
-    density = episode.specification.get("particles_per_cell")  # none in data made before it was kept
+    density = episode.solver.get("particles_per_cell")  # none in data made before it was kept
     return Scene(
         position_N3=np.array(episode.position_TN3[0]),
         velocity_N3=episode.initial_velocity_N3,

@@ -374,6 +374,7 @@ def make_episode(made: MadeScene, result: Any, config: DatagenConfig, config_has
         specification=made.scene.specification,
         solver={
             "settings": physics_settings(config),
+            "particles_per_cell": made.scene.particles_per_cell,
             "counters": dict(result.counters),
             "dataset": {"config_hash": config_hash, "attempt": made.task.attempt},
         },

@@ -253,7 +253,6 @@ def _assemble(config: SceneConfig, seed: int, obstacles: list[_Placed], bodies: 
         specification={
             "kind": "random",
             "seed": seed,
-            "particles_per_cell": config.particles_per_cell,
             "obstacles": [item.record for item in obstacles],
             "groups": [body.record for body in bodies],
         },
