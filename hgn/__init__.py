@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hgn.runtime.simulator import DivergenceError as DivergenceError
+    from hgn.runtime.divergence import DivergedError as DivergedError
     from hgn.runtime.simulator import Simulator as Simulator
     from hgn.scene.mesh import load_mesh as load_mesh
     from hgn.scene.rollout_file import Rollout as Rollout
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "ConfigError": "hgn.schema",
-    "DivergenceError": "hgn.runtime.simulator",
+    "DivergedError": "hgn.runtime.divergence",
     "Obstacle": "hgn.scene.scene",
     "Rollout": "hgn.scene.rollout_file",
     "Scene": "hgn.scene.scene",

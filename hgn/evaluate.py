@@ -12,8 +12,8 @@ from hgn.command import run_command
 from hgn.config import EvaluateConfig
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
-from hgn.network.base import ParticleNetwork
-from hgn.runtime.rollouts import RolloutResult, network_trials
+from hgn.runtime.backend import Backend
+from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import require_frame_rate
 from hgn.scene.distance import share_inside
@@ -42,9 +42,9 @@ def main(mapping: dict[str, Any]) -> int:
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     require_frame_rate(info, episodes[0].frame_rate_hz)
-    rows = one_step_rows(simulator.network, episodes, config)
+    rows = one_step_rows(simulator.backend, episodes, config)
     if config.rollout_frames >= 2:
-        print(simulator.backend_note, file=sys.stderr)
+        print(simulator.backend.note, file=sys.stderr)
         rows.append(rollout_row(simulator, episodes, config.rollout_frames))
     print(table(rows, config, len(episodes)))
     if config.json is not None:
@@ -56,10 +56,10 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def one_step_rows(network: ParticleNetwork, episodes: list[Episode], config: EvaluateConfig) -> list[dict[str, Any]]:
+def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateConfig) -> list[dict[str, Any]]:
     """One row a predictor: {"system", "one_step_mse", "by_material"}."""
-    predictors = {"network": network_predictor(network)} | baselines(network)
-    device = next(network.parameters()).device
+    network, device = backend.network, backend.device
+    predictors = {"network": network_predictor(backend)} | baselines(network)
     total = sum(-(-(len(episode.position_TN3) - 1) // config.frame_stride) for episode in episodes)
     with bar("one-step errors", total=total, unit="frame") as progress:
 
@@ -82,7 +82,7 @@ def rollout_row(simulator: Simulator, episodes: list[Episode], frames: int) -> d
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     with bar("rollouts", total=frames - 1, unit="frame") as progress:
         initial = [InitialState.of_episode(episode) for episode in episodes]
-        trials = network_trials(simulator, initial, frames, lambda _: progress.update())
+        trials = simulate_scenes(simulator, initial, frames, lambda _: progress.update())
     mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
     told = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
     reached = {str(n): sum(trial.frame_count > n for trial in trials) for n in told}

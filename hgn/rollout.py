@@ -17,7 +17,8 @@ from hgn.command import run_command
 from hgn.config import RolloutConfig, SceneConfig
 from hgn.data.lookup import find_episode
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
-from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.runtime.divergence import DivergedError
+from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
@@ -78,11 +79,11 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": config.episode}
-    print(simulator.backend_note, file=sys.stderr)
+    print(simulator.backend.note, file=sys.stderr)
     with bar("simulating", total=frames - 1, unit="frame") as progress:
         try:
             (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
-        except DivergenceError as error:
+        except DivergedError as error:
             raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
     path = Path(config.out if config.out is not None else f"rollout/{name}.vtkhdf")
     made = Rollout(

@@ -30,7 +30,7 @@ WIDEST = 512  # two matrices of it lie on a thread's stack
 COMPILERS = ("cc", "gcc", "clang")
 
 
-def why_not_compiled(width: int, dtype: torch.dtype) -> str | None:
+def unsupported_reason(width: int, dtype: torch.dtype) -> str | None:
     """What keeps rows on a CPU from being computed in one pass, in words; none if nothing does."""
     if dtype != torch.float32:
         return f"it computes float32, not {dtype}"
@@ -41,17 +41,17 @@ def why_not_compiled(width: int, dtype: torch.dtype) -> str | None:
 
 def rows_class(width: int, dtype: torch.dtype) -> type[Rows]:
     """What computes an MLP's rows on a CPU."""
-    return Rows if why_not_compiled(width, dtype) else CompiledRows
+    return Rows if unsupported_reason(width, dtype) else CompiledRows
 
 
-def said(width: int) -> str:
+def describe(width: int) -> str:
     """What computes float32 rows on a CPU, and why, for people."""
-    reason = why_not_compiled(width, torch.float32)
+    reason = unsupported_reason(width, torch.float32)
     return "rows compiled for this CPU" if reason is None else f"rows in PyTorch ({reason})"
 
 
 class CompiledRows(Rows):
-    """Of FCNs whose layers are as wide as each other, or only projections of others."""
+    """Of MLPs whose layers are as wide as each other, or only projections of others."""
 
     def __init__(self, network: torch.nn.Module) -> None:
         super().__init__(network)

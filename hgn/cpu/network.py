@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 from functools import partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
@@ -21,16 +20,24 @@ from torch import nn
 from hgn.cpu.block_threads import for_each, single_threaded
 from hgn.cpu.compiled import rows_class
 from hgn.cpu.rows import Hidden, Rows, Segments
+from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level
-
-if TYPE_CHECKING:
-    from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.hgn import HierarchicalGraphNetwork
 
 # Rows of edges or pairs of a block: at width 128 an intermediate result takes two megabytes. Smaller blocks stay in
 # faster caches, but each operation costs some microseconds of Python, in which all other threads wait, and where rows
 # are compiled, matrices are transposed for each block.
 ROWS_AT_ONCE = 4096
 FEWEST_ROWS = 256  # worth a thread's waking
+
+
+def normalised_acceleration(
+    network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor | None = None
+) -> torch.Tensor:
+    """What the network's own function of that name gives, without gradients."""
+    with torch.no_grad():
+        grid = network.grid(state, origin_S3)
+        return propagate(network, network.encode_particles(state), grid)
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
@@ -41,20 +48,20 @@ def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid
     with torch.no_grad(), single_threaded() as threads:
         cells = [_Cells(level, threads) for level in grid.levels]
         cell_CW = _to_cells(rows_of(network.particle_to_cell), particle_NW, grid, threads)
-        kept: list[torch.Tensor] = []
+        cells_down: list[torch.Tensor] = []
         for i, level in enumerate(cells):
             cell_CW = _passed(rows_of, network.passing_down[i], cell_CW, level, threads)
             if i + 1 == len(cells):
                 break
             parent_C = grid.levels[i].parent_C
             assert parent_C is not None
-            kept.append(cell_CW)
+            cells_down.append(cell_CW)
             message_CW = _to_parents(rows_of(network.fine_to_coarse[i]), cell_CW, level, parent_offset_83, threads)
             cell_CW = cell_CW.new_zeros(grid.levels[i + 1].cell_count, cell_CW.shape[1])
             cell_CW.index_add_(0, parent_C, message_CW)
-        for i in reversed(range(len(kept))):
+        for i in reversed(range(len(cells_down))):
             rows = rows_of(network.coarse_to_fine[i])
-            cell_CW = _to_children(rows, cell_CW, kept[i], cells[i], -parent_offset_83, threads)
+            cell_CW = _to_children(rows, cell_CW, cells_down[i], cells[i], -parent_offset_83, threads)
             cell_CW = _passed(rows_of, network.passing_up[i], cell_CW, cells[i], threads)
         rows, decode = rows_of(network.cell_to_particle), rows_of(network.decode)
         return _to_particles(rows, decode, particle_NW, cell_CW, grid, threads)
@@ -134,7 +141,7 @@ def _to_parents(
 def _to_children(
     rows: Rows,
     coarse_CW: torch.Tensor,
-    kept_CW: torch.Tensor,
+    down_CW: torch.Tensor,
     cells: _Cells,
     offset_83: torch.Tensor,
     threads: int,
@@ -146,12 +153,12 @@ def _to_children(
     _project(rows, table_CW[:count], threads, (0, coarse_CW))
     rows.project_into(table_CW[count:], 2, offset_83, rows.first_bias)
     ends_C2 = torch.stack([cells.level.parent_C, cells.level.octant_C + count], -1)
-    result_CW = torch.empty_like(kept_CW)
+    result_CW = torch.empty_like(down_CW)
     ends = [ends.flatten() for ends in cells.blocks.split(ends_C2)]
-    kept, result = map(cells.blocks.split, (kept_CW, result_CW))
+    down, result = map(cells.blocks.split, (down_CW, result_CW))
 
     def receive(block: int) -> None:
-        rows.output(result[block], Hidden(table_CW, ends[block], 2, 1, kept[block]), kept[block])
+        rows.output(result[block], Hidden(table_CW, ends[block], 2, 1, down[block]), down[block])
 
     for_each(receive, range(len(cells.blocks)), threads)
     return result_CW

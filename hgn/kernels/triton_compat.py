@@ -97,7 +97,7 @@ def use_target(capability: int) -> None:
 
 
 class JitMisses:
-    """Counts the kernels that were compiled since then in this process, not ahead (hgn.kernels.precompile), and the
+    """Counts the kernels that were compiled since then in this process, not ahead (hgn.runtime.precompile), and the
     seconds that took."""
 
     def __init__(self) -> None:

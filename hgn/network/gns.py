@@ -52,19 +52,23 @@ class GraphNetworkSimulator(ParticleNetwork):
         self.encode_edges = MLP((3, 1), width, width, slope=RELU)
         self.steps = nn.ModuleList(InteractionStep(width) for _ in range(config.message_passing_steps))
         self.decode = MLP((width,), width, 3, layer_norm=False, slope=RELU)
-        # What works on the edges, as hgn.runtime.gns_backend chooses it; none: PyTorch and its own gradients.
-        self.edges: Edges | None = None
 
-    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+    def normalised_acceleration(
+        self, state: ParticleState, origin_S3: torch.Tensor | None = None, edges: Edges | None = None
+    ) -> torch.Tensor:
         """The network's raw output [N, 3] of the moving particles. There is no grid for `origin_S3` to move.
 
+        `edges` works on the edges, as a backend chooses it; none: PyTorch and its own gradients.
         Raises: GridRangeError when a particle is not finite or too far from the origin.
         """
         moving = len(state.position_N3)
         state = self.with_static_particles(state)
         neighbours = self.neighbours(state)
-        output_N3 = self.propagate(state, neighbours)
-        return output_N3[:moving]
+        return self.propagate(state, neighbours, edges)[:moving]
+
+    def predict(self, state: ParticleState, edges: Edges | None) -> torch.Tensor:
+        """Accelerations [N, 3] in frame units, with `edges` at work."""
+        return self.normaliser.restore_acceleration(self.normalised_acceleration(state, edges=edges))
 
     def neighbours(self, state: ParticleState) -> NeighbourList:
         """The graph of a state that holds its static particles."""
@@ -93,7 +97,7 @@ class GraphNetworkSimulator(ParticleNetwork):
             surface=None,
         )
 
-    def propagate(self, state: ParticleState, neighbours: NeighbourList) -> torch.Tensor:
+    def propagate(self, state: ParticleState, neighbours: NeighbourList, edges: Edges | None = None) -> torch.Tensor:
         """The raw output [N, 3] of a state and its graph."""
         order_N = neighbours.order_N
         # a gather of what has gradients would have to be summed backward
@@ -104,13 +108,15 @@ class GraphNetworkSimulator(ParticleNetwork):
             material_N=state.material_N[order_N],
             scene_N=state.scene_N[order_N],
         )
-        decoded_N3 = self.decoded(self.encode_particles(state), state.position_N3, neighbours)
+        decoded_N3 = self.decoded(self.encode_particles(state), state.position_N3, neighbours, edges)
         return torch.empty_like(decoded_N3).index_copy(0, order_N, decoded_N3)
 
-    def decoded(self, node_NW: torch.Tensor, position_N3: torch.Tensor, neighbours: NeighbourList) -> torch.Tensor:
+    def decoded(
+        self, node_NW: torch.Tensor, position_N3: torch.Tensor, neighbours: NeighbourList, edges: Edges | None = None
+    ) -> torch.Tensor:
         """The raw output [N, 3] of encoded particles, all in the list's order."""
-        if self.edges is not None:
-            node_NW = self._steps_of_edges(self.edges, node_NW, position_N3, neighbours)
+        if edges is not None:
+            node_NW = self._steps_of_edges(edges, node_NW, position_N3, neighbours)
         elif torch.is_grad_enabled():
             node_NW = self._steps(node_NW, position_N3, neighbours)
         else:

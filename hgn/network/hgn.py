@@ -1,7 +1,5 @@
 """The hierarchical graph network (paper sec. 3.2, fig. 2): plain torch, the reference for every faster path.
 
-On a CPU, where no gradients are wanted, hgn.cpu.network computes the same function, if it can by compiled C.
-
 Steps: encode particles (0), particles to cells (1), message passing on each level down (2, 4, …) with fine to
 coarse (3, 5, …) between, message passing on each level up (8, 10, …) after coarse to fine (7, 9, …), cells to
 particles (11), decode to the acceleration (12). With L levels there are 2 L - 1 message-passing blocks.
@@ -14,7 +12,6 @@ import torch
 from torch import nn
 
 from hgn.config import NetworkConfig
-from hgn.cpu import network as cpu_network
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
@@ -79,16 +76,17 @@ class HierarchicalGraphNetwork(ParticleNetwork):
 
         The finest grid's origin in each scene is 0 unless given.
         """
+        grid = self.grid(state, origin_S3)
+        return self.propagate(self.encode_particles(state), grid)
+
+    def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
+        """The cells of all levels around a state's particles."""
         if origin_S3 is None:
             origin_S3 = torch.zeros_like(state.domain_S3)
-        config = self.config
-        grid = build_hierarchy(state.position_N3, state.scene_N, origin_S3, config.cell_size, config.levels)
-        return self.propagate(self.encode_particles(state), grid)
+        return build_hierarchy(state.position_N3, state.scene_N, origin_S3, self.config.cell_size, self.config.levels)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
         """Steps 1 to 12: latent particles and their grids to normalised accelerations [N, 3]."""
-        if particle_NW.device.type == "cpu" and not torch.is_grad_enabled():
-            return cpu_network.propagate(self, particle_NW, grid)
         corner_83 = CORNER_83.to(particle_NW)
         # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
         parent_offset_83 = 0.5 - corner_83
@@ -100,26 +98,26 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         message_N8W = network.finish(hidden_NH[:, None] + corner_8H).mul_(grid.weight_N8[..., None])
         cell_CW = _scatter(message_N8W, grid.cell_N8, grid.levels[0].cell_count)
 
-        kept: list[torch.Tensor] = []
+        cells_down: list[torch.Tensor] = []
         for i, level in enumerate(grid.levels):
             cell_CW = self.passing_down[i](cell_CW, level)
             if level.parent_C is None or level.octant_C is None:
                 break
-            kept.append(cell_CW)
-            network = _fcn(self.fine_to_coarse[i])
+            cells_down.append(cell_CW)
+            network = _mlp(self.fine_to_coarse[i])
             offset_8H = network.project(1, parent_offset_83) + network.first.bias
             message_CW = network.finish(network.project(0, cell_CW).add_(offset_8H.index_select(0, level.octant_C)))
             cell_CW = _scatter(message_CW, level.parent_C, grid.levels[i + 1].cell_count)
 
-        for i in reversed(range(len(kept))):
+        for i in reversed(range(len(cells_down))):
             level = grid.levels[i]
             assert level.parent_C is not None and level.octant_C is not None
-            network = _fcn(self.coarse_to_fine[i])
+            network = _mlp(self.coarse_to_fine[i])
             offset_8H = network.project(2, -parent_offset_83) + network.first.bias
             hidden_CH = network.project(0, cell_CW).index_select(0, level.parent_C)
-            network.add_projection(hidden_CH, 1, kept[i])
+            network.add_projection(hidden_CH, 1, cells_down[i])
             hidden_CH += offset_8H.index_select(0, level.octant_C)
-            cell_CW = self.passing_up[i](network.finish(hidden_CH).add_(kept[i]), level)
+            cell_CW = self.passing_up[i](network.finish(hidden_CH).add_(cells_down[i]), level)
 
         network = self.cell_to_particle
         cell_CH = network.project(0, cell_CW)
@@ -140,6 +138,6 @@ def _scatter(value: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tens
     return value.new_zeros(count, width).index_add_(0, index.flatten(), value.reshape(-1, width))
 
 
-def _fcn(module: nn.Module) -> MLP:
+def _mlp(module: nn.Module) -> MLP:
     assert isinstance(module, MLP)
     return module

@@ -1,93 +1,244 @@
-"""Which implementation computes the network: the plain one, or the fast one (Triton kernels in CUDA graphs).
+"""The one place that knows which backend computes a network: torch, triton or cpu.
 
-`auto` takes the fast one wherever it runs, and the choice is always said.
+| backend | what it is | networks | gradients |
+|---|---|---|---|
+| torch | PyTorch, the reference | all | yes |
+| triton | Triton kernels, frames and updates in CUDA graphs | hgn, and gns in fp16 | of its own kernels |
+| cpu | compiled C in blocks of rows, a core each | hgn | no |
+
+All have the same signature. `choose` takes the fastest that runs and says why; nobody else asks for a network's class.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 
-from hgn.config import NetworkConfig
+from hgn.config import BACKENDS, PRECISIONS, NetworkConfig
+from hgn.cpu import compiled
+from hgn.cpu import network as cpu_network
+from hgn.cpu.allocator import keep_freed_memory
+from hgn.network.base import ParticleNetwork
+from hgn.network.features import ParticleState
+from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.gns_edges import Edges, PlainEdges
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.stepped_rollout import Rollout, SteppedRollout
 from hgn.runtime.triton_host import why_no_triton
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 
-FAST_WIDTHS = (16, 32, 64, 128)
-FAST_LEVELS = 8
+TRITON_WIDTHS = (16, 32, 64, 128)
+TRITON_LEVELS = 8
 
 
-def why_not_fast(device: torch.device, config: NetworkConfig, precision: str = "tf32") -> str | None:
-    """What keeps backend triton from running, in words; none if nothing does."""
+class Backend:
+    """PyTorch on the device of the network, which every other backend is compared with and takes the signature of."""
+
+    name = "torch"
+    stepped = True  # frames begin one by one, so that scenes that diverge can be left out of the next
+
+    def __init__(self, network: ParticleNetwork, precision: str = "tf32", note: str = "") -> None:
+        self.network, self.precision, self.note = network, precision, note
+        self.device = next(network.parameters()).device
+        self.growths = 0  # of buffers, in all rollouts
+        if self.device.type == "cpu":
+            keep_freed_memory()
+
+    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+        """The network's raw output [N, 3], with gradients if they are enabled."""
+        return self.network.normalised_acceleration(state, origin_S3)
+
+    def predict(self, state: ParticleState) -> torch.Tensor:
+        """Accelerations [N, 3] in frame units."""
+        result: torch.Tensor = self.network(state)
+        return result
+
+    def require_parity(self, state: ParticleState, gradients: bool = False, field: str = "precision") -> None:
+        """Compares a backend of kernels that this machine has compiled with PyTorch. Raises: ConfigError."""
+
+    def rollout(self, state: ParticleState) -> AbstractContextManager[Rollout]:
+        """A simulation that begins with a state."""
+        self.require_parity(state)
+        return nullcontext(SteppedRollout(self.predict, state))
+
+    def release(self) -> None:
+        """Gives back the buffers that simulations keep for those that follow."""
+
+
+class GnsBackend(Backend):
+    """The same for a GNS in PyTorch, by what is fastest on the device for its edges."""
+
+    network: GraphNetworkSimulator
+
+    def __init__(self, network: GraphNetworkSimulator, precision: str = "tf32", note: str = "") -> None:
+        super().__init__(network, precision, note)
+        self.edges = self._edges()
+        self._predict = self._prediction()
+
+    def _edges(self) -> Edges | None:
+        """What works on the edges. None: plain autograd, which passes over them less often than blocks that compute
+        their hidden layer twice; on a CPU such blocks are twice as fast, for they stay in its caches.
+        """
+        if self.precision == "fp16":
+            return PlainEdges(torch.float16)
+        return PlainEdges() if self.device.type == "cpu" else None
+
+    def _prediction(self):  # type: ignore[no-untyped-def]
+        if self.device.type != "cuda" or isinstance(self.edges, PlainEdges):  # which take no room to spare
+            return lambda state: self.network.predict(state, self.edges)
+        from hgn.runtime.gns_graph import GnsGraphs
+
+        return GnsGraphs(self.network, self.edges)
+
+    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+        return self.network.normalised_acceleration(state, origin_S3, self.edges)
+
+    def predict(self, state: ParticleState) -> torch.Tensor:
+        result: torch.Tensor = self._predict(state)
+        return result
+
+    def release(self) -> None:
+        self._predict = self._prediction()
+
+
+class CpuBackend(Backend):
+    """A frame in blocks of rows on a CPU, compiled if there is a compiler; without gradients."""
+
+    name = "cpu"
+    network: HierarchicalGraphNetwork
+
+    def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
+        return cpu_network.normalised_acceleration(self.network, state, origin_S3)
+
+    def predict(self, state: ParticleState) -> torch.Tensor:
+        return self.network.normaliser.restore_acceleration(self.normalised_acceleration(state))
+
+
+def choose(
+    device: torch.device,
+    network: ParticleNetwork,
+    precision: str = "tf32",
+    backend: str = "auto",
+    field: str = "backend",
+) -> Backend:
+    """The backend that is asked for, or with `auto` the fastest that runs; `note` says which and why.
+
+    Raises: ConfigError naming `field` when it is none, or what keeps it from running here.
+    """
+    for name, value, known in ((field, backend, BACKENDS), ("precision", precision, PRECISIONS)):
+        require(value in known, name, f"one of {', '.join(known)}", value)
+    config = network.config
+    reasons = {
+        "triton": triton_unsupported_reason(device, config, precision),
+        "cpu": cpu_unsupported_reason(device, config, precision),
+        "torch": torch_unsupported_reason(config, precision),
+    }
+    name, note = pick(reasons, backend, precision, field)
+    if name == "cpu":
+        note = f"{note}, {compiled.describe(config.width)}"
+    return build(name, network, precision, note)
+
+
+def build(name: str, network: ParticleNetwork, precision: str = "tf32", note: str = "") -> Backend:
+    """The backend of that name, whether the machine supports it or not."""
+    if name == "triton":
+        # Triton, which the others do without, is loaded here.
+        from hgn.runtime.triton_backend import TritonBackend, TritonGnsBackend
+
+        if isinstance(network, GraphNetworkSimulator):
+            return TritonGnsBackend(network, precision, note)
+        assert isinstance(network, HierarchicalGraphNetwork)
+        return TritonBackend(network, precision, note)
+    if name == "cpu":
+        assert isinstance(network, HierarchicalGraphNetwork)
+        return CpuBackend(network, precision, note)
+    if isinstance(network, GraphNetworkSimulator):
+        return GnsBackend(network, precision, note)
+    return Backend(network, precision, note)
+
+
+def fastest_stepped(network: ParticleNetwork, precision: str = "tf32") -> Backend:
+    """The fastest backend that makes frames one by one, for any network and device."""
+    if cpu_unsupported_reason(next(network.parameters()).device, network.config, precision) is None:
+        return build("cpu", network, precision)
+    return with_gradients(network, precision)
+
+
+def with_gradients(network: ParticleNetwork, precision: str) -> Backend:
+    """The fastest backend by which PyTorch trains a network: triton for a GNS in fp16, which has gradients there."""
+    device = next(network.parameters()).device
+    fused = isinstance(network, GraphNetworkSimulator)
+    supported = fused and triton_unsupported_reason(device, network.config, precision) is None
+    return build("triton" if supported else "torch", network, precision)
+
+
+def pick(reasons: Mapping[str, str | None], backend: str, precision: str, field: str) -> tuple[str, str]:
+    """A backend's name, and a line that says so; `reasons` is what keeps each from running, the fastest first.
+
+    Raises: ConfigError when the one that is asked for cannot run, or none with such a precision.
+    """
+    running = [name for name, reason in reasons.items() if reason is None]
+    if backend not in (*running, "auto", "torch"):
+        raise ConfigError(f"{field} must be {' or '.join([*running, 'auto'])} here, got {backend}: {reasons[backend]}")
+    chosen = backend if backend in running else running[0] if running and backend == "auto" else None
+    first = next(iter(reasons))
+    if chosen is None:
+        cause = f"{field}=torch was asked for" if backend == "torch" else f"{first}: {reasons[first]}"
+        raise ConfigError(f"precision must be tf32 or fp32 on backend torch, got {precision}; {cause}")
+    because = f" (not {first}: {reasons[first]})" if backend == "auto" and chosen != first else ""
+    where = field.rpartition(".")[0] or "runtime"
+    return chosen, f"{where} backend: {chosen}{because}, precision {precision}"
+
+
+def torch_unsupported_reason(config: NetworkConfig, precision: str) -> str | None:
+    """What keeps PyTorch from computing a network, in words; none if nothing does."""
+    return "it has no fp16 for hgn networks" if precision == "fp16" and config.kind == "hgn" else None
+
+
+def cpu_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str) -> str | None:
+    """What keeps a network from the backend cpu, in words; none if nothing does."""
+    if device.type != "cpu":
+        return f"it needs the CPU, not {device.type}"
     if config.kind != "hgn":
         return f"it computes hgn networks, not {config.kind}"
-    if reason := _why_no_kernels(device) or _why_not_wide_so(config):
+    return "it computes float32" if precision == "fp16" else None
+
+
+def triton_unsupported_reason(device: torch.device, config: NetworkConfig, precision: str = "tf32") -> str | None:
+    """What keeps simulations from the backend triton, in words; none if nothing does."""
+    if device.type != "cuda":
+        return f"it needs a CUDA device, not {device.type}"
+    if reason := why_no_triton():
         return reason
+    if config.kind != "hgn" and precision != "fp16":
+        return f"it computes {config.kind} with precision fp16, not {precision}"
+    if config.width not in TRITON_WIDTHS:
+        return f"network.width must be one of {', '.join(map(str, TRITON_WIDTHS))} for it, not {config.width}"
     if precision == "fp32":
         return "it computes in tf32 or fp16, not fp32"
-    if config.levels > FAST_LEVELS:
-        return f"network.levels must be at most {FAST_LEVELS} for it, not {config.levels}"
+    if config.levels > TRITON_LEVELS:
+        return f"network.levels must be at most {TRITON_LEVELS} for it, not {config.levels}"
     return None
 
 
-def why_not_trained_fast(
+def training_unsupported_reason(
     device: torch.device, config: NetworkConfig, precision: str, pushforward: bool = False
 ) -> str | None:
-    """What keeps training from backend triton, which updates GNS too, in words; none if nothing does.
+    """What keeps training from the backend triton, in words; none if nothing does.
 
     `pushforward`: it is to train on the network's own simulations.
     """
-    if config.kind == "hgn":
-        return why_not_fast(device, config, precision)
+    if reason := triton_unsupported_reason(device, config, precision):
+        return reason
     if config.obstacle_particles:
         return f"it trains hgn and gns networks, not {config.kind}"
-    if reason := _why_no_kernels(device):
-        return reason
-    if precision != "fp16":
-        return f"it trains gns with precision fp16, not {precision}"
-    if reason := _why_not_wide_so(config):
-        return reason
     if config.maximum_neighbours is not None:
         return f"network.maximum_neighbours must be null for it, not {config.maximum_neighbours}"
-    if pushforward:
+    if pushforward and config.kind != "hgn":
         return "it trains gns on true states alone (training.pushforward_fraction=0)"
     return None
-
-
-def _why_no_kernels(device: torch.device) -> str | None:
-    if device.type != "cuda":
-        return f"it needs a CUDA device, not {device.type}"
-    return why_no_triton()
-
-
-def _why_not_wide_so(config: NetworkConfig) -> str | None:
-    if config.width not in FAST_WIDTHS:
-        return f"network.width must be one of {', '.join(map(str, FAST_WIDTHS))} for it, not {config.width}"
-    return None
-
-
-def choose_path(
-    field: str, backend: str, precision: str, reason: str | None, torch_has_fp16: bool = False
-) -> tuple[str, str]:
-    """`torch` or `triton`, and a line that says so; `reason` is what keeps the latter from running.
-
-    `torch_has_fp16`: of this network.
-    Raises: ConfigError when triton is asked for and cannot run, or fp16 without it.
-    """
-    if backend == "triton" and reason is not None:
-        raise ConfigError(f"{field} must be torch or auto here, got triton: {reason}")
-    chosen = "triton" if backend != "torch" and reason is None else "torch"
-    if chosen == "torch" and precision == "fp16" and not torch_has_fp16:
-        raise ConfigError(
-            f"precision must be tf32 or fp32 on backend torch, got fp16; {reason or f'{field}=torch was asked for'}"
-        )
-    because = f" ({reason})" if chosen == "torch" and backend == "auto" else ""
-    return chosen, f"{field.rpartition('.')[0] or 'runtime'} backend: {chosen}{because}, precision {precision}"
-
-
-def path_on(
-    device: torch.device, network: NetworkConfig, backend: str, precision: str, field: str = "backend"
-) -> tuple[str, str]:
-    """What choose_path answers for a network on a device; GNS has fp16 of its own, see gns_edges."""
-    return choose_path(field, backend, precision, why_not_fast(device, network, precision), network.kind != "hgn")
 
 
 def set_matmul_precision(precision: str) -> None:

@@ -1,11 +1,24 @@
-"""When a simulation has come apart: one rule for both paths, and for training on the network's own states."""
+"""When a simulation has come apart: one rule for all backends, and for training on the network's own states."""
 
 from __future__ import annotations
 
 import torch
 
 
-def lost(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
+class DivergedError(RuntimeError):
+    """Particles are no longer finite, or have left the domain by more than its own size."""
+
+    def __init__(self, frame: int, cause: str) -> None:
+        super().__init__(f"the simulation diverged at frame {frame}: {cause}; train further, or take other weights")
+        self.frame = frame
+
+
+def diverged(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:
     """Which particles are not finite or farther from the domain than its own size, bool [..., N]."""
     inside = (position_N3 > -domain_N3) & (position_N3 < 2 * domain_N3)  # NaN is outside
     return ~inside.all(-1)
+
+
+def describe_diverged(diverged_count: int, particle_count: int) -> str:
+    """How a simulation came apart."""
+    return f"{diverged_count} of {particle_count} particles are not finite or farther from the domain than its own size"

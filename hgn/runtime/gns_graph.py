@@ -15,10 +15,11 @@ import torch
 
 from hgn.network.features import ParticleState
 from hgn.network.gns import EDGES_AT_ONCE, GraphNetworkSimulator
+from hgn.network.gns_edges import Edges
 from hgn.network.neighbours import NeighbourList
 from hgn.network.segments import Segments
 
-GRAPHS_KEPT = 24  # sizes used last; they share their memory
+CACHED_GRAPHS = 24  # sizes used last; they share their memory
 
 
 def rounded_up(count: int) -> int:
@@ -36,11 +37,11 @@ class Inputs:
 
     def tensors(self) -> list[torch.Tensor]:
         state, list_ = self.state, self.neighbours
-        found = [state.position_N3, state.velocity_NM3, state.material_N, state.scene_N, state.domain_S3]
-        found += [list_.order_N, list_.sender_E, list_.receivers.offset_N1, list_.receivers.segment_E]
+        tensors = [state.position_N3, state.velocity_NM3, state.material_N, state.scene_N, state.domain_S3]
+        tensors += [list_.order_N, list_.sender_E, list_.receivers.offset_N1, list_.receivers.segment_E]
         if state.obstacles is not None:
-            found += [state.obstacles.key_K, state.obstacles.normal_K3]
-        return found
+            tensors += [state.obstacles.key_K, state.obstacles.normal_K3]
+        return tensors
 
 
 def padded(state: ParticleState, neighbours: NeighbourList, particles: int, edges: int) -> Inputs:
@@ -64,8 +65,8 @@ def padded(state: ParticleState, neighbours: NeighbourList, particles: int, edge
 class GnsGraphs:
     """Predicts accelerations as the network does, on a CUDA device, without gradients."""
 
-    def __init__(self, network: GraphNetworkSimulator) -> None:
-        self.network = network
+    def __init__(self, network: GraphNetworkSimulator, edges: Edges | None = None) -> None:
+        self.network, self.edges = network, edges
         self._graphs: OrderedDict[tuple[object, ...], _Graph] = OrderedDict()
         self._pool = torch.cuda.graph_pool_handle()
 
@@ -79,7 +80,7 @@ class GnsGraphs:
         neighbours = self.network.neighbours(state)
         edges = rounded_up(neighbours.edge_count)
         if edges > EDGES_AT_ONCE:  # blocks of edges keep a GPU busy by themselves
-            raw_N3 = self.network.propagate(state, neighbours)
+            raw_N3 = self.network.propagate(state, neighbours, self.edges)
         else:
             # Moving particles alone keep their number; static ones come and go.
             particles = moving if len(state.position_N3) == moving else rounded_up(len(state.position_N3))
@@ -89,8 +90,8 @@ class GnsGraphs:
     def _run(self, inputs: Inputs) -> torch.Tensor:
         key = tuple(tensor.shape for tensor in inputs.tensors())
         if key not in self._graphs:
-            self._graphs[key] = _Graph(self.network, inputs, self._pool)
-            if len(self._graphs) > GRAPHS_KEPT:
+            self._graphs[key] = _Graph(self.network, self.edges, inputs, self._pool)
+            if len(self._graphs) > CACHED_GRAPHS:
                 self._graphs.popitem(last=False)
         self._graphs.move_to_end(key)
         return self._graphs[key].run(inputs)
@@ -99,16 +100,18 @@ class GnsGraphs:
 class _Graph:
     """The network captured for one set of shapes."""
 
-    def __init__(self, network: GraphNetworkSimulator, inputs: Inputs, pool: Any) -> None:
+    def __init__(self, network: GraphNetworkSimulator, edges: Edges | None, inputs: Inputs, pool: Any) -> None:
         self._inputs = inputs
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
-            network.propagate(inputs.state, inputs.neighbours)  # libraries set themselves up outside of the graph
+            network.propagate(
+                inputs.state, inputs.neighbours, edges
+            )  # libraries set themselves up outside of the graph
         torch.cuda.current_stream().wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph, pool=pool):
-            self._output_N3 = network.propagate(inputs.state, inputs.neighbours)
+            self._output_N3 = network.propagate(inputs.state, inputs.neighbours, edges)
 
     def run(self, inputs: Inputs) -> torch.Tensor:
         torch._foreach_copy_(self._inputs.tensors(), inputs.tensors())

@@ -21,14 +21,14 @@ from typing import Self
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.kernels.precompile import FrameJob, PrecompileJob, job_text
-from hgn.runtime.backend import why_not_fast
+from hgn.runtime.backend import triton_unsupported_reason
+from hgn.runtime.precompile_program import FrameJob, PrecompileJob, job_text
 from hgn.system.machine import available_cpus
 from hgn.system.processes import die_with_parent
 
 MOST_PROCESSES = 12
 CELL_SHARES = (0.1, 0.4, 1.2)  # of the particles
-COMMAND = (sys.executable, "-m", "hgn.kernels.precompile")
+COMMAND = (sys.executable, "-m", "hgn.runtime.precompile_program")
 
 
 class Precompilation:
@@ -106,11 +106,14 @@ class Precompilation:
 def frames_ahead(
     networks: Sequence[NetworkConfig], precisions: Sequence[str], device: torch.device, particles: Sequence[int]
 ) -> Precompilation | None:
-    """Compiles what simulations of so many particles launch, however far they spread; none where nothing is fast."""
+    """Compiles what simulations of so many particles launch, however far they spread; none where nothing is."""
     if device.type != "cuda" or torch.version.hip is not None:
         return None
     pairs = [
-        (n, p) for n in dict.fromkeys(networks) for p in dict.fromkeys(precisions) if not why_not_fast(device, n, p)
+        (network, precision)
+        for network in dict.fromkeys(networks)
+        for precision in dict.fromkeys(precisions)
+        if network.kind == "hgn" and triton_unsupported_reason(device, network, precision) is None
     ]
     if not pairs:
         return None

@@ -26,7 +26,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import kernel_precision
-from hgn.runtime.divergence import lost
+from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.runtime.parity import OUTPUT_BOUND, relative_error
 from hgn.schema import ConfigError
 
@@ -42,22 +42,14 @@ CHECKED_PARTICLES = 50_000  # at most; the plain network needs memory
 INTEGRATE_BLOCK = 64  # particles
 
 
-class LeftDomainError(RuntimeError):
-    """Particles are no longer finite, or farther from the domain than its own size."""
-
-    def __init__(self, frame: int, lost: int) -> None:
-        super().__init__(f"{lost} particles at frame {frame}")
-        self.frame, self.lost = frame, lost
-
-
 def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
     """Room on each level for a scene that begins with so many cells: few simulations need more later."""
-    found = []
+    capacities = []
     for level, count in enumerate(cells):
         spread = SPREAD_CELLS[min(level, len(SPREAD_CELLS) - 1)] * particles
         roomy = min(HEADROOM * count, spread, ROOMY_CELLS >> 2 * level)
-        found.append(max(256 >> level, _room(count, level, TIGHT_START), int(roomy)))
-    return tuple(found)
+        capacities.append(max(256 >> level, _room(count, level, TIGHT_START), int(roomy)))
+    return tuple(capacities)
 
 
 def _room(count: int, level: int, tight: float) -> int:
@@ -132,8 +124,8 @@ class TritonRollout:
         """Whether `begin` can go on with a state: as many scenes, in such domains, and not too many particles."""
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
             return False
-        seen, known = state.obstacles, self.obstacles
-        same = seen is known is None or (seen is not None and known is not None and seen.cell_size == known.cell_size)
+        new, old = state.obstacles, self.obstacles
+        same = new is old is None or (new is not None and old is not None and new.cell_size == old.cell_size)
         return same and torch.equal(state.domain_S3, self.domain_S3)
 
     def begin(self, state: ParticleState, new_obstacles: bool = False) -> None:
@@ -201,9 +193,7 @@ class TritonRollout:
         self._integrate()
         self.grid.status.zero_()
 
-    def require_agreement(
-        self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "backend"
-    ) -> None:
+    def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "backend") -> None:
         """Compares the first output with the plain network's, as all kernels still stand at the start: `state` is that
         of the start, or its first scenes.
 
@@ -211,9 +201,9 @@ class TritonRollout:
         """
         if self.graph is None:
             self._network_pass()
-        found_N3 = self.fused.output[: len(state.position_N3), :3]
+        output_N3 = self.fused.output[: len(state.position_N3), :3]
         with torch.no_grad():
-            error = relative_error(found_N3, network.normalised_acceleration(state))
+            error = relative_error(output_N3, network.normalised_acceleration(state))
         if not error <= OUTPUT_BOUND:  # NaN fails
             raise ConfigError(
                 f"{field} must be torch on this machine, got triton: its output differs by {error:.1e} "
@@ -269,9 +259,9 @@ class TritonRollout:
     def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:
         """Simulates `frames` more frames; their positions, float32 [frames, N, 3].
 
-        Raises: LeftDomainError, with the number of the frame.
+        Raises: DivergedError, with the number of the frame.
         """
-        kept = np.empty((frames, self.live, 3), np.float32)
+        position_TN3 = np.empty((frames, self.live, 3), np.float32)
         done, half = 0, 0
         ahead: _Look | None = None
         while done < frames:
@@ -281,7 +271,7 @@ class TritonRollout:
             ahead = self._launch(min(self.look_frames, rest), half) if self.overlap and rest else None
             path_TN3, status = self._settle(look)
             taken = len(path_TN3)
-            kept[done : done + taken] = self._taken_away(path_TN3)
+            position_TN3[done : done + taken] = self._taken_away(path_TN3)
             if on_frame is not None:
                 for frame in range(done, done + taken):
                     on_frame(self.frames_done - taken + frame - done + 1)
@@ -290,21 +280,21 @@ class TritonRollout:
                 self._settle(ahead)  # in vain, and over before its buffers go
                 ahead = None
             if status & DIVERGED.value:
-                raise LeftDomainError(self.frames_done, self._lost())
+                raise self._diverged()
             self.make_room(status)
-        return kept
+        return position_TN3
 
     def frames(self) -> Iterator[np.ndarray]:
         """Positions float32 [N, 3] of frame after frame, without an end, computed `look_frames` at a time.
 
-        Raises: LeftDomainError, behind the last frame before it.
+        Raises: DivergedError, behind the last frame before it.
         """
         while True:
             path_TN3, status = self.look(self.look_frames)
-            diverged = bool(status & DIVERGED.value)  # in the last of them
-            yield from path_TN3[: len(path_TN3) - diverged].to("cpu", copy=True).numpy()
-            if diverged:
-                raise LeftDomainError(self.frames_done, self._lost())
+            last_diverged = bool(status & DIVERGED.value)
+            yield from path_TN3[: len(path_TN3) - last_diverged].to("cpu", copy=True).numpy()
+            if last_diverged:
+                raise self._diverged()
             self.make_room(status)
 
     def look(self, frames: int) -> tuple[torch.Tensor, int]:
@@ -355,9 +345,10 @@ class TritonRollout:
         if status & (OVERFLOW | OUT_OF_WINDOW):
             self._grow()
 
-    def _lost(self) -> int:
+    def _diverged(self) -> DivergedError:
         position_N3, domain_N3 = self.position_N3[: self.live], self.domain_S3[self.scene_N[: self.live].long()]
-        return int(lost(position_N3, domain_N3).sum())
+        cause = describe_diverged(int(diverged(position_N3, domain_N3).sum()), self.live)
+        return DivergedError(self.frames_done, cause)
 
     def _grow(self) -> None:
         # all levels: those that still had room are as full, and would have the same captured again soon

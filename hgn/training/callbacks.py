@@ -23,7 +23,8 @@ from hgn.data.lookup import first_indices
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import PATIENCE_S
 from hgn.render.pictures import rollout_of_episode
-from hgn.runtime.rollouts import network_trials
+from hgn.runtime.backend import fastest_stepped
+from hgn.runtime.rollouts import simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, to_mapping
@@ -184,7 +185,8 @@ class Monitor(Callback):
             trainer.global_rank,
             trainer.world_size,
         )
-        predictors = {"network": network_predictor(network)} | baselines(network)
+        backend = fastest_stepped(network, module.training_config.precision)
+        predictors = {"network": network_predictor(backend)} | baselines(network)
         materials = network.config.materials
         interrupted: Callable[[], bool] = lambda: trainer.world_size == 1 and self.stop.signal is not None  # noqa: E731
         errors = one_step_errors(predictors, batches, module.device, materials, interrupted)
@@ -205,12 +207,9 @@ class Monitor(Callback):
         self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
     ) -> dict[str, float]:
         """Errors are means over the scenes that came so far; told beside them is how many came to the end."""
-        # frames of a GNS are captured on backend torch
-        fast = not module.automatic_optimization and module.network.config.kind == "hgn"
-        backend = "triton" if fast else "torch"
-        simulator = Simulator(module.result, episodes[0].frame_rate_hz, backend, module.training_config.precision)
+        simulator = Simulator(module.result, episodes[0].frame_rate_hz, module.simulating_backend())
         frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
-        trials = network_trials(simulator, [InitialState.of_episode(episode) for episode in episodes], frames)
+        trials = simulate_scenes(simulator, [InitialState.of_episode(episode) for episode in episodes], frames)
         error_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
         reached = [n for n in REPORTED_FRAMES if n < len(error_T["all"])]
         values = {f"rollout/mse_frame_{n}": float(error_T["all"][n]) for n in reached}

@@ -14,6 +14,7 @@ import torch
 
 from hgn.data.batch import Batch, make_batch
 from hgn.network.base import ParticleNetwork
+from hgn.runtime.backend import Backend
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 
@@ -77,9 +78,10 @@ def baselines(network: ParticleNetwork) -> dict[str, Predictor]:
     }
 
 
-def network_predictor(network: ParticleNetwork) -> Predictor:
-    """The network without noise and jitter."""
-    return lambda batch: network(batch.state())
+def network_predictor(backend: Backend) -> Predictor:
+    """The network without noise and jitter, as a backend computes it."""
+    restore = backend.network.normaliser.restore_acceleration
+    return lambda batch: restore(backend.normalised_acceleration(batch.state()))
 
 
 def frame_batches(

@@ -142,7 +142,7 @@ class GraphPushforwardPool:
         if capacities is None:
             first = self._first_scenes(episodes, state)
             if first is not None:
-                rollout.require_agreement(self.network, first, "training.backend")
+                rollout.require_parity(self.network, first, "training.backend")
                 if device.type == "cuda":
                     torch.cuda.empty_cache()  # what is free decides where episodes are kept
         rollout.use_values(values)

@@ -15,17 +15,16 @@ import torch
 
 from hgn.config import TrainingConfig
 from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk
-from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.triton_compat import JitMisses
-from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
+from hgn.kernels.update.op import DeviceEpisode, DeviceSample, UpdateSettings
 from hgn.network.base import ParticleNetwork
-from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import kernel_precision
+from hgn.runtime.triton_backend import updates_of
 from hgn.scene.symmetry import drawn_symmetry
 from hgn.training.graph_pushforward import GraphPushforwardPool
-from hgn.training.parity import require_agreement
+from hgn.training.parity import require_parity
 
 REPORTED_UPDATES = 256  # the first ones, which take longest
 DATA_FRACTION = 0.6  # of a GPU's memory at most, for episodes; the others stay in the host's
@@ -58,8 +57,7 @@ class GraphTrainer:
         settings = UpdateSettings.of(training, obstacle_cell_size)
         precision = kernel_precision(training.precision, self.device)
         self._take_over()
-        kind = GnsUpdates if isinstance(network, GraphNetworkSimulator) else Updates
-        self.updates = kind(network, settings, precision, loss_sum, counters, reduce, ranks)
+        self.updates = updates_of(network)(network, settings, precision, loss_sum, counters, reduce, ranks)
         self._read_moments()
         self._averaged = None if averaged is None else self._take_over_average(averaged)
         self._episodes: dict[int, DeviceEpisode] = {}
@@ -68,7 +66,7 @@ class GraphTrainer:
             simulated = averaged or network
             assert isinstance(simulated, HierarchicalGraphNetwork)
             self.pool = GraphPushforwardPool(simulated, training, obstacle_cell_size, rank)
-        self.agreement: tuple[float, float] | None = None  # with the plain network, see hgn.training.parity
+        self.parity: tuple[float, float] | None = None  # with the plain network, see hgn.training.parity
 
     def run(
         self,
@@ -87,7 +85,7 @@ class GraphTrainer:
         with self._timed("placing episodes"):
             for index, episode in chunk.episodes.items():
                 self._episodes[index] = self._placed(episode)
-        if self.agreement is None:
+        if self.parity is None:
             with self._timed("checking the kernels"):
                 self._check(chunk)
         if self.pool is not None and chunk.starts:
@@ -112,7 +110,7 @@ class GraphTrainer:
         shown = None
         if self.symmetric:
             shown = [drawn_symmetry(e.symmetries, s.seed) for e, s in zip(episodes, first, strict=True)]
-        self.agreement = require_agreement(self.updates, episodes, shown)
+        self.parity = require_parity(self.updates, episodes, shown)
 
     @contextmanager
     def _timed(self, what: str) -> Iterator[None]:

@@ -19,7 +19,7 @@ from hgn.data.episode_tensors import UpdateChunk
 from hgn.data.sampler import SamplerState
 from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
-from hgn.runtime.gns_backend import require_agreement, use_edges
+from hgn.runtime.backend import Backend, build, fastest_stepped, with_gradients
 from hgn.schema import to_mapping
 from hgn.training import lightning_compat
 from hgn.training.checkpoint import (
@@ -59,6 +59,7 @@ class TrainingModule(LightningModule):
         self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
         self._fast: Any = None
         self._pool: PushforwardPool | None = None
+        self.backend: Backend | None = None  # of the updates that PyTorch makes, once the device is known
         self._unchecked = True  # whether kernels compute on this machine what they should
 
     def set_statistics(self, statistics: Statistics) -> None:
@@ -112,7 +113,7 @@ class TrainingModule(LightningModule):
         )
         origin_S3 = jittered_origin(batch, self.network.config.cell_size) if config.grid_jitter else None
         target_N3 = self.network.normaliser.normalise_acceleration(batch.acceleration(window_WN3))
-        predicted_N3 = self.network.normalised_acceleration(batch.state(window_WN3), origin_S3)
+        predicted_N3 = (self.backend or self.network).normalised_acceleration(batch.state(window_WN3), origin_S3)
         return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
 
     @property
@@ -122,13 +123,19 @@ class TrainingModule(LightningModule):
         return {} if pool is None else dict(pool.figures)
 
     def on_fit_start(self) -> None:
-        use_edges(self.network, self.training_config.precision)  # by the device that it is on by now
-        use_edges(self.result, self.training_config.precision)
+        self.backend = with_gradients(self.network, self.training_config.precision)
+
+    def simulating_backend(self) -> Backend:
+        """What simulates with the weights that count: the kernels that train, or else what makes frames one by one."""
+        precision = self.training_config.precision
+        if self.automatic_optimization:
+            return fastest_stepped(self.result, precision)
+        return build("triton", self.result, precision)
 
     def on_train_start(self) -> None:
         config = self.training_config
         if self.automatic_optimization and config.pushforward_fraction > 0:
-            self._pool = PushforwardPool(self.result, config, self.data.frame_rate_hz, self.trainer.global_rank)
+            self._pool = PushforwardPool(self.result, config, self.trainer.global_rank)
         if not self.automatic_optimization:
             # Triton, which backend torch does without, is loaded here.
             from hgn.training.graph_trainer import GraphTrainer
@@ -154,7 +161,8 @@ class TrainingModule(LightningModule):
             return None
         if self._unchecked:
             first = self._batch_of(batch) if isinstance(batch, UpdateSamples) else batch
-            require_agreement(self.network, first.state(), gradients=True, field="training.precision")
+            assert self.backend is not None
+            self.backend.require_parity(first.state(), gradients=True, field="training.precision")
             self._unchecked = False
         if isinstance(batch, UpdateSamples):
             assert self._pool is not None
@@ -173,14 +181,14 @@ class TrainingModule(LightningModule):
 
     def _train_chunk(self, chunk: UpdateChunk) -> None:
         first, count = self.global_step, len(chunk.samples)
-        first_chunk = self._fast.agreement is None
+        first_chunk = self._fast.parity is None
         updates = range(first, first + count)
         average_weights = None
         if self.averaged is not None:
             average_weights = [self._average_weight(update) for update in updates]
         self._fast.run(chunk, [self._rate(update) for update in updates], average_weights, first)
         if first_chunk and self.trainer.is_global_zero:
-            outputs, gradients = self._fast.agreement
+            outputs, gradients = self._fast.parity
             text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"
             print(f"backend triton: {text if math.isfinite(outputs) else 'batch too large to check'}", file=sys.stderr)
         report = self._fast.report()

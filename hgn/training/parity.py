@@ -8,28 +8,22 @@ are wrong miss them by far. Shape legend: N particles of all scenes, S scenes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import torch
 
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.update.op import Updates
-from hgn.network.base import ParticleNetwork
 from hgn.network.cell_keys import pack
 from hgn.network.features import ParticleState
-from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.gns_edges import PlainEdges
 from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.parity import GRADIENT_BOUND, OUTPUT_BOUND, relative_error
 from hgn.scene.symmetry import Symmetry
 from hgn.schema import ConfigError
 from hgn.training.symmetry import obstacles_under
 
-CHECKED_PARTICLES = {"hgn": 200_000, "gns": 40_000}  # at most; the plain network needs memory
 
-
-def require_agreement(
+def require_parity(
     updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None = None
 ) -> tuple[float, float]:
     """Relative errors of outputs and of all gradients on the batch that `updates` holds, of these episodes' images.
@@ -37,15 +31,14 @@ def require_agreement(
     Too large a batch is not checked: NaN. Raises: ConfigError when one of them exceeds its bound.
     """
     network, fused, count = updates.network, updates.fused, int(updates.particle_count)
-    if count > CHECKED_PARTICLES.get(network.config.kind, 0):
+    if count > updates.checked_particles:
         return math.nan, math.nan
     state, origin_S3 = _state(updates, episodes, symmetries, count)
     generator = torch.Generator().manual_seed(0)
     weight_N3 = torch.randn(count, 3, generator=generator).to(updates.device) * updates.share_N[:count, None]
     parameters = list(network.parameters())
-    with _plain(network):
-        output_N3 = network.normalised_acceleration(state, origin_S3)
-        expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
+    output_N3 = updates.reference_output(state, origin_S3)
+    expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
     output_error = relative_error(fused.output[:count, :3], output_N3.detach())
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
@@ -68,19 +61,6 @@ def require_agreement(
         del output_N3, expected
         torch.cuda.empty_cache()  # what is free decides where episodes are kept
     return output_error, gradient_error
-
-
-@contextmanager
-def _plain(network: ParticleNetwork) -> Iterator[None]:
-    """A GNS without kernels: in blocks of edges, for autograd keeps ten times as much."""
-    if not isinstance(network, GraphNetworkSimulator):
-        yield
-        return
-    before, network.edges = network.edges, PlainEdges()
-    try:
-        yield
-    finally:
-        network.edges = before
 
 
 def _state(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from hgn.config import SceneConfig, TrainConfig
-from hgn.kernels.precompile import PrecompileJob
 from hgn.kernels.update.op import UpdateSettings
+from hgn.runtime.precompile_program import PrecompileJob
 
 NEIGHBOURS = 100  # of a particle of GNS, about
 

@@ -24,8 +24,9 @@ import torch
 from hgn.config import TrainingConfig
 from hgn.data.batch import BatchSample, UpdateSamples, make_batch
 from hgn.network.base import ParticleNetwork
-from hgn.runtime.divergence import lost
-from hgn.runtime.simulator import Simulator
+from hgn.runtime.backend import fastest_stepped
+from hgn.runtime.divergence import diverged
+from hgn.runtime.stepped_rollout import stepped
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.schema import ConfigError
@@ -95,26 +96,26 @@ def usable_frames(
     """
     now_FN3 = true_TN3[len(true_TN3) - len(simulated_FN3) - 1 : -1]
     square_F = (simulated_FN3 - now_FN3).square().sum(-1).mean(-1)
-    good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~lost(simulated_FN3, domain_3).any(-1)  # NaN is not
+    good_F = (square_F <= (DROPPED_BEYOND * cell_size) ** 2) & ~diverged(simulated_FN3, domain_3).any(-1)  # NaN is not
     count = good_F.int().cumprod(0).sum()
     return count, square_F[(count - 1).clamp(min=0)]
 
 
 def diverged_scenes(position_N3: torch.Tensor, scene_N: torch.Tensor, domain_S3: torch.Tensor) -> torch.Tensor:
-    """Whether each particle belongs to a scene that has lost one, bool [N]."""
+    """Whether each particle belongs to a scene that has one that diverged, bool [N]."""
     scene_N = scene_N.long()
-    lost_S = torch.zeros(len(domain_S3), device=position_N3.device)
-    lost_S.index_add_(0, scene_N, lost(position_N3, domain_S3[scene_N]).float())
-    return lost_S[scene_N] > 0
+    diverged_S = torch.zeros(len(domain_S3), device=position_N3.device)
+    diverged_S.index_add_(0, scene_N, diverged(position_N3, domain_S3[scene_N]).float())
+    return diverged_S[scene_N] > 0
 
 
 class PushforwardPool:
     """The pool on backend torch, which serves every network; see GraphPushforwardPool for triton's."""
 
-    def __init__(self, network: ParticleNetwork, training: TrainingConfig, frame_rate_hz: float, rank: int) -> None:
+    def __init__(self, network: ParticleNetwork, training: TrainingConfig, rank: int) -> None:
         """`network` simulates."""
         self.network, self.training, self.rank = network, training, rank
-        self._simulator = Simulator(network, frame_rate_hz)
+        self._backend = fastest_stepped(network)
         self._samples: list[tuple[BatchSample, float]] = []  # with the rms of the target acceleration
         self.figures: dict[str, float] = {}
 
@@ -152,11 +153,11 @@ class PushforwardPool:
 
     def _simulate(self, starts: Sequence[tuple[Episode, int]]) -> list[torch.Tensor]:
         """Positions [F, N, 3] of each scene; of a scene that diverged, whatever came after."""
-        batch = make_batch(starts, self.network.config).to(self._simulator.device)
+        batch = make_batch(starts, self.network.config).to(self._backend.device)
         begin = state = batch.state()
         path = []
         for _ in range(self.training.pushforward_frames):
-            state = self._simulator.step(state)
+            state = stepped(self._backend.predict, state)
             path.append(state.position_N3.cpu().clone())
             again_N = diverged_scenes(state.position_N3, state.scene_N, state.domain_S3)
             if bool(again_N.any()):

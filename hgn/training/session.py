@@ -17,7 +17,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
-from hgn.runtime.backend import choose_path, set_matmul_precision, why_not_trained_fast
+from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, training_unsupported_reason
 from hgn.schema import to_mapping
 from hgn.system.device import keep_to_quota
 from hgn.system.files import write_atomically
@@ -118,9 +118,11 @@ def _backend(config: TrainConfig) -> tuple[str, str]:
     on_gpu = training.accelerator != "cpu" and torch.cuda.is_available()
     device = torch.device("cuda" if on_gpu else "cpu")
     pushforward = training.pushforward_fraction > 0
-    reason = why_not_trained_fast(device, config.network, training.precision, pushforward)
-    torch_has_fp16 = config.network.kind != "hgn"
-    return choose_path("training.backend", training.backend, training.precision, reason, torch_has_fp16)
+    reasons = {
+        "triton": training_unsupported_reason(device, config.network, training.precision, pushforward),
+        "torch": torch_unsupported_reason(config.network, training.precision),
+    }
+    return pick(reasons, training.backend, training.precision, "training.backend")
 
 
 def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation | None:

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from hgn.cpu import compiled
-from hgn.cpu.compiled import CompiledRows, rows_class, said, why_not_compiled
+from hgn.cpu.compiled import CompiledRows, describe, rows_class, unsupported_reason
 from hgn.cpu.rows import Hidden, Rows, Segments
 from hgn.network.mlp import MLP
 
-NO_COMPILER = compiled.why_not_compiled(16, torch.float32)
+NO_COMPILER = compiled.unsupported_reason(16, torch.float32)
 KINDS = [Rows, pytest.param(CompiledRows, marks=pytest.mark.skipif(NO_COMPILER is not None, reason=str(NO_COMPILER)))]
 TOLERANCE = {"rtol": 1e-5, "atol": 2e-5}
 TABLE = 50
@@ -143,7 +143,7 @@ def test_vectors_of_other_cpus(monkeypatch, tmp_path, narrower):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(compiled, "FLAGS", (*compiled.FLAGS, *narrower))
     monkeypatch.setattr(compiled, "_library", compiled._library.__wrapped__)
-    if (reason := why_not_compiled(128, torch.float32)) is not None:
+    if (reason := unsupported_reason(128, torch.float32)) is not None:
         pytest.skip(reason)  # a CPU of another kind
     network, hidden = fcn_of(128), hidden_of(100, 128, 3, value=True)
     expected_RW, out_RW = expected_outputs(network, hidden), torch.empty(100, 128)
@@ -158,14 +158,16 @@ def test_what_is_not_compiled(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(compiled, "_library", compiled._library.__wrapped__)
     assert rows_class(128, torch.float64) is Rows
-    assert why_not_compiled(24, torch.float32) == "network.width must be a multiple of 16, at most 512, for it, not 24"
+    assert (
+        unsupported_reason(24, torch.float32) == "network.width must be a multiple of 16, at most 512, for it, not 24"
+    )
     monkeypatch.setenv("CC", str(tmp_path / "none"))
-    assert said(128) == f"rows in PyTorch ([Errno 2] No such file or directory: '{tmp_path / 'none'}')"
+    assert describe(128) == f"rows in PyTorch ([Errno 2] No such file or directory: '{tmp_path / 'none'}')"
     monkeypatch.setenv("CC", "false")
-    assert why_not_compiled(128, torch.float32) == "false does not compile rows.c: "
+    assert unsupported_reason(128, torch.float32) == "false does not compile rows.c: "
     monkeypatch.delenv("CC")
     monkeypatch.setattr(compiled, "COMPILERS", ("no-such-compiler",))
-    assert why_not_compiled(128, torch.float32) == "it needs a C compiler: no-such-compiler or CC=…"
+    assert unsupported_reason(128, torch.float32) == "it needs a C compiler: no-such-compiler or CC=…"
     assert rows_class(128, torch.float32) is Rows
     assert not list((tmp_path / "hgn" / "rows").iterdir())
 
@@ -175,7 +177,7 @@ def test_compiled_once(monkeypatch, tmp_path):
     """The next process finds what one has compiled, and needs no compiler."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(compiled, "_library", compiled._library.__wrapped__)
-    assert said(16) == "rows compiled for this CPU"
+    assert describe(16) == "rows compiled for this CPU"
 
     def run(*_, **__):
         raise AssertionError("compiled again")

@@ -13,9 +13,10 @@ from network.test_gns_edges import output_and_gradients
 from hgn.kernels.gns.op import FusedEdges, Tuning, fits
 from hgn.network.features import ParticleState
 from hgn.network.gns_edges import PlainEdges
-from hgn.runtime.gns_backend import edges_for, require_agreement
+from hgn.runtime.backend import GnsBackend, triton_unsupported_reason
 from hgn.runtime.gns_graph import padded
 from hgn.runtime.parity import relative_error
+from hgn.runtime.triton_backend import TritonGnsBackend
 from hgn.schema import ConfigError
 
 SMALL = Tuning(block=16, backward_block=16, product_rows=16)
@@ -55,7 +56,7 @@ def test_fused_edges_equal_the_plain_network(counts, width, precision, output_bo
     edges = FusedEdges(precision, tuning if NATIVE else SMALL)
     found = output_and_gradients(network, edges, state, 1e-5)
     with torch.no_grad():
-        again = network.normalised_acceleration(state)
+        again = network.normalised_acceleration(state, edges=edges)
     assert relative_error(found[0].cpu(), expected[0]) < output_bound
     assert relative_error(again.cpu().double(), expected[0]) < output_bound
     assert relative_error(found[1].cpu(), expected[1]) < gradient_bound
@@ -64,21 +65,22 @@ def test_fused_edges_equal_the_plain_network(counts, width, precision, output_bo
 def test_room_to_spare_changes_nothing():
     """Rows of edges beyond the last offset, as CUDA graphs have them, leave the output as it is."""
     network = gns_of(torch.float32, message_passing_steps=1).to(device())
-    network.edges = FusedEdges(tuning=SMALL)
+    edges = FusedEdges(tuning=SMALL)
     state = on_device(random_state((19, 4), spread=0.1, dtype=torch.float32))
     neighbours = network.neighbours(state)
     with torch.no_grad():
-        expected = network.propagate(state, neighbours)
+        expected = network.propagate(state, neighbours, edges)
         inputs = padded(state, neighbours, 23, neighbours.edge_count + 70)
-        assert torch.equal(network.propagate(inputs.state, inputs.neighbours), expected)
+        assert torch.equal(network.propagate(inputs.state, inputs.neighbours, edges), expected)
 
 
 def test_wrong_kernels_are_refused(monkeypatch):
     """What differs from plain autograd in outputs or gradients is refused, saying what to set; what is right passes."""
     network = gns_of(torch.float32, message_passing_steps=1).to(device())
     state = on_device(random_state((9, 4), spread=0.05, dtype=torch.float32))
-    network.edges = edges = FusedEdges(tuning=SMALL)
-    require_agreement(network, state, gradients=True)
+    backend = TritonGnsBackend(network, "fp16")
+    backend.edges = FusedEdges(tuning=SMALL)
+    backend.require_parity(state, gradients=True)
     step, backward = FusedEdges.step, FusedEdges.encode_backward
 
     def wrong_step(*arguments, **named):
@@ -96,14 +98,15 @@ def test_wrong_kernels_are_refused(monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(FusedEdges, name, wrong)
             with pytest.raises(ConfigError, match=f"precision must be tf32 on this machine, got fp16: its {what}"):
-                require_agreement(network, state, gradients)
-    assert network.edges is edges
+                backend.require_parity(state, gradients)
 
 
 def test_what_works_where():
-    """Half precision takes the kernels on a GPU for widths of matrix units, else PyTorch; float32 autograd there."""
-    cpu, cuda = torch.device("cpu"), torch.device("cuda")
+    """Kernels take widths of matrix units; PyTorch works in blocks on a CPU and in fp16, and by autograd else."""
     assert fits(64) and not fits(24) and not fits(8)
-    assert edges_for(cpu, 128, "tf32") == PlainEdges() and edges_for(cpu, 128, "fp16") == PlainEdges(torch.float16)
-    assert edges_for(cuda, 128, "fp16") == FusedEdges() and edges_for(cuda, 24, "fp16") == PlainEdges(torch.float16)
-    assert edges_for(cuda, 128, "tf32") is None
+    network = gns_of(torch.float32)
+    assert GnsBackend(network, "tf32").edges == PlainEdges()
+    assert GnsBackend(network, "fp16").edges == PlainEdges(torch.float16)
+    assert TritonGnsBackend(network, "fp16").edges == FusedEdges()
+    config = replace(network.config, width=24)
+    assert "not 24" in triton_unsupported_reason(torch.device("cuda"), config, "fp16")

@@ -14,10 +14,9 @@ from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.update.op import UpdateSettings
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.runtime.gns_backend import use_edges
 from hgn.schema import ConfigError
 from hgn.training.muon import Muon
-from hgn.training.parity import require_agreement
+from hgn.training.parity import require_parity
 
 PRECISION = "fp32" if device().type == "cpu" else "fp16"
 
@@ -74,8 +73,6 @@ def test_wrong_kernels_are_refused() -> None:
     made, grids = episode(1, 5, True)
     still, _ = episode(2, 3, False)
     updates = updates_of(network, 2, noise_std=1e-3)
-    use_edges(updates.network, "fp16")  # as for a training: the comparison is with other edges all the same
-    edges = updates.network.edges
     none = torch.zeros(0, 3)
     cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
     episodes = [
@@ -84,12 +81,11 @@ def test_wrong_kernels_are_refused() -> None:
     ]
     samples = [(made, 1, 3), (still, 0, 4)]
     updates.predict(samples)
-    assert max(require_agreement(updates, episodes)) < (1e-3 if PRECISION == "fp32" else 0.1)
-    assert updates.network.edges is edges
+    assert max(require_parity(updates, episodes)) < (1e-3 if PRECISION == "fp32" else 0.1)
     updates.values.mul_(1.3)
     updates.predict(samples)
     with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
-        require_agreement(updates, episodes)
+        require_parity(updates, episodes)
 
 
 def test_what_is_left_of_other_updates_does_no_harm() -> None:

@@ -65,7 +65,7 @@ def test_the_pool_is_that_of_the_plain_path() -> None:
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
     training = training_of(precision="fp32", pushforward_frames=2, noise_std=0.5, noise_min_scale=0.1)
-    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 60.0, 0)
+    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)
     rollouts = []
     for starts in ([(0, 0), (1, 4)], [(1, 0), (2, 6)], [(0, 5), (3, 2)]):
         fast.refresh([(placed(scenes[i], network), frame) for i, frame in starts], values_of(network))
@@ -93,7 +93,7 @@ def test_lost_scenes_are_dropped() -> None:
     small, large = falling(episode(4, seed=1), 0.27), episode(4, seed=2)
     starts = [(small, 2), (large, 2)]
     training = training_of(precision="fp32")
-    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 60.0, 0)
+    fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)
     for mean, kept in ((0.02, 4), (float("nan"), 0), (0.01, 5)):
         network.normaliser.acceleration_mean.fill_(mean)
         fast.refresh([(placed(made, network), frame) for made, frame in starts], values_of(network))
@@ -126,7 +126,7 @@ def test_fast_training_is_the_plain_one(
     """Both paths simulate the same scenes at the same updates and train on the same windows: weights, their average and
     what is logged of the pool agree. The fast one tells where the time of its first updates went."""
     monkeypatch.setattr("hgn.training.graph_trainer.REPORTED_UPDATES", 2)
-    monkeypatch.setattr("hgn.runtime.backend.why_not_fast", lambda *_: None)  # in float32, which it is not offered in
+    monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
     same = {"noise_std": 0.0, "grid_jitter": False, "ema_decay": 0.7, "symmetry": "gravity"}
     own = {"pushforward_fraction": 0.5, "pushforward_every": 1, "pushforward_scenes": 2, "pushforward_frames": 2}
     counts = {"maximum_updates": 2, "log_every": 2, "checkpoint_every": 2, "monitor_every": 2}

@@ -78,7 +78,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind: str) -> None:
     wholes = {i: whole_episode(made, network.config) for i, made in enumerate(episodes)}
     fast.run(UpdateChunk((samples,), wholes, SamplerState()), [0.0])
     updates, count, width = fast.updates, len(state.position_N3), 3 * HISTORY
-    assert fast.agreement is not None and max(fast.agreement) < 1e-3
+    assert fast.parity is not None and max(fast.parity) < 1e-3
     near = {"rtol": 0, "atol": 1e-7}
     torch.testing.assert_close(updates.position_N3[:count].cpu().double(), state.position_N3, **near)
     torch.testing.assert_close(updates.velocity_NV[:count].cpu().double(), state.velocity_NM3.flatten(1), **near)

@@ -14,7 +14,8 @@ from training.runs import metrics, train_mapping
 
 from hgn import train
 from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
-from hgn.runtime.backend import choose_path, path_on, why_not_fast, why_not_trained_fast
+from hgn.network.build import build_network
+from hgn.runtime.backend import choose, pick, training_unsupported_reason, triton_unsupported_reason
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.data_module import UPDATES_AT_ONCE, chunk_length
@@ -43,7 +44,7 @@ def test_fast_training_is_the_plain_one(
 ) -> None:
     """Without noise and jitter both backends make the same updates: every count and log line is there, weights,
     their average and moments agree; a training may change backend at any checkpoint, and ends where the others do."""
-    monkeypatch.setattr("hgn.runtime.backend.why_not_fast", lambda *_: None)  # in float32, which it is not offered in
+    monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
     same = {"noise_std": 0.0, "grid_jitter": False, "warmup_updates": 3, "ema_decay": 0.7}
     ends = {}
     for name, parts in {
@@ -90,7 +91,7 @@ def test_fast_training_of_gns_is_the_plain_one(
     on_cpu = device().type == "cpu"
     if on_cpu:
         monkeypatch.setattr(
-            "hgn.training.session.why_not_trained_fast", lambda *_: None
+            "hgn.training.session.training_unsupported_reason", lambda *_: None
         )  # kernels run in the interpreter
     same = {"noise_std": 0.0, "grid_jitter": False, "optimizer": "muon", "ema_decay": 0.7, "maximum_updates": 3}
     same |= {"log_every": 3, "checkpoint_every": 3, "monitor_every": 3, "precision": "fp32" if on_cpu else "fp16"}
@@ -154,53 +155,79 @@ def test_chunks_end_where_something_is_due() -> None:
     assert chunk_length(training, 0, 1000) >= 1
 
 
+GOLD, HALF = "it needs gold", "it has no fp16"
+
+
 @pytest.mark.parametrize(
-    ("backend", "precision", "reason", "expected"),
+    ("backend", "precision", "reasons", "expected"),
     [
-        ("auto", "tf32", None, ("triton", "training backend: triton, precision tf32")),
-        ("torch", "tf32", None, ("torch", "training backend: torch, precision tf32")),
-        ("auto", "tf32", "it needs gold", ("torch", "training backend: torch (it needs gold), precision tf32")),
-        ("triton", "tf32", "it needs gold", "training.backend must be torch or auto here, got triton: it needs gold"),
-        ("auto", "fp16", "it needs gold", "precision must be tf32 or fp32 on backend torch, got fp16"),
-        ("torch", "fp16", None, "got fp16; training.backend=torch was asked for"),
+        ("auto", "tf32", (None, None), ("triton", "training backend: triton, precision tf32")),
+        ("torch", "tf32", (None, None), ("torch", "training backend: torch, precision tf32")),
+        (
+            "auto",
+            "tf32",
+            (GOLD, None),
+            ("torch", "training backend: torch (not triton: it needs gold), precision tf32"),
+        ),
+        ("triton", "tf32", (GOLD, None), "training.backend must be torch or auto here, got triton: it needs gold"),
+        (
+            "auto",
+            "fp16",
+            (GOLD, HALF),
+            "precision must be tf32 or fp32 on backend torch, got fp16; triton: it",
+        ),
+        ("torch", "fp16", (None, HALF), "got fp16; training.backend=torch was asked for"),
     ],
 )
-def test_the_backend_is_chosen_and_said(backend: str, precision: str, reason: str | None, expected: Any) -> None:
+def test_the_backend_is_chosen_and_said(
+    backend: str, precision: str, reasons: tuple[str | None, str | None], expected: Any
+) -> None:
     """auto takes backend triton where it runs and says so; what cannot be had is refused, never replaced silently."""
+    keeps = dict(zip(("triton", "torch"), reasons, strict=True))
     if isinstance(expected, tuple):
-        assert choose_path("training.backend", backend, precision, reason) == expected
+        assert pick(keeps, backend, precision, "training.backend") == expected
     else:
         with pytest.raises(ConfigError, match=expected):
-            choose_path("training.backend", backend, precision, reason)
+            pick(keeps, backend, precision, "training.backend")
 
 
-def test_gns_has_half_precision_on_backend_torch() -> None:
-    """What other networks are refused there."""
-    assert choose_path("backend", "auto", "fp16", "it computes hgn", True)[0] == "torch"
-    assert path_on(torch.device("cpu"), NetworkConfig(kind="gns", levels=1), "auto", "fp16")[0] == "torch"
-    with pytest.raises(ConfigError, match="got fp16; it needs a CUDA device"):
-        path_on(torch.device("cpu"), NetworkConfig(), "auto", "fp16")
+def test_what_a_cpu_takes() -> None:
+    """An HGN compiled C, unless torch is asked for; a GNS PyTorch, in fp16 too, which an HGN is refused."""
+    cpu = torch.device("cpu")
+    hgn, gns = (build_network(NetworkConfig(width=16, kind=kind, levels=1)) for kind in ("hgn", "gns"))
+    assert [choose(cpu, hgn, "tf32", name).name for name in ("auto", "torch", "cpu")] == ["cpu", "torch", "cpu"]
+    assert choose(cpu, gns).name == choose(cpu, gns, "fp16").name == "torch"
+    for network, precision, backend, message in (
+        (hgn, "fp16", "auto", "got fp16; triton: it needs a CUDA device"),
+        (hgn, "tf32", "triton", "backend must be cpu or torch or auto here, got triton: it needs a CUDA device"),
+        (gns, "tf32", "cpu", "backend must be torch or auto here, got cpu: it computes hgn networks, not gns"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            choose(cpu, network, precision, backend)
 
 
 def test_why_gns_is_not_trained_on_backend_triton() -> None:
     """Another device, precision or width, static particles, a limit of neighbours and own states are each named."""
     gpu, gns = torch.device("cuda"), NetworkConfig(kind="gns", levels=1)
-    assert why_not_trained_fast(gpu, gns, "fp16") is None and why_not_trained_fast(gpu, NetworkConfig(), "tf32") is None
-    assert "not cpu" in str(why_not_trained_fast(torch.device("cpu"), gns, "fp16"))
-    assert "not tf32" in str(why_not_trained_fast(gpu, gns, "tf32"))
-    assert "not 48" in str(why_not_trained_fast(gpu, replace(gns, width=48), "fp16"))
-    assert "not 128" in str(why_not_trained_fast(gpu, replace(gns, maximum_neighbours=128), "fp16"))
-    assert "true states" in str(why_not_trained_fast(gpu, gns, "fp16", pushforward=True))
+    assert (
+        training_unsupported_reason(gpu, gns, "fp16") is None
+        and training_unsupported_reason(gpu, NetworkConfig(), "tf32") is None
+    )
+    assert "not cpu" in str(training_unsupported_reason(torch.device("cpu"), gns, "fp16"))
+    assert "not tf32" in str(training_unsupported_reason(gpu, gns, "tf32"))
+    assert "not 48" in str(training_unsupported_reason(gpu, replace(gns, width=48), "fp16"))
+    assert "not 128" in str(training_unsupported_reason(gpu, replace(gns, maximum_neighbours=128), "fp16"))
+    assert "true states" in str(training_unsupported_reason(gpu, gns, "fp16", pushforward=True))
     static = NetworkConfig(kind="gns_particles", levels=1, obstacle_features=False)
-    assert "not gns_particles" in str(why_not_trained_fast(gpu, static, "fp16"))
+    assert "not gns_particles" in str(training_unsupported_reason(gpu, static, "fp16"))
 
 
 def test_why_backend_triton_does_not_run() -> None:
     """A CPU, GNS, an odd width and too many levels are each named."""
     gpu, hgn = torch.device("cuda"), NetworkConfig()
-    assert why_not_fast(gpu, hgn) is None
-    assert "not cpu" in str(why_not_fast(torch.device("cpu"), hgn))
-    assert "not gns" in str(why_not_fast(gpu, NetworkConfig(kind="gns", levels=1)))
-    assert "not 48" in str(why_not_fast(gpu, NetworkConfig(width=48)))
-    assert "in tf32 or fp16, not fp32" in str(why_not_fast(gpu, hgn, "fp32"))
-    assert "at most 8" in str(why_not_fast(gpu, NetworkConfig(levels=9)))
+    assert triton_unsupported_reason(gpu, hgn) is None
+    assert "not cpu" in str(triton_unsupported_reason(torch.device("cpu"), hgn))
+    assert "fp16, not tf32" in str(triton_unsupported_reason(gpu, NetworkConfig(kind="gns", levels=1)))
+    assert "not 48" in str(triton_unsupported_reason(gpu, NetworkConfig(width=48)))
+    assert "in tf32 or fp16, not fp32" in str(triton_unsupported_reason(gpu, hgn, "fp32"))
+    assert "at most 8" in str(triton_unsupported_reason(gpu, NetworkConfig(levels=9)))

@@ -19,7 +19,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.network.orthogonal import orthogonalised
 from hgn.schema import ConfigError
 from hgn.training.muon import Muon
-from hgn.training.parity import require_agreement
+from hgn.training.parity import require_parity
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -231,9 +231,9 @@ def test_wrong_kernels_are_refused() -> None:
     ]
     samples = [(made, 1, 3), (still, 0, 4)]
     updates.predict(samples)
-    assert max(require_agreement(updates, episodes)) < 1e-3
+    assert max(require_parity(updates, episodes)) < 1e-3
     updates.values.mul_(1.3)
     updates.fused.refresh()
     updates.predict(samples)
     with pytest.raises(ConfigError, match=r"must be torch on this machine.*set training.backend=torch"):
-        require_agreement(updates, episodes)
+        require_parity(updates, episodes)

@@ -19,8 +19,7 @@ def output_and_gradients(
     network: GraphNetworkSimulator, edges: Edges | None, state: ParticleState, weight: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The network's output, and the gradients of all parameters of a random weighting of it, divided by `weight`."""
-    network.edges = edges
-    output = network.normalised_acceleration(state)
+    output = network.normalised_acceleration(state, edges=edges)
     factor = torch.randn(output.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(output)
     parameters = list(network.parameters())
     found = torch.autograd.grad((output * factor * weight).sum(), parameters, allow_unused=True)
@@ -34,12 +33,13 @@ def test_blocks_with_gradients_of_their_own_are_exact(kind, counts, monkeypatch)
     """Outputs and all parameter gradients equal the naive network's, in float64 and in many blocks of edges."""
     monkeypatch.setattr("hgn.network.gns_edges.CPU_ROWS", 30)
     network = gns_of(kind=kind)
-    network.edges = PlainEdges()
     state = state_for(network, counts)
     expected = naive_gns_acceleration(network, state)
-    assert_same_function(network, network.normalised_acceleration(state), expected)
+    assert_same_function(network, network.normalised_acceleration(state, edges=PlainEdges()), expected)
     with torch.no_grad():
-        torch.testing.assert_close(network.normalised_acceleration(state), expected, rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(
+            network.normalised_acceleration(state, edges=PlainEdges()), expected, rtol=1e-10, atol=1e-10
+        )
 
 
 @pytest.mark.parametrize("weight", [1e-9, 1.0, 1e5])
@@ -57,9 +57,9 @@ def test_a_gradient_of_zero_or_not_finite_stays_that():
     """No error at the output gives zero gradients; a NaN there gives NaN, so that the update is skipped."""
     network = gns_of(torch.float32)
     state = random_state((12,), dtype=torch.float32, spread=0.1)
-    network.edges = PlainEdges(torch.float16)
+    edges = PlainEdges(torch.float16)
     weight = network.steps[0].edge.second.weight
     for factor in (0.0, torch.nan):
         network.zero_grad()
-        (network.normalised_acceleration(state) * factor).sum().backward()
+        (network.normalised_acceleration(state, edges=edges) * factor).sum().backward()
         assert weight.grad.isnan().all() if factor else weight.grad.eq(0).all()

@@ -11,7 +11,8 @@ import torch
 from network.states import network_of, random_grid
 
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.simulator import DivergenceError, InitialState, Simulator
+from hgn.runtime.divergence import DivergedError
+from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
@@ -113,7 +114,7 @@ def test_divergence_names_the_frame(acceleration: tuple[float, float, float], fr
     scene = initial(40)
     scene.velocity_N3[:] = 0
     simulator = Simulator(constant(acceleration), 60.0)
-    with pytest.raises(DivergenceError, match=f"diverged at frame {frame}: .*{cause}") as raised:
+    with pytest.raises(DivergedError, match=f"diverged at frame {frame}: .*{cause}") as raised:
         simulator.rollout([scene], 10)
     assert raised.value.frame == frame
 
@@ -130,7 +131,7 @@ def test_initial_state_out_of_range_is_named() -> None:
     """A scene whose particles lie beyond what grid coordinates can express ends as divergence at frame 1."""
     scene = initial(3)
     scene.position_N3[0, 0] = 1e6
-    with pytest.raises(DivergenceError, match="diverged at frame 1: positions must be finite and within"):
+    with pytest.raises(DivergedError, match="diverged at frame 1: positions must be finite and within"):
         Simulator(network_of(torch.float32), 60.0).rollout([scene], 3)
 
 
@@ -179,8 +180,8 @@ def test_frame_by_frame(tmp_path: Path) -> None:
     network = network_of(torch.float32)
     save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
     simulator = Simulator.load(tmp_path / "w.safetensors", device="cpu")
-    assert simulator.frame_rate_hz == 60.0 and simulator.backend_note.startswith(
-        "runtime backend: torch (it needs a CUDA"
+    assert simulator.frame_rate_hz == 60.0 and simulator.backend.note.startswith(
+        "runtime backend: cpu (not triton: it needs a CUDA device, not cpu), precision tf32, rows "
     )
     start, other = initial(30), initial(10, 1)
     scene = Scene(start.position_N3, start.velocity_N3, start.material_N)

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.runtime.backend import path_on
+from hgn.network.build import build_network
+from hgn.runtime.backend import choose
 from hgn.runtime.triton_host import why_no_triton
 from hgn.schema import ConfigError
 
@@ -49,11 +50,9 @@ def test_what_is_missing(host: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_it_is_said(host: Path) -> None:
-    """Backend torch runs instead, and says why; who asks for the fast one is told what to install."""
-    device = torch.device("cuda")
-    path, said = path_on(device, NetworkConfig(), "auto", "tf32")
-    assert path == "torch" and "Python.h" in said
-    with pytest.raises(
-        ConfigError, match="backend must be torch or auto here, got triton: Triton needs Python's headers"
-    ):
-        path_on(device, NetworkConfig(), "triton", "tf32")
+    """Backend torch runs instead, and says why; who asks for triton is told what to install."""
+    device, network = torch.device("cuda"), build_network(NetworkConfig(width=16))
+    chosen = choose(device, network)
+    assert chosen.name == "torch" and "Python.h" in chosen.note
+    with pytest.raises(ConfigError, match="must be torch or auto here, got triton: Triton needs Python's headers"):
+        choose(device, network, backend="triton")

@@ -86,8 +86,8 @@ def test_no_time_where_a_check_is_red(
         after = step(self, state)
         return replace(after, velocity_NM3=1.001 * after.velocity_NM3)
 
-    def wrong_gradient(self, state, neighbours):
-        output = project(self, state, neighbours)
+    def wrong_gradient(self, state, neighbours, edges=None):
+        output = project(self, state, neighbours, edges)
         return output if output.dtype == torch.float64 else output + 0.1 * (output - output.detach())
 
     monkeypatch.setattr(Simulator, "step", wrong_step)
@@ -107,8 +107,8 @@ def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain network passes in float32; a 0.01 % error of the output does not."""
     frame = contenders.Frame(NetworkConfig(width=16, levels=2), Workload(50, 1), CPU)
     assert frame.check("fp32") == "pass"
-    predict = frame.simulator.predict
-    frame.simulator.predict = lambda state: 1.0001 * predict(state)
+    predict = frame.simulator.backend.predict
+    frame.simulator.backend.predict = lambda state: 1.0001 * predict(state)
     assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
 
 

@@ -21,7 +21,7 @@ from datagen.mpm.solver import SceneFailure, Simulated
 from hgn.config import DatagenConfig, MpmConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
-from hgn.runtime.rollouts import RolloutResult, network_trials
+from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights, shipped_weights
 from hgn.scene.distance import share_inside
@@ -199,7 +199,7 @@ def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys:
     found = [(c.row["system"], c.row["precision"]) for c in network_contenders(config, CPU, [episode])]
     assert found == [("hgn", "fp32"), ("gns", "fp32"), ("gns", "fp16")]
     assert "left out: hgn.safetensors at fp16" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match="backend must be torch or auto here, got triton"):
+    with pytest.raises(ConfigError, match="backend must be cpu or torch or auto here, got triton"):
         network_contenders(replace(config, backend="triton"), CPU, [episode])
 
 
@@ -228,10 +228,10 @@ def test_what_counts_most_comes_first(
     assert [name.split(" (")[0] for name in order] == [
         *["constant velocity", "ballistic motion", "mean acceleration"],
         *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
-        "HGN L = 3, M = 2, torch tf32",
+        "HGN L = 3, M = 2, cpu tf32",
         "GNS M = 3, torch fp32",
         "MPM 48³, step 0.5",
-        "HGN L = 3, M = 2, torch fp32",
+        "HGN L = 3, M = 2, cpu fp32",
         "GNS M = 3, torch tf32",
     ]
     report = json.loads((tmp_path / "report.json").read_text())
@@ -299,12 +299,12 @@ def test_a_diverging_scene_ends_alone(data: str) -> None:
     scenes = [InitialState.of_episode(episode) for episode in episodes]
     scenes = [replace(s, material_N=np.full_like(s.material_N, i)) for i, s in enumerate(scenes)]
     simulator = Simulator(network_of(torch.float32), 60.0)
-    simulator.predict = lambda state: (state.material_N == 1)[:, None].float().expand(-1, 3)
-    through, failed = network_trials(simulator, scenes, 5)
+    simulator.backend.predict = lambda state: (state.material_N == 1)[:, None].float().expand(-1, 3)
+    through, failed = simulate_scenes(simulator, scenes, 5)
     assert through.cause is None and through.frame_count == 5
     assert failed.cause is not None and "diverged at frame 2" in failed.cause and failed.frame_count == 2
     assert np.isfinite(failed.position_TN3).all()
-    assert network_trials(simulator, [], 5) == []
+    assert simulate_scenes(simulator, [], 5) == []
 
 
 def test_sinkhorn_against_closed_forms() -> None:
@@ -515,13 +515,13 @@ def test_scenes_beside_one_that_diverges_go_their_way(data: str, kind: str) -> N
     scenes = [InitialState.of_episode(episode) for episode in (*episodes, episodes[0])]
     scenes[1] = replace(scenes[1], velocity_N3=scenes[1].velocity_N3 + np.float32(60.0))
     simulator, calls = Simulator((network_of if kind == "hgn" else gns_of)(torch.float32), 60.0), []
-    predict = simulator.predict
-    simulator.predict = lambda state: calls.append(len(state.position_N3)) or predict(state)
-    first, lost, last = network_trials(simulator, scenes, 5)
+    predict = simulator.backend.predict
+    simulator.backend.predict = lambda state: calls.append(len(state.position_N3)) or predict(state)
+    first, lost, last = simulate_scenes(simulator, scenes, 5)
     assert lost.cause is not None and f"diverged at frame {lost.frame_count}" in lost.cause and len(calls) == 4
     assert calls[0] > calls[-1]
     for trial, scene in ((first, scenes[0]), (last, scenes[2])):
-        (alone,) = network_trials(simulator, [scene], 5)
+        (alone,) = simulate_scenes(simulator, [scene], 5)
         assert trial.cause is None
         np.testing.assert_allclose(trial.position_TN3, alone.position_TN3, atol=1e-6)
 

@@ -101,7 +101,7 @@ class Repeats(torch.nn.Module):
 def test_free_fall(share: float, held: bool) -> None:
     """What goes on as it was falls rightly; it repeats a body's velocity error, or takes it back, and is told so."""
     network = network_of(torch.float32, width=8, material_embedding=2, message_passing_steps=1, levels=2)
-    simulator = Simulator(Repeats(network, share), 60.0)  # type: ignore[arg-type]
+    simulator = Simulator(Repeats(network, share), 60.0, "torch")  # type: ignore[arg-type]
     fall, error = free_fall_rows(simulator, SceneConfig(), "sand")
     assert fall.held and fall.measured == pytest.approx(0.0, abs=1e-3)
     assert error.held is held and error.measured == pytest.approx(share, rel=1e-3)
@@ -121,7 +121,7 @@ def test_failures_are_told(weights: str) -> None:
     case = next(iter(cases(config, network.config)))
     simulator = Simulator(network, 60.0)
     push = torch.tensor(GRAVITY) / 60**2
-    simulator.predict = lambda state: push.expand(len(state.position_N3), 3)
+    simulator.backend.predict = lambda state: push.expand(len(state.position_N3), 3)
     case = Case(case.name, case.scenes, 16, GRAVITY, 12)
     row = row_of(simulator, case, 0.02)
     assert row.held and row.more["share_of_way"] == pytest.approx(1, rel=1e-3)

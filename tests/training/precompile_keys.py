@@ -15,9 +15,9 @@ from triton.compiler import ASTSource
 from triton.runtime.jit import JITFunction
 
 from hgn.config import NetworkConfig
-from hgn.kernels.precompile import PrecompileJob, launches_of
 from hgn.kernels.triton_compat import preload
 from hgn.kernels.update.op import UpdateSettings
+from hgn.runtime.precompile_program import PrecompileJob, launches_of
 
 
 def key_of(function: JITFunction[Any], signature: Any, constants: Any, attributes: Any, options: Any) -> str:

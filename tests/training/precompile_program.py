@@ -7,8 +7,8 @@ from dataclasses import replace
 from no_gpu import use_h100
 
 from hgn.config import NetworkConfig
-from hgn.kernels.precompile import FrameJob, PrecompileJob, compile_share, launches_of
 from hgn.kernels.update.op import UpdateSettings
+from hgn.runtime.precompile_program import FrameJob, PrecompileJob, compile_share, launches_of
 
 use_h100()
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
-from hgn.kernels.precompile import FrameJob, PrecompileJob, job_of, job_text
 from hgn.runtime.precompile import Precompilation, frame_sizes
+from hgn.runtime.precompile_program import FrameJob, PrecompileJob, job_of, job_text
 from hgn.training.precompile import job_of_training
 
 CHECKOUT = Path(__file__).parents[2]

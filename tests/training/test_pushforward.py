@@ -105,7 +105,7 @@ def samples_of(episodes: list[Episode], frame: int, seeds: tuple[int, ...]) -> U
 
 
 def pool_of(network: ParticleNetwork, training: TrainingConfig | None = None) -> PushforwardPool:
-    return PushforwardPool(network, training or training_of(), 60.0, 0)
+    return PushforwardPool(network, training or training_of(), 0)
 
 
 @pytest.mark.parametrize(

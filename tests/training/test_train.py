@@ -95,13 +95,13 @@ def gradients_with_faults(monkeypatch: pytest.MonkeyPatch, faulty: Collection[in
 
 def test_a_scene_that_diverges_leaves_the_others_measured(data, tmp_path, monkeypatch):
     """Its frames count as far as it came, it is told how many came to the end, and pictures are made."""
-    real = callbacks.network_trials
+    real = callbacks.simulate_scenes
 
     def cut_short(*arguments):
         first, *others = real(*arguments)
         return [RolloutResult(first.position_TN3[:2], "diverged"), *others]
 
-    monkeypatch.setattr(callbacks, "network_trials", cut_short)
+    monkeypatch.setattr(callbacks, "simulate_scenes", cut_short)
     run = tmp_path / "run"
     assert train.main(train_mapping(data, run, monitor_rollout_frames=4, monitor_scenes=2)) == 0
     last = [record for record in metrics(run) if "rollout/finished" in record][-1]

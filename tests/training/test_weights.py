@@ -17,6 +17,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.evaluate import one_step_rows
 from hgn.export import export
 from hgn.network.build import build_network
+from hgn.runtime.backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import DataInfo, network_of_checkpoint, read_checkpoint
@@ -45,7 +46,9 @@ def weights_file(
 def evaluate(data: DatagenConfig, weights: Path) -> float:
     mapping = {"weights": str(weights), "data": data.dataset.folder, "rollout_frames": 0, "device": "cpu"}
     config = EvaluateConfig(**mapping)
-    rows = one_step_rows(load_weights(weights)[0], first_episodes(EpisodeStore(config.data, config.split), 5), config)
+    rows = one_step_rows(
+        Backend(load_weights(weights)[0]), first_episodes(EpisodeStore(config.data, config.split), 5), config
+    )
     return next(row["one_step_mse"] for row in rows if row["system"] == "network")
 
 

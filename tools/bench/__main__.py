@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from hgn.command import run_command
-from hgn.runtime.backend import set_matmul_precision, why_not_fast, why_not_trained_fast
+from hgn.runtime.backend import set_matmul_precision, training_unsupported_reason, triton_unsupported_reason
 from hgn.schema import from_mapping, to_mapping
 from hgn.system.device import choose_device
 from hgn.system.files import write_json
@@ -160,9 +160,9 @@ def _maker(
     frame = case.endswith("frame")
     if config.public_gns is not None and case in PUBLIC_GNS_CASES:
         return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
-    if case in ("frame", "train") and why_not_fast(device, config.network, precision) is None:
+    if case in ("frame", "train") and triton_unsupported_reason(device, config.network, precision) is None:
         return functools.partial(FastFrame if frame else FastTrain, precision), "triton"
-    if case == "gns_train" and why_not_trained_fast(device, config.gns, precision) is None:
+    if case == "gns_train" and training_unsupported_reason(device, config.gns, precision) is None:
         return functools.partial(FastTrain, precision), "triton"
     plain = NaiveFrame if case == "naive_frame" else Frame if frame else Train
     made = functools.partial(plain, precision=precision)
@@ -171,7 +171,7 @@ def _maker(
 
 def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tuple[str, ...]) -> list[str]:
     """Those of `cases` that are asked for and mean something; fp16 is backend triton's and our GNS's alone."""
-    fast = why_not_fast(device, config.network, precision) is None
+    fast = triton_unsupported_reason(device, config.network, precision) is None
     wanted = config.cases or tuple(
         case
         for case in CASES

@@ -22,7 +22,7 @@ from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.gns_backend import use_edges
+from hgn.runtime.backend import fastest_stepped, with_gradients
 from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
 from hgn.training.checkpoint import DataInfo
@@ -63,7 +63,7 @@ class Frame:
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
         self.device = device
         self.network = self.reference = bench_network(config, device)
-        self.simulator = Simulator(self.network, FRAME_RATE_HZ, precision=precision)
+        self.simulator = Simulator(self.network, FRAME_RATE_HZ, fastest_stepped(self.network, precision))
         self.state = state_of(work, config, device)
 
     def run(self) -> ParticleState:
@@ -117,7 +117,7 @@ class NaiveFrame(Frame):
         self.network = NaiveNetwork(config)
         self.network.load_state_dict(self.reference.state_dict())
         self.network.to(device).eval()
-        self.simulator = Simulator(self.network, FRAME_RATE_HZ, precision=precision)
+        self.simulator = Simulator(self.network, FRAME_RATE_HZ, "torch", precision)
 
 
 class Train:
@@ -127,7 +127,7 @@ class Train:
         self.device = device
         training = TrainingConfig(batch_scenes=work.scenes)
         self.module = TrainingModule(bench_network(config, device).train(), training, _data_info()).to(device)
-        use_edges(self.module.network, precision)
+        self.module.backend = with_gradients(self.module.network, precision)
         self.batch = batch_of(work, config, device)
         self.optimizer = self.module.configure_optimizers()["optimizer"]
 
@@ -143,6 +143,7 @@ class Train:
         """`pass`, or by how much loss or gradients differ from float64, without noise and jitter."""
         plain = replace(self.module.training_config, noise_std=0.0, grid_jitter=False)
         found = TrainingModule(self.module.network, plain, _data_info())
+        found.backend = self.module.backend
         found.network.zero_grad()
         found_loss = found.loss(self.batch)
         found_loss.backward()
@@ -213,11 +214,8 @@ def reference_acceleration(network: ParticleNetwork, state: ParticleState) -> to
 
 
 def _reference(network: ParticleNetwork) -> ParticleNetwork:
-    """A copy in float64; of GNS one by plain autograd."""
-    reference = copy.deepcopy(network).double()
-    if isinstance(reference, GraphNetworkSimulator):
-        reference.edges = None
-    return reference
+    """A copy in float64."""
+    return copy.deepcopy(network).double()
 
 
 def reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.Tensor:

@@ -10,7 +10,6 @@ import copy
 import torch
 
 from hgn.config import NetworkConfig, TrainingConfig
-from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import kernel_precision
 from hgn.runtime.parity import relative_error
@@ -110,11 +109,10 @@ class FastTrain:
         self.rates = [training.learning_rate] * UPDATES_AT_ONCE
 
     def _updates(self, noise_std: float, grid_jitter: bool):  # type: ignore[no-untyped-def]
-        from hgn.kernels.gns.update import GnsUpdates
-        from hgn.kernels.update.op import Updates, UpdateSettings
+        from hgn.kernels.update.op import UpdateSettings
+        from hgn.runtime.triton_backend import updates_of
 
-        kind = GnsUpdates if isinstance(self.network, GraphNetworkSimulator) else Updates
-        return kind(
+        return updates_of(self.network)(
             copy.deepcopy(self.network),
             UpdateSettings(len(self.samples), noise_std, grid_jitter, OBSTACLE_CELL_SIZE),
             kernel_precision(self.precision, self.device),

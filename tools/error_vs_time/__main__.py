@@ -216,8 +216,8 @@ def _why_unfit(info: WeightsInfo, episodes: Sequence[Episode]) -> str | None:
 def _kernels_ahead(
     networks: Sequence[NetworkContender], episodes: Sequence[Episode], device: torch.device
 ) -> Precompilation | None:
-    """Compiles what networks on backend triton launch: beside the solver, which needs one core."""
-    fast = [contender for contender in networks if contender.backend == "triton"]
+    """Compiles whole frames of networks: beside the solver, which needs one core."""
+    fast = [contender for contender in networks if not contender.stepped]
     if not fast:
         return None
     # Triton, which backend torch does without, is loaded here.

@@ -21,12 +21,12 @@ from hgn.config import NetworkConfig
 from hgn.data.batch import Batch, make_batch
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import path_on, set_matmul_precision
-from hgn.runtime.rollouts import RolloutResult, network_trials
+from hgn.runtime.backend import choose, set_matmul_precision
+from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
-from hgn.training.errors import Predictor, SquaredError
+from hgn.training.errors import Predictor, SquaredError, network_predictor
 from tools.solver_launches import Setting, SolverLaunches
 from tools.solver_rollouts import FrameClock
 
@@ -89,25 +89,25 @@ class NetworkContender:
         require_frame_rate(info, frame_rate_hz)
         config = info.network
         self.device, self.precision = device, precision
-        self.backend, _ = path_on(device, config, backend, self.precision)
-        fast, hgn = self.backend == "triton", config.kind == "hgn"
+        with self.matmul():
+            chosen = choose(device, self.network, precision, backend)
+            self.simulator = Simulator(self.network, info.frame_rate_hz, chosen)
+        self.stepped, hgn = chosen.stepped, config.kind == "hgn"
         if rank == 0:
             others = STATIC_PARTICLES_FIRST if config.obstacle_particles else GNS_FIRST
             self.importance = HGN_FIRST if hgn else others
         else:
-            self.importance = HGN_NEXT if fast else HGN_LAST if hgn else GNS_LAST
-        self.all_at_once = hgn and not fast and device.type == "cuda"  # which waits for the host then
-        self.frames = None if fast or rank == 0 else repeated_frames
+            self.importance = HGN_NEXT if not self.stepped else HGN_LAST if hgn else GNS_LAST
+        self.all_at_once = hgn and self.stepped and device.type == "cuda"  # which waits for the host then
+        self.frames = None if rank == 0 or not self.stepped else repeated_frames
         self._fast: FastPredictor | None = None
-        with self.matmul():
-            self.simulator = Simulator(self.network, info.frame_rate_hz, self.backend, self.precision)
         self.row: dict[str, Any] = {
             "system": config.kind,
             "weights": file.name,
             "levels": config.levels,
             "message_passing_steps": config.message_passing_steps,
             "width": config.width,
-            "backend": self.backend,
+            "backend": chosen.name,
             "precision": precision,
             "updates": info.updates,
         }
@@ -124,22 +124,22 @@ class NetworkContender:
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep:
         config = self.network.config
         with self.matmul():
-            if self.backend == "triton":
+            if not self.stepped:
                 assert isinstance(self.network, HierarchicalGraphNetwork)
                 self._fast = self._fast or FastPredictor(self.network, self.precision)
                 return one_step(self._fast, config, episode, stride, rest_speed, self.device, PARTICLES_AT_ONCE)
-            return one_step(lambda b: self.network(b.state()), config, episode, stride, rest_speed, self.device)
+            return one_step(network_predictor(self.simulator.backend), config, episode, stride, rest_speed, self.device)
 
     def trials(
         self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
     ) -> list[RolloutResult]:
         frames = frames if self.frames is None or on_frame is not None else min(frames, self.frames)
         with self.matmul():
-            return network_trials(self.simulator, [InitialState.of_episode(e) for e in episodes], frames, on_frame)
+            return simulate_scenes(self.simulator, [InitialState.of_episode(e) for e in episodes], frames, on_frame)
 
     def release(self) -> None:
         self._fast = None
-        self.simulator.release()
+        self.simulator.backend.release()
 
 
 def solver_row(grid: int, step: float) -> dict[str, Any]:

@@ -45,7 +45,7 @@ class Timing:
         will be timed, as far as something is captured or compiled for it. Tells the most GPU memory that the first
         scene took, of what torch knows.
         """
-        kind, fast = contender.row["system"], contender.row.get("backend") == "triton"
+        kind, fast = contender.row["system"], not getattr(contender, "stepped", True)
         contender.release()
         before = 0
         if self.device.type == "cuda":

@@ -25,7 +25,7 @@ from torch.nn.parallel import DistributedDataParallel
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import kernel_precision, set_matmul_precision, why_not_fast
+from hgn.runtime.backend import kernel_precision, set_matmul_precision, triton_unsupported_reason
 from hgn.runtime.parity import relative_error
 from hgn.system.machine import available_cpus
 from hgn.training.checkpoint import DataInfo
@@ -229,7 +229,7 @@ def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -
     chosen = averaging_options()["bucket_cap_mb"]
     found = []
     for backend in config.backends:
-        if backend == "triton" and why_not_fast(device, config.network, config.precision):
+        if backend == "triton" and triton_unsupported_reason(device, config.network, config.precision):
             continue
         sent = list(dict.fromkeys([chosen, *config.message_mb])) if backend == "torch" else [None]
         for size in sizes:

@@ -23,7 +23,7 @@ from PIL import Image
 
 from hgn.command import run_command
 from hgn.render.pictures import compare_picture, spread, stacked, write_picture
-from hgn.runtime.rollouts import RolloutResult, network_trials
+from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import Rollout
@@ -53,12 +53,12 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(StabilityNetworkConfig, mapping)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     network, device, backend, info = simulator.network, simulator.device, simulator.backend, simulator.info
-    print(simulator.backend_note, file=sys.stderr)
+    print(simulator.backend.note, file=sys.stderr)
     rows: list[Row] = []
     pictures: list[Image.Image] = []
     drawn = 0.0  # when the picture was last written
     meta = provenance(device) | {"config": without_folders(to_mapping(config)), "weights": Path(config.weights).name}
-    meta |= {"updates": info.updates, "backend": backend, "network": to_mapping(info.network)}
+    meta |= {"updates": info.updates, "backend": backend.name, "network": to_mapping(info.network)}
 
     def keep(done: bool = False) -> None:  # a run that is cut off leaves the cases that it had
         nonlocal drawn
@@ -74,7 +74,7 @@ def main(mapping: dict[str, Any]) -> int:
         order = sorted(range(len(made)), key=lambda i: -sum(len(scene.obstacles) for scene in made[i].scenes))
         starts = {i: threads.submit(initial_states, made[i]) for i in order}
         ahead = None
-        if backend == "triton":
+        if not backend.stepped:
             # Triton, which backend torch does without, is loaded here.
             from hgn.runtime.precompile import frames_ahead
 
@@ -90,15 +90,15 @@ def main(mapping: dict[str, Any]) -> int:
         if ahead is not None:
             print(ahead.wait(), file=sys.stderr)
     meta["seconds_before_cases"] = time.monotonic() - begun
-    late = late_kernels(backend)
+    late = late_kernels(backend.name)
     with bar("cases", total=len(made), unit="case") as progress:
         for case, states in zip(made, initial, strict=True):
-            started, growths, compiled = time.monotonic(), simulator.growths, late()
+            started, growths, compiled = time.monotonic(), simulator.backend.growths, late()
             trials = case_trials(simulator, case, states)
             row = case_row(simulator, case, states, config.energy_bound, *trials)
             if config.picture is not None:
                 pictures.append(case_picture(simulator, case, trials[0][0], Path(config.weights).name))
-            row.more["growths"], row.more["kernels_compiled"] = simulator.growths - growths, late() - compiled
+            row.more["growths"], row.more["kernels_compiled"] = simulator.backend.growths - growths, late() - compiled
             row.more["seconds"] = time.monotonic() - started
             rows.append(row)
             keep()
@@ -130,7 +130,7 @@ def case_trials(
 ) -> tuple[list[RolloutResult], float | None]:
     """Simulates a case; the milliseconds of a frame too."""
     clock = FrameClock()
-    return network_trials(simulator, initial, case.frames, clock), clock.milliseconds()
+    return simulate_scenes(simulator, initial, case.frames, clock), clock.milliseconds()
 
 
 def case_picture(simulator: Simulator, case: Case, trial: RolloutResult, weights: str) -> Image.Image:
@@ -268,15 +268,15 @@ def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
     """A network with a weight that explodes: the runtime must stop at the first frame."""
     broken = copy.deepcopy(simulator.network)
     with torch.no_grad():
-        # Not NaN: paths that are compared with each other before they run could not agree on that.
+        # Not NaN: backends that are compared with each other before they run could not agree on that.
         thrown = FAR_DOMAINS * max(config.scene.domain_size) / broken.normaliser.acceleration_std[0]
         dict(broken.named_parameters())["decode.second.bias"][0] = thrown
     only = StabilityNetworkConfig(config.weights, cases=("single",), frames=4, scene=config.scene)
     scenes: Sequence[InitialState] = [
         InitialState.of_scene(scene) for case in cases(only, broken.config) for scene in case.scenes
     ]
-    sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.backend, simulator.precision)
-    trials = network_trials(sabotaged, scenes, only.frames)
+    sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.backend.name, simulator.backend.precision)
+    trials = simulate_scenes(sabotaged, scenes, only.frames)
     caught = all(trial.cause is not None and trial.frame_count == 1 for trial in trials)
     beyond = next((trial.cause for trial in trials if trial.cause is not None), "the runtime did not say so")
     frames = max(trial.frame_count for trial in trials)

@@ -96,4 +96,4 @@ def _answer(simulator: Simulator, state: ParticleState, added_NM: torch.Tensor) 
 
 @torch.inference_mode()
 def _acceleration(simulator: Simulator, state: ParticleState) -> torch.Tensor:
-    return simulator.network(state)
+    return simulator.backend.predict(state)

@@ -17,12 +17,12 @@ import numpy as np
 import torch
 
 from hgn.command import run_command
-from hgn.config import MpmConfig, NetworkConfig
+from hgn.config import PRECISIONS, MpmConfig, NetworkConfig
 from hgn.data.lookup import first_episodes
 from hgn.data.manifest import SPLITS
 from hgn.data.reader import EpisodeStore
-from hgn.runtime.backend import why_not_fast
-from hgn.runtime.rollouts import RolloutResult, network_trials
+from hgn.runtime.backend import triton_unsupported_reason
+from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import require_frame_rate
 from hgn.scene.episode import Episode
@@ -99,7 +99,7 @@ def main(mapping: dict[str, Any]) -> int:
         simulator = Simulator.load(config.weights, str(device), run.backend, run.precision)
         report.add("network", run.name, simulated(simulator, run, episodes, report.frames), plain)
     if config.solver:
-        simulator.release()
+        simulator.backend.release()
         mpm = from_stored(MpmConfig, store.manifest.config["mpm"], "mpm")
         mpm = replace(mpm, device="gpu" if device.type == "cuda" else "cpu")
         for name, (trials, reference) in solver_floors(mpm, episodes, report.frames, config.displacements).items():
@@ -110,9 +110,8 @@ def main(mapping: dict[str, Any]) -> int:
 
 def runs(device: torch.device, network: NetworkConfig, displacements: Sequence[float]) -> list[Run]:
     """Plain float32 again and displaced, then every other backend and precision of this device."""
-    fast = [Run("triton", name) for name in ("fp32", "tf32", "fp16") if why_not_fast(device, network, name) is None]
-    cuda = device.type == "cuda"  # elsewhere all plain products are float32's
-    plain = [Run("torch", name) for name in ("tf32", "fp16") if cuda and (name == "tf32" or network.kind != "hgn")]
+    fast = [Run("triton", name) for name in PRECISIONS if triton_unsupported_reason(device, network, name) is None]
+    plain = [Run("torch", "tf32")] if device.type == "cuda" else []  # elsewhere all products are float32's
     return [PLAIN, *(replace(PLAIN, displacement=size) for size in displacements), *plain, *fast]
 
 
@@ -120,7 +119,7 @@ def simulated(simulator: Simulator, run: Run, episodes: Sequence[Episode], frame
     """All scenes side by side."""
     scenes = [displaced(episode, run.displacement) for episode in episodes]
     with bar(run.name, total=frames - 1, unit="frame") as progress:
-        return network_trials(simulator, scenes, frames, lambda _: progress.update())
+        return simulate_scenes(simulator, scenes, frames, lambda _: progress.update())
 
 
 def displaced(episode: Episode, size: float) -> InitialState:

@@ -22,7 +22,9 @@ from hgn.kernels.grid.op import OUT_OF_WINDOW
 from hgn.kernels.neighbours.op import DeviceNeighbours
 from hgn.kernels.update.op import TAIL, Layout, Tables, TrainedNetwork, Updates
 from hgn.network.cell_keys import COORDINATE_LIMIT
+from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
+from hgn.network.gns_edges import PlainEdges
 from hgn.schema import ConfigError
 
 OUT = 4  # the decoder's three outputs, padded
@@ -75,7 +77,7 @@ class FusedGns:
     ) -> None:
         """`values` are the network's parameters, and `feature_NF` rows of particles in the batch's order."""
         self.network = views_of(network, values)
-        self.network.edges = FusedEdges.in_tf32() if precision == "tf32" else FusedEdges(precision)
+        self.edges = FusedEdges.in_tf32() if precision == "tf32" else FusedEdges(precision)
         self.parameters = list(self.network.parameters())
         self.weights, self.tables, self.feature_NF, self.particle_count = values, tables, feature_NF, particle_count
         self.output = torch.zeros(tables.particles, OUT, device=values.device)
@@ -98,7 +100,7 @@ class FusedGns:
         position_N3 = torch.where(self._live(), tables.position_N3, 0.0)
         with torch.enable_grad():
             node_NW = self._encoded(feature_NF)
-            self._decoded_N3 = self.network.decoded(node_NW, position_N3, tables.neighbours)
+            self._decoded_N3 = self.network.decoded(node_NW, position_N3, tables.neighbours, self.edges)
         self.output[:, :3].index_copy_(0, order_N, self._decoded_N3.detach())
 
     def backward(self) -> None:
@@ -136,7 +138,12 @@ class GnsUpdates(Updates):
     """The updates of a GNS whose obstacles are features; `capacities` is that of edges."""
 
     growth = 1.5  # neighbours differ more from frame to frame than cells do, and room for them costs memory alone
+    checked_particles = 40_000
     network: GraphNetworkSimulator
+
+    def reference_output(self, state: ParticleState, origin_S3: torch.Tensor) -> torch.Tensor:
+        # In blocks of edges: autograd keeps ten times as much.
+        return self.network.normalised_acceleration(state, origin_S3, PlainEdges())
 
     def _layout(self) -> Layout:
         assert not self.config.obstacle_particles and self.config.maximum_neighbours is None

@@ -27,6 +27,7 @@ from hgn.kernels.muon.op import SquareBlocks
 from hgn.kernels.packing import PackedNetwork, pack_network
 from hgn.kernels.update import kernel
 from hgn.network.base import ParticleNetwork
+from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.scene.symmetry import Symmetry, drawn_symmetry
 from hgn.schema import ConfigError
@@ -166,6 +167,7 @@ class Updates:
     """
 
     growth = GROWTH  # of capacities over what was needed
+    checked_particles = 200_000  # at most, of an update that is compared with PyTorch, which needs memory
     grid: Tables
     fused: TrainedNetwork
 
@@ -308,7 +310,7 @@ class Updates:
     # launches
 
     def allocate(self, particles: int, cells: Sequence[int]) -> None:
-        """Buffers for about so many particles and cells of each level, without samples: for hgn.kernels.precompile."""
+        """Buffers for about so many particles and cells of each level, without samples: for precompilation."""
         self._allocate_tables(1)
         self.particles, self.capacities = 16 * math.ceil(particles / 16), self._rounded(cells)
         self._build()
@@ -504,6 +506,10 @@ class Updates:
         self.fused = self._fused_network()
 
     # what the kind of network decides
+
+    def reference_output(self, state: ParticleState, origin_S3: torch.Tensor) -> torch.Tensor:
+        """What PyTorch computes, with gradients: the normalised accelerations [N, 3]."""
+        return self.network.normalised_acceleration(state, origin_S3)
 
     def _layout(self) -> Layout:
         assert isinstance(self.network, HierarchicalGraphNetwork)

@@ -119,7 +119,7 @@ def test_what_a_device_takes() -> None:
     cuda, cpu = torch.device("cuda"), torch.device("cpu")
     fast = [Run("torch", "tf32"), Run("triton", "tf32"), Run("triton", "fp16")]
     assert runs(cuda, wide, [1e-6]) == [*floors, *fast]
-    assert runs(cuda, gns, [1e-6]) == [*floors, Run("torch", "tf32"), Run("torch", "fp16")]
+    assert runs(cuda, gns, [1e-6]) == [*floors, Run("torch", "tf32"), Run("triton", "fp16")]
     assert runs(cpu, wide, [1e-6]) == floors
 
 

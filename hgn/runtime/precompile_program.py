@@ -1,4 +1,4 @@
-"""python -m hgn.kernels.precompile: compiles a part of the kernels of a training or of simulations, launching none.
+"""python -m hgn.runtime.precompile_program: compiles some kernels of a training or of simulations, launching none.
 
 What it compiles goes into Triton's cache on disk.
 
@@ -18,14 +18,13 @@ from dataclasses import asdict, dataclass
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.grid.op import ObstacleTable, Window
 from hgn.kernels.triton_compat import Launches, build_launcher, noted_launches, preload, use_target
-from hgn.kernels.update.op import Updates, UpdateSettings
+from hgn.kernels.update.op import UpdateSettings
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
-from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.triton_backend import updates_of
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
 from hgn.schema import from_mapping
 
@@ -72,8 +71,7 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
         network = build_network(job.network)
     nothing = torch.zeros(5, device=device)
     reduce: Callable[[torch.Tensor], None] | None = (lambda _: None) if job.several_ranks else None
-    kind = GnsUpdates if isinstance(network, GraphNetworkSimulator) else Updates
-    updates = kind(network, job.settings, job.precision, nothing[:2], nothing, reduce)
+    updates = updates_of(network)(network, job.settings, job.precision, nothing[:2], nothing, reduce)
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
