@@ -65,16 +65,18 @@ def main(mapping: dict[str, Any]) -> int:
             for name, folder in turn if number % 2 == 0 else turn[::-1]:
                 runs[name].append(_run_bench(folder, config.bench, Path(scratch) / "bench.json"))
                 rows = compared(runs)
-                meta = runs[name][-1].get("meta", {}) | provenance("cpu") | _device(runs)
-                write_json(config.out, {"meta": meta | {"config": without_folders(to_mapping(config))}, "rows": rows})
+                meta = provenance("cpu") | _measured(runs) | {"config": without_folders(to_mapping(config))}
+                write_json(config.out, {"meta": meta, "rows": rows})
     print(table(rows, config.trees))
     return 0 if all(row["check"] == PASS for row in rows) else EXIT_RED
 
 
-def _device(runs: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
-    """The device and versions that the benches name."""
-    named = [run["meta"] for reports in runs.values() for run in reports if "meta" in run]
-    return {key: named[0][key] for key in ("device", "versions")} if named else {}
+def _measured(runs: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """The device and versions that the benches name, and each tree's commit."""
+    named = {tree: run["meta"] for tree, reports in runs.items() for run in reports if "meta" in run}
+    first: dict[str, Any] = next(iter(named.values()), {})
+    commits = {tree: meta.get("commit") for tree, meta in named.items()}
+    return {key: first[key] for key in ("device", "versions") if key in first} | {"commits": commits}
 
 
 def _run_bench(folder: Path, options: Sequence[str], out: Path) -> dict[str, Any]:

@@ -102,11 +102,13 @@ def watched_engine(see: Callable[[Launch], None], engine: FusedNetwork) -> Itera
 def watched_edges(see: Callable[[Launch], None]) -> Iterator[None]:
     """Of GNS, whose products read copies that are made for each launch."""
     parameters: dict[int, torch.Tensor] = {}
+    operands: list[torch.Tensor] = []  # held, or another tensor would come to lie where one was and be taken for it
     copy = FusedEdges._operand
 
     def noting(edges: FusedEdges, weight: torch.Tensor) -> torch.Tensor:
         operand = copy(edges, weight)
         parameters[operand.data_ptr()] = weight.detach().double()
+        operands.append(operand)
         return operand
 
     with mock.patch.object(FusedEdges, "_operand", noting), watched(see, parameters):

@@ -21,7 +21,7 @@ if {dies}:
 row = {{"case": "frame", "particles": 4, "scenes": 1, "precision": options["precision"], "memory_gb": 0.1}}
 row |= {{"ms": {ms}, "check": {check!r}}}
 with open(options["json"], "w") as file:
-    json.dump({{"meta": {{"device": "a GPU", "versions": {{}}}}, "rows": [row]}}, file)
+    json.dump({{"meta": {{"device": "a GPU", "versions": {{}}, "commit": {name!r}}}, "rows": [row]}}, file)
 with open({log!r}, "a") as file:
     file.write({name!r} + " ")
 sys.exit(0 if row["check"] == "pass" else 1)
@@ -49,6 +49,7 @@ def test_trees_take_turns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     report = json.loads(out.read_text())
     assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
     assert report["meta"]["device"] == "a GPU"
+    assert report["meta"]["commits"] == dict(zip(trees, "ab", strict=True))
     first, second = report["rows"]
     assert (first["ms"], first["ratio"], first["runs"], first["precision"]) == (2.0, 1.0, 2, "fp16")
     assert (second["tree"], second["ms_range"], second["ratio"]) == (trees[1], [3.0, 3.0], 1.5)
