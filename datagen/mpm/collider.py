@@ -3,17 +3,20 @@
 The paper's cell normals leak when used as a collider, so the solver builds its own from the triangles.
 Shape legend: K contact nodes, P points, F triangles, V vertices.
 
-Sheets (open meshes): nodes within `band_cells` of the surface, with the normal toward the node's own side. The nodes
-nearest to the sheet (within half a cell) stop motion both ways: one that lies just behind the sheet would else pass on
-what comes from the front. Closed bodies: nodes inside, a third of a cell below the surface, with the
-normal outward; where the body is thinner than a cell, so that no node may lie there, those nearer to the surface and
-outside too, in a band of one cell at least. Where two obstacles claim a node, the closest surface wins. What nodes
-leave open the swept test stops.
+Closed bodies: nodes inside, a third of a cell below the surface, with the normal outward; where the body is thinner
+than a cell, so that no node may lie there, those nearer to the surface and outside too, in a band of one cell at least.
+
+Sheets (open meshes): particles on both sides reach the same nodes, and would hold each other through them. So a node
+near a sheet has two fields of mass and velocity (Bardenhagen et al. 2000): one for the particles that see it, one for
+those that the sheet hides it from (the "colours" of Hu et al. 2018, by line of sight). For the latter the node lies
+beyond the surface, as the inside of a body does: there the same rule holds, with the normal toward the sheet.
+
+Where two obstacles claim a node, the closest surface wins. What nodes leave open the swept test stops, with the same
+friction.
 
 A particle's spline reaches 1.5 cells, so a solid block stops well above the uppermost node that stops it: 0.85 cells
 where there is one layer of such nodes, 1.32 where there are more below. For it to rest within a cell of the surface
-those nodes must lie that much lower: 0.15 cells above a sheet at most, so bands are lowered by 0.35 cells the way
-gravity pulls, and stay as thick; and 0.35 cells within a body.
+those nodes must lie 0.35 cells below it.
 """
 
 from __future__ import annotations
@@ -23,17 +26,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from datagen.mpm.sweep import Sweep, build_sweep, near_pairs
+from datagen.mpm.sweep import Sweep, build_sweep, near_pairs, near_slabs
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
-ONE_SIDED, BOTH_SIDES = 1, 2
+SEEN, HIDDEN = 0, 1  # the two fields of a node
 ON_SURFACE_CELLS = 0.05  # nearer than this, the direction to the surface is rounding
-ROUNDING = 2e-6  # of a distance: a sheet midway between nodes has nodes on both sides within half a cell
-BOTH_SIDES_CELLS = 0.5 * (1 + ROUNDING)
-LOWERED_CELLS = 0.35  # of a band, where a sheet lies level
-BARE_CELLS = 0.35  # below a body's surface, where nodes stop nothing
+BARE_CELLS = 0.35  # below a surface, where nodes stop nothing
+STENCIL_CELLS = 1.501  # from a particle to its nodes, along each axis, with rounding
+ON_EDGE = 1e-6  # of a triangle's edge: as near to it a place lies on it
+WIDENED = 1 + 1e-3  # triangles, since kernels look a ten-thousandth beyond their edges
 # squared area over fourth power of the longest edge, below which a triangle has no direction
 FLAT_TRIANGLE = 1e-20
 
@@ -43,8 +46,9 @@ class Collider:
     """A scene's contact nodes, the triangles that none may cross, and which of its bodies are closed."""
 
     node_K3: np.ndarray  # int32, unique
-    normal_K3: np.ndarray  # float32, unit length
-    kind_K: np.ndarray  # uint8: ONE_SIDED or BOTH_SIDES
+    normal_K23: np.ndarray  # float32, of both fields: what is free, unit length; zero where all motion is
+    obstacle_K2: np.ndarray  # int32, whose contact it is in either field
+    doubled_K: np.ndarray  # bool: sheets hide the node from some particles
     closed: tuple[Obstacle, ...]
     sweep: Sweep
 
@@ -64,48 +68,59 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
     indices are out of range.
     """
     shape = tuple(round(length / scene.cell_size) for length in scene.domain_size)
-    surface = _Surface(shape)
-    gravity = np.array(scene.gravity, np.float64)
-    up = -gravity / (np.linalg.norm(gravity) or 1.0)
-    triangles = [np.zeros((0, 3, 3))]
+    count = int(np.prod(shape))
+    surfaces = _Surface(count), _Surface(count)
+    doubled = np.zeros(count, bool)
+    triangles: dict[bool, list[np.ndarray]] = {False: [np.zeros((0, 3, 3))], True: []}
+    owners: dict[bool, list[np.ndarray]] = {False: [np.zeros(0, np.int32)], True: []}
     for index, obstacle in enumerate(scene.obstacles):
-        triangle_F33 = _triangles(obstacle, index) / scene.cell_size
-        triangles.append(triangle_F33)
-        if len(triangle_F33):
-            surface.merge(
-                _closed_contacts(obstacle, triangle_F33, band_cells, shape, scene.cell_size)
-                if obstacle.closed
-                else _sheet_contacts(triangle_F33, band_cells, shape, up)
-            )
-    node = np.flatnonzero(np.isfinite(surface.distance))
+        triangle_F33, rim_F6 = _triangles(obstacle, index, scene.cell_size)
+        triangles[obstacle.closed].append(triangle_F33)
+        owners[obstacle.closed].append(np.full(len(triangle_F33), index, np.int32))
+        if not len(triangle_F33):
+            continue
+        if obstacle.closed:
+            surfaces[SEEN].merge(index, _closed_contacts(obstacle, triangle_F33, band_cells, shape, scene.cell_size))
+        else:
+            surfaces[HIDDEN].merge(index, _sheet_contacts(triangle_F33, rim_F6, shape))
+            centre_F13 = triangle_F33.mean(axis=1, keepdims=True)
+            for node, _ in near_slabs(centre_F13 + WIDENED * (triangle_F33 - centre_F13), STENCIL_CELLS, shape):
+                doubled[np.ravel_multi_index(node.T, shape)] = True
+    node = np.flatnonzero(doubled | np.isfinite(surfaces[SEEN].distance))
     return Collider(
         np.stack(np.unravel_index(node, shape), axis=1).astype(np.int32),
-        surface.normal[node],
-        surface.kind[node],
+        np.stack([surface.normal[node] for surface in surfaces], axis=1),
+        np.stack([surface.obstacle[node] for surface in surfaces], axis=1),
+        doubled[node],
         tuple(obstacle for obstacle in scene.obstacles if obstacle.closed and len(obstacle.triangle_F3)),
-        build_sweep(np.concatenate(triangles), shape),
+        build_sweep(
+            np.concatenate(triangles[False] + triangles[True]),
+            np.concatenate(owners[False] + owners[True]),
+            sum(map(len, triangles[False])),
+            shape,
+        ),
     )
 
 
 class _Surface:
-    """Per node the closest surface: distance in cells, free direction, kind; infinity where there is none."""
+    """Per node the closest surface: distance in cells (infinity where there is none), free direction, obstacle."""
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        count = int(np.prod(shape))
-        self.shape = shape
+    def __init__(self, count: int) -> None:
         self.distance = np.full(count, np.inf)
         self.normal = np.zeros((count, 3), np.float32)
-        self.kind = np.zeros(count, np.uint8)
+        self.obstacle = np.zeros(count, np.int32)
 
-    def merge(self, contacts: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]) -> None:
-        node, distance, normal, kind = contacts
+    def merge(self, obstacle: int, contacts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+        node, distance, normal = contacts
         nearer = distance < self.distance[node]
         node = node[nearer]
-        self.distance[node], self.normal[node], self.kind[node] = distance[nearer], normal[nearer], kind[nearer]
+        self.distance[node], self.normal[node], self.obstacle[node] = distance[nearer], normal[nearer], obstacle
 
 
-def _triangles(obstacle: Obstacle, index: int) -> np.ndarray:
-    """Corners of the triangles that have an area, float64 [F, 3, 3]."""
+def _triangles(obstacle: Obstacle, index: int, cell_size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the triangles that have an area, in cells, float64 [F, 3, 3]; and what of each lies on the rim, bool
+    [F, 6]: the edges opposite to its corners, then the corners. A rim is where no other triangle goes on.
+    """
     vertex = np.asarray(obstacle.vertex_V3, np.float64)
     triangle = np.asarray(obstacle.triangle_F3)
     if not np.isfinite(vertex).all():
@@ -116,10 +131,24 @@ def _triangles(obstacle: Obstacle, index: int) -> np.ndarray:
             f"{triangle.min()} to {triangle.max()}; repair the mesh"
         )
     corner = vertex[triangle].reshape(-1, 3, 3)
-    edge = corner - np.roll(corner, 1, axis=1)
-    longest_square = (edge**2).sum(axis=2).max(axis=1)
-    area_square = (np.cross(edge[:, 0], edge[:, 1]) ** 2).sum(axis=1)
-    return corner[area_square > FLAT_TRIANGLE * longest_square**2]
+    side = corner - np.roll(corner, 1, axis=1)
+    longest_square = (side**2).sum(axis=2).max(axis=1)
+    area_square = (np.cross(side[:, 0], side[:, 1]) ** 2).sum(axis=1)
+    has_area = area_square > FLAT_TRIANGLE * longest_square**2
+    corner = corner[has_area] / cell_size
+    if obstacle.closed or not len(corner):
+        return corner, np.zeros((len(corner), 6), bool)
+    # corners at one place are one: mesh files repeat them
+    _, place_F3 = np.unique(corner.reshape(-1, 3), axis=0, return_inverse=True)
+    place_F3 = place_F3.reshape(-1, 3)
+    ends = np.sort(place_F3[:, [[1, 2], [2, 0], [0, 1]]], axis=2).reshape(-1, 2).astype(np.int64)
+    _, edge_of, uses = np.unique(
+        ends[:, 0] * (place_F3.max() + 1) + ends[:, 1], return_inverse=True, return_counts=True
+    )
+    rim_edge_F3 = (uses[edge_of.ravel()] == 1).reshape(-1, 3)
+    on_rim = np.zeros(place_F3.max() + 1, bool)
+    on_rim[ends[rim_edge_F3.ravel()]] = True
+    return corner, np.concatenate([rim_edge_F3, on_rim[place_F3]], axis=1)
 
 
 def _rasterise(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
@@ -166,22 +195,38 @@ def _points(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _sheet_contacts(
-    triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], up: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    lowered = min(LOWERED_CELLS, band)
-    node, distance, foot, owner = _rasterise(triangle_F33, (band + lowered) * (1 + ROUNDING), shape)
-    on_surface = distance < ON_SURFACE_CELLS
-    away = (_points(node, shape) - foot) / np.where(on_surface, 1.0, distance)[:, None]
-    normal = np.where(on_surface[:, None], _face_normals(triangle_F33)[owner], away)
-    reach = distance + lowered * np.where(on_surface, 0.0, normal @ up)
-    chosen = reach <= band * (1 + ROUNDING)
-    kind = np.where(reach <= BOTH_SIDES_CELLS, BOTH_SIDES, ONE_SIDED)
-    return node[chosen], distance[chosen], normal[chosen], kind[chosen]
+    triangle_F33: np.ndarray, rim_F6: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes that a sheet may hide: flat index [P], distance [P], and what is free for a particle on its other side."""
+    node, distance, foot, owner = _rasterise(triangle_F33, WIDENED * STENCIL_CELLS * np.sqrt(3.0), shape)
+    face = _face_normals(triangle_F33)[owner]
+    offset = _points(node, shape) - foot
+    height = (offset * face).sum(axis=1)
+    away = offset / np.where(distance < ON_SURFACE_CELLS, 1.0, distance)[:, None]
+    # around the rim the way to the foot leads along the sheet, not through it
+    across = (distance < ON_SURFACE_CELLS) | _on_rim(foot, triangle_F33[owner], rim_F6[owner])
+    away[across] = face[across] * np.where(height[across] < 0, -1.0, 1.0)[:, None]
+    depth = np.where(across, np.abs(height), distance)
+    return node, distance, np.where((depth >= BARE_CELLS)[:, None], -away, 0.0)
+
+
+def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -> np.ndarray:
+    """Whether places of triangles lie on what of them `rim_P6` names (see _triangles), bool [P]."""
+    edge_1, edge_2 = triangle_P33[:, 1] - triangle_P33[:, 0], triangle_P33[:, 2] - triangle_P33[:, 0]
+    normal = np.cross(edge_1, edge_2)
+    square = (normal**2).sum(axis=1)
+    from_corner = foot_P3 - triangle_P33[:, 0]
+    share_1 = (np.cross(from_corner, edge_2) * normal).sum(axis=1) / square
+    share_2 = (np.cross(edge_1, from_corner) * normal).sum(axis=1) / square
+    # a place lies on the edge opposite to a corner that it has no share of, and at a corner where it has no other
+    share_P3 = np.stack([1 - share_1 - share_2, share_1, share_2], axis=1)
+    on_edge, at_corner = share_P3 < ON_EDGE, share_P3 > 1 - ON_EDGE
+    return np.asarray((np.concatenate([on_edge, at_corner], axis=1) & rim_P6).any(axis=1))
 
 
 def _closed_contacts(
     obstacle: Obstacle, triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], cell_size: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # one cell at least: a line of nodes that crosses the surface then meets a node of the band
     band = max(band, 1.0)
     node, distance, foot, owner = _rasterise(triangle_F33, band, shape)
@@ -220,7 +265,7 @@ def _closed_contacts(
         depth = np.linalg.norm(out, axis=1)
         node, distance = np.concatenate([node, deep]), np.concatenate([distance, depth])
         normal = np.concatenate([normal, out / depth[:, None]])
-    return node, distance, normal, np.full(len(node), ONE_SIDED)
+    return node, distance, normal
 
 
 def _fill_inside(inside: np.ndarray, near: np.ndarray, obstacle: Obstacle, cell_size: float) -> None:

@@ -15,8 +15,11 @@ from datagen.mpm.mls_mpm import (
     Scalars,
     Vectors,
     choose_time_step,
+    find_hidden,
+    ghost_place,
     initial_stiffness,
     interpolate,
+    interpolate_hidden,
     is_fluid,
     mark,
     move,
@@ -43,6 +46,7 @@ def _particle_to_grid(
     volume: ti.template(),
     label: ti.template(),
     law_row: ti.template(),
+    hidden: ti.template(),
     node: ti.template(),
     gain: ti.template(),
     scene_value: ti.template(),
@@ -50,6 +54,8 @@ def _particle_to_grid(
     setting: ti.template(),
     law: ti.template(),
     shape: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
     variant: ti.template(),
 ):
     """Updates the particle's deformation and adds what it gives to its nodes to one copy of the grid: momentum and mass
@@ -66,6 +72,11 @@ def _particle_to_grid(
         if ti.static(not variant & VARIANT.water) or not is_fluid(material):
             F = deformation[p]
     begins = scene_value[scene, VALUE.begins]
+    hidden_here = 0
+    if ti.static(bool(variant & VARIANT.sheets)):
+        if begins == 1.0:
+            hidden[p] = find_hidden(position[p], scene, contact, contact_normal, setting, shape)
+        hidden_here = hidden[p]
     C = affine[p]
     stretch = ti.Matrix.zero(ti.f32, 3, 3)
     if begins == 0.0:
@@ -73,6 +84,10 @@ def _particle_to_grid(
         v_now, C_now = interpolate(
             position[p], scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, node, inverse_dx, shape, 1
         )
+        if ti.static(bool(variant & VARIANT.sheets)):
+            v_now, C_now = interpolate_hidden(
+                position[p], v_now, C_now, hidden_here, scene, 0, node, inverse_dx, shape, contact, 1
+            )
         C = C_now
         raise_maximum(counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
     A, new_stretch, new_F, new_volume, stiffness = respond(
@@ -105,6 +120,9 @@ def _particle_to_grid(
             if ti.static(bool(variant & VARIANT.several_laws)):
                 share *= law[row + CONSTANT.mass]
             target = index_x[i] + index_y[j] + index_z[k]
+            if ti.static(bool(variant & VARIANT.sheets)):
+                if (hidden_here >> (9 * i + 3 * j + k)) & 1:
+                    target = copy * BLOCK_NODES + ghost_place(base + ti.Vector([i, j, k]), scene, contact, shape)
             if ti.static(bool(variant & VARIANT.atomic)):
                 for a in ti.static(range(3)):
                     ti.atomic_add(gain[target][a], share[a])
@@ -124,6 +142,7 @@ def _grid_to_particle(
     affine: ti.template(),
     volume: ti.template(),
     is_water: ti.i32,
+    hidden: ti.template(),
     node: ti.template(),
     scene_value: ti.template(),
     counter: ti.template(),
@@ -137,6 +156,10 @@ def _grid_to_particle(
     x = position[p]
     first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
     v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape, 1)
+    if ti.static(bool(variant & VARIANT.sheets)):
+        v, C = interpolate_hidden(
+            x, v, C, hidden[p], scene, 0, node, setting[SETTING.inverse_cell_size], shape, contact, 1
+        )
     moved, speed, speed_square = move(
         x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
     )
@@ -158,6 +181,7 @@ def substep(
     volume: Scalars,
     label: Integers,
     law_row: Integers,
+    hidden: Integers,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
     setting: Scalars,
@@ -175,11 +199,13 @@ def substep(
     Order: time step; in the first substep of an interval mark blocks; particles to grid (deformation, plasticity,
     stress), gravity, colliders, walls; in the last grid to particles, advection. `label` holds scene and material of
     each particle, `node` [scenes * blocks * 64] velocity and mass of nodes, `gain` [parts * scenes * blocks * 64] what
-    comes to them, a copy of the grid for each part. `block` ends with the length of the list of touched blocks, and
-    whether it is made anew, for all scenes, because an interval begins in one. `contact` begins with twice the index of
-    each node's normal plus 1 where motion is stopped both ways, or -1; then comes, for each cell, where its list of
-    triangles begins in `contact` itself, or -1; then those lists, each headed by its length. An entry is the place in
-    `contact_normal` of the triangle's four vectors.
+    comes to them, a copy of the grid for each part; both end with the second fields of nodes that sheets hide from some
+    particles, which `hidden` names for each particle (see surface_kernel.hidden_nodes). `block` ends with the length of
+    the list of touched blocks, and whether it is made anew, for all scenes, because an interval begins in one.
+    `contact` begins with the entry of each node, or -1: the place of its vectors in `contact_normal` (see
+    surface_kernel.NODE_VECTORS), and below SHAPE.ghosts that of its second field from SHAPE.ghost_begin on. Then comes,
+    for each base node, where its list of triangles begins in `contact` itself, or -1; then those lists, with their
+    heads (see surface_kernel.LIST_HEAD). An entry is the place in `contact_normal` of the triangle's vectors.
     """
     for scene in range(scene_value.shape[0]):
         choose_time_step(scene, scene_value, counter, setting, shape[SHAPE.maximum_substeps])
@@ -199,8 +225,8 @@ def substep(
             step = scene_value[scene, VALUE.time_step]
             if step > 0.0:
                 _particle_to_grid(
-                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, law_row, node, gain,
-                    scene_value, counter, setting, law, shape, variant,
+                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, law_row, hidden,
+                    node, gain, scene_value, counter, setting, law, shape, contact, contact_normal, variant,
                 )  # fmt: skip
     else:
         for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
@@ -211,8 +237,8 @@ def substep(
                 copy = (task - scene * parts) * shape[SHAPE.all_blocks]
                 for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
                     _particle_to_grid(
-                        p, copy, scene, step, position, velocity, affine, deformation, volume, label, law_row, node,
-                        gain, scene_value, counter, setting, law, shape, variant,
+                        p, copy, scene, step, position, velocity, affine, deformation, volume, label, law_row, hidden,
+                        node, gain, scene_value, counter, setting, law, shape, contact, contact_normal, variant,
                     )  # fmt: skip
 
     for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
@@ -223,28 +249,38 @@ def substep(
         place = global_block * BLOCK_NODES + (n & 63)
         scene = global_block // shape[SHAPE.scene_blocks]
         if scene_value[scene, VALUE.time_step] > 0.0:
-            before = ti.Vector([0.0, 0.0, 0.0, 0.0])
-            if scene_value[scene, VALUE.begins] == 0.0:
-                before = node[place]
-            total = gain[place]
-            for part in ti.static(range(1, variant // VARIANT.parts)):  # what copies hold is summed in order
-                total += gain[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
-            for part in ti.static(range(variant // VARIANT.parts)):
-                gain[place + part * shape[SHAPE.all_blocks] * BLOCK_NODES] = ti.Vector([0.0, 0.0, 0.0, 0.0])
-            mass = before[3] + total[3]
-            v = node_velocity(
-                ti.Vector([before[0], before[1], before[2]]), ti.Vector([total[0], total[1], total[2]]), mass, place,
-                scene, block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value, setting, shape, contact,
-                contact_normal, variant,
-            )  # fmt: skip
-            node[place] = ti.Vector([v[0], v[1], v[2], mass])
+            entry = -1
+            node_fields = 1
+            if ti.static(bool(variant & VARIANT.contact)):
+                entry = contact[place]
+                if entry >= 0 and entry < shape[SHAPE.ghosts]:
+                    node_fields = 2
+            for field in range(node_fields):
+                own = place
+                if field == 1:
+                    own = shape[SHAPE.ghost_begin] + entry
+                before = ti.Vector([0.0, 0.0, 0.0, 0.0])
+                if scene_value[scene, VALUE.begins] == 0.0:
+                    before = node[own]
+                total = gain[own]
+                for part in ti.static(range(1, variant // VARIANT.parts)):  # what copies hold is summed in order
+                    total += gain[own + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
+                for part in ti.static(range(variant // VARIANT.parts)):
+                    gain[own + part * shape[SHAPE.all_blocks] * BLOCK_NODES] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+                mass = before[3] + total[3]
+                v = node_velocity(
+                    ti.Vector([before[0], before[1], before[2]]), ti.Vector([total[0], total[1], total[2]]), mass,
+                    n & 63, 2 * entry + field, scene, block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value,
+                    setting, shape, contact_normal, variant,
+                )  # fmt: skip
+                node[own] = ti.Vector([v[0], v[1], v[2], mass])
 
     for p in range(position.shape[0]):
         scene = label[p] >> MATERIAL_BITS
         if scene_value[scene, VALUE.time_step] > 0.0 and scene_value[scene, VALUE.interval_remaining] == 0.0:
             _grid_to_particle(
-                p, scene, position, velocity, affine, volume, label[p] & MATERIAL_MASK == WATER, node, scene_value,
-                counter, setting, shape, contact, contact_normal, variant,
+                p, scene, position, velocity, affine, volume, label[p] & MATERIAL_MASK == WATER, hidden, node,
+                scene_value, counter, setting, shape, contact, contact_normal, variant,
             )  # fmt: skip
 
 

@@ -64,8 +64,8 @@ class GridLaunch(Launch):
             for _ in range(min(pending, SUBSTEPS_PER_CHECK)):
                 grid_kernel.substep(
                     self.position, self.velocity, self.affine, self.deformation, self.volume, self.label,
-                    self.law_row, self.scene_value, self.counter, self.setting, self.law, self.shape, self.node,
-                    self.gain, self.block, self.contact, self.contact_normal, self.variant,
+                    self.law_row, self.hidden, self.scene_value, self.counter, self.setting, self.law, self.shape,
+                    self.node, self.gain, self.block, self.contact, self.contact_normal, self.variant,
                 )  # fmt: skip
             value = self.scene_value.to_numpy()
             busy = value[:, VALUE.remaining] > 0

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.mpm.collider import BOTH_SIDES, Collider
+from datagen.mpm.collider import Collider
 from datagen.mpm.layout import (
     BLOCK,
     BLOCK_NODES,
@@ -36,7 +36,7 @@ from hgn.schema import ConfigError
 import datagen.mpm.device  # noqa: F401  # isort: skip  # keeps Taichi's banner off stdout
 import taichi as ti  # isort: skip
 
-from datagen.mpm.surface_kernel import TRIANGLE_VECTORS, place_contacts  # isort: skip
+from datagen.mpm.surface_kernel import LIST_HEAD, NODE_VECTORS, TRIANGLE_VECTORS, place_contacts  # isort: skip
 
 MAXIMUM_BLOCKS = 1024  # along an axis: kernels keep ten bits of it
 
@@ -142,7 +142,10 @@ class Launch(ABC):
         self.particle_begin = np.concatenate([[0], np.cumsum([scene.particle_count for scene in scenes])])
         self.particles = int(self.particle_begin[-1])
         self.blocks = tuple(-(-count // BLOCK) for count in node_counts)
-        self.all_blocks = len(scenes) * math.prod(self.blocks)
+        self.scene_nodes = math.prod(self.blocks) * BLOCK_NODES
+        # second fields of nodes come last, in blocks of their own
+        self.ghosts = sum(int(collider.doubled_K.sum()) for collider in colliders)
+        self.all_blocks = len(scenes) * math.prod(self.blocks) + -(-self.ghosts // BLOCK_NODES)
         if max(self.blocks) > MAXIMUM_BLOCKS:
             raise ConfigError(
                 f"domain_size must be at most {MAXIMUM_BLOCKS * BLOCK} cells a side, got {max(node_counts)}; enlarge "
@@ -160,13 +163,14 @@ class Launch(ABC):
         laws, row = material_laws(scenes, config)
         self.present = [bool((label & MATERIAL_MASK == kind).any()) for kind in (WATER, SAND, SNOW)]
         has_contact = any(len(collider.node_K3) for collider in colliders)
-        has_sweep = config.collider_projection and any(len(collider.sweep.cell_K3) for collider in colliders)
+        has_sweep = config.collider_projection and any(len(collider.sweep.base_K3) for collider in colliders)
         self.variant = (
             VARIANT.water * self.present[WATER]
             + VARIANT.sand * self.present[SAND]
             + VARIANT.snow * self.present[SNOW]
             + VARIANT.contact * has_contact
             + VARIANT.sweep * has_sweep
+            + VARIANT.sheets * (self.ghosts > 0)
             + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
             + VARIANT.taichi_elements_water * (config.water_volume_update == "taichi_elements")
             + VARIANT.stiffening_water * (config.water_equation == "stiffening")
@@ -181,13 +185,14 @@ class Launch(ABC):
         self.counter = device_array(np.zeros((len(scenes), COUNT.length), np.int64))
         self.shape = device_array(self._shape())
         self.node = self._node_array(nodes)
+        self.hidden = ti.ndarray(ti.i32, self.particles if self.ghosts else 1)
         places, values, vectors = [], [], [np.zeros((1, 3), np.float32)]
         length = 1
         if has_contact or has_sweep:
             length = self.all_blocks * BLOCK_NODES
-            place, value, normal = self._contacts()
-            places, values, vectors = [place], [value], [normal]
-        if has_sweep:
+            place, value, vector = self._contacts()
+            places, values, vectors = [place], [value], [vector]
+        if has_sweep or self.ghosts:
             place, value, triangle, length = self._sweeps(len(vectors[0]))
             places, values, vectors = [*places, place], [*values, value], [*vectors, triangle]
         self.contact = ti.ndarray(ti.i32, length)
@@ -242,6 +247,8 @@ class Launch(ABC):
         shape[SHAPE.blocks : SHAPE.blocks + 3] = self.blocks
         shape[SHAPE.scene_blocks] = math.prod(self.blocks)
         shape[SHAPE.all_blocks] = self.all_blocks
+        shape[SHAPE.ghosts] = self.ghosts
+        shape[SHAPE.ghost_begin] = len(self.scenes) * self.scene_nodes
         shape[SHAPE.wall_cells] = self.config.wall_cells
         shape[SHAPE.sticky_walls] = self.config.wall_contact == "stick"
         shape[SHAPE.maximum_substeps] = self.config.maximum_substeps_per_frame
@@ -268,15 +275,18 @@ class Launch(ABC):
         return setting
 
     def _contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Places of contact nodes; twice the index of each one's normal, plus 1 where both sides stop; normals."""
-        scene_nodes = math.prod(self.blocks) * BLOCK_NODES
-        places = [
-            self._places(collider.node_K3) + np.int32(index * scene_nodes)
-            for index, collider in enumerate(self.colliders)
-        ]
-        both_sides = np.concatenate([collider.kind_K for collider in self.colliders]) == BOTH_SIDES
-        values = 2 * np.arange(len(both_sides), dtype=np.int32) + both_sides
-        return np.concatenate(places), values, np.concatenate([collider.normal_K3 for collider in self.colliders])
+        """Places of contact nodes, the entry of each (see grid_kernel.substep), and the entries' vectors."""
+        places = np.concatenate(
+            [
+                self._places(collider.node_K3) + np.int32(index * self.scene_nodes)
+                for index, collider in enumerate(self.colliders)
+            ]
+        )
+        order = np.argsort(~np.concatenate([collider.doubled_K for collider in self.colliders]), kind="stable")
+        vector = np.zeros((len(order), NODE_VECTORS, 3), np.float32)
+        vector[:, :2] = np.concatenate([collider.normal_K23 for collider in self.colliders])[order]
+        vector[:, 2, :2] = self.config.collider_friction
+        return places[order], np.arange(len(order), dtype=np.int32), vector.reshape(-1, 3)
 
     def _places(self, node_K3: np.ndarray) -> np.ndarray:
         """Where nodes lie within a scene's arrays of nodes, int32 [K]."""
@@ -291,11 +301,11 @@ class Launch(ABC):
         all_nodes = self.all_blocks * BLOCK_NODES
         sweeps = [collider.sweep for collider in self.colliders]
         lists = sum(len(sweep.begin_K) for sweep in sweeps)
-        end = 2 * all_nodes + lists + sum(len(sweep.triangle_L) for sweep in sweeps)
+        end = 2 * all_nodes + LIST_HEAD * lists + sum(len(sweep.triangle_L) for sweep in sweeps)
         if end >= 2**31:
             raise ConfigError(
                 f"a batch must hold less than 2^31 nodes, cells and lists of triangles, got {end}; lower "
-                "scenes_per_launch, or turn collider_projection off"
+                "scenes_per_launch"
             )
         places = np.empty(end - 2 * all_nodes + lists, np.int32)
         values = np.empty_like(places)
@@ -303,18 +313,22 @@ class Launch(ABC):
         for index, sweep in enumerate(sweeps):
             count = np.diff(np.append(sweep.begin_K, len(sweep.triangle_L))).astype(np.int32)
             order = np.arange(len(count), dtype=np.int32)
-            head = end + sweep.begin_K.astype(np.int32) + order  # each list is headed by its length
-            body = end + 1 + np.arange(len(sweep.triangle_L), dtype=np.int32) + np.repeat(order, count)
+            head = end + sweep.begin_K.astype(np.int32) + LIST_HEAD * order
+            body = np.arange(len(sweep.triangle_L), dtype=np.int32) + np.repeat(LIST_HEAD * (order + 1), count)
             for place, value in (
-                (self._places(sweep.cell_K3) + np.int32(all_nodes + index * (all_nodes // len(sweeps))), head),
+                (self._places(sweep.base_K3) + np.int32(all_nodes + index * self.scene_nodes), head),
                 (head, count),
-                (body, first_vector + TRIANGLE_VECTORS * sweep.triangle_L),
+                (head + 1, sweep.sheets_K),
+                (end + body, first_vector + TRIANGLE_VECTORS * sweep.triangle_L),
             ):
                 places[filled : filled + len(place)], values[filled : filled + len(place)] = place, value
                 filled += len(place)
             first_vector += TRIANGLE_VECTORS * len(sweep.triangle_F43)
-            end += len(count) + len(sweep.triangle_L)
-        return places, values, np.concatenate([sweep.triangle_F43.reshape(-1, 3) for sweep in sweeps]), end
+            end += LIST_HEAD * len(count) + len(sweep.triangle_L)
+        vector = np.zeros((sum(len(sweep.triangle_F43) for sweep in sweeps), TRIANGLE_VECTORS, 3), np.float32)
+        vector[:, :4] = np.concatenate([sweep.triangle_F43 for sweep in sweeps])
+        vector[:, 4, 0] = self.config.collider_friction
+        return places, values, vector.reshape(-1, 3), end
 
     @abstractmethod
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -93,7 +93,7 @@ class Setting(NamedTuple):
     fixed_time_step: int = 2  # s; 0 for the adaptive rule
     fixed_substeps: int = 3  # a frame, where the time step is fixed
     speed_fraction: int = 4
-    friction: int = 5
+    friction: int = 5  # of the domain's walls
     low: int = 6  # 6, 7, 8: smallest coordinates of a particle
     high: int = 9  # 9, 10, 11: largest
     size: int = 12  # 12, 13, 14: of the domain
@@ -113,7 +113,9 @@ class Shape(NamedTuple):
     wall_cells: int = 8
     sticky_walls: int = 9
     maximum_substeps: int = 10
-    part_begin: int = 11  # from here on: first particle of each (scene, part), and the end
+    ghosts: int = 11  # nodes that sheets hide from particles near them, of all scenes: see mls_mpm
+    ghost_begin: int = 12  # the first of their second fields in the array of nodes
+    part_begin: int = 13  # from here on: first particle of each (scene, part), and the end
 
 
 class Variant(NamedTuple):
@@ -129,7 +131,8 @@ class Variant(NamedTuple):
     sweep: int = 128  # particles are stopped at triangles
     stiffening_water: int = 256
     taichi_elements_water: int = 512
-    parts: int = 1024  # times the number of parts
+    sheets: int = 1024  # some nodes have two fields
+    parts: int = 2048  # times the number of parts
 
 
 class Field(NamedTuple):

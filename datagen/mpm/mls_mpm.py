@@ -35,7 +35,7 @@ from datagen.mpm.layout import (
     VALUE,
     VARIANT,
 )
-from datagen.mpm.surface_kernel import meet_collider, stop_at_surface
+from datagen.mpm.surface_kernel import NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
@@ -321,30 +321,35 @@ def node_velocity(
     before,
     momentum,
     mass: ti.f32,
-    place: ti.i32,
+    local: ti.i32,
+    facing: ti.i32,
     scene: ti.i32,
     corner: ti.i32,
     scene_value: ti.template(),
     setting: ti.template(),
     shape: ti.template(),
-    contact: ti.template(),
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """The node's velocity from the one before and what came to its momentum: gravity, colliders and walls too.
+    """The velocity of a node's field from the one before and what came to its momentum: gravity, colliders and walls
+    too.
 
-    `corner` is the block's place along x, y, z, in ten bits each.
+    The node is the `local` one of a block whose place along x, y, z is `corner`, in ten bits each; `facing` is that of
+    the field's contact, or less than 0.
     """
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
         gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
         v = before + momentum / mass + scene_value[scene, VALUE.gravity_time] * gravity
         if ti.static(bool(variant & VARIANT.contact)):
-            entry = contact[place]
-            if entry >= 0:
-                v = meet_collider(v, contact_normal[entry >> 1], entry & 1, setting[SETTING.friction])
+            if facing >= 0:
+                entry = facing // 2
+                field = facing - 2 * entry
+                friction = contact_normal[NODE_VECTORS * entry + 2][0]
+                if field == 1:
+                    friction = contact_normal[NODE_VECTORS * entry + 2][1]
+                v = meet(v, contact_normal[NODE_VECTORS * entry + field], friction)
         # walls last: whatever a collider leaves, nothing leaves the domain
-        local = place & (BLOCK_NODES - 1)
         index = ti.Vector(
             [
                 (corner >> 20) * BLOCK + (local >> 4),
@@ -475,6 +480,100 @@ def settle(
 
 
 @ti.func
+def node_place(index, scene: ti.i32, shape: ti.template()) -> ti.i32:
+    """Where a node's entry lies in arrays that hold one for each node."""
+    block = index >> 2
+    local = index & 3
+    place = (block[0] * shape[SHAPE.blocks + 1] + block[1]) * shape[SHAPE.blocks + 2] + block[2]
+    place = (scene * shape[SHAPE.scene_blocks] + place) * BLOCK_NODES
+    return place + (local[0] * BLOCK + local[1]) * BLOCK + local[2]
+
+
+@ti.func
+def _triangle_list(x, scene: ti.i32, contact: ti.template(), setting: ti.template(), shape: ti.template()) -> ti.i32:
+    """Where the list of triangles near a particle begins in `contact`, or -1."""
+    base = base_node(x, setting[SETTING.inverse_cell_size])
+    return contact[shape[SHAPE.all_blocks] * BLOCK_NODES + node_place(base, scene, shape)]
+
+
+@ti.func
+def find_hidden(
+    x,
+    scene: ti.i32,
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+) -> ti.i32:
+    """Which of a particle's nodes sheets hide from it (see surface_kernel.hidden_nodes); it shares their second field
+    with the others that they hide them from.
+    """
+    bits = 0
+    list_at = _triangle_list(x, scene, contact, setting, shape)
+    if list_at >= 0:
+        bits = hidden_nodes(x * setting[SETTING.inverse_cell_size], list_at, contact, contact_normal)
+    return bits
+
+
+@ti.func
+def ghost_place(index, scene: ti.i32, contact: ti.template(), shape: ti.template()) -> ti.i32:
+    """Where a node's second field lies, in numbers of nodes."""
+    return shape[SHAPE.ghost_begin] + contact[node_place(index, scene, shape)]
+
+
+@ti.func
+def interpolate_hidden(
+    x,
+    v,
+    C,
+    hidden: ti.i32,
+    scene: ti.i32,
+    component: ti.template(),
+    node: ti.template(),
+    inverse_dx: ti.f32,
+    shape: ti.template(),
+    contact: ti.template(),
+    components: ti.template(),
+):
+    """What `interpolate` gave, with the second fields of hidden nodes in place of their first.
+
+    `component` is where a node's velocity begins among its components, times the nodes of a block.
+    """
+    scaled = x * inverse_dx
+    base = ti.floor(scaled - 0.5, ti.i32)
+    new_v = v
+    new_C = C
+    bits = hidden
+    n = 0
+    while bits != 0:
+        if bits & 1:
+            index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
+            offset = ti.cast(index, ti.f32) - scaled
+            place = node_place(index, scene, shape)
+            ghost = shape[SHAPE.ghost_begin] + contact[place]
+            change = ti.Vector([0.0, 0.0, 0.0])
+            if ti.static(components == 1):
+                difference = node[ghost] - node[place]
+                change = ti.Vector([difference[0], difference[1], difference[2]])
+            else:
+                first = planar(place, components) + component
+                second = planar(ghost, components) + component
+                change = ti.Vector([node[second + a * BLOCK_NODES] - node[first + a * BLOCK_NODES] for a in range(3)])
+            change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
+            new_v += change
+            new_C += (4.0 * inverse_dx) * change.outer_product(offset)
+        bits >>= 1
+        n += 1
+    return new_v, new_C
+
+
+@ti.func
+def planar(place: ti.i32, components: ti.template()) -> ti.i32:
+    """Where the first component of a node lies in an array [block, component, node in block]."""
+    return (place >> 6) * (BLOCK_NODES * components) + (place & (BLOCK_NODES - 1))
+
+
+@ti.func
 def move(
     x,
     v,
@@ -494,9 +593,7 @@ def move(
     out = x + scene_value[scene, VALUE.interval_elapsed] * v
     speed = v
     if ti.static(bool(variant & VARIANT.sweep)):
-        cell = ti.floor(x * setting[SETTING.inverse_cell_size], ti.i32)
-        index_x, index_y, index_z = node_places(cell, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape, 1)
-        list_at = contact[shape[SHAPE.all_blocks] * BLOCK_NODES + index_x[0] + index_y[0] + index_z[0]]
+        list_at = _triangle_list(x, scene, contact, setting, shape)
         if list_at >= 0:
             out, speed = stop_at_surface(x, out, v, list_at, scene, contact, contact_normal, counter, setting)
     speed_square = speed.dot(speed)

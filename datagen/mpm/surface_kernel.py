@@ -4,37 +4,75 @@ import taichi as ti
 
 from datagen.mpm.layout import COUNT, SETTING
 
-CLEARANCE = 1e-3  # cells that a particle keeps from a triangle; rounding is 1e-5
+CLEARANCE = 1e-3  # cells from a triangle, nearer than which a particle may not come; rounding is 1e-5
+STOP = 1.5 * CLEARANCE  # where it is put, so that rounding does not bring it nearer
 EDGE = 1e-4  # of a triangle's edge: how far past it a crossing still counts, so that none slips between two
-TRIANGLE_VECTORS = 4  # of a triangle in the array: see datagen.mpm.sweep.Sweep
+# Vectors of a node's contact: what is free for particles that see it, and for those that a sheet hides it from (zero
+# where all motion is), and the friction of each
+NODE_VECTORS = 3
+TRIANGLE_VECTORS = 5  # those of datagen.mpm.sweep.Sweep, and its friction
+LIST_HEAD = 2  # of a list of triangles: how many, and how many of them sheets', which come first
+STENCIL = 27  # nodes of a particle
+ATTEMPTS = 3  # to end a way before all triangles
 
 
 @ti.func
-def meet_collider(v, normal, both_sides: ti.i32, friction: ti.f32):
-    """Contact of a node: separation is free, approach keeps the tangential part less Coulomb friction."""
+def meet(v, normal, friction: ti.f32):
+    """The velocity that a surface leaves: separation is free; approach ends, and Coulomb friction brakes what slides by
+    at most the coefficient times the speed that the approach lost.
+    """
     out = v
     along = v.dot(normal)
-    if both_sides or along < 0.0:
-        tangential = v - along * normal
-        speed = tangential.norm()
-        keep = 1.0
-        if friction > 0.0:
-            keep = ti.max(0.0, 1.0 - friction * ti.abs(along) / ti.max(speed, 1e-20))
-        out = tangential * keep
+    if along < 0.0:
+        out = v - along * normal
+        out *= ti.max(0.0, 1.0 + friction * along / ti.max(out.norm(), 1e-20))
     return out
 
 
 @ti.func
-def _first_crossing(start, end, list_at: ti.i32, contact: ti.template(), contact_normal: ti.template()):
-    """Where the way from start to end (in cells) first meets a triangle of the list that begins at list_at.
+def hidden_nodes(scaled, list_at: ti.i32, contact: ti.template(), contact_normal: ti.template()) -> ti.i32:
+    """Which of a particle's nodes sheets hide from it: bit 9 i + 3 j + k says that the way to node base + (i, j, k)
+    crosses a triangle of a sheet. The particle is at `scaled`, in cells; its base node's list begins at list_at.
+    """
+    bits = 0
+    to_base = ti.floor(scaled - 0.5) - scaled
+    for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + contact[list_at + 1]):
+        triangle = contact[s]
+        normal = contact_normal[triangle + 1]
+        across_1 = contact_normal[triangle + 2]
+        across_2 = contact_normal[triangle + 3]
+        offset = scaled - contact_normal[triangle]
+        height = normal.dot(offset)
+        height_base = height + normal.dot(to_base)
+        lowest = height_base + 2.0 * ti.min(normal, 0.0).sum()
+        highest = height_base + 2.0 * ti.max(normal, 0.0).sum()
+        if (height >= 0.0 and lowest < 0.0) or (height < 0.0 and highest >= 0.0):
+            along_1 = across_1.dot(offset)
+            along_2 = across_2.dot(offset)
+            for n in range(STENCIL):
+                way = to_base + ti.cast(ti.Vector([n // 9, n // 3 % 3, n % 3]), ti.f32)
+                height_node = height + normal.dot(way)
+                if (height_node < 0.0) != (height < 0.0):
+                    fraction = height / (height - height_node)
+                    place_1 = along_1 + fraction * across_1.dot(way)
+                    place_2 = along_2 + fraction * across_2.dot(way)
+                    if place_1 >= -EDGE and place_2 >= -EDGE and place_1 + place_2 <= 1.0 + EDGE:
+                        bits |= 1 << n
+    return bits
 
-    Returns the fraction of the way (2 where there is none), the place to stop at, and the direction that is free
-    there: the triangle's normal on the side of the start.
+
+@ti.func
+def _first_crossing(start, end, list_at: ti.i32, contact: ti.template(), contact_normal: ti.template()):
+    """The triangle that the way from start to end (in cells) meets first, of the list that begins at list_at.
+
+    Returns the fraction of the way (2 where there is none), the end without what of it leads through the triangle, the
+    direction that is free there (the triangle's normal on the side of the start), and the friction.
     """
     first = 2.0
     stop = end
     free = ti.Vector([0.0, 0.0, 0.0])
-    for s in range(list_at + 1, list_at + 1 + contact[list_at]):
+    friction = 0.0
+    for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + contact[list_at]):
         triangle = contact[s]
         corner = contact_normal[triangle]
         normal = contact_normal[triangle + 1]
@@ -52,9 +90,10 @@ def _first_crossing(start, end, list_at: ti.i32, contact: ti.template(), contact
             along_2 = contact_normal[triangle + 3].dot(place - corner)
             if along_1 >= -EDGE and along_2 >= -EDGE and along_1 + along_2 <= 1.0 + EDGE and fraction < first:
                 first = fraction
-                stop = place + normal * (CLEARANCE - normal.dot(place - corner))
+                stop = end + normal * (STOP - after)
                 free = normal
-    return first, stop, free
+                friction = contact_normal[triangle + 4][0]
+    return first, stop, free, friction
 
 
 @ti.func
@@ -71,8 +110,8 @@ def stop_at_surface(
 ):
     """The place that a particle from x reaches on its way to out, and its velocity there.
 
-    A triangle in the way stops it just before, without its velocity into the triangle. Where that place lies behind
-    another triangle (in a corner) it stays at x.
+    A triangle in the way takes what leads through it, and the particle slides on along it with what its friction leaves
+    of the velocity. What then leads through a third triangle (in a corner) stays at x.
     """
     dx = setting[SETTING.cell_size]
     start = x * setting[SETTING.inverse_cell_size]
@@ -80,19 +119,19 @@ def stop_at_surface(
     moved = out
     speed = v
     attempt = 0
-    while attempt < 2:
-        fraction, stop, free = _first_crossing(start, end, list_at, contact, contact_normal)
+    while attempt < ATTEMPTS:
+        fraction, stop, free, friction = _first_crossing(start, end, list_at, contact, contact_normal)
         if fraction <= 1.0:
-            speed -= ti.min(speed.dot(free), 0.0) * free
+            speed = meet(speed, free, friction)
             end = stop
             moved = stop * dx
-            if attempt == 1:
-                moved = x
-            else:
+            if attempt == 0:
                 ti.atomic_add(counter[scene, COUNT.surface_projections], ti.cast(1, ti.i64))
             attempt += 1
+            if attempt == ATTEMPTS:
+                moved = x
         else:
-            attempt = 2
+            attempt = ATTEMPTS
     return moved, speed
 
 

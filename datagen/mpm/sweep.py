@@ -1,8 +1,10 @@
-"""The triangles that no particle may cross, listed by cell, for the swept test after advection.
+"""The triangles near a particle, listed by its base node: those that it may not cross as it moves, and those of sheets
+that may hide nodes from it.
 
-The collider works on the grid's nodes and may let a particle slip by where its band is curved, cornered or folded;
-the swept test stops what would still cross. All lengths are in cells.
-Shape legend: F triangles, K cells near triangles, L entries of all lists.
+A particle with base node I lies half to one and a half cells above it along each axis, and its nodes from I to I + 2:
+all that it can meet on the way to a node, or on a way of half a cell, lies between I and I + 2. All lengths are in
+cells.
+Shape legend: F triangles, K base nodes near triangles, L entries of all lists.
 """
 
 from __future__ import annotations
@@ -12,24 +14,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-REACH_CELLS = 0.5  # that a particle moves in a step, at most, for its crossing to be seen
 PAIRS_PER_CHUNK = 1_000_000  # (cell, triangle) pairs held at once
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Triangles, and for each cell near any which ones a particle in it may meet."""
+    """Triangles, and for each base node near any which ones its particles may meet, those of sheets first."""
 
     # float32: a corner, the unit normal, and two vectors whose products with an offset from the corner are its
     # coordinates along the two edges from there
     triangle_F43: np.ndarray
-    cell_K3: np.ndarray  # int32
+    obstacle_F: np.ndarray  # int32, whose triangle it is
+    base_K3: np.ndarray  # int32
     begin_K: np.ndarray  # int64, into triangle_L; a list ends where the next begins
+    sheets_K: np.ndarray  # int32, how many of a list are sheets'
     triangle_L: np.ndarray  # int32
 
 
-def build_sweep(triangle_F33: np.ndarray, shape: tuple[int, ...]) -> Sweep:
-    """From triangles with an area, corners in cells, in a grid of `shape` cells. Outside the grid there are none."""
+def build_sweep(triangle_F33: np.ndarray, obstacle_F: np.ndarray, sheets: int, shape: tuple[int, ...]) -> Sweep:
+    """From triangles with an area, corners in cells, in a grid of `shape` nodes, the first `sheets` those of sheets.
+
+    Outside the grid there are none.
+    """
     edge_1, edge_2 = triangle_F33[:, 1] - triangle_F33[:, 0], triangle_F33[:, 2] - triangle_F33[:, 0]
     normal = np.cross(edge_1, edge_2)
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -39,21 +45,31 @@ def build_sweep(triangle_F33: np.ndarray, shape: tuple[int, ...]) -> Sweep:
     packed = np.stack([triangle_F33[:, 0], normal, across_1, across_2], axis=1).astype(np.float32)
 
     flats, owners = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    slab = 0.5 * np.abs(normal).sum(axis=1) + REACH_CELLS
-    for cell, owner in near_pairs(triangle_F33 - 0.5, 0.5 + REACH_CELLS, shape):
-        height = ((cell + 0.5 - triangle_F33[owner, 0]) * normal[owner]).sum(axis=1)
-        keep = np.abs(height) <= slab[owner] + 1e-9
-        flats.append(np.ravel_multi_index(cell[keep].T, shape))
-        owners.append(owner[keep])
+    for base, owner in near_slabs(triangle_F33 - 1, 1.0, shape):
+        flats.append(np.ravel_multi_index(base.T, shape))
+        owners.append(owner)
     flat, owner = np.concatenate(flats), np.concatenate(owners)
     order = np.argsort(flat, kind="stable")
-    cell, begin = np.unique(flat[order], return_index=True)
+    base, begin = np.unique(flat[order], return_index=True)
+    before = np.concatenate([[0], np.cumsum(owner[order] < sheets)])
     return Sweep(
         packed,
-        np.stack(np.unravel_index(cell, shape), axis=1).astype(np.int32),
+        obstacle_F.astype(np.int32),
+        np.stack(np.unravel_index(base, shape), axis=1).astype(np.int32),
         begin.astype(np.int64),
+        np.diff(before[np.append(begin, len(order))]).astype(np.int32),
         owner[order].astype(np.int32),
     )
+
+
+def near_slabs(triangle_F33: np.ndarray, reach: float, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, ...]]:
+    """Chunks of (node, triangle index): the nodes whose cube of half side `reach` the triangle's box and plane meet."""
+    normal = np.cross(triangle_F33[:, 1] - triangle_F33[:, 0], triangle_F33[:, 2] - triangle_F33[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    slab = reach * np.abs(normal).sum(axis=1) + 1e-9
+    for node, owner in near_pairs(triangle_F33, reach, shape):
+        keep = np.abs(((node - triangle_F33[owner, 0]) * normal[owner]).sum(axis=1)) <= slab[owner]
+        yield node[keep], owner[keep]
 
 
 def near_pairs(triangle_F33: np.ndarray, band: float, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, ...]]:

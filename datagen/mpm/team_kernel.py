@@ -41,12 +41,16 @@ from datagen.mpm.mls_mpm import (
     Vectors,
     base_node,
     choose_time_step,
+    find_hidden,
+    ghost_place,
     initial_stiffness,
     interpolate,
+    interpolate_hidden,
     mark,
     move,
     node_places,
     node_velocity,
+    planar,
     raise_maximum,
     respond,
     settle,
@@ -61,6 +65,7 @@ MASS = 3
 VELOCITY = 4
 SETTLING = 7  # the mass, for the end of an interval
 COMPONENTS = 8
+HIDDEN_ROW = 1 | 1 << 9 | 1 << 18  # of a particle's hidden nodes, those of one y and z
 
 
 @ti.func
@@ -111,12 +116,6 @@ def _first_node(scene: ti.i32, shape: ti.template()):
 
 
 @ti.func
-def _planar(block: ti.i32, local: ti.i32):
-    """Where the first component of a block's node lies."""
-    return block * (BLOCK_NODES * COMPONENTS) + local
-
-
-@ti.func
 def _cell(x, scene: ti.i32, setting: ti.template(), shape: ti.template()):
     """Where the cell of a particle lies in the arrays of nodes: at its base node."""
     base = base_node(x, setting[SETTING.inverse_cell_size])
@@ -164,6 +163,7 @@ def _strain_and_sort(
     state: ti.template(),
     tag: ti.template(),
     rank: ti.template(),
+    hidden: ti.template(),
     cell_count: ti.template(),
     cell_list: ti.template(),
     block: ti.template(),
@@ -174,6 +174,8 @@ def _strain_and_sort(
     setting: ti.template(),
     law: ti.template(),
     shape: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
     variant: ti.template(),
     threads: ti.template(),
 ):
@@ -195,6 +197,8 @@ def _strain_and_sort(
             cell = _cell(x, scene, setting, shape)
             rank_here = ti.atomic_add(cell_count[cell], 1)
             rank[first + p] = rank_here
+            if ti.static(bool(variant & VARIANT.sheets)):
+                hidden[first + p] = find_hidden(x, scene, contact, contact_normal, setting, shape)
             if rank_here == 0:
                 cell_list[first + ti.atomic_add(live[scene * LIVE.length + LIVE.cells], 1)] = cell
                 mark(
@@ -205,6 +209,11 @@ def _strain_and_sort(
             C = _matrix(state, place, stride, FIELD.affine)
         else:
             v_now, C_now = interpolate(x, velocities, node, setting[SETTING.inverse_cell_size], shape, COMPONENTS)
+            if ti.static(bool(variant & VARIANT.sheets)):
+                v_now, C_now = interpolate_hidden(
+                    x, v_now, C_now, hidden[first + p], scene, VELOCITY * BLOCK_NODES, node,
+                    setting[SETTING.inverse_cell_size], shape, contact, COMPONENTS,
+                )  # fmt: skip
             C = C_now
             fastest = ti.max(fastest, v_now.dot(v_now))
             if ti.static(solid):
@@ -230,6 +239,26 @@ def _strain_and_sort(
 
 
 @ti.func
+def _add_hidden(
+    base,
+    ahead: ti.i32,
+    weight: ti.f32,
+    v,
+    begins: ti.f32,
+    scene: ti.i32,
+    node: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+):
+    """Adds what a particle gives to the second field of the node that lies `ahead` nodes along x from `base`."""
+    place = planar(ghost_place(base + ti.Vector([ahead, 0, 0]), scene, contact, shape), COMPONENTS)
+    for c in ti.static(range(3)):
+        ti.atomic_add(node[place + c * BLOCK_NODES], weight * v[c])
+    if begins == 1.0:
+        ti.atomic_add(node[place + MASS * BLOCK_NODES], weight)
+
+
+@ti.func
 def _scatter(
     lane: ti.i32,
     scene: ti.i32,
@@ -240,6 +269,7 @@ def _scatter(
     state: ti.template(),
     tag: ti.template(),
     order: ti.template(),
+    hidden: ti.template(),
     cell_begin: ti.template(),
     live: ti.template(),
     node: ti.template(),
@@ -247,6 +277,7 @@ def _scatter(
     setting: ti.template(),
     law: ti.template(),
     shape: ti.template(),
+    contact: ti.template(),
     variant: ti.template(),
     threads: ti.template(),
 ):
@@ -288,6 +319,19 @@ def _scatter(
             weight_0 = weight * spline(away[0])
             weight_1 = weight * spline(away[0] + 1.0)
             weight_2 = weight * spline(away[0] + 2.0)
+            if ti.static(bool(variant & VARIANT.sheets)):
+                bits = hidden[first + p] >> slot
+                if bits & HIDDEN_ROW != 0:
+                    row_base = base + ti.Vector([0, offset_y, offset_z])
+                    if bits & 1:
+                        _add_hidden(row_base, 0, weight_0, v_0, begins, scene, node, shape, contact)
+                        weight_0 = 0.0
+                    if bits & (1 << 9):
+                        _add_hidden(row_base, 1, weight_1, v_1, begins, scene, node, shape, contact)
+                        weight_1 = 0.0
+                    if bits & (1 << 18):
+                        _add_hidden(row_base, 2, weight_2, v_2, begins, scene, node, shape, contact)
+                        weight_2 = 0.0
             sum_0 += weight_0 * ti.Vector([v_0[0], v_0[1], v_0[2], 1.0])
             sum_1 += weight_1 * ti.Vector([v_1[0], v_1[1], v_1[2], 1.0])
             sum_2 += weight_2 * ti.Vector([v_2[0], v_2[1], v_2[2], 1.0])
@@ -319,6 +363,7 @@ def _gather(
     state: ti.template(),
     tag: ti.template(),
     order: ti.template(),
+    hidden: ti.template(),
     node: ti.template(),
     scene_value: ti.template(),
     counter: ti.template(),
@@ -338,6 +383,11 @@ def _gather(
         place = particles + p
         x = _vector(state, place, stride, FIELD.position)
         v, C = interpolate(x, velocities, node, setting[SETTING.inverse_cell_size], shape, COMPONENTS)
+        if ti.static(bool(variant & VARIANT.sheets)):
+            v, C = interpolate_hidden(
+                x, v, C, hidden[first + p], scene, VELOCITY * BLOCK_NODES, node,
+                setting[SETTING.inverse_cell_size], shape, contact, COMPONENTS,
+            )  # fmt: skip
         moved, speed, speed_square = move(
             x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
         )
@@ -364,6 +414,7 @@ def advance(
     tag: Integers,
     rank: Integers,
     order: Integers,
+    hidden: Integers,
     cell_count: Integers,
     cell_list: Integers,
     cell_begin: Integers,
@@ -384,10 +435,10 @@ def advance(
 ):
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
-    Arrays, with P particles and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, order,
-    cell_list [P], cell_begin [2 P] and node [7 G] (see COMPONENTS) are work space; cell_count [G] and the flags in
-    block [3 * G / 64] are zero between steps; turn [scenes] says which scene comes when (long ones first). A scene that
-    failed keeps still.
+    Arrays, with P particles and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, order, hidden
+    (see grid_kernel.substep), cell_list [P], cell_begin [2 P] and node [8 G] (see COMPONENTS) are work space;
+    cell_count [G] and the flags in block [3 * G / 64] are zero between steps; turn [scenes] says which scene comes when
+    (long ones first). A scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
     for thread in range(turn.shape[0] * threads):
@@ -429,8 +480,9 @@ def advance(
                     begins = scene_value[scene, VALUE.begins] == 1.0
                     ends = scene_value[scene, VALUE.interval_remaining] == 0.0
                     _strain_and_sort(
-                        lane, scene, first, count, particles, tags, stride, step, state, tag, rank, cell_count,
-                        cell_list, block, live, node, scene_value, counter, setting, law, shape, variant, threads,
+                        lane, scene, first, count, particles, tags, stride, step, state, tag, rank, hidden,
+                        cell_count, cell_list, block, live, node, scene_value, counter, setting, law, shape, contact,
+                        contact_normal, variant, threads,
                     )  # fmt: skip
                     _wait(threads)
                     blocks = live[own + LIVE.blocks]
@@ -454,8 +506,8 @@ def advance(
                             p += threads
                         _wait(threads)
                     _scatter(
-                        lane, scene, first, particles, tags, stride, state, tag, order, cell_begin, live, node,
-                        scene_value, setting, law, shape, variant, threads,
+                        lane, scene, first, particles, tags, stride, state, tag, order, hidden, cell_begin, live,
+                        node, scene_value, setting, law, shape, contact, variant, threads,
                     )  # fmt: skip
                     _wait(threads)
                     n = lane
@@ -463,22 +515,32 @@ def advance(
                         touched = block[block_list + n // BLOCK_NODES]
                         if n % BLOCK_NODES == 0:
                             block[touched] = 0
-                        place = _planar(touched, n % BLOCK_NODES)
-                        gain = ti.Vector([node[place + c * BLOCK_NODES] for c in range(3)])
-                        before = ti.Vector([0.0, 0.0, 0.0])
-                        if not begins:
-                            before = ti.Vector([node[place + (VELOCITY + c) * BLOCK_NODES] for c in range(3)])
-                        v = node_velocity(
-                            before, gain, node[place + MASS * BLOCK_NODES], touched * BLOCK_NODES + n % BLOCK_NODES,
-                            scene, block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES], scene_value, setting,
-                            shape, contact, contact_normal, variant,
-                        )  # fmt: skip
-                        for c in ti.static(range(3)):
-                            node[place + c * BLOCK_NODES] = 0.0
-                            node[place + (VELOCITY + c) * BLOCK_NODES] = v[c]
-                        if ends:
-                            node[place + SETTLING * BLOCK_NODES] = node[place + MASS * BLOCK_NODES]
-                            node[place + MASS * BLOCK_NODES] = 0.0
+                        local = n % BLOCK_NODES
+                        entry = -1
+                        node_fields = 1
+                        if ti.static(bool(variant & VARIANT.contact)):
+                            entry = contact[touched * BLOCK_NODES + local]
+                            if entry >= 0 and entry < shape[SHAPE.ghosts]:
+                                node_fields = 2
+                        for field in range(node_fields):
+                            place = planar(touched * BLOCK_NODES + local, COMPONENTS)
+                            if field == 1:
+                                place = planar(shape[SHAPE.ghost_begin] + entry, COMPONENTS)
+                            gain = ti.Vector([node[place + c * BLOCK_NODES] for c in range(3)])
+                            before = ti.Vector([0.0, 0.0, 0.0])
+                            if not begins:
+                                before = ti.Vector([node[place + (VELOCITY + c) * BLOCK_NODES] for c in range(3)])
+                            v = node_velocity(
+                                before, gain, node[place + MASS * BLOCK_NODES], local, 2 * entry + field, scene,
+                                block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES], scene_value, setting,
+                                shape, contact_normal, variant,
+                            )  # fmt: skip
+                            for c in ti.static(range(3)):
+                                node[place + c * BLOCK_NODES] = 0.0
+                                node[place + (VELOCITY + c) * BLOCK_NODES] = v[c]
+                            if ends:
+                                node[place + SETTLING * BLOCK_NODES] = node[place + MASS * BLOCK_NODES]
+                                node[place + MASS * BLOCK_NODES] = 0.0
                         n += threads
                     if begins:
                         c = lane
@@ -488,7 +550,8 @@ def advance(
                     _wait(threads)
                     if ends:
                         _gather(
-                            lane, scene, first, count, particles, tags, stride, state, tag, order, node, scene_value,
+                            lane, scene, first, count, particles, tags, stride, state, tag, order, hidden, node,
+                            scene_value,
                             counter, setting, shape, contact, contact_normal, variant, threads,
                         )  # fmt: skip
                         _wait(threads)

@@ -83,8 +83,9 @@ class TeamLaunch(Launch):
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
         self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
         team_kernel.advance(
-            frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.cell_count, self.cell_list,
-            self.cell_begin, self.block, self.live, self.node, self.turn, self.scene_value, self.counter, self.setting,
-            self.law, self.shape, self.contact, self.contact_normal, output, self.variant, self.threads,
+            frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.hidden, self.cell_count,
+            self.cell_list, self.cell_begin, self.block, self.live, self.node, self.turn, self.scene_value,
+            self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, output, self.variant,
+            self.threads,
         )  # fmt: skip
         return output

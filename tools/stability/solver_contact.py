@@ -1,0 +1,157 @@
+"""Contact with obstacles against closed forms: what leaves a surface leaves as in free flight, what slides is braked by
+Coulomb's law, at any offset of the surface from the grid's nodes and in any orientation.
+
+Each case is a block of particles at a wide sheet or a flat face of a closed body, turned as a whole together with
+gravity. Lengths are in cells, times in seconds.
+Shape legend: T frames, N particles.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from datagen.mpm.solver import SceneFailure, Simulated, simulate
+from hgn.config import MpmConfig
+from hgn.scene.material import MATERIALS, SAND, SNOW
+from hgn.scene.rotation import euler_rotation, rotate
+from hgn.scene.scene import Obstacle, Scene
+from tools.stability.row import Row
+
+DOMAIN_CELLS = 32
+GRAVITY = 9.8  # m/s²
+FRAME_RATE_HZ = 120.0
+ORIENTATIONS = {"aligned": (0.0, 0.0, 0.0), "tilted": (27.0, 0.0, 13.0), "turned over": (180.0, 40.0, 0.0)}
+OFFSETS = (0.0, 0.1, 0.2, 0.3, 0.34, 0.36, 0.5, 0.7, 0.8, 0.9)  # of a surface above a node, in cells
+GAPS = (0.25, 0.5, 0.85, 1.2)  # between a sheet and the block below it
+LEAVING_SPEEDS = (0.3, 1.0, 3.0)  # m/s
+FRICTIONS = (0.1, 0.3, 0.5)
+SLOPE_DEG = 35.0
+FLIGHT_ERROR = 0.02  # of the way of free flight, at most
+FRICTION_ERRORS = {SAND: 0.05, SNOW: 0.10}
+BLOCK_CELLS = (4.0, 3.0, 4.0)
+SETTLING_S = 0.1  # until a block that comes to lie on a surface slides steadily
+SLIDING_S = 0.3
+QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where a surface lies: `offset` cells above the node in the middle of the domain, turned about it."""
+
+    offset: float
+    turn: str = "aligned"
+    cell_size: float = 1 / 64
+
+    def place(self, place_N3: np.ndarray) -> np.ndarray:
+        """From cells beside, above and before the middle of the surface to domain units."""
+        turned = rotate(np.asarray(place_N3, np.float64) + np.array([0, self.offset, 0]), self.rotation)
+        return np.asarray((turned + DOMAIN_CELLS / 2) * self.cell_size)
+
+    @property
+    def rotation(self) -> np.ndarray:
+        return euler_rotation(ORIENTATIONS[self.turn])
+
+
+def sheet(setting: Setting, half: float = 40.0) -> Obstacle:
+    """A square sheet; without `half` it reaches beyond the domain."""
+    corner = np.array([[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]])
+    return Obstacle("sheet", setting.place(corner), QUAD, False)
+
+
+def body(setting: Setting) -> Obstacle:
+    """A closed box whose upper face is the surface."""
+    corner = np.array([[x, y, z] for x in (-40, 40) for y in (-40, 0) for z in (-40, 40)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangle = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.int32)
+    return Obstacle("body", setting.place(corner), triangle, True)
+
+
+def block(
+    setting: Setting,
+    material: int,
+    bottom: float,
+    obstacles: tuple[Obstacle, ...],
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    size: tuple[float, float, float] = BLOCK_CELLS,
+) -> Scene:
+    """A block with its lower face `bottom` cells above the surface, eight particles a cell; vectors turn with it."""
+    count = round(8 * math.prod(size))
+    place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * size - [size[0] / 2, -bottom, size[2] / 2]
+    turned = rotate(np.array([velocity, gravity]), setting.rotation)
+    return Scene(
+        position_N3=setting.place(place).astype(np.float32),
+        velocity_N3=np.tile(turned[0].astype(np.float32), (count, 1)),
+        material_N=np.full(count, material, np.uint8),
+        obstacles=obstacles,
+        domain_size=(DOMAIN_CELLS * setting.cell_size,) * 3,
+        cell_size=setting.cell_size,
+        gravity=(float(turned[1, 0]), float(turned[1, 1]), float(turned[1, 2])),
+    )
+
+
+def centres(setting: Setting, outcome: Simulated | SceneFailure) -> np.ndarray:
+    """The block's centre along the surface's own axes at each frame, m, float64 [T, 3]."""
+    if isinstance(outcome, SceneFailure):
+        raise RuntimeError(outcome.cause)
+    return np.asarray(rotate(outcome.position_TN3.astype(np.float64).mean(axis=1), setting.rotation.T))
+
+
+def flight_errors(
+    settings: list[Setting], material: int, config: MpmConfig, seconds: float = 0.25
+) -> list[dict[str, float]]:
+    """Of each setting the largest error of the way, as a fraction of that without sheet: below a sheet under gravity,
+    over all GAPS, and leaving a sheet at LEAVING_SPEEDS without gravity.
+    """
+    frames = 1 + round(seconds * FRAME_RATE_HZ)
+    cases = [(setting, "below", gap) for setting in settings for gap in GAPS]
+    cases += [(setting, "leaving", speed) for setting in settings for speed in LEAVING_SPEEDS]
+    scenes = []
+    for setting, kind, value in cases:
+        for obstacles in ((sheet(setting),), ()):
+            if kind == "below":
+                down = (0.0, -GRAVITY, 0.0)
+                scenes.append(block(setting, material, -value - BLOCK_CELLS[1], obstacles, gravity=down))
+            else:
+                # the fastest goes as far as half the domain allows
+                scenes.append(block(setting, material, 0.3, obstacles, (0.0, value, 0.0)))
+    outcomes = simulate(scenes, config, frames, FRAME_RATE_HZ)
+    worst: list[dict[str, float]] = [{"below": 0.0, "leaving": 0.0} for _ in settings]
+    for index, (setting, kind, value) in enumerate(cases):
+        ways = []
+        last = -1
+        if kind == "leaving":
+            last = min(frames - 1, int(FRAME_RATE_HZ * 10 * setting.cell_size / value))
+        for outcome in outcomes[2 * index : 2 * index + 2]:
+            centre = centres(setting, outcome)
+            ways.append(centre[last, 1] - centre[0, 1])
+        own = worst[settings.index(setting)]
+        own[kind] = max(own[kind], abs(ways[0] / ways[1] - 1))
+    return worst
+
+
+def acting_frictions(
+    cases: list[tuple[Setting, bool, int]], friction: float, config: MpmConfig, slope_deg: float = SLOPE_DEG, speed: float = 0.0
+) -> list[float]:
+    """The Coulomb coefficient that acts on a block of a material that slides on a sheet, or on a body where the second
+    of a case is true, as gravity points down a slope: what its centre's acceleration lacks, over the force that presses
+    it on. `config` says the coefficient that is set.
+    """
+    sine, cosine = math.sin(math.radians(slope_deg)), math.cos(math.radians(slope_deg))
+    gravity = (GRAVITY * sine, -GRAVITY * cosine, 0.0)
+    scenes = [
+        block(setting, material, 0.8, (body(setting) if closed else sheet(setting),), (speed, 0.0, 0.0), gravity)
+        for setting, closed, material in cases
+    ]
+    first = round(SETTLING_S * FRAME_RATE_HZ)
+    frames = 1 + round((SETTLING_S + SLIDING_S) * FRAME_RATE_HZ)
+    acting = []
+    for (setting, _, _), outcome in zip(cases, simulate(scenes, config, frames, FRAME_RATE_HZ), strict=True):
+        way = centres(setting, outcome)[first:]
+        time = np.arange(len(way)) / FRAME_RATE_HZ
+        acceleration = 2 * np.polyfit(time, way, 2)[0]
+        acting.append(float((GRAVITY * sine - acceleration[0]) / (GRAVITY * cosine + acceleration[1])))
+    return acting
