@@ -8,17 +8,18 @@ Shape legend: T frames, N particles.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from hgn.config import MpmConfig
-from hgn.scene.material import MATERIALS, SAND, SNOW
+from hgn.scene.material import SAND, SNOW
 from hgn.scene.rotation import euler_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
-from tools.stability.row import Row
 
 DOMAIN_CELLS = 32
 GRAVITY = 9.8  # m/s²
@@ -27,13 +28,15 @@ ORIENTATIONS = {"aligned": (0.0, 0.0, 0.0), "tilted": (27.0, 0.0, 13.0), "turned
 OFFSETS = (0.0, 0.1, 0.2, 0.3, 0.34, 0.36, 0.5, 0.7, 0.8, 0.9)  # of a surface above a node, in cells
 GAPS = (0.25, 0.5, 0.85, 1.2)  # between a sheet and the block below it
 LEAVING_SPEEDS = (0.3, 1.0, 3.0)  # m/s
+LEAVING_CELLS = 8  # that the fastest go at most
 FRICTIONS = (0.1, 0.3, 0.5)
 SLOPE_DEG = 35.0
 FLIGHT_ERROR = 0.02  # of the way of free flight, at most
 FRICTION_ERRORS = {SAND: 0.05, SNOW: 0.10}
-BLOCK_CELLS = (4.0, 3.0, 4.0)
-SETTLING_S = 0.1  # until a block that comes to lie on a surface slides steadily
-SLIDING_S = 0.3
+FLYING_CELLS, SLIDING_CELLS, FALLING_CELLS = (3.0, 2.0, 3.0), (5.0, 2.0, 5.0), (7.0, 3.0, 7.0)  # of blocks
+START_CELLS = -5.0  # up the slope from the middle, where sliding blocks begin
+SETTLING_S, SLIDING_S = 0.3, 0.2  # until a block that came to lie on a surface slides steadily; then
+FALLING_S = 0.6
 QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
 
@@ -72,15 +75,15 @@ def body(setting: Setting) -> Obstacle:
 def block(
     setting: Setting,
     material: int,
-    bottom: float,
+    low: tuple[float, float, float],
+    size: tuple[float, float, float],
     obstacles: tuple[Obstacle, ...],
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    size: tuple[float, float, float] = BLOCK_CELLS,
 ) -> Scene:
-    """A block with its lower face `bottom` cells above the surface, eight particles a cell; vectors turn with it."""
+    """A block from `low` on, in cells about the middle of the surface, eight particles a cell; vectors turn with it."""
     count = round(8 * math.prod(size))
-    place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * size - [size[0] / 2, -bottom, size[2] / 2]
+    place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * size + np.array(low)
     turned = rotate(np.array([velocity, gravity]), setting.rotation)
     return Scene(
         position_N3=setting.place(place).astype(np.float32),
@@ -101,51 +104,75 @@ def centres(setting: Setting, outcome: Simulated | SceneFailure) -> np.ndarray:
 
 
 def flight_errors(
-    settings: list[Setting], material: int, config: MpmConfig, seconds: float = 0.25
+    cases: Sequence[tuple[Setting, int]], config: MpmConfig, seconds: float = 0.25
 ) -> list[dict[str, float]]:
-    """Of each setting the largest error of the way, as a fraction of that without sheet: below a sheet under gravity,
-    over all GAPS, and leaving a sheet at LEAVING_SPEEDS without gravity.
+    """Of each setting and material the largest error of the way, as a fraction of that of free flight: of what is
+    `below` a sheet under gravity, over all GAPS, and of what is `leaving` it at LEAVING_SPEEDS without gravity.
     """
     frames = 1 + round(seconds * FRAME_RATE_HZ)
-    cases = [(setting, "below", gap) for setting in settings for gap in GAPS]
-    cases += [(setting, "leaving", speed) for setting in settings for speed in LEAVING_SPEEDS]
-    scenes = []
-    for setting, kind, value in cases:
-        for obstacles in ((sheet(setting),), ()):
-            if kind == "below":
-                down = (0.0, -GRAVITY, 0.0)
-                scenes.append(block(setting, material, -value - BLOCK_CELLS[1], obstacles, gravity=down))
-            else:
-                # the fastest goes as far as half the domain allows
-                scenes.append(block(setting, material, 0.3, obstacles, (0.0, value, 0.0)))
+    scenes, ways = [], []
+    width, height, depth = FLYING_CELLS
+    for setting, material in cases:
+        surface = (sheet(setting),)
+        for gap in GAPS:
+            low = (-width / 2, -gap - height, -depth / 2)
+            scenes.append(block(setting, material, low, FLYING_CELLS, surface, gravity=(0.0, -GRAVITY, 0.0)))
+            ways.append(("below", frames - 1, -GRAVITY * seconds**2 / 2))
+        for speed in LEAVING_SPEEDS:
+            low = (-width / 2, 0.3, -depth / 2)
+            scenes.append(block(setting, material, low, FLYING_CELLS, surface, (0.0, speed, 0.0)))
+            last = min(frames - 1, int(FRAME_RATE_HZ * LEAVING_CELLS * setting.cell_size / speed))
+            ways.append(("leaving", last, speed * last / FRAME_RATE_HZ))
     outcomes = simulate(scenes, config, frames, FRAME_RATE_HZ)
-    worst: list[dict[str, float]] = [{"below": 0.0, "leaving": 0.0} for _ in settings]
-    for index, (setting, kind, value) in enumerate(cases):
-        ways = []
-        last = -1
-        if kind == "leaving":
-            last = min(frames - 1, int(FRAME_RATE_HZ * 10 * setting.cell_size / value))
-        for outcome in outcomes[2 * index : 2 * index + 2]:
-            centre = centres(setting, outcome)
-            ways.append(centre[last, 1] - centre[0, 1])
-        own = worst[settings.index(setting)]
-        own[kind] = max(own[kind], abs(ways[0] / ways[1] - 1))
+    worst = []
+    for index, (setting, _) in enumerate(cases):
+        errors = {"below": 0.0, "leaving": 0.0}
+        own = slice(index * len(ways) // len(cases), (index + 1) * len(ways) // len(cases))
+        for outcome, (kind, last, way) in zip(outcomes[own], ways[own], strict=True):
+            centre = centres(setting, outcome)[:, 1]
+            errors[kind] = max(errors[kind], abs(float(centre[last] - centre[0]) / way - 1))
+        worst.append(errors)
     return worst
 
 
-def acting_frictions(
-    cases: list[tuple[Setting, bool, int]], friction: float, config: MpmConfig, slope_deg: float = SLOPE_DEG, speed: float = 0.0
-) -> list[float]:
+def glued_below(cases: Sequence[tuple[Setting, int]], config: MpmConfig) -> list[float]:
+    """Of a block of each material that falls onto a sheet smaller than itself, the fraction that ends just below it."""
+    width, _, depth = FALLING_CELLS
+    half = width / 3
+    scenes = [
+        block(
+            setting, material, (-width / 2, 1.5, -depth / 2), FALLING_CELLS, (sheet(setting, half),),
+            gravity=(0.0, -GRAVITY, 0.0),
+        )
+        for setting, material in cases
+    ]  # fmt: skip
+    frames = 1 + round(FALLING_S * FRAME_RATE_HZ)
+    fractions = []
+    for (setting, _), outcome in zip(cases, simulate(scenes, config, frames, FRAME_RATE_HZ), strict=True):
+        if isinstance(outcome, SceneFailure):
+            raise RuntimeError(outcome.cause)
+        middle = rotate(setting.place(np.zeros((1, 3))), setting.rotation.T)
+        place = (rotate(outcome.position_TN3[-1].astype(np.float64), setting.rotation.T) - middle) / setting.cell_size
+        below = (np.abs(place[:, [0, 2]]) < half).all(axis=1) & (place[:, 1] < 0) & (place[:, 1] > -2)
+        fractions.append(float(below.mean()))
+    return fractions
+
+
+def acting_frictions(cases: Sequence[tuple[Setting, bool, int]], friction: float, config: MpmConfig) -> list[float]:
     """The Coulomb coefficient that acts on a block of a material that slides on a sheet, or on a body where the second
     of a case is true, as gravity points down a slope: what its centre's acceleration lacks, over the force that presses
-    it on. `config` says the coefficient that is set.
+    it on.
     """
-    sine, cosine = math.sin(math.radians(slope_deg)), math.cos(math.radians(slope_deg))
+    sine, cosine = math.sin(math.radians(SLOPE_DEG)), math.cos(math.radians(SLOPE_DEG))
     gravity = (GRAVITY * sine, -GRAVITY * cosine, 0.0)
+    low = (START_CELLS - SLIDING_CELLS[0] / 2, 0.5, -SLIDING_CELLS[2] / 2)
     scenes = [
-        block(setting, material, 0.8, (body(setting) if closed else sheet(setting),), (speed, 0.0, 0.0), gravity)
+        block(
+            setting, material, low, SLIDING_CELLS, (body(setting) if closed else sheet(setting),), gravity=gravity
+        )
         for setting, closed, material in cases
-    ]
+    ]  # fmt: skip
+    config = dataclasses.replace(config, collider_friction=friction)
     first = round(SETTLING_S * FRAME_RATE_HZ)
     frames = 1 + round((SETTLING_S + SLIDING_S) * FRAME_RATE_HZ)
     acting = []
