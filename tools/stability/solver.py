@@ -1,8 +1,8 @@
 """python -m tools.stability solver [--json FILE] [picture=FILE]: what the solver bears, up to where, and beyond.
 
-Rows: the largest stable step against the formula, stiffness, speed of impact, convergence of the default step, leaks
-through obstacles, a long run, and what published experiments found. On two CPU cores each case takes minutes, the
-table of leaks with leak_seconds=0.1 leak_block_cells=3.
+Rows: the largest stable step against the formula, stiffness, speed of impact, convergence of the default step, flight
+from obstacles and friction on them, leaks through them, a long run, and what published experiments found. On two CPU
+cores each case takes minutes, the table of leaks with leak_seconds=0.1 leak_block_cells=3.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
 from tools.stability.row import Row, table
+from tools.stability.solver_contact import contacts
 from tools.stability.solver_leak import OFFSETS, leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
+from tools.stability.solver_scenes import CELL
 from tools.stability.solver_steps import Point, draw, largest_steps
 from tools.stability.solver_validation import grids, validation
 
 PART = "solver"
-CASES = ("steps", "stiffness", "impact", "convergence", "leak", "long", "validation", "grid")
+CASES = ("steps", "stiffness", "impact", "convergence", "contact", "leak", "long", "validation", "grid")
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ def main(mapping: dict[str, Any]) -> int:
         "stiffness": lambda: stiffnesses(mpm),
         "impact": lambda: impacts(mpm),
         "convergence": lambda: convergence(mpm),
+        "contact": lambda: contacts(mpm, CELL),
         "leak": lambda: leaks(
             _leak_settings(mpm, config), config.leak_seconds, config.leak_block_cells, config.leak_offsets
         ),

@@ -12,14 +12,16 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from hgn.config import MpmConfig
-from hgn.scene.material import SAND, SNOW
+from hgn.scene.material import MATERIALS, SAND, SNOW
 from hgn.scene.rotation import euler_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
+from tools.stability.row import Row
 
 DOMAIN_CELLS = 32
 GRAVITY = 9.8  # m/s²
@@ -182,3 +184,40 @@ def acting_frictions(cases: Sequence[tuple[Setting, bool, int]], friction: float
         acceleration = 2 * np.polyfit(time, way, 2)[0]
         acting.append(float((GRAVITY * sine - acceleration[0]) / (GRAVITY * cosine + acceleration[1])))
     return acting
+
+
+def contacts(config: MpmConfig, cell_size: float) -> list[Row]:
+    """Rows of the worst of all OFFSETS, for each orientation and material: free flight, friction, and what is glued."""
+    rows = []
+    settings = [Setting(offset, turn, cell_size) for turn in ORIENTATIONS for offset in OFFSETS]
+    places = [(setting, material) for setting in settings for material in range(len(MATERIALS))]
+    for (turn, kind), errors in _grouped(places, flight_errors(places, config)).items():
+        for name in ("below", "leaving"):
+            worst = max(error[name] for error in errors)
+            beyond = "of the way of free flight, at most"
+            case = f"contact, {name} a sheet {turn}, {MATERIALS[kind]}"
+            rows.append(Row(case, FLIGHT_ERROR, worst, worst <= FLIGHT_ERROR, beyond))
+    for (turn, kind), fractions in _grouped(places, glued_below(places, config)).items():
+        worst = max(fractions)
+        case = f"contact, glued below a sheet {turn}, {MATERIALS[kind]}"
+        rows.append(Row(case, 0.0, worst, worst == 0, "of the particles, at most"))
+    for closed, surface in ((False, "a sheet"), (True, "a body")):
+        for friction in FRICTIONS:
+            places = [(setting, material) for setting in settings for material in FRICTION_ERRORS]
+            cases = [(setting, closed, material) for setting, material in places]
+            for (turn, kind), acting in _grouped(places, acting_frictions(cases, friction, config)).items():
+                worst = max(acting, key=lambda value: abs(value - friction))
+                held = abs(worst / friction - 1) <= FRICTION_ERRORS[kind]
+                beyond = f"mean {np.mean(acting):.4g}; within {FRICTION_ERRORS[kind]:.0%} wanted"
+                rows.append(
+                    Row(f"contact, friction on {surface} {turn}, {MATERIALS[kind]}", friction, worst, held, beyond)
+                )
+    return rows
+
+
+def _grouped(places: Sequence[tuple[Setting, int]], values: Sequence[Any]) -> dict[tuple[str, int], list[Any]]:
+    """What belongs to the offsets of each orientation and material."""
+    groups: dict[tuple[str, int], list[Any]] = {}
+    for (setting, material), value in zip(places, values, strict=True):
+        groups.setdefault((setting.turn, material), []).append(value)
+    return groups
