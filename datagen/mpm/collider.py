@@ -3,7 +3,7 @@
 The paper's cell normals leak when used as a collider, so the solver builds its own from the triangles.
 Shape legend: K contact nodes, P points, F triangles, V vertices.
 
-Closed bodies: nodes inside, a third of a cell below the surface, with the normal outward; where the body is thinner
+Closed bodies: nodes inside, 0.4 cells below the surface, with the normal outward; where the body is thinner
 than a cell, so that no node may lie there, those nearer to the surface and outside too, in a band of one cell at least.
 
 Sheets (open meshes): particles on both sides reach the same nodes, and would hold each other through them. So a node
@@ -15,8 +15,8 @@ Where two obstacles claim a node, the closest surface wins. What nodes leave ope
 friction.
 
 A particle's spline reaches 1.5 cells, so a solid block stops well above the uppermost node that stops it: 0.85 cells
-where there is one layer of such nodes, 1.32 where there are more below. For it to rest within a cell of the surface
-those nodes must lie 0.35 cells below it.
+where there is one layer of such nodes, up to 1.38 where there are more below. For it to rest within a cell of the
+surface those nodes must lie 0.4 cells below it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from hgn.schema import ConfigError
 
 SEEN, HIDDEN = 0, 1  # the two fields of a node
 ON_SURFACE_CELLS = 0.05  # nearer than this, the direction to the surface is rounding
-BARE_CELLS = 0.35  # below a surface, where nodes stop nothing
+BARE_CELLS = 0.4  # below a surface, where nodes stop nothing
 STENCIL_CELLS = 1.501  # from a particle to its nodes, along each axis, with rounding
 ON_EDGE = 1e-6  # of a triangle's edge: as near to it a place lies on it
 WIDENED = 1 + 1e-3  # triangles, since kernels look a ten-thousandth beyond their edges

@@ -27,9 +27,10 @@ def test_sheets_release() -> None:
 
 
 def test_nothing_is_glued_below_a_sheet() -> None:
-    """Of sand and water that fall onto a small sheet and around it, nothing stays just below it."""
-    cases = [(Setting(0.3, "aligned", CELL), material) for material in (SAND, WATER)]
-    assert glued_below(cases, CONFIG) == [0.0, 0.0]
+    """Of water, sand and snow that fall onto a small sheet and around it, nothing stays just below it."""
+    cases = [(Setting(offset, "aligned", CELL), material) for offset in (0.3, 0.5) for material in (WATER, SAND)]
+    cases.append((Setting(0.3, "aligned", CELL), SNOW))
+    assert glued_below(cases, CONFIG) == [0.0] * len(cases)
 
 
 @pytest.mark.parametrize("friction", FRICTIONS)
@@ -39,6 +40,8 @@ def test_friction_acts_as_set(friction: float) -> None:
     """
     cases = [(Setting(offset, "aligned", CELL), False, kind) for offset in (0.0, 0.3, 0.5) for kind in (SAND, SNOW)]
     if friction == FRICTIONS[-1]:
-        cases += [(Setting(offset, "aligned", CELL), True, SAND) for offset in (0, 0.2, 0.34, 0.36, 0.5, 0.7, 0.9)]
+        cases += [
+            (Setting(offset, "aligned", CELL), True, SAND) for offset in (0, 0.2, 0.34, 0.36, 0.41, 0.5, 0.7, 0.9)
+        ]
     for case, acting in zip(cases, acting_frictions(cases, friction, CONFIG), strict=True):
         assert acting == pytest.approx(friction, rel=FRICTION_ERRORS[case[2]]), case
