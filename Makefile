@@ -17,6 +17,9 @@ setup: $(VENV)/.installed
 # modules are compiled as they are used: that of all at once takes longer than the tests of some
 INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off --no-compile -c constraints.txt
 
+# but Taichi, which Python warns of as it compiles it
+COMPILE = $(RUN) -W ignore -m compileall -q $(VENV)/lib/python*/site-packages/taichi
+
 $(VENV)/.created:
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 13) and "Python 3.11 or 3.12 is needed (Taichi), got " + sys.version.split()[0] + "; name one with make PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
@@ -24,11 +27,13 @@ $(VENV)/.created:
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(VENV)/.created
 	$(INSTALL) -e '.[dev]'
+	$(COMPILE)
 	@touch $@ $(VENV)/.demo
 
 # what the demo needs alone: the tests' packages are larger
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/.created
 	$(INSTALL) -e '.[datagen,train]'
+	$(COMPILE)
 	@touch $@
 
 demo: $(VENV)/.demo

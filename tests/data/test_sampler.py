@@ -35,7 +35,7 @@ def test_each_sample_once_an_epoch(frames, batch, world_size, seed):
 @settings(max_examples=60, deadline=None)
 @given(frame_counts, st.integers(1, 4), st.integers(1, 3), st.integers(0, 20), st.integers(1, 20))
 def test_resume_equals_no_interruption(frames, batch, world_size, before, after):
-    """Starting again from the sampler_state gives the samples, and their seeds, that would have come."""
+    """Starting again from the state gives the samples, and their seeds, that would have come."""
     for rank in range(world_size):
         order = EpisodeSampler(3, batch, lambda _: frames, rank=rank, world_size=world_size)
         take(order, before)
@@ -52,9 +52,9 @@ def test_growing_data_waits_for_the_next_epoch():
     again = EpisodeSampler(0, 1, lambda _: published, order.state)
     rest = take(again, 1)
     assert sorted(s[:2] for s in first + rest) == [(0, 0), (0, 1)]
-    assert again.sampler_state.episodes == 1
+    assert again.state.episodes == 1
     assert sorted(s[:2] for s in take(again, 5)) == [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]
-    assert again.sampler_state == SamplerState(1, 5, 2)
+    assert again.state == SamplerState(1, 5, 2)
 
 
 def test_epochs_and_seeds_differ():

@@ -80,16 +80,11 @@ def test_training_and_rollout_see_the_same_surface(
 @pytest.mark.parametrize("experiment", ["gns", "gns_particles"])
 def test_experiments_name_the_papers_baselines(experiment: str) -> None:
     """The experiments compose to ten steps, R = 0.035, on the main data set."""
-    from hydra import compose, initialize_config_dir
-
     from hgn.config import TrainConfig, config_directory
+    from hgn.hydra_compat import compose
     from hgn.schema import from_mapping
 
-    with initialize_config_dir(str(config_directory()), version_base="1.3"):
-        from omegaconf import OmegaConf
-
-        mapping = OmegaConf.to_container(compose("train", [f"+experiment={experiment}", "run=runs/x"]), resolve=True)
-    assert isinstance(mapping, dict)
+    (mapping,) = compose(config_directory(), "train", ["train", f"+experiment={experiment}", "run=runs/x"])
     mapping.pop("name")
     config = from_mapping(TrainConfig, mapping)
     network = config.network

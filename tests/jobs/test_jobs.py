@@ -214,7 +214,7 @@ def test_slurm_trains(
     assert done.stdout.count("trained 4 of 4 updates") == 1
     checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert checkpoint["hgn"]["updates"] == 4
-    assert checkpoint["hgn"]["cursor"]["position"] == 8  # four updates with a scene on each of two tasks
+    assert checkpoint["hgn"]["sampler_state"]["position"] == 8  # four updates with a scene on each of two tasks
     assert not (tmp_path / "scontrol.log").exists()
 
 

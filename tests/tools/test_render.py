@@ -15,7 +15,7 @@ from hgn.data.lookup import find_episode
 from hgn.render.pictures import rollout_of_episode
 from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
 from hgn.schema import ConfigError
-from tools.render import RenderConfig, main
+from tools.render import main
 
 FRAMES = 9
 
@@ -155,12 +155,3 @@ def test_bad_input(tmp_path: Path, change: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         main(mapping)
     assert [entry.name for entry in tmp_path.iterdir()] == ["fall.vtkhdf"]
-
-
-def test_config_file_has_the_fields_of_the_dataclass() -> None:
-    """conf/command/render.yaml and RenderConfig name the same keys, with the same defaults."""
-    import yaml
-
-    root = Path(__file__).resolve().parents[2]
-    keys = yaml.safe_load((root / "conf" / "command" / "render.yaml").read_text())
-    assert keys | {"rollout": "file", "others": ()} == vars(RenderConfig(rollout="file", out="pictures"))
