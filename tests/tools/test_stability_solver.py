@@ -79,7 +79,7 @@ def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     ]  # fmt: skip
     assert rows[1].held and rows[2].held
     assert [row.predicted for row in rows[4:6]] == pytest.approx([1.24, 0.74])
-    assert rows[4].measured > rows[6].measured
+    assert rows[5].measured < rows[7].measured  # so few cells tell heights apart, not run-outs
 
 
 def test_height_is_taken_while_there_is_a_block() -> None:
