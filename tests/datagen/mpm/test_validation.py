@@ -183,7 +183,9 @@ def test_water_at_rest_keeps_its_level(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_sand_column_and_its_laws() -> None:
-    """Eight cells are too few for the run-out, but not for the order of the laws: Taichi Elements' cone runs out least, and Matsuoka and Nakai's sand less far than a cone that is weaker."""
+    """Eight cells are too few for the run-out, but not for the order of the laws: Taichi Elements' cone runs out least,
+    and Matsuoka and Nakai's sand less far than a cone that is weaker.
+    """
     config = MpmConfig(device="cpu")
     own, cone, theirs = (
         column_rows(1.0, law, angle, config, 8)
