@@ -3,7 +3,8 @@
 To add a material: its name at the end here (old episodes keep their indices), in `FLUIDS` if it is one; its colour in
 `hgn.render.renderer.MATERIAL_COLORS`; its law in `datagen.mpm.constitutive`, switched on by a bit of
 `datagen.mpm.layout.Variant` that `datagen.mpm.launch` sets where a scene has it; its parameters, if it has any, in
-`hgn.config.MpmConfig`, in `datagen.mpm.layout.law_of` and below. Data, networks, training and reports go by the index.
+`hgn.config.MpmConfig`, in `datagen.mpm.layout.constants` and below. Data, networks, training and reports go by
+the index.
 """
 
 from __future__ import annotations
