@@ -26,9 +26,9 @@ from hgn.command import run_command
 from hgn.schema import ConfigError, from_mapping, require, require_positive, to_mapping
 from hgn.system.files import write_json
 from hgn.system.provenance import provenance, without_folders
+from tools.bench.contenders import PASS
 
 EXIT_RED = 1
-PASS = "pass"
 SOURCES = ("hgn", "tools", "conf", "datagen", "pyproject.toml")  # of a commit
 WORK = ("case", "particles", "scenes", "precision")  # what is the same work in two trees
 

@@ -48,6 +48,7 @@ from datagen.mpm.mls_mpm import (
     interpolate_hidden,
     mark,
     move,
+    node_place,
     node_places,
     node_velocity,
     planar,
@@ -118,9 +119,7 @@ def _first_node(scene: ti.i32, shape: ti.template()):
 @ti.func
 def _cell(x, scene: ti.i32, setting: ti.template(), shape: ti.template()):
     """Where the cell of a particle lies in the arrays of nodes: at its base node."""
-    base = base_node(x, setting[SETTING.inverse_cell_size])
-    index_x, index_y, index_z = node_places(base, scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, shape, 1)
-    return index_x[0] + index_y[0] + index_z[0]
+    return node_place(base_node(x, setting[SETTING.inverse_cell_size]), scene, shape)
 
 
 @ti.func

@@ -34,7 +34,8 @@ CASES = ("steps", "stiffness", "impact", "convergence", "contact", "leak", "long
 class StabilitySolverConfig:
     """`python -m tools.stability solver`: what is tried."""
 
-    cases: tuple[str, ...] | None = None  # steps, stiffness, impact, convergence, leak, long, validation; null: all
+    # steps, stiffness, impact, convergence, contact, leak, long, validation, grid; null: all
+    cases: tuple[str, ...] | None = None
     device: str = "auto"  # or cpu, gpu
     leak_seconds: float = 5.0  # simulated, for each row of the table of leaks
     leak_block_cells: float = 4.0  # side of the blocks that hit the obstacles, eight particles a cell

@@ -14,6 +14,7 @@ from hgn.config import MpmConfig
 from hgn.scene.material import SNOW, WATER
 from hgn.scene.scene import Scene
 from tools.stability import solver_validation
+from tools.stability.row import Row
 from tools.stability.solver_validation import column_rows, edge, repose, rest
 
 CELL = 1 / 16
@@ -182,7 +183,14 @@ def test_water_at_rest_keeps_its_level(monkeypatch: pytest.MonkeyPatch) -> None:
     assert row.measured < -0.01
 
 
-def test_sand_column_and_its_laws() -> None:
+@pytest.fixture(scope="module")
+def low_column() -> tuple[Row, Row]:
+    """Run-out and height of a column half as high as wide, eight cells in radius."""
+    run_out, height = column_rows(0.5, "matsuoka_nakai", 31.0, MpmConfig(device="cpu"), 8)
+    return run_out, height
+
+
+def test_sand_column_and_its_laws(low_column: tuple[Row, Row]) -> None:
     """Eight cells are too few for the run-out, but not for the order of the laws: Taichi Elements' cone runs out least,
     and Matsuoka and Nakai's sand less far than a cone that is weaker.
     """
@@ -192,7 +200,7 @@ def test_sand_column_and_its_laws() -> None:
         for law, angle in (("matsuoka_nakai", 31.0), ("plane_strain", 31.0), ("compression", 45.0))
     )
     assert theirs[0].measured < own[0].measured < cone[0].measured
-    low, _ = column_rows(0.5, "matsuoka_nakai", 31.0, config, 8)
+    low, _ = low_column
     assert low.measured < low.predicted
     assert "walls" not in low.beyond
 
@@ -201,9 +209,9 @@ ROUGH_FLOOR = "sheets as rough floors hold sand lower since nodes near them have
 
 
 @pytest.mark.xfail(reason=ROUGH_FLOOR, strict=True)
-def test_height_of_a_low_column() -> None:
+def test_height_of_a_low_column(low_column: tuple[Row, Row]) -> None:
     """Eight cells are enough for the height of a low column."""
-    _, height = column_rows(0.5, "matsuoka_nakai", 31.0, MpmConfig(device="cpu"), 8)
+    _, height = low_column
     assert height.held
 
 
