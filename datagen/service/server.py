@@ -214,6 +214,7 @@ def _progress(manifest: Manifest, pool: PoolState) -> dict[str, object]:
             "frames": pool.frames,
             "running": [{"frame": frame, "scenes": scenes} for frame, scenes in pool.running.values()],
             "error": pool.error,
+            "log_error": pool.log_error,
         },
     }
 

@@ -1,7 +1,8 @@
 """The pool as a process of its own, kept alive by the service: whatever becomes of it, what is published is served.
 
 A pool that dies, or ends for want of disk space, is started again after a pause that grows while no episode gets
-finished. One whose configuration is at fault is not: the service says so and goes on serving.
+finished. One whose configuration is at fault is not: the service says so and goes on serving. A log that cannot be
+written ends nothing; a fault of the supervisor itself ends the service.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ class PoolState:
     frames: int = 0  # of an episode
     running: dict[int, tuple[int, int]] = field(default_factory=dict)  # worker -> frame reached, scenes at once
     error: str = ""  # the last one
+    log_error: str = ""  # why the last line of the log could not be written
 
 
 class Supervisor:
@@ -46,7 +48,7 @@ class Supervisor:
     def __init__(self, config: DatagenConfig, progress: Progress, backend: Backend | None = None) -> None:
         self._config, self._progress, self._backend = config, progress, backend
         self.state = PoolState()  # replaced as a whole, so that other threads may read it at any time
-        self.unusable: str | None = None  # why the generator could not even begin
+        self.unusable: str | None = None  # why the service has to end
         self.on_unusable = lambda: None
         self._stopping = threading.Event()
         self._process: multiprocessing.process.BaseProcess | None = None
@@ -64,6 +66,17 @@ class Supervisor:
         self._thread.join()
 
     def _run(self) -> None:
+        try:
+            self._supervise()
+        except Exception as error:  # noqa: BLE001 - not swallowed: the service ends with it
+            self._set(status="failed", error=repr(error), running={})
+            self._give_up(f"the pool's supervisor failed: {error!r}")
+
+    def _give_up(self, text: str) -> None:
+        self.unusable = text
+        self.on_unusable()
+
+    def _supervise(self) -> None:
         pause = _FIRST_PAUSE_S
         while not self._stopping.is_set():
             before = self.state.done
@@ -76,13 +89,12 @@ class Supervisor:
             self._set(status="waiting", error=text, running={})
             if outcome == "config_error":
                 self._set(status="failed")
-                self._progress.message(f"error: {text}")
+                self._say("message", f"error: {text}")
                 if not self.state.total:
-                    self.unusable = text
-                    self.on_unusable()
+                    self._give_up(text)
                 return
             pause = _FIRST_PAUSE_S if self.state.done != before else min(2 * pause, _LONGEST_PAUSE_S)
-            self._progress.message(f"the pool ended ({text}); it is started again in {pause:.0f} s")
+            self._say("message", f"the pool ended ({text}); it is started again in {pause:.0f} s")
             self._stopping.wait(pause)
         self._set(status="stopped", running={})
 
@@ -132,7 +144,16 @@ class Supervisor:
             self._set(done=state.done + 1)
         elif kind == "found":
             self._set(done=state.done + values[0])
-        getattr(self._progress, kind)(*values)
+        self._say(kind, *values)
+
+    def _say(self, kind: str, *values: Any) -> None:
+        try:
+            getattr(self._progress, kind)(*values)
+        except OSError as error:  # whoever read the log has gone, or its disk is full
+            self._set(log_error=str(error))
+        else:
+            if self.state.log_error:
+                self._set(log_error="")
 
     def _set(self, **values: Any) -> None:
         self.state = replace(self.state, **values)

@@ -250,6 +250,28 @@ def test_stopping_ends_the_pool_in_order(make_config: MakeConfig, backend: Backe
     assert "run the same command to go on" in recorder.messages[-1]
 
 
+@pytest.mark.parametrize("error", [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space left"), KeyError("fault")])
+def test_log_that_nobody_reads(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    """Whoever reads the log may leave, and its disk may be full: generation goes on. A fault of ours ends the service,
+    and what is said of the generator is true."""
+
+    class Log(Progress):
+        def message(self, text: str) -> None:
+            raise error
+
+    outcomes = iter([("died", "SIGKILL"), ("complete", "")])
+    monkeypatch.setattr(Supervisor, "_run_once", lambda self: next(outcomes))
+    ended: list[str] = []
+    supervisor = Supervisor(make_config(), Log())
+    supervisor.on_unusable = lambda: ended.append(supervisor.unusable or "")
+    with supervisor:
+        supervisor._thread.join()
+    if isinstance(error, OSError):
+        assert supervisor.state.status == "complete" and not ended and error.strerror in supervisor.state.log_error
+    else:
+        assert supervisor.state.status == "failed" and ended == ["the pool's supervisor failed: KeyError('fault')"]
+
+
 def run_service(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setattr(sys, "argv", ["service", *arguments])
     with pytest.raises(SystemExit) as exit_:
