@@ -7,7 +7,7 @@ of threads at work. On a GPU all particles scatter at once into one copy with at
 
 import taichi as ti
 
-from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, COUNT, SETTING, SHAPE, STATUS, VALUE, VARIANT, has_solid
 from datagen.mpm.mls_mpm import (
     Integers,
     Matrices,
@@ -68,7 +68,7 @@ def _particle_to_grid(
     if ti.static(bool(variant & VARIANT.several_laws)):
         row = law_row[p]
     F = ti.Matrix.identity(ti.f32, 3)
-    if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
+    if ti.static(has_solid(variant)):
         if ti.static(not variant & VARIANT.water) or not is_fluid(material):
             F = deformation[p]
     begins = scene_value[scene, VALUE.begins]
@@ -96,7 +96,7 @@ def _particle_to_grid(
     if scene_value[scene, VALUE.interval_remaining] > 0.0:
         affine[p] = new_stretch
     volume[p] = new_volume
-    if ti.static(bool(variant & (VARIANT.sand | VARIANT.snow))):
+    if ti.static(has_solid(variant)):
         if ti.static(not variant & VARIANT.water) or not is_fluid(material):
             deformation[p] = new_F
     raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)

@@ -9,8 +9,7 @@ import numpy as np
 
 from datagen.mpm.device import Device
 from datagen.mpm.launch import Launch, device_array, device_vectors
-from datagen.mpm.layout import COUNT, STATUS, VALUE, VARIANT
-from hgn.scene.material import SAND, SNOW
+from datagen.mpm.layout import COUNT, STATUS, VALUE, VARIANT, has_solid
 
 import taichi as ti  # isort: skip
 
@@ -31,8 +30,7 @@ class GridLaunch(Launch):
         self.position = device_vectors(np.concatenate([scene.position_N3 for scene in self.scenes]))
         self.velocity = device_vectors(np.concatenate([scene.velocity_N3 for scene in self.scenes]))
         self.affine = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)
-        solid = self.present[SAND] or self.present[SNOW]
-        self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, self.particles if solid else 1)
+        self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, self.particles if has_solid(self.variant) else 1)
         self.volume = ti.ndarray(ti.f32, self.particles)
         self.block = device_array(np.zeros(3 * self.all_blocks + 2, np.int32))
         grid_kernel.start(

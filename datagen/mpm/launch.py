@@ -20,6 +20,7 @@ from datagen.mpm.layout import (
     BLOCK_NODES,
     CONSTANT,
     COUNT,
+    MATERIAL_VARIANTS,
     REPORTED,
     SETTING,
     SHAPE,
@@ -29,7 +30,7 @@ from datagen.mpm.layout import (
     constants,
 )
 from hgn.config import MpmConfig
-from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS, SAND, SNOW, WATER
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
@@ -161,13 +162,10 @@ class Launch(ABC):
             [(index << MATERIAL_BITS) + np.asarray(scene.material_N, np.int32) for index, scene in enumerate(scenes)]
         )
         laws, row = material_laws(scenes, config)
-        self.present = [bool((label & MATERIAL_MASK == kind).any()) for kind in (WATER, SAND, SNOW)]
         has_contact = any(len(collider.node_K3) for collider in colliders)
         has_sweep = config.collider_projection and any(len(collider.sweep.base_K3) for collider in colliders)
         self.variant = (
-            VARIANT.water * self.present[WATER]
-            + VARIANT.sand * self.present[SAND]
-            + VARIANT.snow * self.present[SNOW]
+            sum(MATERIAL_VARIANTS[material] for material in np.unique(label & MATERIAL_MASK))
             + VARIANT.contact * has_contact
             + VARIANT.sweep * has_sweep
             + VARIANT.sheets * (self.ghosts > 0)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hgn.config import MpmConfig
+from hgn.scene.material import FLUIDS, MATERIALS
 
 BLOCK = 4  # nodes along the side of a block of the grid
 BLOCK_NODES = BLOCK**3
@@ -172,6 +173,13 @@ class Live(NamedTuple):
 CONSTANT, COUNT, VALUE, STATUS = Constant(), Count(), SceneValue(), Status()
 SETTING, SHAPE, VARIANT = Setting(), Shape(), Variant()
 FIELD, TAG, LIVE = Field(), Tag(), Live()
+MATERIAL_VARIANTS: tuple[int, ...] = tuple(getattr(VARIANT, name) for name in MATERIALS)
+SOLID_VARIANTS = sum(bit for material, bit in enumerate(MATERIAL_VARIANTS) if material not in FLUIDS)
+
+
+def has_solid(variant: int) -> bool:
+    """Whether a kernel of this variant, of `Variant`'s bits, has particles with a deformation gradient."""
+    return variant & SOLID_VARIANTS != 0
 
 
 def lame_parameters(config: MpmConfig) -> tuple[float, float]:

@@ -34,6 +34,7 @@ from datagen.mpm.layout import (
     STATUS,
     VALUE,
     VARIANT,
+    has_solid,
 )
 from datagen.mpm.surface_kernel import NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
@@ -263,7 +264,7 @@ def respond(
     (both as they were for water) and volume; and its present (3 lambda + 2 mu) / density.
     """
     has_water = ti.static(bool(variant & VARIANT.water))
-    has_solid = ti.static(bool(variant & (VARIANT.sand | VARIANT.snow)))
+    solids = ti.static(has_solid(variant))
     inverse_dx = setting[SETTING.inverse_cell_size]
     density = law[row + CONSTANT.density]
     scale = -step * 4.0 * inverse_dx * inverse_dx / density  # V0 / mass = 1 / density
@@ -273,7 +274,7 @@ def respond(
     new_volume = volume
     stiffness = 0.0
     if ti.static(has_water):
-        if ti.static(not has_solid) or is_fluid(material):
+        if ti.static(not solids) or is_fluid(material):
             expansion = step * C.trace()
             if ti.static(bool(variant & VARIANT.taichi_elements_water)):
                 expansion = (ti.Matrix.identity(ti.f32, 3) + step * C).determinant() - 1.0
@@ -291,7 +292,7 @@ def respond(
                 stiffness = rough * rough
             for i in ti.static(range(3)):
                 A[i, i] += scale * pressure
-    if ti.static(has_solid):
+    if ti.static(solids):
         if ti.static(not has_water) or not is_fluid(material):
             rate = 0.5 * (C + C.transpose())
             new_stretch = stretch + step * rate

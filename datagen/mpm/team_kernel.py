@@ -34,6 +34,7 @@ from datagen.mpm.layout import (
     TAG,
     VALUE,
     VARIANT,
+    has_solid,
 )
 from datagen.mpm.mls_mpm import (
     Integers,
@@ -181,7 +182,7 @@ def _strain_and_sort(
     """The materials' answer of each particle (left in place of C), and in the first step of an interval its rank among
     the particles of its cell.
     """
-    solid = ti.static(bool(variant & (VARIANT.sand | VARIANT.snow)))
+    solid = ti.static(has_solid(variant))
     begins = scene_value[scene, VALUE.begins]
     velocities = _first_node(scene, shape) + VELOCITY * BLOCK_NODES
     largest = 0.0
@@ -441,7 +442,7 @@ def advance(
     """
     ti.loop_config(block_dim=threads)
     for thread in range(turn.shape[0] * threads):
-        fields = ti.static(FIELD.solid if variant & (VARIANT.sand | VARIANT.snow) else FIELD.fluid)
+        fields = ti.static(FIELD.solid if has_solid(variant) else FIELD.fluid)
         scene = turn[thread // threads]
         lane = thread % threads
         first = shape[SHAPE.part_begin + scene]

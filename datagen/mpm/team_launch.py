@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from datagen.mpm.launch import Launch, device_array
-from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, TAG
-from hgn.scene.material import SAND, SNOW
+from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, TAG, has_solid
 
 import taichi as ti  # isort: skip
 
@@ -30,7 +29,7 @@ class TeamLaunch(Launch):
     def __init__(self, threads: int, *batch: Any) -> None:
         super().__init__(*batch)
         self.threads = threads
-        fields = FIELD.solid if self.present[SAND] or self.present[SNOW] else FIELD.fluid
+        fields = FIELD.solid if has_solid(self.variant) else FIELD.fluid
         self.state = ti.ndarray(ti.f32, 2 * fields * self.particles)
         tag = np.zeros((2, TAG.length, self.particles), np.int32)
         tag[0, TAG.origin] = np.concatenate([np.arange(scene.particle_count) for scene in self.scenes])

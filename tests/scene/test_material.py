@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datagen.mpm.layout import MATERIAL_VARIANTS, VARIANT, has_solid
 from hgn.render.renderer import MATERIAL_COLORS
 from hgn.scene.material import FLUIDS, MATERIAL_BITS, MATERIAL_MASK, MATERIALS
 
@@ -17,3 +18,10 @@ def test_labels_keep_scene_and_material() -> None:
 
 def test_each_material_has_its_look() -> None:
     assert len(MATERIAL_COLORS) == len(MATERIALS) and set(FLUIDS) <= set(range(len(MATERIALS)))
+
+
+def test_what_is_no_fluid_is_a_solid() -> None:
+    """A kernel keeps deformation gradients if it is compiled for a material outside of FLUIDS, whatever else it has."""
+    other = VARIANT.contact | VARIANT.sweep | VARIANT.several_laws
+    for material, bit in enumerate(MATERIAL_VARIANTS):
+        assert bit.bit_count() == 1 and has_solid(bit | other) == (material not in FLUIDS)
