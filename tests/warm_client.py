@@ -21,6 +21,7 @@ def main(path: str, arguments: list[str]) -> None:
     server.connect(path)
     environment = dict(os.environ, WARM_PARENT=str(os.getppid()))
     request = {"arguments": arguments, "cwd": os.getcwd(), "environment": environment}  # noqa: PTH109 - loads slowly
+    request["network"] = f"/proc/{os.getpid()}/ns/net"
     data = json.dumps(request).encode() + b"\n"
     sent = socket.send_fds(server, [data], [0, 1, 2])
     server.sendall(data[sent:])

@@ -2,12 +2,13 @@
 
 Loading PyTorch and Lightning takes seconds, and the tests start dozens of trainings. `python warm_server.py SOCKET`
 loads them once and forks, before any thread or device exists, for each request of warm_client.py, which stands in for
-the interpreter: same arguments, folder, environment, standard streams, signals and exit status.
+the interpreter: same arguments, folder, environment, network, standard streams, signals and exit status.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import random
@@ -16,6 +17,7 @@ import selectors
 import signal
 import socket
 import sys
+from pathlib import Path
 from typing import Any
 
 PRELOADED = (
@@ -79,12 +81,21 @@ def serve(path: str) -> dict[str, Any]:
                 selector.unregister(key.fileobj)
 
 
+def enter_network(path: str) -> None:
+    """Of the process whose network namespace is at that path."""
+    if not Path(path).samefile("/proc/self/ns/net"):
+        with Path(path).open() as namespace:
+            if ctypes.CDLL(None, use_errno=True).setns(namespace.fileno(), 0):
+                raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), path)
+
+
 def run(request: dict[str, Any]) -> None:
     """What the interpreter does with its arguments."""
     for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     random.seed()
+    enter_network(request["network"])
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["environment"])

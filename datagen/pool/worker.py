@@ -36,6 +36,7 @@ from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
+from hgn.system.extras import missing_extra
 from hgn.system.processes import die_with_parent
 
 _FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
@@ -198,6 +199,8 @@ def error_message(error: Exception) -> tuple[Any, ...]:
     """What a worker tells the pool of a fault that no scene is to blame for."""
     if isinstance(error, ConfigError):
         return "config_error", str(error)
+    if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error)):
+        return "config_error", missing
     if isinstance(error, OSError):
         return "os_error", error.errno, error.strerror, None if error.filename is None else str(error.filename)
     return "error", "".join(traceback.format_exception(error))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 
 # as pyproject.toml lists them
 EXTRA_OF = {
@@ -26,6 +27,8 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
     package = (error.name or "").split(".")[0]
     if package not in EXTRA_OF:
         return None
+    if package == "taichi" and sys.version_info >= (3, 13):
+        return "this needs taichi, which is published for Python 3.11 and 3.12 alone; use one of them"
     return f"this needs {package}, which is not installed; pip install 'hgn[{EXTRA_OF[package]}]'"
 
 

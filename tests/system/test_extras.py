@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from datagen.pool.worker import error_message
 from hgn.system.extras import EXTRA_OF, missing_extra
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,6 +29,16 @@ def test_each_package_is_in_the_extra_that_is_named() -> None:
 def test_a_package_of_no_extra_is_no_such_error() -> None:
     """A module that is missing for another reason is a fault, not a missing extra."""
     assert missing_extra(ModuleNotFoundError(name="hgn.nothing")) is None
+    assert error_message(ModuleNotFoundError(name="hgn.nothing"))[0] == "error"
+
+
+def test_a_worker_names_the_extra_that_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Generating without the solver's package ends in one line too; where there is none, it says for which Pythons."""
+    error = ModuleNotFoundError(name="taichi.lang")
+    told = "this needs taichi, which is not installed; pip install 'hgn[datagen]'"
+    assert error_message(error) == ("config_error", told)
+    monkeypatch.setattr("sys.version_info", (3, 13))
+    assert "published for Python 3.11 and 3.12 alone" in error_message(error)[1]
 
 
 HIDE = """

@@ -9,7 +9,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -43,15 +42,15 @@ def free_port() -> int:
 
 
 def torchrun(
-    folder: Path, *options: str, python: str = sys.executable, prefix: Sequence[str] = (), **variables: str
+    folder: Path, *options: str, python: Path, prefix: Sequence[str] = (), **variables: str
 ) -> subprocess.Popen[str]:
     """Starts torchrun on ddp_program.py, CPU processes that talk through gloo."""
     return subprocess.Popen(
-        [*prefix, python, "-m", "torch.distributed.run", *options, str(PROGRAM), str(folder)],
+        [*prefix, str(python), "-m", "torch.distributed.run", *options, str(PROGRAM), str(folder)],
         cwd=folder,
         env=os.environ
         | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1"}
-        | {"PYTHON_EXEC": python}
+        | {"PYTHON_EXEC": str(python)}
         | variables,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -143,7 +142,7 @@ def test_two_ranks_train_as_one(reference: Reference, warm_python: Path, tmp_pat
     are bitwise the same. A training goes on from there on one rank, where it left the order."""
     one_machine = ("--nnodes", "1", "--nproc-per-node", "2", "--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0")
     cut = reference.folder(tmp_path / "cut", [(0, 1, 13, signal.SIGTERM, "self")])
-    assert "exitcode  : 143" in output(torchrun(cut, *one_machine, python=str(warm_python)))
+    assert "exitcode  : 143" in output(torchrun(cut, *one_machine, python=warm_python))
     weights = reference.check(cut, 128 + signal.SIGTERM)
     assert (cut / "starts_0").read_text() == "0\n"
     assert len(list((cut / "run" / "tensorboard").glob("events.*"))) == 1
@@ -152,7 +151,7 @@ def test_two_ranks_train_as_one(reference: Reference, warm_python: Path, tmp_pat
 
     signals = [(0, 1, 13, signal.SIGKILL, "self"), (1, 0, 16, signal.SIGTERM, "launcher")]
     killed = reference.folder(tmp_path / "killed", signals)
-    process = torchrun(killed, *one_machine, "--max-restarts", "1", python=str(warm_python))
+    process = torchrun(killed, *one_machine, "--max-restarts", "1", python=warm_python)
     text = output(process)
     assert process.returncode != 0 and "signal" in text.lower()
     assert (killed / "starts_1").read_text() == "0\n10\n", text  # a checkpoint at every fifth update
@@ -198,7 +197,9 @@ def two_machines() -> Iterator[tuple[str, str, str]]:
             subprocess.run(["ip", "netns", "del", name], capture_output=True)
 
 
-def test_two_machines_train_as_one(reference: Reference, two_machines: tuple[str, str, str], tmp_path: Path) -> None:
+def test_two_machines_train_as_one(
+    reference: Reference, two_machines: tuple[str, str, str], warm_python: Path, tmp_path: Path
+) -> None:
     """Two machines (network namespaces) under torchrun have the gradients of one process and equal weights after 20
     updates; SIGUSR1 to one rank of one machine ends both, with a checkpoint."""
     folder = reference.folder(tmp_path / "two", [(0, 1, 11, signal.SIGUSR1, "self")])
@@ -209,6 +210,7 @@ def test_two_machines_train_as_one(reference: Reference, two_machines: tuple[str
             *("--nnodes", "2", "--nproc-per-node", "1", "--rdzv-backend", "c10d", "--rdzv-id", "two"),
             *("--rdzv-endpoint", f"{address}:29500", "--rdzv-conf", f"is_host={int(number == 0)}"),
             *("--local-addr", f"10.213.7.{number + 1}"),
+            python=warm_python,
             prefix=("ip", "netns", "exec", machine),
             GLOO_SOCKET_IFNAME="cable",
         )
