@@ -71,6 +71,12 @@ class SceneConfig:
     # of the groups, that begin with a velocity where maximum_initial_speed is above 0
     moving_group_fraction: float = 1.0
     lone_particles: int = 0  # far from all others; else a network learns that what is alone lies on the floor
+    # of the groups that begin with a velocity, those whose is exactly along gravity or against it, or across it
+    pure_direction_fraction: float = 0.0
+    colliding_scene_fraction: float = 0.0  # of the scenes: no obstacles, and the groups are thrown at each other
+    zero_gravity_fraction: float = 0.0  # of the scenes
+    tilted_gravity_fraction: float = 0.0  # of the scenes, with gravity of any direction and …
+    maximum_tilted_gravity: float = 19.6  # … any size up to this, domain units per second squared
 
     def __post_init__(self) -> None:
         for axis, length in zip("xyz", self.domain_size, strict=True):
@@ -79,8 +85,15 @@ class SceneConfig:
             require(math.isfinite(value), f"gravity ({axis})", "finite", value)
         require_positive(self, "cell_size", "group_size", "particles_per_cell")
         require_non_negative(self, "obstacle_count", "group_count", "clearance_cells", "maximum_initial_speed")
-        require_non_negative(self, "lone_particles")
-        require_fraction(self, "moving_group_fraction")
+        require_non_negative(self, "lone_particles", "maximum_tilted_gravity")
+        require_fraction(self, "moving_group_fraction", "pure_direction_fraction", "colliding_scene_fraction")
+        require_fraction(self, "zero_gravity_fraction", "tilted_gravity_fraction")
+        other = self.zero_gravity_fraction + self.tilted_gravity_fraction
+        rule = f"at most 1 - zero_gravity_fraction ({self.zero_gravity_fraction:g})"
+        require(other <= 1, "tilted_gravity_fraction", rule, self.tilted_gravity_fraction)
+        for name in ("pure_direction_fraction", "colliding_scene_fraction"):
+            moving = self.maximum_initial_speed > 0 or getattr(self, name) == 0
+            require(moving, "maximum_initial_speed", f"above 0 where {name} is", self.maximum_initial_speed)
         low, high = self.obstacle_size
         require(0 < low <= high < math.inf, "obstacle_size", "0 < smallest <= largest", list(self.obstacle_size))
         for i, name in enumerate(self.materials):
@@ -194,6 +207,11 @@ class MpmConfig:
             require(self.scenes_per_launch >= 1, "scenes_per_launch", "at least 1", self.scenes_per_launch)
 
 
+def _spread(number: int, fraction: float) -> bool:
+    """Whether the item of this number, from 1, is among a fraction of all, as evenly spread as can be."""
+    return math.floor(number * fraction + 1e-9) > math.floor((number - 1) * fraction + 1e-9)
+
+
 @dataclass(frozen=True)
 class DatasetConfig:
     """How many episodes, how long, where they are kept, and who makes them."""
@@ -203,6 +221,8 @@ class DatasetConfig:
     validation_scenes: int = 5
     test_scenes: int = 20
     frames: int = 300  # frame 0 is the initial state
+    long_fraction: float = 0.0  # of the episodes of each split, evenly spread, that have long_frames
+    long_frames: int = 300
     frame_rate_hz: float = 60.0
     seed: int = 0
     # true: a GPU begins with few scenes, which takes longer in all; training and the service set it
@@ -220,7 +240,9 @@ class DatasetConfig:
     def __post_init__(self) -> None:
         require_positive(self, "frame_rate_hz", "episodes_per_shard", "maximum_attempts")
         require_non_negative(self, "training_scenes", "validation_scenes", "test_scenes", "seed")
-        require(self.frames >= 2, "frames", "at least 2", self.frames)
+        for name in ("frames", "long_frames"):
+            require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
+        require_fraction(self, "long_fraction")
         require(self.folder != "", "folder", "a folder name", self.folder)
         if self.workers is not None:
             require(self.workers >= 1, "workers", "at least 1", self.workers)
@@ -231,6 +253,15 @@ class DatasetConfig:
         if task is not None and tasks is not None:
             require(tasks >= 1, "array_tasks", "at least 1", tasks)
             require(0 <= task < tasks, "array_task", f"0 to {tasks - 1}, below array_tasks", task)
+
+    @property
+    def most_frames(self) -> int:
+        """Of the longest episode."""
+        return max(self.frames, self.long_frames) if self.long_fraction > 0 else self.frames
+
+    def frames_of(self, index: int) -> int:
+        """Of an episode by its index within its split."""
+        return self.long_frames if _spread(index + 1, self.long_fraction) else self.frames
 
     def scenes(self, split: str) -> int:
         return {"train": self.training_scenes, "validation": self.validation_scenes, "test": self.test_scenes}[split]

@@ -78,7 +78,7 @@ def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
     scene = config.scene
     nodes = math.prod(math.ceil(length / scene.cell_size) for length in scene.domain_size)
     particles = scene.group_count * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
-    held = memory_bytes / 2 / (12 * config.dataset.frames * max(particles, 1))
+    held = memory_bytes / 2 / (12 * config.dataset.most_frames * max(particles, 1))
     return max(1, int(min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes, held)))
 
 

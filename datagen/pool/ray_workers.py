@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-import pkgutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,16 @@ from typing import Any
 from datagen.pool.plan import SceneTask
 from datagen.pool.pool import MAXIMUM_MAKERS, WorkerPlan, gpu_first_launch, gpu_scenes_per_launch
 from datagen.pool.shard import pack_episode, stage_parts
-from datagen.pool.worker import Backend, MadeScene, Worker, error_message, failure_of, make_episode, make_scene
+from datagen.pool.worker import (
+    Backend,
+    MadeScene,
+    Worker,
+    error_message,
+    failure_of,
+    make_episode,
+    make_scene,
+    simulate_batch,
+)
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.schema import ConfigError
@@ -179,16 +187,8 @@ class _Solver:
         return answers if len(answers) > 1 else answers[0]
 
     def _simulate(self, batch: list[MadeScene]) -> list[tuple[Any, ...]]:
-        dataset = self._config.dataset
         config_hash = identity_hash(dataset_identity(self._config))
-        results = pkgutil.resolve_name(self._backend.simulate)(
-            [made.scene for made in batch],
-            self._config.mpm,
-            dataset.frames,
-            dataset.frame_rate_hz,
-            cpu_threads=self._threads,
-            colliders=[made.collider for made in batch],
-        )
+        results = simulate_batch(batch, self._config, self._backend, self._threads)
         answers: list[tuple[Any, ...]] = []
         for made, result in zip(batch, results, strict=True):
             cause = failure_of(result)

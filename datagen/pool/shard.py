@@ -130,10 +130,10 @@ def inspect_shard(path: Path, shard: ShardRange, config: DatagenConfig) -> Shard
     entries, statistics = [], []
     for index, (key, members) in zip(shard.indices, located.items(), strict=True):
         episode, attempt = _read_own_episode(path, content, key, members, config)
-        seed = scene_seed(config.dataset.seed, shard.split, index, attempt)
-        if episode.seed != seed or episode.frame_count != config.dataset.frames:
+        seed, frames = scene_seed(config.dataset.seed, shard.split, index, attempt), config.dataset.frames_of(index)
+        if episode.seed != seed or episode.frame_count != frames:
             raise ConfigError(
-                f"{path}: {key} must have seed {seed} and {config.dataset.frames} frames, got {episode.seed} "
+                f"{path}: {key} must have seed {seed} and {frames} frames, got {episode.seed} "
                 f"and {episode.frame_count}; delete it and run the generator again"
             )
         entries.append(EpisodeEntry(key, index, seed, attempt, episode.particle_count, episode.frame_count, members))

@@ -302,8 +302,6 @@ def _solve(
 ) -> None:
     if gpu is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpu
-    simulate = pkgutil.resolve_name(backend.simulate)
-    dataset = config.dataset
     config_hash = identity_hash(dataset_identity(config))
     inbox = _Inbox(connection)
     on_gpu = threads is None
@@ -315,15 +313,7 @@ def _solve(
         for batch in inbox.batches():
             if on_gpu:  # the next may come already
                 send("idle")
-            results = simulate(
-                [made.scene for made in batch],
-                config.mpm,
-                dataset.frames,
-                dataset.frame_rate_hz,
-                on_frame=_frame_reporter(send, len(batch)),
-                cpu_threads=threads,
-                colliders=[made.collider for made in batch],
-            )
+            results = simulate_batch(batch, config, backend, threads, lambda count: _frame_reporter(send, count))
             for future in staging:
                 future.result()
             staging = [
@@ -333,6 +323,33 @@ def _solve(
             send("frame", 0, 0)
             if not on_gpu:
                 send("idle")
+
+
+def simulate_batch(
+    batch: list[MadeScene],
+    config: DatagenConfig,
+    backend: Backend,
+    threads: int | None,
+    reporter: Callable[[int], Callable[[int], None]] | None = None,
+) -> list[Any]:
+    """What the solver returns for each scene, by one launch for each length of episodes; `reporter` makes of a launch's
+    scene count what is called with each of its frames.
+    """
+    simulate, lengths = pkgutil.resolve_name(backend.simulate), [config.dataset.frames_of(m.task.index) for m in batch]
+    results: dict[SceneTask, Any] = {}
+    for frames in sorted(set(lengths)):
+        launch = [made for made, length in zip(batch, lengths, strict=True) if length == frames]
+        found = simulate(
+            [made.scene for made in launch],
+            config.mpm,
+            frames,
+            config.dataset.frame_rate_hz,
+            on_frame=reporter and reporter(len(launch)),
+            cpu_threads=threads,
+            colliders=[made.collider for made in launch],
+        )
+        results |= zip((made.task for made in launch), found, strict=True)
+    return [results[made.task] for made in batch]
 
 
 def _stage(send: _Sender, config: DatagenConfig, config_hash: str, inbox: _Inbox, made: MadeScene, result: Any) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hgn.config import DatagenConfig, is_mesh_file
+from hgn.config import DatagenConfig, SceneConfig, is_mesh_file
 from hgn.renamed import stored_names
 from hgn.scene.episode import SCHEMA_VERSION
 from hgn.scene.shapes import mesh_sha256
@@ -20,6 +20,11 @@ from hgn.schema import ConfigError, to_mapping
 
 # of the solver's settings: where and how many at once, which no trajectory depends on beyond rounding
 _NOT_PHYSICS = ("device", "scenes_per_launch")
+# of scenes, younger than some data sets: where they are at their defaults the data set is as it was without them
+_LATER_OPTIONS = (
+    "pure_direction_fraction", "colliding_scene_fraction", "zero_gravity_fraction", "tilted_gravity_fraction",
+    "maximum_tilted_gravity",
+)  # fmt: skip
 
 
 def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
@@ -31,11 +36,18 @@ def dataset_identity(config: DatagenConfig) -> dict[str, Any]:
     """
     shapes = config.scene.obstacle_shapes
     named = [f"{Path(shape).name} {mesh_sha256(shape)}" if is_mesh_file(shape) else shape for shape in shapes]
+    scene = stored_names(to_mapping(config.scene), "scene")
+    for option in _LATER_OPTIONS:
+        if scene[option] == getattr(SceneConfig, option):
+            del scene[option]
+    lengths: dict[str, float] = {"frames": config.dataset.frames}
+    if config.dataset.long_fraction > 0:
+        lengths |= {"long_fraction": config.dataset.long_fraction, "long_frames": config.dataset.long_frames}
     return {
         "schema_version": SCHEMA_VERSION,
-        "scene": stored_names(to_mapping(config.scene), "scene") | {"obstacle_shapes": named},
+        "scene": scene | {"obstacle_shapes": named},
         "mpm": physics_settings(config),
-        "frames": config.dataset.frames,
+        **lengths,
         "frame_rate_hz": config.dataset.frame_rate_hz,
         "seed": config.dataset.seed,
     }

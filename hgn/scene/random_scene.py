@@ -8,7 +8,7 @@ sines and cosines (in the unit shapes) are rounded to float32.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,8 @@ from hgn.schema import ConfigError, require
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
+
+Vector = tuple[float, float, float]
 
 REPORT_SEED = 1_000_000  # the first of scenes that reports draw for themselves: a data set's seeds are hashes
 LAYOUTS = 5  # whole scenes begun afresh before giving up
@@ -56,6 +58,7 @@ class _NoRoomError(Exception):
 
 def generate_scene(config: SceneConfig, seed: int) -> Scene:
     """A random scene with particles at rest, or with one velocity per group; a lone particle is a group of size 0.
+    Its gravity is the config's, none, or a drawn one.
 
     Obstacles lie completely inside the domain, `clearance_cells` solver cells from each other and none inside
     another; groups keep the same distance to obstacles, to each other and to the solver's walls. Items are
@@ -66,7 +69,12 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     """
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number >= 0", seed)
     rng = np.random.Generator(np.random.PCG64(seed))
-    lone_rng = np.random.Generator(np.random.PCG64([seed, 1]))  # the rest of a scene is the same without them
+    # the rest of a scene is the same without them
+    lone_rng, motion_rng = (np.random.Generator(np.random.PCG64([seed, stream])) for stream in (1, 2))
+    gravity = _draw_gravity(config, motion_rng)
+    colliding = motion_rng.random() < config.colliding_scene_fraction
+    if colliding:
+        config = replace(config, obstacle_count=0)
     failure = ""
     for _ in range(LAYOUTS):
         try:
@@ -77,8 +85,9 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
             failure = str(error)
             continue
         bodies = [_fill_group(config, shape, region, rng) for shape, region in groups]
+        bodies = _collide(config, bodies, motion_rng) if colliding else _purify(config, bodies, gravity, motion_rng)
         bodies += [_fill_group(config, "cube", region, lone_rng) for region in lone]
-        return _assemble(config, seed, obstacles, bodies)
+        return _assemble(config, seed, gravity, obstacles, bodies)
     raise ConfigError(f"{failure} ({LAYOUTS} layouts, seed {seed})")
 
 
@@ -235,7 +244,62 @@ def _fill_group(config: SceneConfig, shape: str, region: Region, rng: np.random.
     return _Body(fill(region, count, rng), velocity, material, record)
 
 
-def _assemble(config: SceneConfig, seed: int, obstacles: list[_Placed], bodies: list[_Body]) -> Scene:
+def _draw_gravity(config: SceneConfig, rng: np.random.Generator) -> Vector:
+    """One of the three kinds; a tilted one is uniform in direction and in size."""
+    kind, size = rng.random(2).tolist()
+    direction_3 = _random_direction(rng)
+    if kind < config.zero_gravity_fraction:
+        return 0.0, 0.0, 0.0
+    if kind < config.zero_gravity_fraction + config.tilted_gravity_fraction:
+        return _triple(size * config.maximum_tilted_gravity * direction_3)
+    return config.gravity
+
+
+def _purify(config: SceneConfig, bodies: list[_Body], gravity: Vector, rng: np.random.Generator) -> list[_Body]:
+    """Gives some of the moving groups a velocity exactly along gravity, against it or across it, uniform in size;
+    y is up where there is no gravity.
+    """
+    if config.pure_direction_fraction == 0:
+        return bodies
+    up_3 = -np.array(gravity if any(gravity) else (0.0, -1.0, 0.0))
+    up_3 /= np.sqrt((up_3 * up_3).sum())
+    changed = []
+    for body in bodies:
+        chosen, kind, size = rng.random(3).tolist()
+        across_3 = _random_direction(rng)
+        across_3 = across_3 - (across_3 * up_3).sum() * up_3
+        across_3 /= np.sqrt((across_3 * across_3).sum())
+        direction_3 = up_3 if kind < 0.25 else -up_3 if kind < 0.5 else across_3
+        pure = chosen < config.pure_direction_fraction and body.velocity_3.any()
+        changed.append(_thrown(body, size * config.maximum_initial_speed * direction_3) if pure else body)
+    return changed
+
+
+def _collide(config: SceneConfig, bodies: list[_Body], rng: np.random.Generator) -> list[_Body]:
+    """Throws groups, two by two or all, so that they meet in the middle, off centre by up to half a group's size: the
+    fastest at half the maximum speed or more. A group without a partner rests.
+    """
+    pairs, changed = rng.random() < 0.5, [_thrown(body, np.zeros(3)) for body in bodies]
+    size = 2 if pairs else max(len(bodies), 1)
+    for first in range(0, len(bodies) - 1, size):
+        centre_B3 = np.array([body.record["position"] for body in bodies[first : first + size]])
+        if len(centre_B3) < 2:
+            continue
+        aim_B3 = centre_B3.mean(axis=0) + 0.5 * config.group_size * points_in_ball(len(centre_B3), 3, rng)
+        speed = config.maximum_initial_speed * (0.5 + 0.5 * rng.random())
+        way_B3 = aim_B3 - centre_B3
+        way_B3 *= speed / np.sqrt((way_B3 * way_B3).sum(axis=1)).max()
+        for place, velocity_3 in enumerate(way_B3, first):
+            changed[place] = _thrown(bodies[place], velocity_3)
+    return changed
+
+
+def _thrown(body: _Body, velocity_3: np.ndarray) -> _Body:
+    velocity_3 = velocity_3 + 0.0  # no -0.0
+    return replace(body, velocity_3=velocity_3, record=body.record | {"velocity": velocity_3.tolist()})
+
+
+def _assemble(config: SceneConfig, seed: int, gravity: Vector, obstacles: list[_Placed], bodies: list[_Body]) -> Scene:
     none = np.zeros((0, 3), np.float32)
     counts = [len(body.position_N3) for body in bodies]
     materials = np.array([material_index(body.material) for body in bodies], np.uint8)
@@ -247,7 +311,7 @@ def _assemble(config: SceneConfig, seed: int, obstacles: list[_Placed], bodies: 
         obstacles=tuple(item.obstacle for item in obstacles),
         domain_size=config.domain_size,
         cell_size=config.cell_size,
-        gravity=config.gravity,
+        gravity=gravity,
         seed=seed,
         particles_per_cell=config.particles_per_cell,
         specification={
@@ -278,10 +342,19 @@ def _random_quaternion(rng: np.random.Generator) -> tuple[float, float, float, f
             return w / length, x / length, y / length, z / length
 
 
+def _random_direction(rng: np.random.Generator) -> np.ndarray:
+    """A uniformly random unit vector, by rejection in the ball."""
+    while True:
+        point_3 = points_in_ball(1, 3, rng)[0]
+        length = float(np.sqrt((point_3 * point_3).sum()))
+        if length > 0.1:  # dividing by less would magnify rounding
+            return point_3 / length
+
+
 def _choice(options: tuple[str, ...], rng: np.random.Generator) -> str:
     return options[int(rng.random() * len(options))]
 
 
-def _triple(point: np.ndarray) -> tuple[float, float, float]:
+def _triple(point: np.ndarray) -> Vector:
     x, y, z = point.tolist()
     return x, y, z

@@ -19,7 +19,7 @@ def stage(writer: DatasetWriter, split: str, index: int) -> None:
     config, task = writer.config, writer.task(split, index)
     scene = ballistic_solver.generate_scene(config.scene, task.seed)
     grid = ballistic_solver.build_obstacle_grid((), scene.cell_size, 0, scene.domain_size)
-    (result,) = ballistic_solver.simulate([scene], config.mpm, config.dataset.frames, 60.0)
+    (result,) = ballistic_solver.simulate([scene], config.mpm, config.dataset.frames_of(index), 60.0)
     episode = make_episode(MadeScene(task, scene, grid), result, config, writer.config_hash)
     stage_episode(writer.folder, episode)
     writer.add_staged(split, index)

@@ -74,6 +74,21 @@ def test_whole_dataset(
     assert {path.suffix for path in Path(config.dataset.folder).iterdir()} == {".tar", ".json", ""}
 
 
+def test_long_episodes(make_config: MakeConfig, backend: Backend) -> None:
+    """A third of each split's episodes, evenly spread, have long_frames; a launch of both kinds becomes two."""
+    config = make_config(training_scenes=9, validation_scenes=3, test_scenes=0, long_fraction=0.34, long_frames=11)
+    generate(config, backend, WorkerPlan(1, None, 2, 4, 4))
+    manifest = Manifest.load(config.dataset.folder)
+    entries = [[e for shard in manifest.shards_of(split) for e in shard.episodes] for split in ("train", "validation")]
+    frames = [[entry.frames for entry in sorted(some, key=lambda entry: entry.index)] for some in entries]
+    short = config.dataset.frames
+    assert frames == [[short, short, 11] * 3, [short, short, 11]]
+    for episode in EpisodeStore(Path(config.dataset.folder), "train").episodes:
+        time_s, down = (episode.frame_count - 1) / 60, np.array(episode.gravity)
+        moved_N3 = episode.position_TN3[-1] - episode.position_TN3[0] - time_s * episode.initial_velocity_N3
+        np.testing.assert_allclose(moved_N3, np.tile(0.5 * time_s**2 * down, (len(moved_N3), 1)), atol=1e-6)
+
+
 def test_batches(make_config: MakeConfig, backend: Backend, control: Path) -> None:
     """A solver that takes several scenes a launch starts with a small launch and fills the later ones."""
     config = make_config(training_scenes=9, validation_scenes=0, test_scenes=0)

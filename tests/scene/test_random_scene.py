@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from hgn.config import DatagenConfig, SceneConfig
+from hgn.config import DatagenConfig, DatasetConfig, SceneConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.group import WALL_CELLS, fill, particle_count, points_in_ball, region_of
@@ -168,6 +168,81 @@ def test_a_share_of_the_groups_begins_with_a_velocity():
     assert not any(generate_scene(replace(config, moving_group_fraction=0.0), 1).velocity_N3.flat)
 
 
+MOVING = SceneConfig(
+    obstacle_count=1, maximum_initial_speed=3.0, moving_group_fraction=0.5, pure_direction_fraction=0.4,
+    colliding_scene_fraction=0.25, zero_gravity_fraction=0.2, tilted_gravity_fraction=0.3,
+)  # fmt: skip
+
+
+def test_gravity_of_a_share_of_the_scenes():
+    """Of 400 scenes a fifth have no gravity, three tenths one of any direction and of any size to 2 g, the others the
+    config's; a scene's draws follow from its seed, and nothing else of it changes with gravity."""
+    gravity_S3 = np.array([generate_scene(replace(MOVING, group_count=0), seed).gravity for seed in range(400)])
+    size_S = np.linalg.norm(gravity_S3, axis=1)
+    upright_S = (gravity_S3 == (0.0, -9.8, 0.0)).all(axis=1)
+    tilted_S3 = gravity_S3[(size_S > 0) & ~upright_S]
+    assert 0.14 < (size_S == 0).mean() < 0.26 and 0.23 < len(tilted_S3) / 400 < 0.37
+    assert 8.5 < size_S[(size_S > 0) & ~upright_S].mean() < 11.1 and size_S.max() <= 19.6
+    assert np.abs((tilted_S3 / np.linalg.norm(tilted_S3, axis=1, keepdims=True)).mean(axis=0)).max() < 0.2
+    scene, upright = generate_scene(MOVING, 5), generate_scene(replace(MOVING, tilted_gravity_fraction=0.0), 5)
+    assert digest(scene) == digest(generate_scene(MOVING, 5)) and scene.gravity != upright.gravity
+    assert (scene.position_N3 == upright.position_N3).all()
+    assert {generate_scene(replace(MOVING, tilted_gravity_fraction=0.8), seed).gravity for seed in range(3)} != {
+        (0.0, -9.8, 0.0)
+    }
+
+
+def test_pure_directions():
+    """About 0.4 of the moving groups move exactly along gravity (as often up as down) or exactly across it, at speeds
+    uniform to the maximum; tilted gravity counts, and a group at rest stays at rest."""
+    config = replace(MOVING, colliding_scene_fraction=0.0)
+    up = down = across = oblique = resting = 0
+    for seed in range(100, 180):
+        scene = generate_scene(config, seed)
+        down_3 = np.array(scene.gravity if any(scene.gravity) else (0.0, -1.0, 0.0))
+        down_3 /= np.linalg.norm(down_3)
+        for group in scene.specification["groups"]:
+            velocity_3 = np.array(group["velocity"])
+            speed = np.linalg.norm(velocity_3)
+            assert speed <= 3.0
+            cosine = velocity_3 @ down_3 / speed if speed else np.nan
+            resting += speed == 0
+            up += cosine < -1 + 1e-12
+            down += cosine > 1 - 1e-12
+            across += abs(cosine) < 1e-12
+            oblique += 1e-12 <= abs(cosine) <= 1 - 1e-12
+    moving = up + down + across + oblique
+    assert 0.42 < resting / 320 < 0.58 and 0.3 < (up + down + across) / moving < 0.5
+    assert min(up, down) > 5 and across > 15
+    upright = replace(config, moving_group_fraction=1.0, pure_direction_fraction=1.0, tilted_gravity_fraction=0.0)
+    for seed in range(5):
+        velocity_N3 = generate_scene(upright, seed).velocity_N3
+        assert ((velocity_N3[:, 1] == 0) | ~velocity_N3[:, [0, 2]].any(axis=1)).all()
+
+
+def test_colliding_scenes():
+    """A quarter of the scenes have no obstacles, and there groups meet: at some moment before they could cross the
+    domain, partners lie closer than their size, whatever the gravity, which all of them share."""
+    scenes = [generate_scene(MOVING, seed) for seed in range(60)]
+    colliding = [scene for scene in scenes if not scene.obstacles]
+    assert 0.12 < len(colliding) / 60 < 0.4
+    pairs = 0
+    for scene in colliding:
+        place_B3, velocity_B3 = (
+            np.array([g[k] for g in scene.specification["groups"]]) for k in ("position", "velocity")
+        )
+        assert 1.5 - 1e-9 <= np.linalg.norm(velocity_B3, axis=1).max() <= 3.0 + 1e-9
+        for body in range(4):
+            met = [
+                np.linalg.norm(place_B3[body] - place_B3[other] + t * (velocity_B3[body] - velocity_B3[other])) < 0.08
+                for other in range(4) for t in np.linspace(0, 0.7, 400) if other != body
+            ]  # fmt: skip
+            assert any(met)
+        pairs += not np.allclose(velocity_B3.sum(axis=0), velocity_B3[:2].sum(axis=0) * 2, atol=1e-3)
+    lone = generate_scene(replace(MOVING, colliding_scene_fraction=1.0, group_count=1), 0)
+    assert not lone.velocity_N3.any() and pairs > 0
+
+
 def test_draws_cover_their_ranges():
     """Over 60 scenes every shape and material appears, and sizes fill their range without a strong bias."""
     scenes = [generate_scene(PAPER, seed) for seed in range(60)]
@@ -297,3 +372,39 @@ def test_own_meshes_among_the_obstacles(tmp_path):
         dataset_identity(DatagenConfig(scene=SceneConfig(obstacle_shapes=("none.obj",))))
     with pytest.raises(ConfigError, match=r"obstacle_shapes\[0\] must be one of half_box, .*, or a mesh file"):
         SceneConfig(obstacle_shapes=("torus",))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"pure_direction_fraction": 1.5}, "pure_direction_fraction must be .*, got 1.5"),
+        ({"colliding_scene_fraction": -0.1}, "colliding_scene_fraction must be .*, got -0.1"),
+        ({"zero_gravity_fraction": float("nan")}, "zero_gravity_fraction must be .*, got nan"),
+        ({"maximum_tilted_gravity": float("inf")}, "maximum_tilted_gravity must be .*, got inf"),
+        (
+            {"zero_gravity_fraction": 0.6, "tilted_gravity_fraction": 0.5},
+            r"tilted_gravity_fraction must be at most 1 - zero_gravity_fraction \(0.6\), got 0.5",
+        ),
+        (
+            {"colliding_scene_fraction": 0.1},
+            "maximum_initial_speed must be above 0 where colliding_scene_fraction is, got 0.0",
+        ),
+    ],
+)
+def test_bad_options_of_motion_are_named(options, message):
+    """Shares are between 0 and 1, alone and together, and what is thrown needs a speed."""
+    with pytest.raises(ConfigError, match=message):
+        SceneConfig(**options)
+
+
+def test_motion_is_identity_only_where_there_is_some():
+    """A data set from before these options is the same data set now; with one of them it is another."""
+    before = dataset_identity(DatagenConfig())
+    assert not {"colliding_scene_fraction", "maximum_tilted_gravity"} & before["scene"].keys()
+    assert "long_frames" not in before
+    for config in (
+        DatagenConfig(scene=SceneConfig(zero_gravity_fraction=0.1)),
+        DatagenConfig(scene=SceneConfig(tilted_gravity_fraction=0.1, maximum_tilted_gravity=5.0)),
+        DatagenConfig(dataset=DatasetConfig(long_fraction=0.1)),
+    ):
+        assert identity_hash(dataset_identity(config)) != identity_hash(before)

@@ -11,7 +11,10 @@ import pytest
 
 from datagen.mpm.device import initialise
 from datagen.mpm.solver import SceneFailure, Simulated, fixed_substeps, particle_bounds, simulate
-from hgn.config import MpmConfig
+from datagen.pool.plan import SceneTask
+from datagen.pool.worker import Backend, make_episode, make_scene, simulate_batch
+from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
+from hgn.scene.episode import decode_episode, encode_episode
 from hgn.scene.material import MATERIALS, SAND, SNOW, WATER
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
@@ -386,3 +389,29 @@ def test_one_thread_repeats_itself_in_silence() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (4.0, 3.0, -12.0)])
+def test_an_episode_keeps_its_scenes_gravity(gravity: tuple) -> None:
+    """A random scene in motion becomes an episode that says its gravity, also as stored bytes; until something is
+    met its bodies drift straight, or along that gravity."""
+    size = float(np.linalg.norm(gravity))
+    config = DatagenConfig(
+        scene=SceneConfig(
+            obstacle_count=0, group_count=1, group_size=0.06, maximum_initial_speed=1.0, gravity=gravity,
+            domain_size=(0.5, 0.5, 0.5), cell_size=1 / 32,
+            zero_gravity_fraction=float(size == 0), tilted_gravity_fraction=0.0,
+        ),
+        mpm=ADAPTIVE, dataset=DatasetConfig(frames=4),
+    )  # fmt: skip
+    answer, made = make_scene(SceneTask("train", 0, 0, 3), config, Backend())
+    assert answer == "made"
+    (result,) = simulate_batch([made], config, Backend(), 2)
+    stored = encode_episode(make_episode(made, result, config, "0" * 64))
+    episode = decode_episode("train-000000", stored)
+    assert episode.gravity == gravity
+    time_T1 = np.arange(4)[:, None] / 60
+    centre_T3 = episode.position_TN3.astype(np.float64).mean(axis=1)
+    expected_T3 = centre_T3[0] + time_T1 * episode.initial_velocity_N3[0] + 0.5 * time_T1**2 * np.array(gravity)
+    assert episode.initial_velocity_N3.any()
+    np.testing.assert_allclose(centre_T3, expected_T3, atol=1e-5)
