@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from network.states import network_of, random_state
 
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds
@@ -24,13 +23,12 @@ from hgn.network.grid import build_hierarchy
 from hgn.network.neighbours import neighbour_list
 from hgn.runtime.simulator import Simulator
 from hgn.schema import ConfigError, from_mapping
-from tools.bench import contenders
+from tools.bench import contenders, triton_contenders
 from tools.bench.__main__ import main, workloads
 from tools.bench.config import BenchConfig
-from tools.bench.fast import FastFrame, FastTrain
-from tools.bench.naive import NaiveNetwork
 from tools.bench.states import TILE_PARTICLES, Workload, positions, scene_of
 from tools.bench.timing import Timed, alternate
+from tools.bench.triton_contenders import TritonFrame, TritonTrain
 
 CPU = torch.device("cpu")
 SMALL = {
@@ -67,10 +65,10 @@ def test_rows_of_every_case(
     assert all(keys <= row.keys() and row["check"] == "pass" and row["ms"] > 0 for row in rows)
     for scenes in (1, 2):
         cases = sorted(row["case"] for row in rows if row["scenes"] == scenes)
-        assert cases == ["frame", "gns_frame", "gns_train", "mpm_frame", "naive_frame", "train"]
+        assert cases == ["frame", "gns_frame", "gns_train", "mpm_frame", "torch_frame", "train"]
     phases = {row["case"]: set(row["phases"]) for row in rows if "phases" in row}
     ours = {"features", "grid", "network"}
-    assert phases == {"frame": ours, "naive_frame": ours, "gns_frame": {"neighbours", "network"}}
+    assert phases == {"frame": ours, "torch_frame": ours, "gns_frame": {"neighbours", "network"}}
     printed = capsys.readouterr().out
     assert all(case in printed for case in ("gns_train takes", "mpm_frame takes", "parts without graphs"))
 
@@ -104,22 +102,12 @@ def test_no_time_where_a_check_is_red(
 
 
 def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plain network passes in float32; a 0.01 % error of the output does not."""
+    """Backend torch passes in float32; a 0.01 % error of the output does not."""
     frame = contenders.Frame(NetworkConfig(width=16, levels=2), Workload(50, 1), CPU)
     assert frame.check("fp32") == "pass"
     predict = frame.simulator.backend.predict
     frame.simulator.backend.predict = lambda state: 1.0001 * predict(state)
     assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
-
-
-@pytest.mark.parametrize("changes", [{}, {"levels": 1}, {"obstacle_features": False}])
-def test_the_naive_network_is_the_same_function(changes: dict[str, Any]) -> None:
-    """What our frame is timed beside computes ours, in float64: obstacles, several scenes, one level."""
-    network = network_of(**changes)
-    naive = NaiveNetwork(network.config).double()
-    naive.load_state_dict(network.state_dict())
-    state = random_state((40, 1, 9), obstacles=network.config.obstacle_features)
-    torch.testing.assert_close(naive(state), network(state), rtol=1e-10, atol=1e-10)
 
 
 def test_gns_in_half_precision(tmp_path: Path) -> None:
@@ -131,21 +119,21 @@ def test_gns_in_half_precision(tmp_path: Path) -> None:
     assert all(row["check"] == "pass" and row["precision"] == "fp16" for row in rows)
 
 
-def test_the_fast_path_is_checked_like_the_plain_one() -> None:
+def test_triton_is_checked_like_torch() -> None:
     """Frames, loss and gradients of backend triton pass in float32 (in the interpreter), and a wrong weight not."""
     config = NetworkConfig(width=16, levels=1, message_passing_steps=1)
-    frame = FastFrame("fp32", config, Workload(2, 1), CPU)
+    frame = TritonFrame("fp32", config, Workload(2, 1), CPU)
     assert frame.check("fp32") == "pass"
     frame.rollout.values.mul_(1.001)
     frame.rollout._build(frame.rollout.grid.capacities)
     assert frame.check("fp32").startswith("relative error of acceleration")
-    train = FastTrain("fp32", config, Workload(2, 2), CPU)
+    train = TritonTrain("fp32", config, Workload(2, 2), CPU)
     assert train.check("fp32") == "pass"
     with torch.no_grad():
         train.network.decode.second.bias += 0.1
     expected = contenders.reference_gradients(train.network, train.batch)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tools.bench.fast.reference_gradients", lambda *_: (1.001 * expected[0], expected[1]))
+        patch.setattr(triton_contenders, "reference_gradients", lambda *_: (1.001 * expected[0], expected[1]))
         assert train.check("fp32").startswith("relative error of loss 1.0e-03 exceeds")
 
 

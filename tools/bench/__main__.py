@@ -21,21 +21,21 @@ from hgn.system.device import choose_device
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
-from tools.bench.config import CASES, PLAIN_CASES, PUBLIC_GNS_CASES, BenchConfig
-from tools.bench.contenders import PASS, Frame, MpmFrame, NaiveFrame, Train, checked_workload
-from tools.bench.fast import FastFrame, FastTrain
+from tools.bench.config import CASES, PUBLIC_GNS_CASES, BenchConfig
+from tools.bench.contenders import PASS, Frame, MpmFrame, Train, checked_workload
 from tools.bench.public_gns import PublicFrame, PublicTrain
 from tools.bench.states import TILE_PARTICLES, Workload
 from tools.bench.timing import Timed, alternate
+from tools.bench.triton_contenders import TritonFrame, TritonTrain
 
 GPU_PARTICLES, GPU_SCENES = (TILE_PARTICLES, 40_000, 400_000), (1, 8, 32)
 CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
 PHASE_ROUNDS = 11
 OUT_OF_MEMORY = "out of memory"
 EXIT_RED = 1
-FRAME_CASES = ("frame", "plain_frame", "naive_frame", "gns_frame", "public_gns_frame", "mpm_frame")
-TRAIN_CASES = ("train", "plain_train", "gns_train", "public_gns_train")
-Contender = Frame | Train | FastFrame | FastTrain | PublicFrame | PublicTrain
+FRAME_CASES = ("frame", "torch_frame", "gns_frame", "public_gns_frame", "mpm_frame")
+TRAIN_CASES = ("train", "torch_train", "gns_train", "public_gns_train")
+Contender = Frame | Train | TritonFrame | TritonTrain | PublicFrame | PublicTrain
 
 
 @dataclass
@@ -161,32 +161,33 @@ def _maker(
     if config.public_gns is not None and case in PUBLIC_GNS_CASES:
         return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
     if case in ("frame", "train") and triton_unsupported_reason(device, config.network, precision) is None:
-        return functools.partial(FastFrame if frame else FastTrain, precision), "triton"
+        return functools.partial(TritonFrame if frame else TritonTrain, precision), "triton"
     if case == "gns_train" and training_unsupported_reason(device, config.gns, precision) is None:
-        return functools.partial(FastTrain, precision), "triton"
-    plain = NaiveFrame if case == "naive_frame" else Frame if frame else Train
-    made = functools.partial(plain, precision=precision)
-    return made, None if "gns" in case else "torch"
+        return functools.partial(TritonTrain, precision), "triton"
+    if not frame:
+        return functools.partial(Train, precision=precision), None if "gns" in case else "torch"
+    fastest = "cpu" if case == "frame" and device.type == "cpu" else "torch"
+    backend = None if "gns" in case else fastest
+    return functools.partial(Frame, precision=precision, backend=backend), backend
 
 
 def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tuple[str, ...]) -> list[str]:
     """Those of `cases` that are asked for and mean something; fp16 is backend triton's and our GNS's alone."""
-    fast = triton_unsupported_reason(device, config.network, precision) is None
+    triton = triton_unsupported_reason(device, config.network, precision) is None
+    fastest_differs = {"torch_frame": triton or device.type == "cpu", "torch_train": triton}  # from torch
     wanted = config.cases or tuple(
         case
         for case in CASES
-        if (fast or case not in PLAIN_CASES)
-        and (device.type == "cpu" or case != "naive_frame")
-        and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
+        if fastest_differs.get(case, True) and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
     )
     if precision == "fp16":
-        known = (("frame", "train") if fast else ()) + ("gns_frame", "gns_train")
+        known = (("frame", "train") if triton else ()) + ("gns_frame", "gns_train")
         wanted = tuple(case for case in known if case in wanted)
     return [case for case in cases if case in wanted]
 
 
 def _finish(entry: Entry) -> None:
-    if isinstance(entry.contender, MpmFrame | FastFrame) and entry.contender.failure is not None:
+    if isinstance(entry.contender, MpmFrame | TritonFrame) and entry.contender.failure is not None:
         entry.row["check"] = entry.contender.failure
     if entry.timed is not None and entry.row["check"] == PASS:
         low, middle, high = entry.timed.quartiles()

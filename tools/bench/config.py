@@ -8,8 +8,7 @@ from hgn.config import PRECISIONS, NetworkConfig
 from hgn.schema import require, require_positive
 
 PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
-PLAIN_CASES = ("plain_frame", "plain_train")
-CASES = ("frame", "train", "naive_frame", *PLAIN_CASES, "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
+CASES = ("frame", "train", "torch_frame", "torch_train", "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
 
 
 def _bench_gns() -> NetworkConfig:
@@ -20,8 +19,8 @@ def _bench_gns() -> NetworkConfig:
 class BenchConfig:
     """`python -m tools.bench`: what is timed."""
 
-    # of frame, train (backend triton where it runs), plain_frame, plain_train, naive_frame, gns_frame,
-    # gns_train, public_gns_frame, public_gns_train, mpm_frame; null: all that differ here
+    # of frame, train (the fastest backend), torch_frame, torch_train, gns_frame, gns_train, public_gns_frame,
+    # public_gns_train, mpm_frame; null: all that differ here
     cases: tuple[str, ...] | None = None
     particles: tuple[int, ...] | None = None  # of one scene; null: 4296, 40000, 400000 on a GPU, 4296 on a CPU
     # side by side, of the smallest number of particles; null: 1, 8, 32 on a GPU, 1 on a CPU

@@ -22,12 +22,11 @@ from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import fastest_stepped, with_gradients
+from hgn.runtime.backend import build, fastest_stepped, with_gradients
 from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
-from tools.bench.naive import NaiveNetwork
 from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_of, state_of
 from tools.bench.timing import Timed, once
 
@@ -60,10 +59,18 @@ def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwor
 class Frame:
     """One frame of a simulation: features, grid or neighbours, network, integration."""
 
-    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
+    def __init__(
+        self,
+        config: NetworkConfig,
+        work: Workload,
+        device: torch.device,
+        precision: str = "fp32",
+        backend: str | None = None,  # none: the fastest that makes frames one by one
+    ) -> None:
         self.device = device
-        self.network = self.reference = bench_network(config, device)
-        self.simulator = Simulator(self.network, FRAME_RATE_HZ, fastest_stepped(self.network, precision))
+        self.network = bench_network(config, device)
+        chosen = build(backend, self.network, precision) if backend else fastest_stepped(self.network, precision)
+        self.simulator = Simulator(self.network, FRAME_RATE_HZ, chosen)
         self.state = state_of(work, config, device)
 
     def run(self) -> ParticleState:
@@ -76,11 +83,11 @@ class Frame:
         """`pass`, or by how much the accelerations differ from float64."""
         found_N3 = self.run().velocity_NM3[:, 0].double() - self.state.velocity_NM3[:, 0].double()
         with torch.no_grad():
-            expected_N3 = reference_acceleration(self.reference, self.state)
+            expected_N3 = reference_acceleration(self.network, self.state)
         return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
 
     def phases(self, rounds: int) -> dict[str, float]:
-        """Medians of the plain network's parts, ms."""
+        """Medians of the parts by backend torch, ms."""
         with torch.inference_mode():
             return {
                 name: float(np.median([once(part, self.device) for _ in range(rounds)][1:]))
@@ -107,17 +114,6 @@ class Frame:
             "grid": grid,
             "network": lambda: network.propagate(latent_NW, built),  # type: ignore[arg-type]
         }
-
-
-class NaiveFrame(Frame):
-    """The same frame by the network as one writes it first, which has to agree with ours in float64."""
-
-    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
-        super().__init__(config, work, device, precision)
-        self.network = NaiveNetwork(config)
-        self.network.load_state_dict(self.reference.state_dict())
-        self.network.to(device).eval()
-        self.simulator = Simulator(self.network, FRAME_RATE_HZ, "torch", precision)
 
 
 class Train:

@@ -1,21 +1,17 @@
-"""python -m tools.studies.solver_times [--json FILE]: the solver: many scenes, many particles, Taichi Elements.
+"""python -m tools.studies.solver_times [--json FILE]: frames of the solver, for many scenes and for many particles.
 
 Many scenes: random scenes with obstacles, simulated from their start; timed is the second half of the frames, when most
-particles have landed. Many particles: one scene of clumps and spray. With `taichi_elements=COPY` Taichi Elements runs
-the paper's four cubes on the same device, and ours runs them at its step, alone and 256 times side by side. A contender
-whose scenes fail, or end with a position that is not finite, gets no time.
+particles have landed. Many particles: one scene of clumps and spray. A contender whose scenes fail, or end with a
+position that is not finite, gets no time.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,18 +21,13 @@ from hgn.command import run_command
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.scene import Scene
-from hgn.schema import ConfigError, from_mapping, require, require_one_of, to_mapping
+from hgn.schema import from_mapping, require, require_one_of, to_mapping
 from hgn.system.files import write_json
-from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
 from tools.bench.states import Workload, scene_of
-from tools.studies.taichi_elements import WARM_FRAMES, cubes, faithful_mode, run_theirs, taichi_elements_substeps
 
 FRAME_RATE_HZ = 60.0
-CUBES = [(0.3, 0.3, 0.3), (0.3, 0.3, 0.7), (0.7, 0.3, 0.3), (0.7, 0.3, 0.7)]
-CUBE_KINDS = [0, 1, 2, 0]
-SIDE_BY_SIDE = 256
 EXIT_RED = 1
 
 
@@ -48,8 +39,6 @@ class SolverTimesConfig:
     particles: tuple[int, ...] = (4_296, 40_000, 400_000, 1_000_000)  # of one scene
     scene_frames: int = 60  # of the random scenes; the second half is timed
     particle_frames: int = 6
-    # a folder with a copy of github.com/taichi-dev/taichi_elements, to time beside ours
-    taichi_elements: str | None = None
     device: str = "auto"  # or cpu, gpu
     json: str | None = None  # also write the rows to this file; --json FILE does the same
 
@@ -59,18 +48,6 @@ class SolverTimesConfig:
         for name in ("scene_frames", "particle_frames"):
             require(getattr(self, name) >= 3, name, "at least 3", getattr(self, name))
         require_one_of(self, "device", ("auto", "cpu", "gpu"))
-        if self.taichi_elements is not None:
-            least = WARM_FRAMES + 3
-            require(
-                self.scene_frames >= least,
-                "scene_frames",
-                f"at least {least} beside Taichi Elements",
-                self.scene_frames,
-            )
-        if self.taichi_elements is not None and not (Path(self.taichi_elements) / "engine/mpm_solver.py").is_file():
-            raise ConfigError(
-                f"taichi_elements must be a folder with a copy of it (engine/mpm_solver.py), got {self.taichi_elements}"
-            )
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -81,11 +58,18 @@ def main(mapping: dict[str, Any]) -> int:
     made = _random_scenes(max(config.scenes, default=0), MpmConfig().collider_band_cells)
     device = initialise(config.device)
     meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": without_folders(to_mapping(config))}
+    mpm = MpmConfig(device=device.kind)
     rows: list[dict[str, Any]] = []
-    cases = _cases(made, config, device.kind)
+    cases: list[tuple[str, int]] = [("random scenes with obstacles", count) for count in config.scenes]
+    cases += [("one scene", count) for count in config.particles]
     with bar("cases", len(cases), unit="case") as progress:
-        for case in cases:
-            rows += case()
+        for case, count in cases:
+            if case == "one scene":
+                row = _timed([scene_of(Workload(count, 1), 0, 0.035)], mpm, config.particle_frames)
+            else:
+                scenes, colliders = zip(*made[:count], strict=True)
+                row = _timed(scenes, mpm, config.scene_frames, colliders)
+            rows.append({"case": case} | row)
             progress.update()
             if config.json is not None:  # after each: what a later case does takes nothing away
                 write_json(config.json, {"meta": meta, "rows": rows})
@@ -110,62 +94,17 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _cases(
-    made: list[tuple[Scene, Collider]], config: SolverTimesConfig, kind: str
-) -> list[Callable[[], list[dict[str, Any]]]]:
-    """Each times its contenders when it is called, and gives their rows."""
-    mpm = MpmConfig(device=kind)
-
-    def scenes(count: int) -> list[dict[str, Any]]:
-        own = [scene for scene, _ in made[:count]]
-        colliders = [collider for _, collider in made[:count]]
-        row = _timed(own, mpm, config.scene_frames, colliders=colliders)
-        return [{"case": "random scenes with obstacles"} | row]
-
-    def particles(count: int) -> list[dict[str, Any]]:
-        return [{"case": "one scene"} | _timed([scene_of(Workload(count, 1), 0, 0.035)], mpm, config.particle_frames)]
-
-    cases = [partial(scenes, count) for count in config.scenes]
-    cases += [partial(particles, count) for count in config.particles]
-    return [*cases, partial(_beside_taichi_elements, config, kind)] if config.taichi_elements else list(cases)
-
-
-def _beside_taichi_elements(config: SolverTimesConfig, kind: str) -> list[dict[str, Any]]:
-    assert config.taichi_elements is not None
-    scene = cubes(CUBE_KINDS, CUBES, 0.08)
-    faithful, rate = faithful_mode(kind)
-    theirs: dict[str, Any] = {"case": "Taichi Elements, four cubes", "scenes": 1, "particles": scene.particle_count}
-    try:
-        _, seconds = run_theirs(
-            scene, config.taichi_elements, config.scene_frames, 0 if kind == "gpu" else available_cpus()
-        )
-        theirs |= {"substeps": taichi_elements_substeps(), "ms": 1e3 * seconds}
-    except subprocess.CalledProcessError as error:  # it has said why
-        theirs |= {"substeps": None, "ms": None, "cause": f"ended with {error.returncode}"}
-    return [
-        theirs,
-        *(
-            {"case": "the same, ours at its step"} | _timed([scene] * count, faithful, config.scene_frames, rate)
-            for count in ((1, SIDE_BY_SIDE) if kind == "gpu" else (1,))
-        ),
-    ]
-
-
 def _timed(
-    scenes: list[Scene],
-    mpm: MpmConfig,
-    frames: int,
-    rate: float = FRAME_RATE_HZ,
-    colliders: list[Collider] | None = None,
+    scenes: Sequence[Scene], mpm: MpmConfig, frames: int, colliders: Sequence[Collider] | None = None
 ) -> dict[str, Any]:
     """Milliseconds a frame of the second half, after a first simulation that compiles."""
     from datagen.mpm.solver import SceneFailure, Simulated, simulate
 
-    simulate(scenes, mpm, 2, rate, colliders=colliders)
+    simulate(scenes, mpm, 2, FRAME_RATE_HZ, colliders=colliders)
     ends: list[float] = []
     outcomes = simulate(
-        scenes, mpm, frames, rate, lambda _: ends.append(time.perf_counter()), colliders=colliders
-    )  # fmt: skip
+        scenes, mpm, frames, FRAME_RATE_HZ, lambda _: ends.append(time.perf_counter()), colliders=colliders
+    )
     row: dict[str, Any] = {"scenes": len(scenes), "particles": sum(scene.particle_count for scene in scenes)}
     failures = [outcome.cause for outcome in outcomes if isinstance(outcome, SceneFailure)]
     found = [outcome for outcome in outcomes if isinstance(outcome, Simulated)]

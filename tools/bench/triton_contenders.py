@@ -31,7 +31,7 @@ OBSTACLE_CELL_SIZE = 1 / 64
 FIRST_MOMENT_SHARE = 0.1  # of Adam, of the gradient, after the first update
 
 
-class FastFrame:
+class TritonFrame:
     """One frame of a simulation; what is timed puts the same state back before each."""
 
     def __init__(self, precision: str, config: NetworkConfig, work: Workload, device: torch.device) -> None:
@@ -83,7 +83,7 @@ class FastFrame:
         return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
 
 
-class FastTrain:
+class TritonTrain:
     """One training update: batch, noise, jitter, grid or neighbours, forward, backward, Adam."""
 
     def __init__(self, precision: str, config: NetworkConfig, work: Workload, device: torch.device) -> None:
