@@ -25,6 +25,7 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 SYMMETRIES = ("none", "gravity")
+NETWORK_INPUTS = ("absolute", "relative")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 TRAINING_BACKENDS = ("auto", "torch", "triton")
 PRECISIONS = ("fp32", "tf32", "fp16")
@@ -336,6 +337,10 @@ class NetworkConfig:
     material_embedding: int = 16  # E
     wall_distance_cells: float = 8.0  # d_max / R
     obstacle_features: bool = True
+    # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
+    # gravity are exact
+    inputs: str = "absolute"
+    contact_reach_cells: float = 1.5  # of relative inputs: walls are seen from so many R on
     materials: tuple[str, ...] = MATERIALS
     maximum_neighbours: int | None = None  # of a particle of GNS, the nearest; null: all within R
     # of gns_particles: how far apart static particles are, at least, in obstacle cells
@@ -352,11 +357,17 @@ class NetworkConfig:
             "velocity_history",
             "material_embedding",
             "wall_distance_cells",
+            "contact_reach_cells",
             "static_spacing_cells",
         )
+        require_one_of(self, "inputs", NETWORK_INPUTS)
         for i, name in enumerate(self.materials):
             material_index(name, f"materials[{i}]")
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
+        if self.relative:
+            require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
+            rule = "at least 2 with inputs=relative, which are of differences"
+            require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
         if self.kind == "hgn":
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
         else:
@@ -381,8 +392,16 @@ class NetworkConfig:
         return self.obstacle_features or self.obstacle_particles
 
     @property
+    def relative(self) -> bool:
+        """Whether inputs are relative: nothing depends on a motion that all particles have in common."""
+        return self.inputs == "relative"
+
+    @property
     def feature_width(self) -> int:
-        """Numbers per particle: velocities, obstacle normal, wall distances, embedding (paper sec. 3.1)."""
+        """Numbers per particle, the embedding last: paper sec. 3.1, or hgn.network.relative."""
+        if self.relative:
+            motion = 3 * (self.velocity_history - 1) + 3 * self.levels + 3
+            return motion + 6 + 6 * self.obstacle_features + self.material_embedding
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + self.material_embedding
 
 

@@ -37,7 +37,7 @@ def normalised_acceleration(
     """What the network's own function of that name gives, without gradients."""
     with torch.no_grad():
         grid = network.grid(state, origin_S3)
-        return propagate(network, network.encode_particles(state), grid)
+        return propagate(network, network.encode_particles(state, grid), grid)
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 
 from hgn.config import NetworkConfig
+from hgn.data.episode_tensors import frame_gravity, shown_symmetries
 from hgn.data.sampler import SamplerState
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.scene.rollout_file import episode_surface
-from hgn.scene.symmetry import Symmetry, scene_symmetries
+from hgn.scene.symmetry import Symmetry
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,7 @@ class Batch:
             material_N=self.material_N,
             scene_N=self.scene_N,
             domain_S3=self.domain_S3,
+            gravity_S3=self.gravity_S3,
             obstacles=self.obstacles,
             surface=self.surface,
         )
@@ -127,7 +129,7 @@ def make_batch(
     if network.obstacle_particles:
         surface = SurfaceParticles.of([episode_surface(e, network.static_spacing_cells) for e in episodes])
     particles = tuple(len(episode.material_N) for episode in episodes)
-    gravity_S3 = np.array([np.asarray(e.gravity) / e.frame_rate_hz**2 for e in episodes], np.float32)
+    gravity_S3 = np.array([frame_gravity(episode) for episode in episodes], np.float32)
     return Batch(
         window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
         material_N=material_rows(np.concatenate([episode.material_N for episode in episodes]), network.materials),
@@ -141,5 +143,5 @@ def make_batch(
         sampler_state=sampler_state,
         weight_S=tuple(weights),
         noise_scale_S=tuple(noise_scales),
-        symmetries_S=tuple(scene_symmetries(e.gravity, e.domain_size, e.obstacle_grid.cell_size) for e in episodes),
+        symmetries_S=tuple(shown_symmetries(e, network) for e in episodes),
     )

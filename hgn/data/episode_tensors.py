@@ -15,7 +15,7 @@ from hgn.data.sampler import Sample, SamplerState
 from hgn.network.features import material_rows
 from hgn.scene.episode import Episode
 from hgn.scene.history import frames_before
-from hgn.scene.symmetry import Symmetry, scene_symmetries
+from hgn.scene.symmetry import Symmetry, Vector, scene_symmetries
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,7 @@ class EpisodeTensors:
     obstacle_cell_K3: torch.Tensor  # int32; empty where the network sees none
     obstacle_normal_K3: torch.Tensor
     domain_size: tuple[float, float, float]
+    gravity: Vector  # domain units per frame squared
     symmetries: tuple[Symmetry, ...] = ()  # what training may show instead of the scene
 
 
@@ -50,5 +51,18 @@ def whole_episode(episode: Episode, network: NetworkConfig) -> EpisodeTensors:
         torch.from_numpy(np.array(grid.cell_K3[:seen], np.int32)),
         torch.from_numpy(np.array(grid.normal_K3[:seen], np.float32)),
         episode.domain_size,
-        scene_symmetries(episode.gravity, episode.domain_size, grid.cell_size),
+        frame_gravity(episode),
+        shown_symmetries(episode, network),
     )
+
+
+def frame_gravity(episode: Episode) -> Vector:
+    """In domain units per frame squared."""
+    x, y, z = (value / episode.frame_rate_hz**2 for value in episode.gravity)
+    return x, y, z
+
+
+def shown_symmetries(episode: Episode, network: NetworkConfig) -> tuple[Symmetry, ...]:
+    """What training may show instead of the scene: where inputs are relative, gravity turns with it."""
+    kept = (0.0, 0.0, 0.0) if network.relative else episode.gravity
+    return scene_symmetries(kept, episode.domain_size, episode.obstacle_grid.cell_size)

@@ -12,7 +12,9 @@ from torch import nn
 
 from hgn.config import NetworkConfig
 from hgn.network.features import Normaliser, ParticleState, wall_distances
+from hgn.network.grid import GridHierarchy
 from hgn.network.mlp import LEAKY_SLOPE, MLP
+from hgn.network.relative import relative_features
 
 
 class ParticleNetwork(nn.Module, ABC):
@@ -25,7 +27,9 @@ class ParticleNetwork(nn.Module, ABC):
         self.normaliser = Normaliser()
         self.embedding = nn.Embedding(embeddings or len(config.materials), config.material_embedding)
         normal_width = 3 if config.obstacle_features else 0
-        parts = (3 * config.velocity_history, normal_width, 6, config.material_embedding)
+        parts: tuple[int, ...] = (3 * config.velocity_history, normal_width, 6, config.material_embedding)
+        if config.relative:
+            parts = (config.feature_width - config.material_embedding, config.material_embedding)
         self.encode = MLP(parts, config.width, config.width, slope=slope)
 
     @property
@@ -34,7 +38,18 @@ class ParticleNetwork(nn.Module, ABC):
 
     def forward(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
         """Accelerations in frame units [N, 3]."""
-        return self.normaliser.restore_acceleration(self.normalised_acceleration(state, origin_S3))
+        return self.restored_acceleration(self.normalised_acceleration(state, origin_S3), state)
+
+    def restored_acceleration(self, normalised_N3: torch.Tensor, state: ParticleState) -> torch.Tensor:
+        """The raw output in frame units; with relative inputs it is what is added to gravity."""
+        acceleration_N3 = self.normaliser.restore_acceleration(normalised_N3)
+        return acceleration_N3 + state.gravity_S3[state.scene_N] if self.config.relative else acceleration_N3
+
+    def target(self, acceleration_N3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
+        """What the raw output should be for these accelerations and gravity, all in frame units: the inverse."""
+        return self.normaliser.normalise_acceleration(
+            acceleration_N3 - gravity_N3 if self.config.relative else acceleration_N3
+        )
 
     @abstractmethod
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
@@ -43,8 +58,18 @@ class ParticleNetwork(nn.Module, ABC):
         `origin_S3` moves the grid, where the network has one.
         """
 
-    def encode_particles(self, state: ParticleState) -> torch.Tensor:
-        """Particle features to latent vectors [N, W] (sec. 3.2, step 0). Zero normals are not multiplied."""
+    def encode_particles(self, state: ParticleState, grid: GridHierarchy | None = None) -> torch.Tensor:
+        """Particle features to latent vectors [N, W] (sec. 3.2, step 0). Zero normals are not multiplied.
+
+        Relative inputs are taken from the grid's cells, too.
+        """
+        if self.config.relative:
+            assert grid is not None
+            material_MH = self.encode.project(1, self.embedding.weight) + self.encode.first.bias
+            feature_NF = relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
+            return self.encode.finish(
+                self.encode.add_projection(material_MH.index_select(0, state.material_N), 0, feature_NF)
+            )
         velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
         maximum = self.config.wall_distance_cells * self.config.cell_size
         wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)

@@ -28,6 +28,7 @@ class ParticleState:
     material_N: torch.Tensor  # int64, index into the network's materials
     scene_N: torch.Tensor  # int64, index of the particle's scene
     domain_S3: torch.Tensor  # domain size of each scene
+    gravity_S3: torch.Tensor  # of each scene, domain units per frame squared
     obstacles: ObstacleCells | None
     surface: SurfaceParticles | None = None  # where the network sees obstacles as particles
 
@@ -59,6 +60,12 @@ class Normaliser(nn.Module):
         getattr(self, f"{quantity}_mean").copy_(mean_3)
         total_3 = torch.sqrt(std_3.double() ** 2 + noise_std**2).clamp(min=1e-9)
         getattr(self, f"{quantity}_std").copy_(total_3)
+
+    def set_isotropic(self, acceleration_std_3: torch.Tensor, noise_std: float) -> None:
+        """For relative inputs: no means, and one scale everywhere, the root mean square of the axes' with the noise."""
+        for quantity in ("velocity", "acceleration"):
+            scale = acceleration_std_3.double().square().mean().sqrt().expand(3)
+            self.set(quantity, torch.zeros(3), scale, noise_std)
 
     def normalise_velocity(self, velocity: torch.Tensor) -> torch.Tensor:
         return (velocity - self.velocity_mean) / self.velocity_std

@@ -77,7 +77,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         The finest grid's origin in each scene is 0 unless given.
         """
         grid = self.grid(state, origin_S3)
-        return self.propagate(self.encode_particles(state), grid)
+        return self.propagate(self.encode_particles(state, grid), grid)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

@@ -113,7 +113,7 @@ class CpuBackend(Backend):
         return cpu_network.normalised_acceleration(self.network, state, origin_S3)
 
     def predict(self, state: ParticleState) -> torch.Tensor:
-        return self.network.normaliser.restore_acceleration(self.normalised_acceleration(state))
+        return self.network.restored_acceleration(self.normalised_acceleration(state), state)
 
 
 def choose(
@@ -212,6 +212,8 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
         return f"it needs a CUDA device, not {device.type}"
     if reason := why_no_triton():
         return reason
+    if config.relative:
+        return "its kernels read absolute inputs (network.inputs)"
     if config.kind != "hgn" and precision != "fp16":
         return f"it computes {config.kind} with precision fp16, not {precision}"
     if config.width not in TRITON_WIDTHS:

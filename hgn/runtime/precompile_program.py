@@ -105,6 +105,7 @@ def _nowhere(config: NetworkConfig, particles: int, scenes: int, device: str) ->
         torch.zeros(particles, dtype=torch.int32, device=device),
         torch.zeros(particles, dtype=torch.int64, device=device),
         torch.zeros(scenes, 3, device=device),
+        torch.zeros(scenes, 3, device=device),
         None,
     )
 

@@ -20,12 +20,14 @@ from hgn.runtime.backend import Backend, build, choose, set_matmul_precision
 from hgn.runtime.stepped_rollout import stepped
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.episode import Episode
-from hgn.scene.history import ballistic_positions
+from hgn.scene.history import ballistic_velocities
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
 from hgn.scene.rollout_file import cell_obstacles, episode_surface
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import require
 from hgn.system.device import choose_device
+
+LARGEST_GRAVITY = 98.0  # domain units per second squared
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,24 +123,20 @@ class Simulator:
         """The state at frame 0, with a ballistic history.
 
         Raises: ConfigError when a scene holds a material that the network does not know, or, for weights that were
-        loaded, another gravity or obstacle cells of another size.
+        loaded, a gravity that they cannot take (absolute inputs: another, relative: a huge one) or obstacle cells of
+        another size.
         """
         return self._start(_initial(scenes))
 
     def _start(self, scenes: Sequence[InitialState]) -> ParticleState:
         config = self.network.config
-        velocities = []
         for scene in scenes:
             self._require_scene_fits(scene)
-            past = ballistic_positions(
-                scene.position_N3,
-                scene.velocity_N3,
-                scene.gravity,
-                self.frame_rate_hz,
-                range(-config.velocity_history, 0),
-            )
-            positions_HN3 = np.concatenate([past, scene.position_N3[None].astype(np.float32)])
-            velocities.append(np.diff(positions_HN3, axis=0)[::-1].transpose(1, 0, 2))
+        gravity_S3 = np.array([scene.gravity for scene in scenes], np.float64).reshape(-1, 3) / self.frame_rate_hz**2
+        velocities = [
+            ballistic_velocities(scene.velocity_N3 / self.frame_rate_hz, gravity_3, config.velocity_history)
+            for scene, gravity_3 in zip(scenes, gravity_S3, strict=True)
+        ]
         material_N = material_rows(np.concatenate([scene.material_N for scene in scenes]), config.materials)
         counts = [len(scene.position_N3) for scene in scenes]
         position_N3 = np.concatenate([scene.position_N3 for scene in scenes]).astype(np.float32)
@@ -152,6 +150,7 @@ class Simulator:
             material_N=material_N.to(self.device),
             scene_N=torch.from_numpy(np.repeat(np.arange(len(scenes)), counts)).to(self.device),
             domain_S3=torch.tensor([scene.domain_size for scene in scenes], dtype=torch.float32).to(self.device),
+            gravity_S3=torch.from_numpy(gravity_S3.astype(np.float32)).to(self.device),
             obstacles=obstacles and obstacles.to(self.device),
             surface=surface and surface.to(self.device),
         )
@@ -194,9 +193,13 @@ class Simulator:
         info, cell_size = self._info, scene.obstacle_grid.cell_size
         if info is None:
             return
-        rule = f"the weights' {info.gravity}, which a network cannot take from a scene"
-        remedy = "train one on scenes with this gravity"
-        require(tuple(scene.gravity) == info.gravity, "gravity", rule, scene.gravity, remedy)
+        if info.network.relative:
+            rule = f"at most {LARGEST_GRAVITY:g} in size, ten times the earth's"
+            require(float(np.linalg.norm(scene.gravity)) <= LARGEST_GRAVITY, "gravity", rule, scene.gravity)
+        else:
+            rule = f"the weights' {info.gravity}, which a network of absolute inputs cannot take from a scene"
+            remedy = "take weights of relative inputs, or train some on scenes with this gravity"
+            require(tuple(scene.gravity) == info.gravity, "gravity", rule, scene.gravity, remedy)
         if info.network.sees_obstacles:
             rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"
             require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)

@@ -31,6 +31,16 @@ def ballistic_positions(
     return (position_N3 + velocity_N3 * time_T11 + fall_3 * time_T11**2).astype(np.float32)
 
 
+def ballistic_velocities(velocity_N3: np.ndarray, gravity_3: np.ndarray, history: int) -> np.ndarray:
+    """Displacements in the frames up to now of particles in free flight, newest first, float32 [N, history, 3].
+
+    Units: domain units per frame (squared). Over a frame that ends k frames ago a particle moves v - (k + 1/2) g;
+    computed in float64, so that two of them differ by g to rounding of the velocity, not of the position.
+    """
+    age_H1 = np.arange(history)[:, None] + 0.5
+    return (velocity_N3[:, None].astype(np.float64) - age_H1 * np.asarray(gravity_3, np.float64)).astype(np.float32)
+
+
 def frames_before(episode: Episode, first: int) -> np.ndarray:
     """The frames `first` (negative) to -1 of an episode, float32 [-first, N, 3]: where free flight came from."""
     return ballistic_positions(

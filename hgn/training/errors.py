@@ -80,8 +80,12 @@ def baselines(network: ParticleNetwork) -> dict[str, Predictor]:
 
 def network_predictor(backend: Backend) -> Predictor:
     """The network without noise and jitter, as a backend computes it."""
-    restore = backend.network.normaliser.restore_acceleration
-    return lambda batch: restore(backend.normalised_acceleration(batch.state()))
+
+    def predict(batch: Batch) -> torch.Tensor:
+        state = batch.state()
+        return backend.network.restored_acceleration(backend.normalised_acceleration(state), state)
+
+    return predict
 
 
 def frame_batches(

@@ -65,6 +65,10 @@ class TrainingModule(LightningModule):
     def set_statistics(self, statistics: Statistics) -> None:
         """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
         noise = self.training_config.noise_std
+        if self.network.config.relative:
+            self.network.normaliser.set_isotropic(torch.tensor(statistics.acceleration.std), noise)
+            self._begin_average()
+            return
         for quantity in ("velocity", "acceleration"):
             moments = getattr(statistics, quantity)
             mean_3, std_3 = torch.tensor(moments.mean), torch.tensor(moments.std)
@@ -112,7 +116,7 @@ class TrainingModule(LightningModule):
             batch, config.noise_std, config.noise_correlated_fraction, self.network.config.cell_size
         )
         origin_S3 = jittered_origin(batch, self.network.config.cell_size) if config.grid_jitter else None
-        target_N3 = self.network.normaliser.normalise_acceleration(batch.acceleration(window_WN3))
+        target_N3 = self.network.target(batch.acceleration(window_WN3), batch.gravity_S3[batch.scene_N])
         predicted_N3 = (self.backend or self.network).normalised_acceleration(batch.state(window_WN3), origin_S3)
         return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
 

@@ -22,13 +22,14 @@ def drawn_symmetries(batch: Batch) -> list[Symmetry]:
 
 
 def under_symmetries(batch: Batch, symmetries: Sequence[Symmetry]) -> Batch:
-    """A copy of the batch with the scenes' images in it; gravity and domain are their own images."""
+    """A copy of the batch with the scenes' images in it; domains are their own images."""
     obstacles, surface = batch.obstacles, batch.surface
     if surface is not None:
         surface = SurfaceParticles(_points(surface.position_P3, surface.scene_P, symmetries), surface.scene_P)
     return replace(
         batch,
         window_WN3=_points(batch.window_WN3, batch.scene_N, symmetries),
+        gravity_S3=_vectors(batch.gravity_S3, torch.arange(len(symmetries), device=batch.scene_N.device), symmetries),
         obstacles=obstacles and obstacles_under(obstacles, symmetries),
         surface=surface,
     )
@@ -44,8 +45,7 @@ def obstacles_under(obstacles: ObstacleCells, symmetries: Sequence[Symmetry]) ->
     last_S3 = torch.tensor([s.cells for s in symmetries], device=scene_K.device) - 1
     cell_K3 = cell_K3.gather(-1, source_K3)
     key_K = pack(scene_K, torch.where(mirrored_K3, last_S3[scene_K] - cell_K3, cell_K3))
-    normal_K3 = obstacles.normal_K3.gather(-1, source_K3)
-    normal_K3 = torch.where(mirrored_K3, -normal_K3, normal_K3)
+    normal_K3 = _vectors(obstacles.normal_K3, scene_K, symmetries)
     order_K = torch.argsort(key_K)
     return ObstacleCells(key_K[order_K], normal_K3[order_K], obstacles.cell_size)
 
@@ -56,6 +56,13 @@ def _points(point_N3: torch.Tensor, scene_N: torch.Tensor, symmetries: Sequence[
     sum_S3 = torch.tensor([s.mirror_sum for s in symmetries], dtype=torch.float64).to(point_N3)
     point_N3 = point_N3.gather(-1, source_N3.expand(point_N3.shape))
     return torch.where(mirrored_N3, sum_S3[scene_N] - point_N3, point_N3)
+
+
+def _vectors(vector_N3: torch.Tensor, scene_N: torch.Tensor, symmetries: Sequence[Symmetry]) -> torch.Tensor:
+    """The images of directions [N, 3]."""
+    source_N3, mirrored_N3 = _axes(symmetries, scene_N)
+    vector_N3 = vector_N3.gather(-1, source_N3)
+    return torch.where(mirrored_N3, -vector_N3, vector_N3)
 
 
 def _axes(symmetries: Sequence[Symmetry], scene_N: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -76,7 +76,7 @@ def test_wrong_kernels_are_refused() -> None:
     none = torch.zeros(0, 3)
     cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
     episodes = [
-        EpisodeTensors(each.position_TN3, each.material_N, *obstacles, each.domain_size)
+        EpisodeTensors(each.position_TN3, each.material_N, *obstacles, each.domain_size, (0.0, 0.0, 0.0))
         for each, obstacles in ((made, cells), (still, (none.int(), none)))
     ]
     samples = [(made, 1, 3), (still, 0, 4)]

@@ -134,7 +134,7 @@ def test_memory_of_a_simulation(particles: int, side: int, most: float, monkeypa
         whole = HierarchicalGraphNetwork(NetworkConfig())
         position_N3, velocity_NM3 = torch.zeros(particles, 3), torch.zeros(particles, 5, 3)
         index_N = torch.zeros(particles, dtype=torch.int64)
-        state = ParticleState(position_N3, velocity_NM3, index_N, index_N, torch.zeros(1, 3), None)
+        state = ParticleState(position_N3, velocity_NM3, index_N, index_N, torch.zeros(1, 3), torch.zeros(1, 3), None)
     rollout = TritonRollout(whole, state, "fp16", first_capacities(cells, particles))
     gc.collect()
     held = sum(size for storage, size in on_meta().items() if storage not in before)

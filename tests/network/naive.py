@@ -37,9 +37,8 @@ def _one_scene(network, state, members, scene, origin_S3):
         parts = [v]
         if config.obstacle_features:
             parts.append(_normal(state, x, scene))
-        wall = torch.cat([x, state.domain_S3[scene] - x]).clamp(-maximum, maximum) / maximum
-        parts += [wall, network.embedding.weight[state.material_N[i]]]
-        latent.append(network.encode(torch.cat(parts)))
+        parts.append(torch.cat([x, state.domain_S3[scene] - x]).clamp(-maximum, maximum) / maximum)
+        latent.append(parts)
 
     pairs = []  # (particle row, cell, weight, centre - x in cells)
     for row, i in enumerate(members):
@@ -53,6 +52,14 @@ def _one_scene(network, state, members, scene, origin_S3):
             if float(weight) != 0:
                 cell = tuple(b + c for b, c in zip(base, corner, strict=True))
                 pairs.append((row, cell, weight, torch.tensor(cell).to(u) - u))
+
+    if config.relative:
+        latent = [_relative(network, state, i, scene, row, members, pairs) for row, i in enumerate(members)]
+    embedding = network.embedding.weight
+    latent = [
+        network.encode(torch.cat([*parts, embedding[state.material_N[i]]]))
+        for i, parts in zip(members, latent, strict=True)
+    ]
 
     values = {}
     for row, cell, weight, offset in pairs:
@@ -82,6 +89,47 @@ def _one_scene(network, state, members, scene, origin_S3):
     for row, cell, weight, offset in pairs:
         change[row] = change[row] + weight * network.cell_to_particle(values[cell], latent[row], -offset)
     return [network.decode(value + delta) for value, delta in zip(latent, change, strict=True)]
+
+
+def _relative(network, state, i, scene, row, members, pairs):
+    """The columns of relative inputs, one number after the other."""
+    config, scale = network.config, float(network.normaliser.acceleration_std[0])
+    x, gravity = state.position_N3[i].tolist(), state.gravity_S3[scene].tolist()
+    v = state.velocity_NM3[i].tolist()
+
+    def f(value):
+        return math.asinh(value / scale)
+
+    history = [f(v[k][a] - v[k + 1][a] - gravity[a]) for k in range(len(v) - 1) for a in range(3)]
+    surroundings = []
+    for level in range(config.levels):
+        mass, momentum = {}, {}
+        for other, cell, weight, _ in pairs:
+            at = tuple(k >> level for k in cell)
+            mass[at] = mass.get(at, 0.0) + float(weight)
+            moving = state.velocity_NM3[members[other], 0].tolist()
+            momentum[at] = [p + float(weight) * u for p, u in zip(momentum.get(at, [0.0] * 3), moving, strict=True)]
+        mean = [0.0] * 3
+        for other, cell, weight, _ in pairs:
+            at = tuple(k >> level for k in cell)
+            if other == row:
+                mean = [m + float(weight) * p / mass[at] for m, p in zip(mean, momentum[at], strict=True)]
+        surroundings += [f(v[0][a] - mean[a]) for a in range(3)]
+    reach, walls = config.contact_reach_cells * config.cell_size, []
+    for side in (0, 1):
+        for a in range(3):
+            distance = x[a] if side == 0 else float(state.domain_S3[scene, a]) - x[a]
+            away = v[0][a] if side == 0 else -v[0][a]
+            walls.append(min(max(1 - (distance + min(0.0, away)) / reach, 0.0), 2.0))
+    normals = []
+    if config.obstacle_features:
+        place = state.position_N3[i]
+        ahead = [_normal(state, place + state.velocity_NM3[i, 0] * (k / 4), scene) for k in (1, 2, 3, 4)]
+        seen = [normal for normal in ahead if normal.any()]
+        normals = [*_normal(state, place, scene).tolist(), *(seen[0].tolist() if seen else [0.0] * 3)]
+    gate = 1.0 if any(normals) else min(2 * max(walls), 1.0)
+    contact = [gate * f(v[0][a]) for a in range(3)]
+    return [torch.tensor([*history, *surroundings, *contact, *walls, *normals], dtype=state.position_N3.dtype)]
 
 
 def _messages(passing, values):

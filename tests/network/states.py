@@ -14,6 +14,8 @@ from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.scene.obstacle_grid import ObstacleGrid
 
+GRAVITY = (0.0, -9.8 / 3600, 0.0)  # domain units per frame squared
+
 
 def random_grid(seed: int, cells: int, cell_size: float = 1 / 64, extent: int = 24) -> ObstacleGrid:
     """Random obstacle cells with random unit normals."""
@@ -41,6 +43,7 @@ def random_state(
         material_N=torch.randint(0, 3, (total,), generator=generator),
         scene_N=torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),
         domain_S3=torch.ones(len(counts), 3, dtype=dtype),
+        gravity_S3=torch.tensor([GRAVITY]).repeat(len(counts), 1).to(dtype),
         obstacles=ObstacleCells.of(grids) if obstacles else None,
     )
 
@@ -54,6 +57,7 @@ def scene_of(state: ParticleState, scene: int, grid: ObstacleCells | None) -> Pa
         state.material_N[mine],
         torch.zeros(int(mine.sum()), dtype=torch.long),
         state.domain_S3[scene : scene + 1],
+        state.gravity_S3[scene : scene + 1],
         grid,
     )
 
@@ -81,6 +85,9 @@ def _with_random_weights(config: NetworkConfig, dtype: torch.dtype) -> ParticleN
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
+    if config.relative:
+        network.normaliser.set_isotropic(torch.tensor([1e-3, 2e-3, 1e-3]), 1e-3)
+        return network.to(dtype)
     network.normaliser.set("velocity", torch.tensor([1e-4, -2e-3, 0.0]), torch.tensor([1e-3, 2e-3, 3e-3]), 1e-3)
     network.normaliser.set("acceleration", torch.tensor([0.0, -1e-3, 1e-5]), torch.tensor([1e-3, 2e-3, 1e-3]), 1e-3)
     return network.to(dtype)

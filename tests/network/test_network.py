@@ -46,6 +46,9 @@ def test_fcn_halves_equal_the_definition():
         ((1, 17, 3), {"levels": 1}),
         ((12,), {"levels": 4, "message_passing_steps": 1, "width": 7}),
         ((15,), {"obstacle_features": False, "velocity_history": 5}),
+        ((23, 9), {"inputs": "relative"}),
+        ((1, 12), {"inputs": "relative", "levels": 1, "contact_reach_cells": 4.0}),
+        ((12,), {"inputs": "relative", "obstacle_features": False}),
     ],
 )
 def test_network_equals_the_literal_definition(counts, changes):

@@ -27,6 +27,7 @@ from hgn.training.symmetry import drawn_symmetries, obstacles_under, under_symme
 
 CELL_SIZE = 1 / 64
 EIGHT = scene_symmetries((0.0, -9.8, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
+ALL_48 = scene_symmetries((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), CELL_SIZE)
 # of a scene without gravity: its square is not the identity, nor is it its own inverse
 CYCLIC = Symmetry((1, 2, 0), (True, False, False), (63, 63, 63), CELL_SIZE)
 CENTRE = np.full(3, 63 / 128)  # of the solver's nodes
@@ -52,7 +53,8 @@ def seeds_of(symmetries: Sequence[Symmetry], group: tuple[Symmetry, ...] = EIGHT
 
 
 def doubled(batch: Batch) -> Batch:
-    return replace(batch, window_WN3=batch.window_WN3.double(), domain_S3=batch.domain_S3.double())
+    names = ("window_WN3", "domain_S3", "gravity_S3")
+    return replace(batch, **{name: getattr(batch, name).double() for name in names})
 
 
 def by_hand(batch: Batch, episodes: Sequence[Episode], symmetries: Sequence[Symmetry]) -> Batch:
@@ -73,6 +75,9 @@ def by_hand(batch: Batch, episodes: Sequence[Episode], symmetries: Sequence[Symm
     return replace(
         batch,
         window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
+        gravity_S3=torch.stack(
+            [torch.tensor(matrix_of(s)) @ g for s, g in zip(symmetries, batch.gravity_S3, strict=True)]
+        ),
         obstacles=ObstacleCells.of(grids) if batch.obstacles is not None else None,
         surface=SurfaceParticles.of(points) if batch.surface is not None else None,
     )
@@ -89,17 +94,19 @@ def loss_and_gradients(network: ParticleNetwork, batch: Batch, symmetry: str) ->
     ("network", "shown"),
     [
         (network_of(levels=2, message_passing_steps=1), EIGHT),
+        (network_of(levels=2, message_passing_steps=1, inputs="relative"), ALL_48[::6]),
         (gns_of(message_passing_steps=1, cell_size=0.05), EIGHT[5:7]),
         (gns_of(kind="gns_particles", message_passing_steps=1, cell_size=0.05), EIGHT[5:7]),
     ],
-    ids=["hgn", "gns", "gns_particles"],
+    ids=["hgn", "relative", "gns", "gns_particles"],
 )
 def test_training_sees_the_image(network: ParticleNetwork, shown: Sequence[Symmetry]) -> None:
     """With noise and grid jitter, loss and gradients of a batch whose samples draw each of the symmetries are those of
     the batch of images made by hand, to 1e-6 (positions of float32) or better; and not those of the batch itself."""
     cells = 200 if network.config.obstacle_particles else 4_000  # sampling surfaces takes time
     episodes = [scene_with_obstacles(i, cells=cells) for i in range(len(shown))]
-    batch = doubled(make_batch([(e, 6) for e in episodes], network.config, seeds_of(shown)))
+    group = ALL_48 if network.config.relative else EIGHT
+    batch = doubled(make_batch([(e, 6) for e in episodes], network.config, seeds_of(shown, group)))
     assert drawn_symmetries(batch) == list(shown)
     loss, gradient = loss_and_gradients(network, batch, "gravity")
     expected_loss, expected = loss_and_gradients(network, by_hand(batch, episodes, shown), "none")
@@ -130,7 +137,9 @@ def test_particles_meet_the_same_obstacles() -> None:
         velocity = image.state().velocity_NM3[:, k]
         torch.testing.assert_close(velocity, turned(batch.state().velocity_NM3[:, k]), rtol=0, atol=1e-15)
     torch.testing.assert_close(image.acceleration(), turned(batch.acceleration()), rtol=0, atol=1e-15)
-    assert torch.equal(image.gravity_S3, batch.gravity_S3) and torch.equal(image.domain_S3, batch.domain_S3)
+    turn_S33 = torch.tensor(np.array([matrix_of(s) for s in shown])).to(batch.gravity_S3)
+    assert torch.equal(image.gravity_S3, torch.einsum("sij,sj->si", turn_S33, batch.gravity_S3))
+    assert torch.equal(image.domain_S3, batch.domain_S3)
 
 
 def test_cells_are_those_of_the_mirrored_mesh() -> None:

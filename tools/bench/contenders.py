@@ -20,7 +20,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.grid import build_hierarchy
+from hgn.network.grid import GridHierarchy, build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import build, fastest_stepped, with_gradients
 from hgn.runtime.parity import relative_error
@@ -105,14 +105,15 @@ class Frame:
         assert isinstance(network, HierarchicalGraphNetwork)
         config, origin_S3 = network.config, torch.zeros_like(state.domain_S3)
 
-        def grid() -> object:
+        def grid() -> GridHierarchy:
             return build_hierarchy(state.position_N3, state.scene_N, origin_S3, config.cell_size, config.levels)
 
-        built, latent_NW = grid(), network.encode_particles(state)
+        built = grid()
+        latent_NW = network.encode_particles(state, built)
         return {
-            "features": lambda: network.encode_particles(state),
+            "features": lambda: network.encode_particles(state, built),
             "grid": grid,
-            "network": lambda: network.propagate(latent_NW, built),  # type: ignore[arg-type]
+            "network": lambda: network.propagate(latent_NW, built),
         }
 
 

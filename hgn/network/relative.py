@@ -1,0 +1,110 @@
+"""Relative inputs: what a particle is told where a motion common to all changes nothing (`network.inputs: relative`).
+
+Not the paper's (sec. 3.1 has absolute velocities and wall distances). Away from surfaces the features stay the same
+under any common velocity, and in free flight under any gravity, which the output is added to: g + s_a * decoder.
+Columns, in this order, with f(x) = asinh(x / s_a), s_a the normaliser's scale, which is odd, as the cube's symmetries
+ask:
+
+| columns | what |
+|---|---|
+| 3 (H - 1) | f(v^{n-k} - v^{n-k-1} - g), k = 0 … H - 2: zero in free flight |
+| 3 L | f(v_p - U_l(x_p)) on each level, finest first, U_l the momentum over the mass of the cells around |
+| 3 | G f(v^n): the velocity against what stands still, where that is within reach |
+| 6 | walls within reach, lower x, y, z, then upper |
+| 3 + 3 | obstacle normals, at the particle and where it is flying to; only with obstacle_features |
+
+Shape legend: N particles, H velocities, L levels, C cells of a level, S scenes.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from hgn.config import NetworkConfig
+from hgn.network.features import ParticleState
+from hgn.network.grid import GridHierarchy
+from hgn.network.obstacles import ObstacleCells
+
+WALL_LIMIT = 2.0  # of wall_nearness: beyond the plane by the reach
+STEPS_AHEAD = 4  # places looked at on the way of one frame
+SMALLEST_MASS = 1e-30  # a cell that rounding gave no weight has no velocity either
+
+
+def relative_features(
+    state: ParticleState, grid: GridHierarchy, config: NetworkConfig, scale: torch.Tensor
+) -> torch.Tensor:
+    """All columns but the embedding, [N, feature_width - material_embedding]; `scale` is s_a, frame units."""
+    velocity_N3 = state.velocity_NM3[:, 0]
+    wall_N6 = wall_nearness(
+        state.position_N3,
+        velocity_N3,
+        state.domain_S3[state.scene_N],
+        config.contact_reach_cells * config.cell_size,
+    )
+    normal_N6 = None
+    if config.obstacle_features:
+        normal_N6 = obstacle_normals(state.position_N3, velocity_N3, state.scene_N, state.obstacles)
+    parts = [
+        torch.asinh(history(state.velocity_NM3, state.gravity_S3[state.scene_N]) / scale),
+        torch.asinh(surroundings(velocity_N3, grid) / scale),
+        contact_gate(wall_N6, normal_N6)[:, None] * torch.asinh(velocity_N3 / scale),
+        wall_N6,
+    ]
+    return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1)
+
+
+def history(velocity_NH3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
+    """Accelerations of the frames past less gravity, newest first, [N, 3 (H - 1)]."""
+    return (velocity_NH3[:, :-1] - velocity_NH3[:, 1:] - gravity_N3[:, None]).flatten(1)
+
+
+def surroundings(velocity_N3: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
+    """Velocities less that of the cells around on each level, [N, 3 L].
+
+    A cell's velocity is sum(m v) / sum(m), on the finest level over its particles with their trilinear weights, above
+    over its children; a particle takes those of its 8 cells' ancestors with its own weights.
+    """
+    weight_N8 = grid.weight_N8
+    value_N84 = weight_N8[..., None] * torch.cat([velocity_N3, torch.ones_like(velocity_N3[:, :1])], -1)[:, None]
+    momentum_C4 = value_N84.new_zeros(grid.levels[0].cell_count, 4)
+    momentum_C4.index_add_(0, grid.cell_N8.flatten(), value_N84.flatten(0, 1))
+    cell_N8, columns = grid.cell_N8, []
+    for i, level in enumerate(grid.levels):
+        mean_C3 = momentum_C4[:, :3] / momentum_C4[:, 3:].clamp(min=SMALLEST_MASS)
+        columns.append(velocity_N3 - (weight_N8[..., None] * mean_C3[cell_N8]).sum(1))
+        if level.parent_C is not None:
+            coarse_C4 = momentum_C4.new_zeros(grid.levels[i + 1].cell_count, 4)
+            momentum_C4 = coarse_C4.index_add_(0, level.parent_C, momentum_C4)
+            cell_N8 = level.parent_C[cell_N8]
+    return torch.cat(columns, dim=-1)
+
+
+def wall_nearness(
+    position_N3: torch.Tensor, velocity_N3: torch.Tensor, domain_N3: torch.Tensor, reach: float
+) -> torch.Tensor:
+    """How near the domain's six planes are, lower ones first, [N, 6]: 0 from `reach` on, 1 at the plane, at most 2.
+
+    A particle that flies towards a plane is as near as it would be one frame later.
+    """
+    distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
+    away_N6 = torch.cat([velocity_N3, -velocity_N3], dim=-1)
+    return (1 - (distance_N6 + away_N6.clamp(max=0)) / reach).clamp(0, WALL_LIMIT)
+
+
+def obstacle_normals(
+    position_N3: torch.Tensor, velocity_N3: torch.Tensor, scene_N: torch.Tensor, obstacles: ObstacleCells | None
+) -> torch.Tensor:
+    """The normal at the particle, and the first one at a quarter, a half … of the next frame's way, [N, 6]; else 0."""
+    here_N3, ahead_N3 = torch.zeros_like(position_N3), torch.zeros_like(position_N3)
+    if obstacles is not None:
+        here_N3 = obstacles.normals(position_N3, scene_N)
+        for step in range(STEPS_AHEAD, 0, -1):
+            normal_N3 = obstacles.normals(position_N3 + velocity_N3 * (step / STEPS_AHEAD), scene_N)
+            ahead_N3 = torch.where(normal_N3.any(-1, keepdim=True), normal_N3, ahead_N3)
+    return torch.cat([here_N3, ahead_N3], dim=-1)
+
+
+def contact_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
+    """G [N]: exactly 0 where no surface is within reach, 1 where a normal is, rising to 1 half way to a wall."""
+    gate_N = (2 * wall_N6.amax(-1)).clamp(max=1)
+    return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)

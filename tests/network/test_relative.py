@@ -1,0 +1,235 @@
+"""Relative inputs: what holds for any weights, in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from network.states import gns_of, network_of, random_grid, random_state
+from scene.test_symmetry import CUBE, matrix_of
+
+from hgn.config import NetworkConfig
+from hgn.network.features import Normaliser, ParticleState
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.obstacles import ObstacleCells
+from hgn.network.relative import contact_gate, obstacle_normals, relative_features, wall_nearness
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.symmetry import Symmetry, scene_symmetries
+from hgn.schema import ConfigError
+
+HISTORY, SURROUNDINGS, CONTACT = slice(0, 12), slice(12, 21), slice(21, 24)  # with five velocities and three levels
+WALLS, NORMALS = slice(24, 30), slice(30, 36)
+ALL_48 = scene_symmetries((0.0, 0.0, 0.0), CUBE, 1 / 64)
+
+
+def airborne(counts: tuple[int, ...] = (40, 17, 1)) -> ParticleState:
+    """Scenes far from walls and without obstacles, each with a gravity of its own; particles move as they please."""
+    state = random_state(counts, obstacles=False, spread=0.2)
+    gravity_S3 = 3e-3 * torch.randn(len(counts), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return replace(state, position_N3=state.position_N3 + 0.38, gravity_S3=gravity_S3)
+
+
+def in_flight(state: ParticleState, velocity: tuple[float, float, float], gravity_3: torch.Tensor) -> ParticleState:
+    """All particles with one velocity, and the free fall that leads there behind them."""
+    age_H1 = torch.arange(5, dtype=torch.float64)[:, None]
+    velocity_H3 = torch.tensor(velocity, dtype=torch.float64) - age_H1 * gravity_3
+    return replace(
+        state,
+        velocity_NM3=velocity_H3.expand(len(state.position_N3), 5, 3),
+        gravity_S3=gravity_3.expand(state.scene_count, 3),
+    )
+
+
+def columns(network: HierarchicalGraphNetwork, state: ParticleState) -> torch.Tensor:
+    return relative_features(state, network.grid(state), network.config, network.normaliser.acceleration_std[0])
+
+
+@pytest.mark.parametrize("velocity", [(5e-2, 0.0, 0.0), (0.0, 1.7e-2, 0.0), (-1e-3, 5e-3, 2e-2)])
+@pytest.mark.parametrize("counts", [(40, 17, 1), (1,)])
+def test_a_common_velocity_changes_nothing(counts: tuple[int, ...], velocity: tuple[float, float, float]) -> None:
+    """Away from surfaces accelerations are the same to rounding with up to 3 m/s more in any direction, whatever the
+    particles do among themselves; and they depend on that."""
+    network, state = network_of(inputs="relative"), airborne(counts)
+    boosted = replace(state, velocity_NM3=state.velocity_NM3 + torch.tensor(velocity, dtype=torch.float64))
+    torch.testing.assert_close(network(boosted), network(state), rtol=0, atol=1e-14)
+    stirred = replace(state, velocity_NM3=state.velocity_NM3 * 2)
+    assert float((network(stirred) - network(state)).detach().abs().max()) > 1e-6
+
+
+def test_another_place_changes_nothing() -> None:
+    """Particles and the grid's origin beside each other elsewhere, away from surfaces, accelerate alike."""
+    network, state = network_of(inputs="relative"), airborne()
+    shift_3 = torch.tensor([0.07, -0.05, 0.11], dtype=torch.float64)
+    moved = replace(state, position_N3=state.position_N3 + shift_3)
+    torch.testing.assert_close(network(moved, shift_3.expand(3, 3)), network(state), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, -(2.0**-8), 0.0), (2.0**-9, 2.0**-10, -(2.0**-7)), (0.0, 0.0, 0.0)])
+def test_free_flight_knows_no_gravity(gravity: tuple[float, float, float]) -> None:
+    """In free flight all columns of motion are exactly zero (numbers with short binary fractions), so that what is
+    added to gravity is the same under any, and at rest without one."""
+    network, state = network_of(inputs="relative"), airborne()
+    gravity_3 = torch.tensor(gravity, dtype=torch.float64)
+    flying = in_flight(state, (2.0**-5, -(2.0**-6), 2.0**-7), gravity_3)
+    found = columns(network, flying)
+    assert not found[:, HISTORY].any() and not found[:, CONTACT.start :].any()
+    assert float(found[:, SURROUNDINGS].abs().max()) < 1e-12
+    resting = in_flight(state, (0.0, 0.0, 0.0), torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(network(flying) - gravity_3, network(resting), rtol=0, atol=1e-14)
+
+
+def test_each_scene_has_its_gravity() -> None:
+    """A scene's accelerations in a batch of other gravities are those that it has alone with its own."""
+    network, state = network_of(inputs="relative"), airborne()
+    together = network(state)
+    for scene in range(3):
+        mine = state.scene_N == scene
+        alone = ParticleState(
+            state.position_N3[mine],
+            state.velocity_NM3[mine],
+            state.material_N[mine],
+            torch.zeros(int(mine.sum()), dtype=torch.long),
+            state.domain_S3[:1],
+            state.gravity_S3[scene : scene + 1],
+            None,
+        )
+        torch.testing.assert_close(network(alone), together[mine], rtol=0, atol=1e-14)
+    other = replace(state, gravity_S3=state.gravity_S3.flip(0))
+    assert float((network(other) - together).detach().abs().max()) > 1e-4
+
+
+def test_no_particles() -> None:
+    """An empty scene has no accelerations."""
+    network, state = network_of(inputs="relative"), airborne()
+    nobody = replace(
+        state,
+        position_N3=state.position_N3[:0],
+        velocity_NM3=state.velocity_NM3[:0],
+        material_N=state.material_N[:0],
+        scene_N=state.scene_N[:0],
+    )
+    assert network(nobody).shape == (0, 3)
+
+
+@pytest.mark.parametrize("symmetry", ALL_48, ids=lambda s: f"{s.source}{s.mirrored}")
+def test_columns_turn_with_the_scene(symmetry: Symmetry) -> None:
+    """Scene and gravity turned and mirrored together by what keeps a cube: columns of vectors do as they, walls change
+    places; with obstacles and walls within reach. The grid's cells are their own images here."""
+    network = network_of(inputs="relative", cell_size=1 / 8, contact_reach_cells=3.0)
+    grid = random_grid(3, 40_000, extent=64)
+    state = replace(random_state((60,), spread=0.95), obstacles=ObstacleCells.of([grid]))
+    state = replace(state, velocity_NM3=10 * state.velocity_NM3)
+    turn_33 = torch.tensor(matrix_of(symmetry), dtype=torch.float64)
+    centre_K3 = (grid.cell_K3 + 0.5) / 64 - 0.5
+    cell_K3 = np.floor((centre_K3 @ turn_33.numpy().T + 0.5) * 64).astype(np.int32)
+    order = np.lexsort(cell_K3.T[::-1])
+    normal_K3 = (grid.normal_K3 @ turn_33.numpy().T.astype(np.float32))[order]
+    image = replace(
+        state,
+        position_N3=(state.position_N3 - 0.5) @ turn_33.T + 0.5,
+        velocity_NM3=state.velocity_NM3 @ turn_33.T,
+        gravity_S3=state.gravity_S3 @ turn_33.T,
+        obstacles=ObstacleCells.of([ObstacleGrid(1 / 64, cell_K3[order], normal_K3)]),
+    )
+    before, after = columns(network, state), columns(network, image)
+    assert before.abs().amax(0).min() > 0, "every column shows something"
+    vectors = [*range(0, CONTACT.stop), *range(NORMALS.start, NORMALS.stop)]
+    expected = (before[:, vectors].unflatten(1, (-1, 3)) @ turn_33.T).flatten(1)
+    torch.testing.assert_close(after[:, vectors], expected, rtol=0, atol=1e-10)
+    outward_63 = torch.cat([-torch.eye(3), torch.eye(3)]).double()
+    place_6 = (outward_63 @ turn_33.T @ outward_63.T).argmax(1)  # of each wall's image
+    torch.testing.assert_close(after[:, WALLS][:, place_6], before[:, WALLS], rtol=0, atol=1e-12)
+
+
+def test_surfaces_beyond_reach_are_not_seen() -> None:
+    """A hair beyond the reach of all walls the columns of contact are exactly zero, at any speed along them; a hair
+    within it they are not, and the gate is 1 half way."""
+    network = network_of(inputs="relative")
+    reach = 1.5 * network.config.cell_size
+    state = in_flight(airborne((3,)), (0.0, 0.0, 2e-2), torch.zeros(3, dtype=torch.float64))
+    place = torch.tensor([[reach * 1.0001, 0.5, 0.5], [reach * 0.9999, 0.5, 0.5], [0.5, 1 - reach / 2, 0.5]])
+    state = replace(state, position_N3=place.double())
+    found = columns(network, state)
+    assert not found[0, CONTACT.start :].any()
+    assert found[1, CONTACT].any() and int(found[1, WALLS].argmax()) == 0
+    along = float(torch.asinh(torch.tensor(2e-2, dtype=torch.float64) / network.normaliser.acceleration_std[0]))
+    assert float(found[2, CONTACT][2]) == pytest.approx(along) and int(found[2, WALLS].argmax()) == 4
+
+
+@pytest.mark.parametrize("wall", range(6))
+def test_a_wall_is_seen_a_frame_before_it_is_hit(wall: int) -> None:
+    """At 10 m/s towards a wall, one frame before the particle is there: so is its gate, while at rest, or at that speed
+    away from the wall, nothing shows at that place."""
+    axis, upper = wall % 3, wall >= 3
+    towards = torch.zeros(1, 3, dtype=torch.float64)
+    towards[0, axis] = 10 / 60 if upper else -10 / 60
+    place = torch.full((1, 3), 0.5, dtype=torch.float64)
+    place[0, axis] = 1 - 10 / 60 if upper else 10 / 60
+    domain = torch.ones(1, 3, dtype=torch.float64)
+    seen = wall_nearness(place, towards, domain, 0.0525)
+    assert float(seen[0, wall]) == pytest.approx(1.0) and int((seen > 0).sum()) == 1
+    assert contact_gate(seen, None).tolist() == [1.0]
+    for velocity in (torch.zeros_like(towards), -towards):
+        unseen = wall_nearness(place, velocity, domain, 0.0525)
+        assert not unseen.any() and contact_gate(unseen, None).tolist() == [0.0]
+    behind = place + 2 * towards  # beyond the plane by as much
+    assert float(wall_nearness(behind, towards, domain, 0.0525)[0, wall]) == 2.0
+
+
+def test_a_sheet_ahead_is_seen() -> None:
+    """A particle that flies over a sheet of one cell within a frame sees the first normal on its way, in its own scene
+    alone; one that flies away sees none, and the one in the sheet sees it twice where it stays."""
+    cell_K3 = np.array([[i, 20, k] for i in range(10, 54) for k in range(10, 54)], np.int32)
+    up = np.tile(np.array([[0, 1, 0]], np.float32), (len(cell_K3), 1))
+    nothing = ObstacleGrid(1 / 64, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+    obstacles = ObstacleCells.of([ObstacleGrid(1 / 64, cell_K3, up), nothing])
+    height = torch.tensor([21.5, 21.5, 20.5, 21.5], dtype=torch.float64) / 64
+    place = torch.stack([torch.full_like(height, 0.5), height, torch.full_like(height, 0.5)], 1)
+    velocity = torch.zeros(4, 3, dtype=torch.float64)
+    velocity[:, 1] = torch.tensor([-2.5, 2.5, 0.0, -2.5]) / 60
+    found = obstacle_normals(place, velocity, torch.tensor([0, 0, 0, 1]), obstacles)
+    assert found.tolist() == [[0, 0, 0, 0, 1, 0], [0] * 6, [0, 1, 0, 0, 1, 0], [0] * 6]
+    no_wall = torch.zeros(4, 6, dtype=torch.float64)
+    assert contact_gate(no_wall, found).tolist() == [1, 0, 1, 0]
+
+
+def test_one_scale_for_all_axes() -> None:
+    """The scale is the root mean square of the axes' spreads with the noise, there are no means; the target is the
+    inverse of what the output means."""
+    normaliser = Normaliser()
+    normaliser.set_isotropic(torch.tensor([3e-3, 0.0, 6e-3]), 4e-3)
+    expected = ((9 + 0 + 36) / 3 + 16) ** 0.5 * 1e-3
+    for quantity in ("velocity", "acceleration"):
+        torch.testing.assert_close(getattr(normaliser, f"{quantity}_std"), torch.full((3,), expected))
+        assert not getattr(normaliser, f"{quantity}_mean").any()
+    network, state = network_of(inputs="relative"), airborne()
+    raw = network.normalised_acceleration(state)
+    back = network.target(network.restored_acceleration(raw, state), state.gravity_S3[state.scene_N])
+    torch.testing.assert_close(back, raw, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"inputs": "Relative"}, "inputs must be one of absolute, relative, got 'Relative'"),
+        ({"inputs": "relative", "velocity_history": 1}, "velocity_history must be at least 2 with inputs=relative"),
+        ({"contact_reach_cells": 0.0}, "contact_reach_cells must be"),
+        ({"kind": "gns", "levels": 1, "inputs": "relative"}, "inputs must be absolute for gns, got 'relative'"),
+    ],
+)
+def test_bad_input(changes: dict[str, object], message: str) -> None:
+    """One line says field, rule and value."""
+    with pytest.raises(ConfigError, match=message):
+        NetworkConfig(**changes)  # type: ignore[arg-type]
+
+
+def test_width_of_the_encoder() -> None:
+    """55 numbers with five velocities and four levels, and others as the configuration says; weights of absolute inputs
+    keep their shapes."""
+    assert NetworkConfig(inputs="relative").feature_width == 12 + 12 + 3 + 6 + 6 + 16
+    small = NetworkConfig(inputs="relative", levels=2, velocity_history=3, obstacle_features=False)
+    assert small.feature_width == 6 + 6 + 3 + 6 + 16
+    for network in (network_of(inputs="relative"), network_of(), gns_of()):
+        assert network.encode.first.weight.shape[1] == network.config.feature_width
