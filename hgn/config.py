@@ -515,6 +515,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require(self.run != "", "run", "a folder name", self.run)
+        upright = self.scene.zero_gravity_fraction == 0 and self.scene.tilted_gravity_fraction == 0
+        rule = "relative where scene.zero_gravity_fraction or scene.tilted_gravity_fraction is above 0"
+        require(self.network.relative or upright, "network.inputs", rule, self.network.inputs)
         require(
             self.network.sees_obstacles or self.scene.obstacle_count == 0,
             "network.obstacle_features",

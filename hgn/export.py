@@ -31,6 +31,7 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32") -> 
         frame_rate_hz=data.frame_rate_hz,
         obstacle_cell_size=data.obstacle_cell_size,
         gravity=data.gravity,
+        maximum_initial_speed=data.maximum_initial_speed,
         updates=updates_of_checkpoint(checkpoint),
         provenance=provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.config_hash},
     )

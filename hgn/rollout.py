@@ -13,6 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hgn.command import run_command
 from hgn.config import RolloutConfig, SceneConfig
 from hgn.data.lookup import find_episode
@@ -79,6 +81,13 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": config.episode}
+    known, fastest = simulator.info.maximum_initial_speed, _fastest(initial)
+    if known is not None and fastest > known:
+        print(
+            f"velocity: groups begin with up to {fastest:.3g} domain units per second, those of the data of "
+            f"{weights.stem} with up to {known:g}; beyond that collisions and contacts are a guess",
+            file=sys.stderr,
+        )
     print(simulator.backend.note, file=sys.stderr)
     with bar("simulating", total=frames - 1, unit="frame") as progress:
         try:
@@ -99,6 +108,10 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     )
     write_rollout(path, made)
     return path, made
+
+
+def _fastest(initial: InitialState) -> float:
+    return float(np.linalg.norm(initial.velocity_N3, axis=-1).max(initial=0.0))
 
 
 def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:

@@ -33,7 +33,9 @@ class WeightsInfo:
     network: NetworkConfig
     frame_rate_hz: float  # of the data: one step of the network is one frame
     obstacle_cell_size: float
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # of the data, which a network cannot take from a scene
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # of the data; absolute inputs cannot take another
+    # of the data's groups, domain units per second; null: not known
+    maximum_initial_speed: float | None = None
     format_version: int = FORMAT_VERSION
     updates: int = 0
     provenance: dict[str, Any] = field(default_factory=dict)  # commit, data set, date, versions

@@ -32,6 +32,7 @@ class DataInfo:
     frame_rate_hz: float
     obstacle_cell_size: float
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
+    maximum_initial_speed: float | None = None  # of the groups, domain units per second; null: not known
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -59,7 +59,11 @@ def train_network(
 
     training, run = config.training, Path(config.run)
     data = DataInfo(
-        store.manifest.config_hash, config.dataset.frame_rate_hz, config.scene.cell_size, config.scene.gravity
+        store.manifest.config_hash,
+        config.dataset.frame_rate_hz,
+        config.scene.cell_size,
+        config.scene.gravity,
+        config.scene.maximum_initial_speed,
     )
     lightning_compat.quieten()
     devices, nodes = layout(training)

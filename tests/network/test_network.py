@@ -97,19 +97,19 @@ def test_batch_equals_single_scenes(spread, changes):
     ("dtype", "tolerance", "kind"),
     [(torch.float64, 1e-12, Rows), (torch.float32, 1e-5, Rows), (torch.float32, 1e-5, None)],
 )
-@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize(("inputs", "threads"), [("absolute", 1), ("absolute", 2), ("absolute", 3), ("relative", 2)])
 @pytest.mark.parametrize("rows", [20, 300, 4096])
 @pytest.mark.parametrize("counts", [(70, 1, 30), (1,), (400,)])
-def test_blocks_change_nothing(monkeypatch, dtype, tolerance, kind, threads, rows, counts):
+def test_blocks_change_nothing(monkeypatch, dtype, tolerance, kind, inputs, threads, rows, counts):
     """Frames on a CPU, in blocks on several threads, equal the float64 output with gradients, the same every time."""
-    network = network_of(width=128, levels=4).train()
+    network = network_of(width=128, levels=4, inputs=inputs).train()
     state = random_state(counts, spread=0.15)
     expected = network.normalised_acceleration(state).detach()
     monkeypatch.setattr("hgn.cpu.network.ROWS_AT_ONCE", rows)
     if kind is not None:  # none: compiled, where there is a compiler
         monkeypatch.setattr("hgn.cpu.network.rows_class", lambda *_: kind)
     state = replace(state, position_N3=state.position_N3.to(dtype), velocity_NM3=state.velocity_NM3.to(dtype))
-    state = replace(state, domain_S3=state.domain_S3.to(dtype))
+    state = replace(state, domain_S3=state.domain_S3.to(dtype), gravity_S3=state.gravity_S3.to(dtype))
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

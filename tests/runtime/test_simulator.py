@@ -11,6 +11,7 @@ import torch
 from network.states import network_of, random_grid
 
 from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.relative import history
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
@@ -210,6 +211,37 @@ def test_what_loaded_weights_cannot_take(tmp_path: Path) -> None:
                 next(simulator.frames(coarse))
         else:
             simulator.start([coarse])
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (9.8, 0.0, -3.0), (0.0, 19.6, 0.0)])
+def test_relative_inputs_take_any_gravity(tmp_path: Path, gravity: tuple[float, float, float]) -> None:
+    """Weights of relative inputs that add nothing to gravity fly a scene along the closed form, whatever its own is, in
+    a batch with another's; the history that they begin with shows none of it."""
+    network = network_of(torch.float32, inputs="relative")
+    with torch.no_grad():
+        for parameter in network.decode.parameters():
+            parameter.zero_()
+    save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
+    simulator = Simulator.load(tmp_path / "w.safetensors", device="cpu")
+    scenes = [initial(9), replace(initial(25), gravity=gravity)]
+    state = simulator.start(scenes)
+    shown = history(state.velocity_NM3, state.gravity_S3[state.scene_N]) / network.normaliser.acceleration_std[0]
+    assert float(shown.abs().max()) < 1e-4
+    time_T11 = (np.arange(9) / 60)[:, None, None]
+    for scene, path_TN3 in zip(scenes, simulator.rollout(scenes, 9), strict=True):
+        fall_3 = 0.5 * np.array(scene.gravity)
+        expected_TN3 = scene.position_N3 + scene.velocity_N3 * time_T11 + fall_3 * time_T11**2
+        np.testing.assert_allclose(path_TN3, expected_TN3, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, -99.0, 0.0), (60.0, 60.0, 60.0), (0.0, float("nan"), 0.0)])
+def test_no_network_takes_a_huge_gravity(tmp_path: Path, gravity: tuple[float, float, float]) -> None:
+    """More than ten times the earth's, or none that is a number, is refused with the bound."""
+    network = network_of(torch.float32, inputs="relative")
+    save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
+    simulator = Simulator.load(tmp_path / "w.safetensors", device="cpu")
+    with pytest.raises(ConfigError, match="gravity must be at most 98 in size, ten times the earth's, got"):
+        simulator.start([replace(initial(5), gravity=gravity)])
 
 
 @pytest.mark.parametrize(
