@@ -49,7 +49,7 @@ def is_mesh_file(name: str | Path) -> bool:
 def require_rollout_name(field: str, name: str | None) -> None:
     """Refuses names of pictures, which people give where a rollout file is to be."""
     picture = name is not None and Path(name).suffix in (".png", ".gif", ".webp")
-    require(name != "" and not picture, field, "the name of an HDF5 file, as in rollout.vtkhdf", name)
+    require(name != "" and not picture, field, "the name of a rollout file, as in rollout.vtkhdf", name)
 
 
 @dataclass(frozen=True)
@@ -576,7 +576,9 @@ class RolloutConfig:
     """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
 
     weights: str = "obstacles"  # a file of python -m hgn.export, or the name of shipped weights
-    out: str | None = None  # the file to write; null: rollout/NAME.vtkhdf
+    # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
+    out: str | None = None
+    surface: bool = False  # water also as a closed surface, in USD and PLY
     render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene …
     scene: str | None = None

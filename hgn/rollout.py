@@ -18,12 +18,13 @@ import numpy as np
 from hgn.command import run_command
 from hgn.config import RolloutConfig, SceneConfig
 from hgn.data.lookup import find_episode
+from hgn.render.exchange import require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
 from hgn.scene.random_scene import generate_scene
-from hgn.scene.rollout_file import Rollout, obstacles_of_episode, write_rollout
+from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, sheets_of_meshes
 from hgn.schema import ConfigError, from_mapping
@@ -53,6 +54,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
 
     Raises: ConfigError for bad input, weights that let the simulation diverge among them; nothing is written then.
     """
+    require_exchange(Path(config.out or "rollout.vtkhdf"), config.surface)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     weights = find_weights(config.weights)
     source = {"weights": weights.name, "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
@@ -94,7 +96,6 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
             (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
         except DivergedError as error:
             raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
-    path = Path(config.out if config.out is not None else f"rollout/{name}.vtkhdf")
     made = Rollout(
         position_TN3=position_TN3,
         material_N=initial.material_N,
@@ -106,8 +107,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         source=source,
         reference_TN3=reference_TN3,
     )
-    write_rollout(path, made)
-    return path, made
+    return save_rollout(config.out or f"rollout/{name}.vtkhdf", made, config.surface), made
 
 
 def _fastest(initial: InitialState) -> float:

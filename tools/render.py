@@ -2,7 +2,8 @@
 
 Into a folder go NAME.png (frames beside each other), NAME.gif (the animation) and, with ground truth,
 NAME_error.png (error over time); into a file that ends in .png, .gif or .webp (an animation in half the space) goes
-that picture alone. Other rollouts of the same scene (`others=[FILE,...]`) are drawn beside it, under `names`.
+that picture alone; into .usdc, .usda, .usd or .ply the rollout for other programs (`surface=true`: water as a closed
+surface too). Other rollouts of the same scene (`others=[FILE,...]`) are drawn beside it, under `names`.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from hgn.command import run_command
 from hgn.data.lookup import find_episode
+from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, save_rollout
 from hgn.render.pictures import (
     animate,
     compare_picture,
@@ -37,7 +39,8 @@ ANIMATIONS = (".gif", ".webp")
 class RenderConfig:
     """The options of `python -m tools.render`."""
 
-    out: str  # a folder, or one file that ends in .png, .gif or .webp (animated, half as large as GIF)
+    out: str  # a folder, or one file that ends in .png, .gif, .webp (animated, half as large as GIF), .usdc or .ply
+    surface: bool = False  # water also as a closed surface, in USD and PLY
     rollout: str | None = None  # file that python -m hgn.rollout wrote
     others: tuple[str, ...] = ()  # more rollouts of the same scene, drawn beside it or beside the episode
     # of rollout (or the episode) and of each of others; null: prediction (ground truth), and the files' names
@@ -101,8 +104,12 @@ def main(mapping: Mapping[str, Any]) -> int:
         _write_png(config, versions, out)
     elif out.suffix in ANIMATIONS:
         _write_animation(config, versions, out)
+    elif out.suffix in (*USD_ENDINGS, PLY_ENDING):
+        with bar("writing", total=rollout.frame_count, unit="frame") as progress:
+            print(save_rollout(out, rollout, config.surface, progress.update))
     elif out.suffix and not out.is_dir():
-        raise ConfigError(f"out must be a folder or end in .png, {' or '.join(ANIMATIONS)}, got {config.out!r}")
+        endings = ", ".join((".png", *ANIMATIONS, *USD_ENDINGS, PLY_ENDING))
+        raise ConfigError(f"out must be a folder or end in one of {endings}, got {config.out!r}")
     else:
         _write_png(config, versions, out / f"{name}.png")
         if config.gif:

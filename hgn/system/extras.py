@@ -17,6 +17,8 @@ EXTRA_OF = {
     "h11": "service",
     "starlette": "service",
     "uvicorn": "service",
+    "pxr": "files",
+    "pysplashsurf": "files",
     "ray": "ray",
     "s3fs": "s3",
 }

@@ -15,7 +15,7 @@ from datagen.pool.worker import error_message
 from hgn.system.extras import EXTRA_OF, missing_extra
 
 ROOT = Path(__file__).resolve().parents[2]
-BROUGHT_ALONG = {"lightning_utilities": "lightning", "aiohttp": "fsspec"}  # by a package that an extra lists
+BROUGHT_BY = {"lightning_utilities": "lightning", "aiohttp": "fsspec", "pxr": "usd-core"}  # listed in an extra
 
 
 def test_each_package_is_in_the_extra_that_is_named() -> None:
@@ -23,7 +23,7 @@ def test_each_package_is_in_the_extra_that_is_named() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for package, extra in EXTRA_OF.items():
         listed = {re.split(r"[^\w-]", requirement)[0] for requirement in extras[extra]}
-        assert BROUGHT_ALONG.get(package, package) in listed, package
+        assert BROUGHT_BY.get(package, package) in listed, package
 
 
 def test_a_package_of_no_extra_is_no_such_error() -> None:

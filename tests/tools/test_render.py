@@ -139,7 +139,7 @@ def test_other_rollouts_stand_beside_it(tmp_path: Path) -> None:
         ({"data": "folder"}, "rollout must be left out where data and episode are given"),
         ({"rollout": "nothing.h5"}, "rollout must be an existing file"),
         ({"names": ["a", "b"]}, "names must be 1 different ones"),
-        ({"out": "picture.jpg"}, r"out must be a folder or end in \.png, \.gif or \.webp, got 'picture\.jpg'"),
+        ({"out": "picture.jpg"}, r"out must be a folder or end in one of \.png, .*\.ply, got 'picture\.jpg'"),
         ({"frames": [0, 9]}, r"frames\[1\] must be in \[0, 9\)"),
         ({"every": 0}, "every must be at least 1"),
         ({"size": 10}, "size must be 64 to 4096 pixels"),

@@ -1,0 +1,193 @@
+"""Rollouts as files that other programs read: USD for Blender, Houdini and Omniverse, PLY sequences for any tool.
+
+Both hold particles by material with velocities, the obstacles as meshes and, where asked for, water as a closed
+surface. Needs the extra `files` (usd-core, pysplashsurf); PLY without a surface needs nothing.
+Shape legend: T frames, N particles, V vertices, F triangles.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from hgn.render.pictures import particle_spacing
+from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR
+from hgn.scene.material import FLUIDS, MATERIALS
+from hgn.scene.rollout_file import Rollout, frame_velocity, write_rollout
+from hgn.schema import ConfigError
+from hgn.system.extras import require_installed
+from hgn.system.files import sync_folder
+
+USD_ENDINGS = (".usdc", ".usda", ".usd")
+PLY_ENDING = ".ply"
+# Of the surface, in particle radii (half the spacing): with these it encloses the volume of a block of 8 particles a
+# cell within 4 %, as a lattice and as a random filling.
+SMOOTHING_LENGTH, CUBE_SIZE, THRESHOLD = 3.0, 1.0, 0.6
+
+
+def save_rollout(
+    path: str | Path, rollout: Rollout, surface: bool = False, progress: Callable[[], Any] = lambda: None
+) -> Path:
+    """Writes `rollout` in the form that the name's ending asks for; returns the (first) file.
+
+    `.usdc`, `.usda`, `.usd`: one USD stage. `.ply`: NAME_0000.ply, NAME_0001.ply, …, NAME_obstacle_0.ply, …
+    Anything else: VTKHDF. With `surface` USD and PLY also hold the fluid's surface; `progress` is called once a frame.
+    Raises: ConfigError for a surface in VTKHDF; ModuleNotFoundError without the extra `files`.
+    """
+    path = Path(path)
+    require_exchange(path, surface)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix not in (*USD_ENDINGS, PLY_ENDING):
+        write_rollout(path, rollout)
+        return path
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        partial = Path(folder) / path.name
+        if path.suffix == PLY_ENDING:
+            _write_ply(partial, rollout, surface, progress)
+        else:
+            _write_usd(partial, rollout, surface, progress)
+        written = [file.replace(path.parent / file.name) for file in sorted(Path(folder).iterdir())]
+    sync_folder(path.parent)
+    return written[0]
+
+
+def require_exchange(path: Path, surface: bool) -> None:
+    """Whether `save_rollout` can write this, asked before a simulation. Raises: as it does."""
+    if path.suffix in USD_ENDINGS:
+        require_installed("pxr")
+    if surface:
+        if path.suffix not in (*USD_ENDINGS, PLY_ENDING):
+            raise ConfigError(f"surface must be false unless out ends in .usdc, .usda, .usd or .ply, got out={path}")
+        require_installed("pysplashsurf")
+
+
+def fluid_surface(position_N3: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """The closed surface around a fluid's particles, which lie `spacing` apart: float64 [V, 3], int32 [F, 3].
+
+    Marching cubes on SPH's density field, by splashsurf. Empty where there is no particle.
+    """
+    if not len(position_N3):
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
+    import pysplashsurf
+
+    surface, _ = pysplashsurf.reconstruction_pipeline(
+        position_N3.astype(np.float64),
+        particle_radius=spacing / 2,
+        smoothing_length=SMOOTHING_LENGTH,
+        cube_size=CUBE_SIZE,
+        iso_surface_threshold=THRESHOLD,
+    )
+    mesh = surface.mesh
+    assert isinstance(mesh, pysplashsurf.TriMesh3d)
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int32)
+
+
+def _surfaces(rollout: Rollout) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Of each frame."""
+    fluid_N = np.isin(rollout.material_N, FLUIDS)
+    spacing = particle_spacing(rollout.position_TN3[0, fluid_N])
+    for position_N3 in rollout.position_TN3:
+        yield fluid_surface(position_N3[fluid_N], spacing)
+
+
+def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[], Any]) -> None:
+    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(rollout.frame_rate_hz)
+    stage.SetFramesPerSecond(rollout.frame_rate_hz)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(rollout.frame_count - 1)
+    world = UsdGeom.Xform.Define(stage, "/World")
+    stage.SetDefaultPrim(world.GetPrim())
+    world.GetPrim().SetCustomDataByKey("gravity", Gf.Vec3d(*rollout.gravity))
+
+    def colour(shape: Any, rgb_3: np.ndarray) -> None:
+        shape.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*map(float, rgb_3))]))
+
+    def mesh(name: str, rgb_3: np.ndarray) -> Any:
+        prim = UsdGeom.Mesh.Define(stage, f"/World/{name}")
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        prim.CreateDoubleSidedAttr(True)
+        colour(prim, rgb_3)
+        return prim
+
+    def fill(prim: Any, vertex_V3: np.ndarray, triangle_F3: np.ndarray, time: Any) -> None:
+        points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertex_V3, np.float32))
+        prim.GetPointsAttr().Set(points, time)
+        prim.GetFaceVertexCountsAttr().Set(Vt.IntArray(len(triangle_F3), 3), time)
+        prim.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(triangle_F3.reshape(-1).astype(np.int32)), time)
+        prim.GetExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(points), time)
+
+    for obstacle in rollout.obstacles:
+        prim = mesh(f"obstacles/{_identifier(obstacle.name)}", OBSTACLE_COLOR)
+        fill(prim, obstacle.vertex_V3, obstacle.triangle_F3, Usd.TimeCode.Default())
+    velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
+    width = particle_spacing(rollout.position_TN3[0])
+    of_material = {}
+    for index, name in enumerate(MATERIALS):
+        mine_N = np.flatnonzero(rollout.material_N == index)
+        if len(mine_N):
+            prim = UsdGeom.Points.Define(stage, f"/World/particles/{name}")
+            prim.CreateIdsAttr(Vt.Int64Array.FromNumpy(mine_N.astype(np.int64)))
+            prim.CreateWidthsAttr(Vt.FloatArray([width]))
+            prim.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+            prim.GetPrim().CreateAttribute("primvars:material", Sdf.ValueTypeNames.String).Set(name)
+            colour(prim, MATERIAL_COLORS[index])
+            of_material[prim] = mine_N
+    water = mesh("surface", MATERIAL_COLORS[FLUIDS[0]]) if surface else None
+    surfaces = _surfaces(rollout) if surface else iter(())
+    for frame, (position_N3, velocity_N3) in enumerate(zip(rollout.position_TN3, velocity_TN3, strict=True)):
+        for prim, mine_N in of_material.items():
+            points = Vt.Vec3fArray.FromNumpy(position_N3[mine_N])
+            prim.GetPointsAttr().Set(points, frame)
+            prim.GetVelocitiesAttr().Set(Vt.Vec3fArray.FromNumpy(velocity_N3[mine_N]), frame)
+            prim.GetExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(points), frame)
+        if water is not None:
+            fill(water, *next(surfaces), frame)
+        progress()
+    stage.GetRootLayer().Save()
+
+
+def _identifier(name: str) -> str:
+    from pxr import Tf
+
+    return str(Tf.MakeValidIdentifier(name))
+
+
+def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[], Any]) -> None:
+    velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
+    fields = [(name, "<f4") for name in ("x", "y", "z", "vx", "vy", "vz")]
+    fields += [(name, "u1") for name in ("material", "red", "green", "blue")]
+    row_N = np.zeros(rollout.particle_count, fields)
+    row_N["material"] = rollout.material_N
+    for name, value_N in zip(("red", "green", "blue"), 255 * MATERIAL_COLORS[rollout.material_N].T, strict=True):
+        row_N[name] = value_N
+    kinds = {"<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"comment material: {', '.join(MATERIALS)}"]
+    header += [f"element vertex {len(row_N)}", *(f"property {kinds[kind]} {name}" for name, kind in fields)]
+    surfaces = _surfaces(rollout) if surface else iter(())
+    digits = max(4, len(str(rollout.frame_count - 1)))
+    for frame, (position_N3, velocity_N3) in enumerate(zip(rollout.position_TN3, velocity_TN3, strict=True)):
+        for name, value_N in zip("xyz", position_N3.T, strict=True):
+            row_N[name] = value_N
+        for name, value_N in zip(("vx", "vy", "vz"), velocity_N3.T, strict=True):
+            row_N[name] = value_N
+        target = path.with_stem(f"{path.stem}_{frame:0{digits}d}")
+        target.write_bytes("\n".join((*header, "end_header", "")).encode() + row_N.tobytes())
+        if surface:
+            _export(path.with_stem(f"{path.stem}_surface_{frame:0{digits}d}"), *next(surfaces))
+        progress()
+    for index, obstacle in enumerate(rollout.obstacles):
+        _export(path.with_stem(f"{path.stem}_obstacle_{index}"), obstacle.vertex_V3, obstacle.triangle_F3)
+
+
+def _export(path: Path, vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> None:
+    path.write_bytes(trimesh.exchange.ply.export_ply(trimesh.Trimesh(vertex_V3, triangle_F3, process=False)))

@@ -1,0 +1,112 @@
+"""Rollouts as USD and PLY, read back by USD's own library and trimesh."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from pxr import Usd, UsdGeom
+
+from hgn.render.exchange import fluid_surface, save_rollout
+from hgn.render.pictures import particle_spacing
+from hgn.rollout import main as rollout_main
+from hgn.scene.material import MATERIALS
+from hgn.scene.rollout_file import Rollout, frame_velocity
+from hgn.scene.scene import Obstacle
+from hgn.schema import ConfigError
+
+SPACING = 1 / 128
+
+
+def block(random: bool, side: int = 12) -> np.ndarray:
+    """A cube of water, 8 particles in a cell of 1/64, float64 [N, 3]."""
+    if random:
+        return 0.3 + np.random.default_rng(0).random((side**3, 3)) * side * SPACING
+    return 0.3 + (np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) * SPACING
+
+
+@pytest.fixture(scope="module")
+def rollout() -> Rollout:
+    """Water and sand by turns, moving; a box and a sheet; names that USD does not allow."""
+    start_N3 = block(random=False, side=6).astype(np.float32)
+    motion_T13 = np.arange(3, dtype=np.float32)[:, None, None] * np.float32((0.01, -0.002, 0.0))
+    box = trimesh.creation.box((0.3, 0.1, 0.2))
+    obstacles = tuple(
+        Obstacle(name, box.vertices + shift, box.faces[:count].astype(np.int32), closed)
+        for name, shift, count, closed in (("my box-1", 0.5, 12, True), ("2 sheets", 0.2, 4, False))
+    )
+    material_N = np.arange(len(start_N3), dtype=np.uint8) % 2
+    return Rollout(start_N3 + motion_T13, material_N, obstacles, (1.0, 1.0, 1.0), 60.0)
+
+
+def test_usd_is_read_back(tmp_path: Path, rollout: Rollout) -> None:
+    """Every position, velocity, index and triangle; seconds by the frame rate; nothing else is left in the folder."""
+    path = save_rollout(tmp_path / "a" / "scene.usdc", rollout, surface=True)
+    assert [file.name for file in path.parent.iterdir()] == ["scene.usdc"]
+    stage = Usd.Stage.Open(str(path))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 2, 60)
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    velocity_TN3 = frame_velocity(rollout.position_TN3, 60.0)
+    for index, name in enumerate(MATERIALS[:2]):
+        points = UsdGeom.Points(stage.GetPrimAtPath(f"/World/particles/{name}"))
+        mine_N = np.array(points.GetIdsAttr().Get())
+        np.testing.assert_array_equal(mine_N, np.flatnonzero(rollout.material_N == index))
+        assert list(points.GetWidthsAttr().Get()) == pytest.approx([SPACING])
+        for frame in range(3):
+            np.testing.assert_array_equal(points.GetPointsAttr().Get(frame), rollout.position_TN3[frame, mine_N])
+            np.testing.assert_array_equal(points.GetVelocitiesAttr().Get(frame), velocity_TN3[frame, mine_N])
+    assert not stage.GetPrimAtPath("/World/particles/snow")
+    obstacles = stage.GetPrimAtPath("/World/obstacles").GetChildren()
+    for prim, obstacle in zip(obstacles, rollout.obstacles, strict=True):
+        mesh = UsdGeom.Mesh(prim)
+        np.testing.assert_allclose(mesh.GetPointsAttr().Get(), obstacle.vertex_V3, rtol=1e-6)
+        indices = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+        np.testing.assert_array_equal(indices, obstacle.triangle_F3)
+    surface = UsdGeom.Mesh(stage.GetPrimAtPath("/World/surface"))
+    first, last = (np.array(surface.GetPointsAttr().Get(frame)) for frame in (0, 2))
+    np.testing.assert_allclose(last.mean(0) - first.mean(0), (0.02, -0.004, 0), atol=SPACING / 2)
+
+
+def test_ply_is_read_back(tmp_path: Path, rollout: Rollout) -> None:
+    """A file a frame with places, velocities and materials; the obstacles once; the water's surface a frame."""
+    first = save_rollout(tmp_path / "scene.ply", rollout, surface=True)
+    assert first == tmp_path / "scene_0000.ply"
+    parts = ("obstacle_0", "obstacle_1", *(f"{kind}000{i}" for kind in ("", "surface_") for i in range(3)))
+    names = {f"scene_{part}.ply" for part in parts}
+    assert {file.name for file in tmp_path.iterdir()} == names
+    cloud = trimesh.load(tmp_path / "scene_0002.ply")
+    np.testing.assert_array_equal(cloud.vertices.astype(np.float32), rollout.position_TN3[2])
+    data = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    velocity_N3 = np.stack([data[name] for name in ("vx", "vy", "vz")], -1)
+    np.testing.assert_array_equal(velocity_N3, frame_velocity(rollout.position_TN3, 60.0)[2])
+    np.testing.assert_array_equal(data["material"], rollout.material_N)
+    assert len(trimesh.load(tmp_path / "scene_obstacle_1.ply", process=False).faces) == 4
+    assert trimesh.load(tmp_path / "scene_surface_0001.ply").is_watertight
+
+
+@pytest.mark.parametrize("random", [False, True])
+def test_the_surface_encloses_the_water(random: bool) -> None:
+    """Closed, and of the particles' volume within 5 %, for a lattice and a random filling."""
+    position_N3 = block(random)
+    mesh = trimesh.Trimesh(*fluid_surface(position_N3, particle_spacing(position_N3)), process=False)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(len(position_N3) * SPACING**3, rel=0.05)
+
+
+def test_no_fluid_no_surface() -> None:
+    """Sand alone has an empty surface."""
+    vertex_V3, triangle_F3 = fluid_surface(np.zeros((0, 3)), SPACING)
+    assert vertex_V3.shape == triangle_F3.shape == (0, 3)
+
+
+def test_what_cannot_be_written_is_said_before_the_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A surface in VTKHDF; USD without its library."""
+    with pytest.raises(ConfigError, match="surface must be false unless out ends in"):
+        rollout_main({"surface": True, "weights": "no such weights"})
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pxr" else find_spec(name))
+    with pytest.raises(ModuleNotFoundError, match="pxr"):
+        rollout_main({"out": "scene.usdc", "weights": "no such weights"})
