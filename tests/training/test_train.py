@@ -81,6 +81,23 @@ def test_a_run_leaves_what_it_promises(data, tmp_path):
     assert session.hparams["network/width"].number_value == 8
 
 
+def test_relative_inputs_train_as_all_others(data, tmp_path):
+    """With all symmetries, noise, pushforward and a moving average: the normaliser has no means and one scale, the
+    data's with the noise."""
+    run, options = tmp_path / "run", {"symmetry": "gravity", "pushforward_fraction": 0.5, "pushforward_frames": 2}
+    mapping = train_mapping(data, run, **options, pushforward_every=4, pushforward_scenes=2, ema_decay=0.9)
+    assert train.main(mapping | {"network": mapping["network"] | {"inputs": "relative"}}) == 0
+    state = weights(run / "checkpoints" / "last.ckpt")
+    std_3 = torch.tensor(Manifest.load(data.dataset.folder).statistics("train").acceleration.std)
+    expected = float((std_3.square().mean() + 0.000848528**2).sqrt())
+    for name in ("network", "averaged"):
+        assert state[f"{name}.normaliser.acceleration_std"].tolist() == pytest.approx([expected] * 3)
+        assert state[f"{name}.normaliser.velocity_std"].tolist() == pytest.approx([expected] * 3)
+        assert not state[f"{name}.normaliser.acceleration_mean"].any()
+    values = {name: value for record in metrics(run) for name, value in record.items()}
+    assert math.isfinite(values["one_step/validation"]) and values["pushforward/windows"] > 0
+
+
 def gradients_with_faults(monkeypatch: pytest.MonkeyPatch, faulty: Collection[int]) -> None:
     """Puts one NaN into the gradient of some updates, before the callbacks see it."""
     original = TrainingModule.on_after_backward
