@@ -212,8 +212,6 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
         return f"it needs a CUDA device, not {device.type}"
     if reason := why_no_triton():
         return reason
-    if config.relative:
-        return "its kernels read absolute inputs (network.inputs)"
     if config.kind != "hgn" and precision != "fp16":
         return f"it computes {config.kind} with precision fp16, not {precision}"
     if config.width not in TRITON_WIDTHS:

@@ -105,6 +105,7 @@ class TritonRollout:
         self.material_N = torch.zeros(self.particles, dtype=torch.int32, device=self.device)
         self.domain_S3 = torch.zeros(self.scenes, 3, device=self.device)
         self.origin_S3 = torch.zeros_like(self.domain_S3)
+        self.gravity_S3 = torch.zeros_like(self.domain_S3)  # zero with absolute inputs, which have learned it
         self.obstacles = obstacles
         if obstacles is None and state.obstacles is not None:
             self.obstacles = ObstacleTable.of(state.obstacles, state.scene_count)
@@ -150,6 +151,8 @@ class TritonRollout:
         self.scene_N[:count].copy_(state.scene_N)
         self.material_N[:count].copy_(state.material_N)
         self.domain_S3.copy_(state.domain_S3)
+        if self.config.relative:
+            self.gravity_S3.copy_(state.gravity_S3)
 
     def use_values(self, values: torch.Tensor) -> None:
         """Takes over parameters in the packed layout."""
@@ -177,7 +180,14 @@ class TritonRollout:
         limits = [min(limit, 8 * self.particles) for limit in limits]
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
         self.grid = DeviceGrid(
-            window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size, self.device
+            window,
+            self.scenes,
+            rounded,
+            self.particles,
+            feature_columns(config),
+            config.cell_size,
+            self.device,
+            config.relative,
         )
         self.fused = FusedNetwork(config, self.packed, self.values, self.grid, self.count, self.precision)
         if self.device.type == "cuda":
@@ -219,19 +229,18 @@ class TritonRollout:
         config, grid = self.config, self.grid
         grid.build(self.position_N3, self.scene_N, self.origin_S3, self.count)
         grid.prepare(
+            config,
             self.position_N3,
             self.velocity_NV,
             self.scene_N,
             self.material_N,
             self.origin_S3,
             self.domain_S3,
+            self.gravity_S3,
             self.count,
             self.velocity_mean,
             self.velocity_std,
             self.obstacles,
-            config.velocity_history,
-            config.obstacle_features,
-            config.wall_distance_cells * config.cell_size,
         )
         self.fused.forward()
 
@@ -242,6 +251,7 @@ class TritonRollout:
             velocity=self.velocity_NV,
             scene_of=self.scene_N,
             domain=self.domain_S3,
+            gravity=self.gravity_S3,
             mean=self.mean,
             std=self.std,
             particle_count=self.count,

@@ -36,6 +36,11 @@ class Symmetry:
         x, y, z = (count * self.cell_size for count in self.cells)
         return x, y, z
 
+    def direction(self, vector: Vector) -> Vector:
+        """The image of a vector that has no place, as gravity."""
+        x, y, z = (-vector[s] if m else vector[s] for s, m in zip(self.source, self.mirrored, strict=True))
+        return x, y, z
+
     @cached_property
     def code(self) -> int:
         """All but the cell size in one integer below 2^60, for the kernels."""
@@ -56,10 +61,9 @@ def scene_symmetries(gravity: Vector, domain_size: Vector, cell_size: float) -> 
     found = []
     for s0, s1, s2 in permutations(range(3)):
         for m0, m1, m2 in product((False, True), repeat=3):
-            source, mirrored = (s0, s1, s2), (m0, m1, m2)
-            image = [-gravity[s] if m else gravity[s] for s, m in zip(source, mirrored, strict=True)]
-            if image == list(gravity) and [domain_size[s] for s in source] == list(domain_size):
-                found.append(Symmetry(source, mirrored, cells, cell_size))
+            symmetry = Symmetry((s0, s1, s2), (m0, m1, m2), cells, cell_size)
+            if symmetry.direction(gravity) == gravity and [domain_size[s] for s in symmetry.source] == [*domain_size]:
+                found.append(symmetry)
     return tuple(found)
 
 

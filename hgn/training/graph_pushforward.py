@@ -96,14 +96,13 @@ class GraphPushforwardPool:
         history, device = self.network.config.velocity_history, truths[0].device
         past_TN3 = torch.cat([truth[: history + 1] for truth in truths], dim=1)
         counts = torch.tensor([episode.particles for episode in episodes], device=device)
-        domain_S3 = torch.tensor([episode.domain_size for episode in episodes], device=device)
         return ParticleState(
             position_N3=past_TN3[-1],
             velocity_NM3=past_TN3.diff(dim=0).flip(0).transpose(0, 1),
             material_N=torch.cat([episode.material_N for episode in episodes]),
             scene_N=torch.arange(len(episodes), device=device).repeat_interleave(counts),
-            domain_S3=domain_S3,
-            gravity_S3=torch.zeros_like(domain_S3),
+            domain_S3=torch.tensor([episode.domain_size for episode in episodes], device=device),
+            gravity_S3=torch.tensor([episode.gravity for episode in episodes], device=device),
             obstacles=None,
         )
 

@@ -141,7 +141,9 @@ class GraphTrainer:
         cells, normals = episode.obstacle_cell_K3, episode.obstacle_normal_K3
         obstacles = ObstacleHash.of(cells, normals).to(self.device) if len(cells) else None
         material_N = episode.material_N.to(self.device)
-        return DeviceEpisode(position_TN3, material_N, obstacles, episode.domain_size, episode.symmetries)
+        return DeviceEpisode(
+            position_TN3, material_N, obstacles, episode.domain_size, episode.gravity, episode.symmetries
+        )
 
     def _take_over(self) -> None:
         """Makes parameters and moments views of flat buffers, so that one launch copies all of them."""

@@ -86,7 +86,7 @@ def _state(
         updates.material_N[:count].long(),
         updates.scene_N[:count].long(),
         updates.domain_S3,
-        torch.zeros_like(updates.domain_S3),
+        updates.gravity_S3,
         obstacles,
     )
     return state, updates.origin_S3

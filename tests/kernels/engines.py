@@ -43,6 +43,7 @@ def engine_of(
         feature_columns(config),
         config.cell_size,
         where,
+        config.relative,
     )
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)
@@ -63,6 +64,15 @@ def run_forward(
     engine: FusedNetwork, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
 ) -> torch.Tensor:
     """The engine's normalised accelerations of the state, [N, 3]."""
+    prepare(engine, network, state, origin_S3)
+    engine.forward()
+    return engine.output[: len(state.position_N3), :3].cpu()
+
+
+def prepare(
+    engine: FusedNetwork, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
+) -> None:
+    """The state's cells and features in the engine's grid."""
     where, grid, config = engine.device, engine.grid, network.config
 
     def padded(value: torch.Tensor) -> torch.Tensor:
@@ -79,22 +89,19 @@ def run_forward(
     grid.build(position, scene, origin, engine.particle_count)
     normaliser = network.normaliser
     grid.prepare(
+        config,
         position,
         velocity,
         scene,
         material,
         origin,
         domain,
+        state.gravity_S3.float().to(where),
         engine.particle_count,
         normaliser.velocity_mean.float().to(where),
         normaliser.velocity_std.float().to(where),
         obstacles,
-        config.velocity_history,
-        config.obstacle_features,
-        config.wall_distance_cells * config.cell_size,
     )
-    engine.forward()
-    return engine.output[: len(state.position_N3), :3].cpu()
 
 
 def gradients(engine: FusedTrainingNetwork, network: HierarchicalGraphNetwork) -> list[torch.Tensor]:

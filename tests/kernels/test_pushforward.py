@@ -42,7 +42,9 @@ def placed(made: Episode, network: HierarchicalGraphNetwork) -> DeviceEpisode:
     whole, where = whole_episode(made, network.config), device()
     cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3
     obstacles = ObstacleHash.of(cells, normals).to(where) if len(cells) else None
-    return DeviceEpisode(whole.position_TN3.to(where), whole.material_N.to(where), obstacles, whole.domain_size)
+    return DeviceEpisode(
+        whole.position_TN3.to(where), whole.material_N.to(where), obstacles, whole.domain_size, whole.gravity
+    )
 
 
 def values_of(network: HierarchicalGraphNetwork) -> torch.Tensor:
@@ -59,10 +61,11 @@ def assert_same_pools(fast: GraphPushforwardPool, plain: PushforwardPool) -> Non
         assert asked == pytest.approx(acceleration, abs=1e-6)
 
 
-def test_the_pool_is_that_of_the_plain_path() -> None:
+@pytest.mark.parametrize("inputs", ["absolute", "relative"])
+def test_the_pool_is_that_of_the_plain_path(inputs: str) -> None:
     """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
-    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, inputs=inputs).to(device())
     scenes = [scene_with_obstacles(0, 7), episode(5, seed=1), scene_with_obstacles(2, 6), scene_with_obstacles(3, 12)]
     training = training_of(precision="fp32", pushforward_frames=2, noise_std=0.5, noise_min_scale=0.1)
     fast, plain = GraphPushforwardPool(network, training, CELL_SIZE, 0), PushforwardPool(network, training, 0)

@@ -21,6 +21,7 @@ from hgn.runtime import triton_rollout
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
+from hgn.scene.symmetry import Vector
 from hgn.schema import ConfigError
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
@@ -28,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("large_tiles")
 GRAVITY = (0.0, -9.8, 0.0)
 
 
-def scene(particles: int, seed: int = 0) -> InitialState:
+def scene(particles: int, seed: int = 0, gravity: Vector = GRAVITY) -> InitialState:
     rng = np.random.default_rng(seed)
     return InitialState(
         position_N3=(0.05 + 0.1 * rng.random((particles, 3))).astype(np.float32),
@@ -36,19 +37,21 @@ def scene(particles: int, seed: int = 0) -> InitialState:
         material_N=rng.integers(0, 3, particles).astype(np.uint8),
         obstacle_grid=random_grid(seed, 4_000),
         domain_size=(0.4, 0.4, 0.4),
-        gravity=GRAVITY,
+        gravity=gravity,
     )
 
 
-def network(levels: int = 1) -> HierarchicalGraphNetwork:
-    return network_of(torch.float32, width=16, levels=levels, message_passing_steps=1).to(device())
+def network(levels: int = 1, **changes: object) -> HierarchicalGraphNetwork:
+    return network_of(torch.float32, width=16, levels=levels, message_passing_steps=1, **changes).to(device())
 
 
-def test_frames_are_those_of_the_plain_loop() -> None:
-    """Two scenes at once move as in the plain simulator, frame by frame, and each frame is announced once."""
-    scenes, seen = [scene(5), scene(3, 1)], []
-    expected = Simulator(network(2), 60.0, "torch").rollout(scenes, 3)
-    found = Simulator(network(2), 60.0, "triton", "fp32").rollout(scenes, 3, seen.append)
+@pytest.mark.parametrize("inputs", ["absolute", "relative"])
+def test_frames_are_those_of_the_plain_loop(inputs: str) -> None:
+    """Two scenes at once, of different gravity, move as in the plain simulator, frame by frame, and each frame is
+    announced once."""
+    scenes, seen = [scene(5), scene(3, 1, (3.0, -1.0, 2.0))], []
+    expected = Simulator(network(2, inputs=inputs), 60.0, "torch").rollout(scenes, 3)
+    found = Simulator(network(2, inputs=inputs), 60.0, "triton", "fp32").rollout(scenes, 3, seen.append)
     assert seen == [1, 2]
     for path_TN3, expected_TN3 in zip(found, expected, strict=True):
         assert path_TN3.shape == expected_TN3.shape and path_TN3.dtype == np.float32
@@ -70,14 +73,14 @@ def test_overflow_loses_nothing() -> None:
 
 
 def test_later_simulations_begin_anew() -> None:
-    """What a simulator has captured it uses again, for a scene of fewer particles and other obstacles too; the frames
-    are bitwise those of a new simulator, after one that diverged as well."""
-    first, second = scene(3), scene(2, 1)
-    again = Simulator(network(), 60.0, "triton", "fp32")
+    """What a simulator has captured it uses again, for a scene of fewer particles, other obstacles and other gravity
+    too; the frames are bitwise those of a new simulator, after one that diverged as well."""
+    first, second = scene(3), scene(2, 1, (0.0, 2.0, 0.0))
+    again = Simulator(network(inputs="relative"), 60.0, "triton", "fp32")
     again.rollout([first], 2)
     kept = again.backend.idle[1]
     for one in (second, first):
-        (expected,) = Simulator(network(), 60.0, "triton", "fp32").rollout([one], 2)
+        (expected,) = Simulator(network(inputs="relative"), 60.0, "triton", "fp32").rollout([one], 2)
         (found,) = again.rollout([one], 2)
         assert again.backend.idle[1] is kept
         np.testing.assert_array_equal(found, expected)

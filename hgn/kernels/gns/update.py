@@ -18,7 +18,7 @@ from torch.nn import functional
 from hgn.kernels.forward import feature_columns
 from hgn.kernels.gns.op import FusedEdges
 from hgn.kernels.grid.kernel import prepare_features
-from hgn.kernels.grid.op import OUT_OF_WINDOW
+from hgn.kernels.grid.op import OUT_OF_WINDOW, PARTICLE_BLOCK, feature_arguments
 from hgn.kernels.neighbours.op import DeviceNeighbours
 from hgn.kernels.update.op import TAIL, Layout, Tables, TrainedNetwork, Updates
 from hgn.network.cell_keys import COORDINATE_LIMIT
@@ -28,7 +28,6 @@ from hgn.network.gns_edges import PlainEdges
 from hgn.schema import ConfigError
 
 OUT = 4  # the decoder's three outputs, padded
-FEATURE_BLOCK = 32
 
 
 @dataclass(frozen=True)
@@ -161,27 +160,24 @@ class GnsUpdates(Updates):
         )
 
     def _grid(self) -> None:
-        config, sees = self.config, self.config.obstacle_features
+        config = self.config
         self.grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
-        prepare_features[(triton.cdiv(self.particles, FEATURE_BLOCK),)](
-            position=self.position_N3,
-            velocity=self.velocity_NV,
-            scene_of=self.scene_N,
-            material_of=self.material_N,
-            domain=self.domain_S3,
-            particle_count=self.particle_count,
+        prepare_features[(triton.cdiv(self.particles, PARTICLE_BLOCK),)](
+            **feature_arguments(
+                config,
+                self.position_N3,
+                self.velocity_NV,
+                self.scene_N,
+                self.material_N,
+                self.domain_S3,
+                self.particle_count,
+                self.obstacles,
+                self.settings.symmetry,
+                self.feature_NF,
+            ),
             mean=self.velocity_mean,
             std=self.velocity_std,
-            obstacle_table=self._obstacle_row,
-            obstacle_cell_size=self.settings.obstacle_cell_size,
-            features=self.feature_NF,
             wall_maximum=config.wall_distance_cells * config.cell_size,
-            HISTORY=config.velocity_history,
-            NORMALS=int(sees),
-            OBSTACLES=sees,
-            SYMMETRY=self.settings.symmetry,
-            FEATURES=self.feature_NF.shape[1],
-            BLOCK=FEATURE_BLOCK,
         )
 
     def _make_room(self, status: int, needed: list[int]) -> None:

@@ -238,7 +238,7 @@ def _find_obstacle(x, y, z, line, live):
     end = tl.load(bucket + place + 1, mask=live, other=0)
     entry = tl.zeros_like(start) - 1
     ask = live & (start < end)
-    while tl.max(ask.to(tl.int32), 0) > 0:
+    while tl.max(ask.to(tl.int32)) > 0:
         here = tl.load(entry_key + start, mask=ask, other=-1)
         entry = tl.where(ask & (here == key), start, entry)
         start += 1
@@ -262,86 +262,43 @@ def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
 
 
 @triton.jit
-def _store_features(
-    row,
-    live,
-    scene,
-    position,
-    velocity,
-    material_of,
-    domain,
-    mean,
-    std,
-    obstacle_table,
-    obstacle_cell_size,
-    features,
-    wall_maximum,
-    HISTORY: tl.constexpr,
-    NORMALS: tl.constexpr,
-    OBSTACLES: tl.constexpr,
-    SYMMETRY: tl.constexpr,
-    FEATURES: tl.constexpr,
-):
-    """Features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES]. Without
-    OBSTACLES nothing is looked up and the normals stay zero; with SYMMETRY the particles are an image of the scene that
-    the obstacle table is of: looked up there, normals brought back."""
-    column = tl.arange(0, FEATURES)
-    axis = column % 3
-    here = live[:, None]
-    # 3 * HISTORY velocities: column 3 k + axis
-    is_velocity = column < 3 * HISTORY
-    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + column[None, :], mask=here & is_velocity[None, :], other=0.0)
-    centred = v - tl.load(mean + axis)[None, :]
-    value = tl.where(
-        is_velocity[None, :], tl.div_rn(centred, tl.load(std + axis)[None, :] + tl.zeros_like(centred)), 0.0
-    )
-    WALLS: tl.constexpr = 3 * HISTORY + 3 * NORMALS
-    if OBSTACLES:
-        ox = tl.load(position + row * 3, mask=live, other=0.0)
-        oy = tl.load(position + row * 3 + 1, mask=live, other=0.0)
-        oz = tl.load(position + row * 3 + 2, mask=live, other=0.0)
-        ox = tl.floor(tl.div_rn(ox, obstacle_cell_size))
-        oy = tl.floor(tl.div_rn(oy, obstacle_cell_size))
-        oz = tl.floor(tl.div_rn(oz, obstacle_cell_size))
-        line = obstacle_table + scene * OBSTACLE_COLUMNS
+def _normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr):
+    """The obstacle normals' three parts at positions of any shape, zeros where there is none; `line` is their scenes'
+    row of the obstacle table. With SYMMETRY the positions are an image of the scene that the table is of: looked up
+    there, normals brought back."""
+    x = tl.floor(tl.div_rn(x, obstacle_cell_size))
+    y = tl.floor(tl.div_rn(y, obstacle_cell_size))
+    z = tl.floor(tl.div_rn(z, obstacle_cell_size))
+    if SYMMETRY:
+        symmetry = tl.load(line + OBSTACLE_COLUMNS - 1, mask=live, other=0)
+        ix, iy, iz = _before_mirror(x, symmetry, 0), _before_mirror(y, symmetry, 1), _before_mirror(z, symmetry, 2)
+        x = _from_axis(ix, iy, iz, symmetry, 0)
+        y = _from_axis(ix, iy, iz, symmetry, 1)
+        z = _from_axis(ix, iy, iz, symmetry, 2)
+    near = live & (tl.abs(x) < LIMIT) & (tl.abs(y) < LIMIT) & (tl.abs(z) < LIMIT)
+    x = tl.where(near, x, 0.0).to(tl.int64)
+    y = tl.where(near, y, 0.0).to(tl.int64)
+    z = tl.where(near, z, 0.0).to(tl.int64)
+    near = near & (tl.load(line, mask=near, other=0) != 0)
+    entry = _find_obstacle(x, y, z, line, near)
+    at = tl.load(line + 2, mask=near, other=0).to(tl.pointer_type(tl.float32)) + entry * 3
+    found = ()
+    for axis in tl.static_range(3):
         if SYMMETRY:
-            symmetry = tl.load(line + OBSTACLE_COLUMNS - 1, mask=live, other=0)
-            ix = _before_mirror(ox, symmetry, 0)
-            iy = _before_mirror(oy, symmetry, 1)
-            iz = _before_mirror(oz, symmetry, 2)
-            ox = _from_axis(ix, iy, iz, symmetry, 0)
-            oy = _from_axis(ix, iy, iz, symmetry, 1)
-            oz = _from_axis(ix, iy, iz, symmetry, 2)
-        near = live & (tl.abs(ox) < LIMIT) & (tl.abs(oy) < LIMIT) & (tl.abs(oz) < LIMIT)
-        ox = tl.where(near, ox, 0.0).to(tl.int64)
-        oy = tl.where(near, oy, 0.0).to(tl.int64)
-        oz = tl.where(near, oz, 0.0).to(tl.int64)
-        near = near & (tl.load(line, mask=near, other=0) != 0)
-        entry = _find_obstacle(ox, oy, oz, line, near)
-        is_normal = (column >= 3 * HISTORY) & (column < WALLS)
-        entry_normal = tl.load(line + 2, mask=near, other=0).to(tl.pointer_type(tl.float32))
-        if SYMMETRY:
-            part = symmetry[:, None] >> (axis * CODE_BITS).to(tl.int64)[None, :]
-            normal_axis = part & 3
-        else:
-            normal_axis = axis[None, :]
-        normal = tl.load(
-            (entry_normal + entry * 3)[:, None] + normal_axis,
-            mask=(entry >= 0)[:, None] & is_normal[None, :],
-            other=0.0,
-        )
-        if SYMMETRY:
+            part = symmetry >> CODE_BITS * axis
+            normal = tl.load(at + (part & 3), mask=entry >= 0, other=0.0)
             normal = tl.where((part >> 2 & 1) == 1, -normal, normal)
-        value += normal
-    is_wall = (column >= WALLS) & (column < WALLS + 6)
-    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
-    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
-    distance = tl.where((column >= WALLS + 3)[None, :], size - place, place)
-    distance = tl.minimum(tl.maximum(distance, -wall_maximum), wall_maximum) / wall_maximum
-    value = tl.where(is_wall[None, :], distance, value)
-    material = tl.load(material_of + row, mask=live, other=0)
-    value = tl.where((column[None, :] - (WALLS + 6)) == material[:, None], 1.0, value)
-    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
+        else:
+            normal = tl.load(at + axis, mask=entry >= 0, other=0.0)
+        found = found + (normal,)  # noqa: RUF005 - Triton knows no unpacking here
+    return found
+
+
+@triton.jit
+def _with_column(value, number, x):
+    """`value` [N, F] with the column x [N] in place of one of its own."""
+    column = tl.arange(0, value.shape[1])
+    return tl.where((column == number)[None, :], x[:, None], value)
 
 
 @triton.jit
@@ -349,35 +306,26 @@ def prepare_particles(
     position,
     velocity,
     scene_of,
-    material_of,
     origin,
-    domain,
     particle_count,
     low,
     geometry,
     occupied,
     prefix_sum,
-    mean,
-    std,
-    obstacle_table,
-    obstacle_cell_size,
-    features,
     cell_of,
     weight_of,
     fraction_of,
+    motion,
     cell_size,
-    wall_maximum,
     capacity,
     HISTORY: tl.constexpr,
-    NORMALS: tl.constexpr,
-    OBSTACLES: tl.constexpr,
-    SYMMETRY: tl.constexpr,
-    FEATURES: tl.constexpr,
+    MOTION: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Features of each particle, see _store_features; its 8 cells, their weights, and its fraction.
+    """Each particle's 8 cells, their weights, and its fraction; with MOTION its parts of the finest cells' mass and
+    momentum are added to `motion` [.., 4].
 
-    Reference: hgn.network.features; test: tests/kernels/test_network.py.
+    Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -411,30 +359,37 @@ def prepare_particles(
     tl.store(fraction_of + row * 3, fx, mask=live)
     tl.store(fraction_of + row * 3 + 1, fy, mask=live)
     tl.store(fraction_of + row * 3 + 2, fz, mask=live)
+    if MOTION:
+        touched = (cell >= 0) & (weight > 0)
+        tl.atomic_add(motion + cell * 4, weight, mask=touched, sem="relaxed")
+        for axis in tl.static_range(3):
+            v = tl.load(velocity + row * (3 * HISTORY) + axis, mask=live, other=0.0)
+            tl.atomic_add(motion + cell * 4 + 1 + axis, weight * v[:, None], mask=touched, sem="relaxed")
     # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
     tl.store(cell_of + row[:, None] * 8 + corner, tl.maximum(cell, 0), mask=here)
     tl.store(weight_of + row[:, None] * 8 + corner, weight, mask=here)
 
-    _store_features(
-        row,
-        live,
-        scene,
-        position,
-        velocity,
-        material_of,
-        domain,
-        mean,
-        std,
-        obstacle_table,
-        obstacle_cell_size,
-        features,
-        wall_maximum,
-        HISTORY,
-        NORMALS,
-        OBSTACLES,
-        SYMMETRY,
-        FEATURES,
-    )
+
+@triton.jit
+def sum_motion(motion, parent, geometry, counts, LEVELS: tl.constexpr, BLOCK: tl.constexpr):
+    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels.
+
+    Reference: hgn.network.features; test: tests/kernels/test_relative.py.
+    """
+    count = tl.load(counts)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = cell < count
+    part = tl.arange(0, 4)[None, :]
+    value = tl.load(motion + cell[:, None] * 4 + part, mask=there[:, None], other=0.0)
+    for level in tl.static_range(1, LEVELS):
+        line = geometry + level * GEOMETRY_COLUMNS
+        # a parent past the capacity is none (-1)
+        cell = tl.load(parent + tl.load(line - GEOMETRY_COLUMNS + 6) + cell, mask=there, other=-1)
+        there = there & (cell >= 0)
+        at = motion + (tl.load(line + 6) + cell)[:, None] * 4 + part
+        tl.atomic_add(at, value, mask=there[:, None], sem="relaxed")
 
 
 @triton.jit
@@ -458,9 +413,10 @@ def prepare_features(
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """The features alone, see _store_features.
+    """Absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES].
+    Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in _normals.
 
-    Reference: hgn.network.features; test: tests/kernels/test_gns_update.py.
+    Reference: hgn.network.features; test: tests/kernels/test_network.py, tests/kernels/test_gns_update.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -468,26 +424,149 @@ def prepare_features(
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
     scene = tl.load(scene_of + row, mask=live, other=0)
-    _store_features(
-        row,
-        live,
-        scene,
-        position,
-        velocity,
-        material_of,
-        domain,
-        mean,
-        std,
-        obstacle_table,
-        obstacle_cell_size,
-        features,
-        wall_maximum,
-        HISTORY,
-        NORMALS,
-        OBSTACLES,
-        SYMMETRY,
-        FEATURES,
+    column = tl.arange(0, FEATURES)
+    axis = column % 3
+    here = live[:, None]
+    # 3 * HISTORY velocities: column 3 k + axis
+    is_velocity = column < 3 * HISTORY
+    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + column[None, :], mask=here & is_velocity[None, :], other=0.0)
+    centred = v - tl.load(mean + axis)[None, :]
+    value = tl.where(
+        is_velocity[None, :], tl.div_rn(centred, tl.load(std + axis)[None, :] + tl.zeros_like(centred)), 0.0
     )
+    WALLS: tl.constexpr = 3 * HISTORY + 3 * NORMALS
+    if OBSTACLES:
+        x = tl.load(position + row * 3, mask=live, other=0.0)
+        y = tl.load(position + row * 3 + 1, mask=live, other=0.0)
+        z = tl.load(position + row * 3 + 2, mask=live, other=0.0)
+        line = obstacle_table + scene * OBSTACLE_COLUMNS
+        normal = _normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY)
+        for i in tl.static_range(3):
+            value = _with_column(value, 3 * HISTORY + i, normal[i])
+    is_wall = (column >= WALLS) & (column < WALLS + 6)
+    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
+    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=here & is_wall[None, :], other=0.0)
+    distance = tl.where((column >= WALLS + 3)[None, :], size - place, place)
+    distance = tl.minimum(tl.maximum(distance, -wall_maximum), wall_maximum) / wall_maximum
+    value = tl.where(is_wall[None, :], distance, value)
+    material = tl.load(material_of + row, mask=live, other=0)
+    value = tl.where((column[None, :] - (WALLS + 6)) == material[:, None], 1.0, value)
+    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
+
+
+@triton.jit
+def _asinh(x):
+    """Exactly odd, and within float32's rounding next to zero too: log(1 + y) as Kahan has it."""
+    size = tl.abs(x)
+    y = size + size * size / (1 + tl.sqrt(1 + size * size))
+    one = 1 + y
+    rounded = one - 1
+    result = tl.where(rounded == 0, y, tl.log(one) * (y / tl.where(rounded == 0, 1.0, rounded)))
+    return tl.where(x < 0, -result, result)
+
+
+@triton.jit
+def prepare_relative_features(
+    position,
+    velocity,
+    scene_of,
+    material_of,
+    domain,
+    gravity,
+    particle_count,
+    scale,
+    obstacle_table,
+    obstacle_cell_size,
+    cell_of,
+    weight_of,
+    motion,
+    parent,
+    geometry,
+    features,
+    reach,
+    HISTORY: tl.constexpr,
+    LEVELS: tl.constexpr,
+    NORMALS: tl.constexpr,
+    OBSTACLES: tl.constexpr,
+    SYMMETRY: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
+    velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
+    near a surface velocity, walls, and the normals here and ahead if NORMALS; one-hot material. Differences of
+    velocity are in units of `scale`, and their asinh. OBSTACLES and SYMMETRY as in prepare_features.
+
+    Reference: hgn.network.features; test: tests/kernels/test_relative.py.
+    """
+    HISTORIES: tl.constexpr = 3 * (HISTORY - 1)
+    CONTACT: tl.constexpr = HISTORIES + 3 * LEVELS
+    WALLS: tl.constexpr = CONTACT + 3
+    MATERIAL: tl.constexpr = WALLS + 6 + 6 * NORMALS
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < count
+    here = live[:, None]
+    scene = tl.load(scene_of + row, mask=live, other=0)
+    column = tl.arange(0, FEATURES)
+    axis = column % 3
+    is_history = here & (column < HISTORIES)[None, :]
+    at = velocity + row[:, None] * (3 * HISTORY) + column[None, :]
+    value = tl.load(at, mask=is_history, other=0.0) - tl.load(at + 3, mask=is_history, other=0.0)
+    value -= tl.load(gravity + scene[:, None] * 3 + axis[None, :], mask=is_history, other=0.0)
+    corner = tl.arange(0, 8)[None, :]
+    corners = here & (corner >= 0)
+    cell = tl.load(cell_of + row[:, None] * 8 + corner, mask=corners, other=0)
+    weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=corners, other=0.0)
+    for level in tl.static_range(LEVELS):
+        first = tl.load(geometry + level * GEOMETRY_COLUMNS + 6)
+        at = motion + (first + cell) * 4
+        mass = tl.load(at, mask=corners, other=0.0)
+        share = tl.where(mass > 0, weight / tl.where(mass > 0, mass, 1.0), 0.0)
+        for i in tl.static_range(3):
+            around = tl.sum(share * tl.load(at + 1 + i, mask=corners, other=0.0), 1)
+            own = tl.load(velocity + row * (3 * HISTORY) + i, mask=live, other=0.0)
+            value = _with_column(value, HISTORIES + 3 * level + i, own - around)
+        if level < LEVELS - 1:
+            # a parent past the capacity: the frame is void, but nothing may be read out of bounds
+            cell = tl.maximum(tl.load(parent + first + cell, mask=corners, other=0), 0)
+    is_contact = here & ((column >= CONTACT) & (column < WALLS))[None, :]
+    is_wall = here & ((column >= WALLS) & (column < WALLS + 6))[None, :]
+    upper = (column >= WALLS + 3)[None, :]
+    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact | is_wall, other=0.0)
+    value = tl.where(is_contact, v, value)
+    value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
+    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=is_wall, other=0.0)
+    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=is_wall, other=0.0)
+    distance = tl.where(upper, size - place, place) + tl.minimum(tl.where(upper, -v, v), 0.0)
+    near = tl.where(is_wall, tl.minimum(tl.maximum(1 - distance / reach, 0.0), 2.0), 0.0)
+    gate = tl.minimum(2 * tl.max(near, 1), 1.0)
+    value = tl.where(is_wall, near, value)
+    if OBSTACLES:
+        # here, and a quarter of a frame's way ahead four times
+        quarters = tl.arange(0, 8)[None, :]
+        asked = here & (quarters < 5)
+        at = position + row[:, None] * 3 + 0 * quarters
+        v_at = velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
+        time = 0.25 * quarters.to(tl.float32)
+        x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
+        y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
+        z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
+        line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
+        normal = _normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY)
+        found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
+        ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
+        for i in tl.static_range(3):
+            value = _with_column(value, WALLS + 6 + i, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
+            there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
+            value = _with_column(value, WALLS + 9 + i, there)
+        gate = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, gate)
+    value = tl.where(is_contact, value * gate[:, None], value)
+    material = tl.load(material_of + row, mask=live, other=0)
+    value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
+    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
 
 
 settle_keys(globals())

@@ -8,16 +8,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import triton
 
+from hgn.config import NetworkConfig
 from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES, SCENE_LIMIT, pack, unpack
 from hgn.network.obstacles import ObstacleCells
 
 MARK_BLOCK = 128
+PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
 MARGIN_CELLS = 4  # of a window, around what it must hold
 OBSTACLE_COLUMNS = kernel.OBSTACLE_COLUMNS.value
@@ -114,6 +117,7 @@ class DeviceGrid:
 
     Buffers (int32): counts_L (after clipping), needed_L (before), status (sticky flags); neighbour, parent, octant and
     children of level l as views; per particle cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF.
+    For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other.
     """
 
     def __init__(
@@ -125,6 +129,7 @@ class DeviceGrid:
         features: int,
         cell_size: float,
         device: torch.device,
+        relative: bool = False,
     ) -> None:
         assert scenes < SCENE_LIMIT
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
@@ -152,6 +157,7 @@ class DeviceGrid:
         self.weight_N8 = torch.zeros(particles, 8, device=device)
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
         self.feature_NF = torch.zeros(particles, features, device=device)
+        self.motion_C4 = torch.zeros(at if relative else 1, 4, device=device)
         self._at = [row[6] for row in rows]
 
     def neighbour(self, level: int) -> torch.Tensor:
@@ -211,52 +217,105 @@ class DeviceGrid:
 
     def prepare(
         self,
+        config: NetworkConfig,
         position: torch.Tensor,
         velocity: torch.Tensor,
         scene_N: torch.Tensor,
         material_N: torch.Tensor,
         origin_S3: torch.Tensor,
         domain_S3: torch.Tensor,
+        gravity_S3: torch.Tensor,
         count: torch.Tensor,
         mean_3: torch.Tensor,
         std_3: torch.Tensor,
         obstacles: ObstacleTable | None,
-        history: int,
-        normals: bool,
-        wall_maximum: float,
         symmetry: bool = False,
     ) -> None:
-        """Features and cells of every particle; without `obstacles` normals are zero, and nothing is looked up.
+        """Cells and features of every particle; without `obstacles` normals are zero, and nothing is looked up.
 
-        With `symmetry` the obstacles are seen under the symmetries in their rows.
+        Velocities have `mean_3` and `std_3`; gravity counts for relative inputs alone. With `symmetry` the obstacles
+        are seen under the symmetries in their rows.
         """
-        kernel.prepare_particles[(triton.cdiv(self.particles, 32),)](
+        blocks = (triton.cdiv(self.particles, PARTICLE_BLOCK),)
+        if config.relative:
+            self.motion_C4.zero_()
+        kernel.prepare_particles[blocks](
             position=position,
             velocity=velocity,
             scene_of=scene_N,
-            material_of=material_N,
             origin=origin_S3,
-            domain=domain_S3,
             particle_count=count,
             low=self.low,
             geometry=self.geometry,
             occupied=self.occupied,
             prefix_sum=self.prefix_sum,
-            mean=mean_3,
-            std=std_3,
-            obstacle_table=obstacles.row_S5 if obstacles else self.counts_L,
-            obstacle_cell_size=obstacles.cell_size if obstacles else 1.0,
-            features=self.feature_NF,
             cell_of=self.cell_N8,
             weight_of=self.weight_N8,
             fraction_of=self.fraction_N3,
+            motion=self.motion_C4,
             cell_size=self.cell_size,
-            wall_maximum=wall_maximum,
             capacity=self.capacities[0],
-            HISTORY=history,
-            NORMALS=int(normals),
-            OBSTACLES=normals and obstacles is not None,
-            SYMMETRY=symmetry,
-            FEATURES=self.features,
-            BLOCK=32,
+            HISTORY=config.velocity_history,
+            MOTION=config.relative,
+            BLOCK=PARTICLE_BLOCK,
         )
+        arguments = feature_arguments(
+            config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
+        )
+        if not config.relative:
+            wall_maximum = config.wall_distance_cells * config.cell_size
+            kernel.prepare_features[blocks](**arguments, mean=mean_3, std=std_3, wall_maximum=wall_maximum)
+            return
+        if self.levels > 1:
+            kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK),)](
+                motion=self.motion_C4,
+                parent=self._parent,
+                geometry=self.geometry,
+                counts=self.counts_L,
+                LEVELS=self.levels,
+                BLOCK=MARK_BLOCK,
+            )
+        kernel.prepare_relative_features[blocks](
+            **arguments,
+            gravity=gravity_S3,
+            scale=std_3,
+            cell_of=self.cell_N8,
+            weight_of=self.weight_N8,
+            motion=self.motion_C4,
+            parent=self._parent,
+            geometry=self.geometry,
+            reach=config.contact_reach_cells * config.cell_size,
+            LEVELS=self.levels,
+        )
+
+
+def feature_arguments(
+    config: NetworkConfig,
+    position: torch.Tensor,
+    velocity: torch.Tensor,
+    scene_N: torch.Tensor,
+    material_N: torch.Tensor,
+    domain_S3: torch.Tensor,
+    count: torch.Tensor,
+    obstacles: ObstacleTable | None,
+    symmetry: bool,
+    feature_NF: torch.Tensor,
+) -> dict[str, Any]:
+    """What the kernels of features of both kinds take, in programs of PARTICLE_BLOCK particles."""
+    return {
+        "position": position,
+        "velocity": velocity,
+        "scene_of": scene_N,
+        "material_of": material_N,
+        "domain": domain_S3,
+        "particle_count": count,
+        "obstacle_table": obstacles.row_S5 if obstacles else count,
+        "obstacle_cell_size": obstacles.cell_size if obstacles else 1.0,
+        "features": feature_NF,
+        "HISTORY": config.velocity_history,
+        "NORMALS": int(config.obstacle_features),
+        "OBSTACLES": config.obstacle_features and obstacles is not None,
+        "SYMMETRY": symmetry,
+        "FEATURES": feature_NF.shape[1],
+        "BLOCK": PARTICLE_BLOCK,
+    }

@@ -20,6 +20,7 @@ def integrate(
     velocity,
     scene_of,
     domain,
+    gravity,
     mean,
     std,
     particle_count,
@@ -32,7 +33,7 @@ def integrate(
     COLUMNS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """v += a, x += v, and the new positions into path [T, N, 3] at `frame`.
+    """v += a, x += v, and the new positions into path [T, N, 3] at `frame`; a is gravity and the restored output.
 
     Where the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its
     own size are counted in `lost`, once an axis; `advance` then ends the simulation.
@@ -54,9 +55,10 @@ def integrate(
     v = tl.load(at - tl.where(newest, 0, 3), mask=live, other=0.0)
     a = tl.load(output + row[:, None] * OUT + axis, mask=live_axis, other=0.0)
     a = a * tl.load(std + axis) + tl.load(mean + axis)
+    scene = tl.load(scene_of + row, mask=row < count, other=0)
+    a += tl.load(gravity + scene[:, None] * 3 + axis, mask=live_axis, other=0.0)
     v = tl.where(newest, v + a, v)
     x = tl.load(position + entry, mask=live_axis, other=0.0) + v
-    scene = tl.load(scene_of + row, mask=row < count, other=0)
     size = tl.load(domain + scene[:, None] * 3 + axis, mask=live_axis, other=1.0)
     now = tl.load(frame).to(tl.int64)
     tl.debug_barrier()  # all have read before one writes

@@ -67,7 +67,7 @@ def draw_waves(
 @triton.jit
 def assemble_batch(
     samples,
-    sample_domain,
+    sample_vectors,
     update,
     position,
     velocity,
@@ -77,6 +77,7 @@ def assemble_batch(
     share_of,
     origin,
     domain,
+    gravity,
     obstacle_table,
     particle_count,
     mean,
@@ -96,15 +97,16 @@ def assemble_batch(
     """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
     with NOISE each particle has its own, with WAVES a part comes from the waves of its scene, see draw_waves.
 
-    The target is v_true^{n+1} - v_noisy^n, normalised. Grid origins are uniform in [-jitter, 0]. Noise and jitter are
-    Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY the window is the image of the
-    stored one; velocities come from the stored positions, for mirrored ones are rounded. SCENES: a power of two, at
-    least `scenes`.
+    The target is v_true^{n+1} - v_noisy^n less gravity, normalised. sample_vectors [updates, S, 2, 3] are the domain's
+    size and gravity as the sample shows them; gravity is zero with absolute inputs. Grid origins are uniform in
+    [-jitter, 0]. Noise and jitter are Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY
+    the window is the image of the stored one; velocities come from the stored positions, for mirrored ones are rounded.
+    SCENES: a power of two, at least `scenes`.
 
     Reference: hgn.training.noise; test: tests/kernels/test_update.py.
     """
     table = samples + tl.load(update).to(tl.int64) * scenes * SAMPLE_COLUMNS
-    domains = sample_domain + tl.load(update) * scenes * 3
+    vectors = sample_vectors + tl.load(update) * scenes * 6
     last = table + (scenes - 1) * SAMPLE_COLUMNS
     count = (tl.load(last + 1) + tl.load(last + 2)).to(tl.int32)
     scene = tl.arange(0, SCENES)
@@ -115,9 +117,11 @@ def assemble_batch(
         seed = tl.load(table + scene * SAMPLE_COLUMNS + 3, mask=there, other=0)
         for axis in tl.static_range(3):
             draw = tl.rand(seed, scene * 0 + JITTER_OFFSET + axis)
-            size = tl.load(domains + scene * 3 + axis, mask=there, other=0.0)
             tl.store(origin + scene * 3 + axis, -jitter * draw, mask=there)
+            size = tl.load(vectors + scene * 6 + axis, mask=there, other=0.0)
             tl.store(domain + scene * 3 + axis, size, mask=there)
+            pull = tl.load(vectors + scene * 6 + 3 + axis, mask=there, other=0.0)
+            tl.store(gravity + scene * 3 + axis, pull, mask=there)
         for i in tl.static_range(OBSTACLE_COLUMNS):
             at = table + scene * SAMPLE_COLUMNS + SAMPLE_COLUMNS - OBSTACLE_COLUMNS + i
             value = tl.load(at, mask=there, other=0)
@@ -183,7 +187,7 @@ def assemble_batch(
             mirror_sum = (part >> 3 & CODE_MASK).to(tl.float32) * obstacle_cell_size
             before = tl.where(mirrored, mirror_sum - before, before)
         tl.store(position + row * 3 + axis, before + moved, mask=live)
-        acceleration = step - v
+        acceleration = step - v - tl.load(vectors + scene_row * 6 + 3 + axis, mask=live, other=0.0)
         scaled = (acceleration - tl.load(mean + axis)) / tl.load(std + axis)
         tl.store(target + row * 3 + axis, scaled, mask=live)
 

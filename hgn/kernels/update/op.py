@@ -29,7 +29,7 @@ from hgn.kernels.update import kernel
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.scene.symmetry import Symmetry, drawn_symmetry
+from hgn.scene.symmetry import Symmetry, Vector, drawn_symmetry
 from hgn.schema import ConfigError
 
 SAMPLE_COLUMNS = kernel.SAMPLE_COLUMNS.value
@@ -50,7 +50,8 @@ class DeviceEpisode:
     position_TN3: torch.Tensor
     material_N: torch.Tensor  # int32, index into the network's materials
     obstacles: ObstacleHash | None
-    domain_size: tuple[float, float, float]
+    domain_size: Vector
+    gravity: Vector = (0.0, 0.0, 0.0)  # domain units per frame squared; for relative inputs alone
     symmetries: tuple[Symmetry, ...] = ()  # of which one is drawn for each sample, where that is asked
 
     def __post_init__(self) -> None:
@@ -198,6 +199,7 @@ class Updates:
         self.loss, self.norm = torch.zeros(1, device=device), torch.zeros(1, device=device)
         scenes, normaliser = settings.scenes, network.normaliser
         self.origin_S3, self.domain_S3 = torch.zeros(scenes, 3, device=device), torch.ones(scenes, 3, device=device)
+        self.gravity_S3 = torch.zeros(scenes, 3, device=device)  # zero with absolute inputs
         columns = 4 + 3 * self.config.velocity_history  # a wave's number and phase, its amplitude in each velocity
         self.waves_SKC = torch.zeros(scenes, SMOOTH_WAVES, columns, device=device)
         sees = self.config.obstacle_features
@@ -212,7 +214,7 @@ class Updates:
         self.captures, self.capture_seconds = 0, 0.0
         self._reach = (torch.zeros(3), torch.zeros(3))  # what the window must hold
         self._graphs: list[torch.cuda.CUDAGraph] = []
-        self._samples = self._domains = self._rates = self._shares = torch.empty(0)
+        self._samples = self._vectors = self._rates = self._shares = torch.empty(0)
 
     # updates
 
@@ -274,18 +276,22 @@ class Updates:
         table[..., 3] = np.array([sample.seed for sample in flat]).reshape(count.shape)
         real = np.array([(sample.weight, sample.noise_scale) for sample in flat], np.float64)
         table[..., 5:7] = real.view(np.int64).reshape(*count.shape, 2)
+        shown = [Symmetry()] * len(flat)
         if self.settings.symmetry:
-            drawn = [drawn_symmetry(sample.episode.symmetries, sample.seed).code for sample in flat]
-            table[..., -1] = np.array(drawn).reshape(count.shape)
-        domain = np.array([sample.episode.domain_size for sample in flat], np.float32).reshape(len(chunk), scenes, 3)
+            shown = [drawn_symmetry(sample.episode.symmetries, sample.seed) for sample in flat]
+            table[..., -1] = np.array([symmetry.code for symmetry in shown]).reshape(count.shape)
+        vectors = np.zeros((len(flat), 2, 3), np.float32)
+        vectors[:, 0] = [sample.episode.domain_size for sample in flat]
+        if self.config.relative:
+            vectors[:, 1] = [s.direction(sample.episode.gravity) for s, sample in zip(shown, flat, strict=True)]
         most = int(count.sum(1).max())
         if len(chunk) > len(self._rates):
             self._allocate_tables(max(len(chunk), TABLE_UPDATES))
         self._samples[: len(chunk)].copy_(torch.from_numpy(table))
-        self._domains[: len(chunk)].copy_(torch.from_numpy(domain))
+        self._vectors[: len(chunk)].copy_(torch.from_numpy(vectors).view(*count.shape, 2, 3))
         self._rates[: len(chunk)].copy_(torch.tensor(rates, dtype=torch.float64))
         self.update.zero_()
-        largest = torch.from_numpy(domain.reshape(-1, 3)).amax(0)
+        largest = torch.from_numpy(vectors[:, 0]).amax(0)
         self._reach = (self._reach[0], torch.maximum(self._reach[1], largest))
         return most
 
@@ -293,7 +299,7 @@ class Updates:
         self._graphs = []  # they read the old tables
         shape = (length, self.settings.scenes)
         self._samples = torch.zeros(*shape, SAMPLE_COLUMNS, dtype=torch.int64, device=self.device)
-        self._domains = torch.zeros(*shape, 3, device=self.device)
+        self._vectors = torch.zeros(*shape, 2, 3, device=self.device)
         self._rates = torch.zeros(length, device=self.device)
         self._shares = torch.zeros(length, device=self.device)
 
@@ -426,7 +432,7 @@ class Updates:
             )
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
             samples=self._samples,
-            sample_domain=self._domains,
+            sample_vectors=self._vectors,
             update=self.update,
             position=self.position_N3,
             velocity=self.velocity_NV,
@@ -436,6 +442,7 @@ class Updates:
             share_of=self.share_N,
             origin=self.origin_S3,
             domain=self.domain_S3,
+            gravity=self.gravity_S3,
             obstacle_table=self._obstacle_row,
             particle_count=self.particle_count,
             mean=self.mean,
@@ -455,23 +462,22 @@ class Updates:
 
     def _grid(self) -> None:
         """What follows from where the particles are."""
-        config, grid = self.config, self.grid
+        grid = self.grid
         assert isinstance(grid, DeviceGrid)
         grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
         grid.prepare(
+            self.config,
             self.position_N3,
             self.velocity_NV,
             self.scene_N,
             self.material_N,
             self.origin_S3,
             self.domain_S3,
+            self.gravity_S3,
             self.particle_count,
             self.velocity_mean,
             self.velocity_std,
             self.obstacles,
-            config.velocity_history,
-            config.obstacle_features,
-            config.wall_distance_cells * config.cell_size,
             self.settings.symmetry,
         )
 
@@ -533,6 +539,7 @@ class Updates:
             feature_columns(config),
             config.cell_size,
             self.device,
+            config.relative,
         )
 
     def _make_room(self, status: int, needed: list[int]) -> None:

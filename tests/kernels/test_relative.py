@@ -1,0 +1,100 @@
+"""The kernels of relative inputs against hgn.network.relative: features, outputs, gradients, updates, rollouts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from kernels.engines import engine_of, inference_of, prepare, run_forward
+from kernels.test_network import compare, drawn, float32_state
+from network.states import network_of
+
+from hgn.network.features import ParticleState
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.relative import relative_features
+from hgn.runtime.parity import relative_error
+
+pytestmark = pytest.mark.usefixtures("large_tiles")
+
+EVERYWHERE = (17, 1, 6)  # particles of three scenes
+PRECISIONS = {"fp32": 1e-5, "tf32": 2e-3, "fp16": 2e-3}
+
+
+def relative_network(**changes: object) -> HierarchicalGraphNetwork:
+    config = {"width": 16, "levels": 3, "message_passing_steps": 1, "contact_reach_cells": 2.0}
+    return network_of(inputs="relative", **{**config, **changes})
+
+
+def moving_state(counts: tuple[int, ...], obstacles: bool = True, spread: float = 0.3) -> ParticleState:
+    """Scenes of different gravity, some of whose particles fly through several cells in a frame, out of the domain or
+    lie on a cell's corner."""
+    state = float32_state(counts, obstacles, spread)
+    generator = torch.Generator().manual_seed(2)
+    gravity_S3 = torch.randn(len(counts), 3, generator=generator) * 3e-3
+    fast_N = torch.rand(len(state.position_N3), generator=generator) < 0.5
+    state.velocity_NM3[fast_N] *= 32.0
+    state.position_N3[0] = torch.tensor([0.0625, 0.125, -0.0009765625])
+    return replace(state, gravity_S3=gravity_S3.double())
+
+
+def features_of(network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor) -> torch.Tensor:
+    """The kernels' columns, [N, FEATURES]."""
+    engine = engine_of(network, state)
+    prepare(engine, network, state, origin_S3)
+    assert int(engine.grid.status) == 0
+    return engine.grid.feature_NF[: len(state.position_N3)].cpu().double()
+
+
+@pytest.mark.parametrize(
+    ("counts", "obstacles", "changes"),
+    [
+        (EVERYWHERE, True, {}),
+        (EVERYWHERE, False, {"velocity_history": 2}),
+        ((1,), True, {"levels": 1}),
+        ((7, 2), False, {"obstacle_features": False, "levels": 4, "materials": ("water", "snow", "sand")}),
+    ],
+)
+def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict) -> None:
+    """Each column is that of hgn.network.relative in float64, the material one-hot behind them, and zeros behind that;
+    among the particles are some within a surface's reach and some beyond."""
+    network, state = relative_network(**changes), moving_state(counts, obstacles)
+    state = replace(state, velocity_NM3=state.velocity_NM3[:, : network.config.velocity_history])
+    origin_S3, _ = drawn(network, state)
+    found = features_of(network, state, origin_S3)
+    grid, scale = network.grid(state, origin_S3), network.normaliser.acceleration_std[0]
+    expected = relative_features(state, grid, network.config, scale).double()
+    width, materials = expected.shape[1], len(network.config.materials)
+    for column in range(width):
+        assert float((found[:, column] - expected[:, column]).abs().max()) < 2e-5, column
+    assert torch.equal(found[:, width : width + materials].argmax(-1), state.material_N)
+    assert torch.equal(found[:, width:].sum(-1), torch.ones(len(found)).double())
+    contact = 3 * (network.config.velocity_history - 1) + 3 * network.config.levels
+    assert len(found) == 1 or (found[:, contact].eq(0).any() and found[:, contact].ne(0).any())
+    assert found.shape[1] == (32 if width + materials <= 32 else 64)
+
+
+@pytest.mark.parametrize(("counts", "obstacles"), [(EVERYWHERE, True), ((1,), False)])
+def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool) -> None:
+    """In float32 outputs and every gradient are those of the plain network in float64 to 2e-5."""
+    network, state = relative_network(levels=2), moving_state(counts, obstacles)
+    output, together, each = compare(network, state, "fp32", 1.0, 256)
+    assert max(output, together, *each) < 2e-5
+
+
+@pytest.mark.parametrize("precision", list(PRECISIONS))
+def test_a_boost_changes_nothing(precision: str) -> None:
+    """Away from surfaces 3 m/s more for all, in any direction, and another gravity in free flight, leave the output of
+    inference as it was to the rounding of velocities in float32."""
+    network = relative_network()
+    state = moving_state((23, 5), obstacles=False, spread=0.1)
+    state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))
+    origin_S3, _ = drawn(network, state)
+    engine = inference_of(engine_of(network, state, precision), network)
+    outputs = []
+    for boost in ((0.0, 0.0, 0.0), (5e-2, 0.0, 0.0), (-1e-2, 3e-2, 2e-2)):
+        faster = replace(state, velocity_NM3=state.velocity_NM3 + torch.tensor(boost, dtype=torch.float64))
+        outputs.append(run_forward(engine, network, faster, origin_S3).clone())
+    assert float(outputs[0].norm()) > 0
+    for output in outputs[1:]:
+        assert relative_error(output, outputs[0]) < {"fp32": 1e-4, "tf32": 2e-3, "fp16": 2e-3}[precision]
