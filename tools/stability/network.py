@@ -1,6 +1,7 @@
 """python -m tools.stability network weights=…: how long, how large, how fast and how far a network holds.
 
-A row is a case: frames asked for, frames reached, and whether everything stayed finite, inside of the domain and
+Closed forms come first: flight, gravity, collisions (network_motion.py), then rest and slopes beside the solver. A row
+of the others has frames asked for, frames reached, and whether everything stayed finite, inside of the domain and
 without energy from nowhere. Where a rollout fails, the runtime must have said so; a last case breaks a weight for that.
 """
 
@@ -22,10 +23,10 @@ import torch
 from PIL import Image
 
 from hgn.command import run_command
+from hgn.config import MpmConfig
 from hgn.render.pictures import compare_picture, spread, stacked, write_picture
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import from_mapping, to_mapping
 from hgn.system.files import write_json
@@ -33,9 +34,9 @@ from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
 from tools.measures import energies, energy_scale, neighbours, outside_domain
-from tools.solver_rollouts import FrameClock
+from tools.solver_rollouts import FrameClock, solver_trials
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
-from tools.stability.network_free_fall import free_fall_rows
+from tools.stability.network_motion import motion_rows
 from tools.stability.row import Row, table
 
 PART = "network"
@@ -43,7 +44,9 @@ PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
 LONGEST = 100.0  # domain that is drawn whole, in heights
 DRAWN_EVERY_S = 5.0  # the picture of all cases so far, which takes longer with each
 WAY_BOUND = 0.2  # how far off a known way may be
-DENSITY_BOUND = 2.0  # times as many neighbours, or as few, may snow at rest have after thousands of frames
+DENSITY_BOUND = 2.0  # times as many neighbours, or as few, may there be at rest after thousands of frames
+DRIFT_FACTOR, DRIFT_CELLS = 2.0, 1.0  # of the solver's own drift at rest, and so many of its cells, may there be
+HEIGHT_CELLS = 0.1  # that the mean height at rest may differ from the solver's
 FAR_DOMAINS = 100.0  # how far the guard's case throws particles
 
 
@@ -69,6 +72,7 @@ def main(mapping: dict[str, Any]) -> int:
             drawn = time.monotonic()
 
     made = list(cases(config, network.config))
+    solver = MpmConfig(device=config.solver_device) if config.solver else None
     with ThreadPoolExecutor(available_cpus()) as threads, ExitStack() as stack:
         # What the runtime makes of obstacles takes seconds where there are many: the largest cases first.
         order = sorted(range(len(made)), key=lambda i: -sum(len(scene.obstacles) for scene in made[i].scenes))
@@ -82,9 +86,10 @@ def main(mapping: dict[str, Any]) -> int:
             ahead = frames_ahead([network.config], [config.precision], device, particles)
         if ahead is not None:
             stack.enter_context(ahead)
-        if "free_fall" in (config.cases or CASES):
-            for material in network.config.materials:
-                rows += free_fall_rows(simulator, config.scene, material)
+        for row in motion_rows(
+            simulator, config.scene, network.config.materials, config.cases or CASES, config.scenes_at_once, solver
+        ):
+            rows.append(row)
             keep()
         initial = [starts[i].result() for i in range(len(made))]  # nothing runs beside what is timed
         if ahead is not None:
@@ -95,7 +100,10 @@ def main(mapping: dict[str, Any]) -> int:
         for case, states in zip(made, initial, strict=True):
             started, growths, compiled = time.monotonic(), simulator.backend.growths, late()
             trials = case_trials(simulator, case, states)
-            row = case_row(simulator, case, states, config.energy_bound, *trials)
+            beside = None
+            if solver is not None and case.beside_solver:
+                beside = solver_trials(case.scenes, solver, case.frames, simulator.frame_rate_hz)
+            row = case_row(simulator, case, states, config.energy_bound, *trials, beside)
             if config.picture is not None:
                 pictures.append(case_picture(simulator, case, trials[0][0], Path(config.weights).name))
             row.more["growths"], row.more["kernels_compiled"] = simulator.backend.growths - growths, late() - compiled
@@ -168,8 +176,9 @@ def case_row(
     energy_bound: float,
     trials: Sequence[RolloutResult],
     milliseconds: float | None,
+    beside: Sequence[RolloutResult] | None = None,
 ) -> Row:
-    """Says whether a case held."""
+    """Says whether a case held; `beside` is what the solver makes of it."""
     reached = min(trial.frame_count for trial in trials)
     finite = all(bool(np.isfinite(trial.position_TN3).all()) for trial in trials)
     growth = max(
@@ -178,16 +187,18 @@ def case_row(
     outside = max(
         outside_domain(trial.position_TN3[-1], scene.domain_size) for trial, scene in zip(trials, initial, strict=True)
     )
-    way = None
-    if case.known_3 is not None:
-        known = case.known_3, case.known_frames
-        way = min(
-            share_of_way(trial, scene, simulator.frame_rate_hz, *known)
-            for trial, scene in zip(trials, initial, strict=True)
-        )
+
+    def came(some: Sequence[RolloutResult]) -> float:
+        return min(share_of_way(*pair, simulator.frame_rate_hz, case) for pair in zip(some, initial, strict=True))
+
+    way = came(trials) if case.known_3 is not None else None
     astray = way is not None and abs(way - 1) > WAY_BOUND
-    density = snow_density(trials, initial, case.settled) if case.settled is not None else None
-    loose = density is not None and not 1 / DENSITY_BOUND <= density <= DENSITY_BOUND
+    more: dict[str, Any] = {"solver_share_of_way": came(beside)} if beside and way is not None else {}
+    restless = None
+    if case.settled is not None and beside is not None:
+        own, solvers = (at_rest(some, initial, case.settled) for some in (trials, beside))
+        more |= {"rest": own, "solver_rest": solvers}
+        restless = unrest(own, solvers)
     causes = [trial.cause for trial in trials if trial.cause is not None]
     beyond = None
     if causes:
@@ -198,8 +209,8 @@ def case_row(
         beyond = f"energy grows by {growth:.2g} of a fall through the domain"
     elif astray:
         beyond = f"comes {100 * (way or 0):.2g} % of its way in the first {case.known_frames} frames"
-    elif loose:
-        beyond = f"snow has {density:.2g} times the neighbours that it had after {case.settled} frames"
+    elif restless:
+        beyond = restless
     elif outside:
         beyond = f"{100 * outside:.2g} % of the particles end outside of the domain"
     return Row(
@@ -215,10 +226,10 @@ def case_row(
             "energy_growth": growth if math.isfinite(growth) else None,
             "outside_domain": outside,
             "share_of_way": way,
-            "snow_density": density,
             "failed_scenes": len(causes),
             "guard": "missed" if not finite else "raised" if causes else "not needed",
             "ms": milliseconds,
+            **more,
         },
     )
 
@@ -234,34 +245,51 @@ def energy_growth(trial: RolloutResult, scene: InitialState, frame_rate_hz: floa
     return max(0.0, float(energy_T.max()) - start) / energy_scale(gravity_3, scene.domain_size)
 
 
-def share_of_way(
-    trial: RolloutResult, scene: InitialState, frame_rate_hz: float, known: Sequence[float], frames: int
-) -> float:
-    """How far the particles came in so many frames along a known acceleration, of what that and their velocity make."""
-    last = min(frames, trial.frame_count - 1)
-    known_3, seconds = np.asarray(known, np.float64), last / frame_rate_hz
+def share_of_way(trial: RolloutResult, scene: InitialState, frame_rate_hz: float, case: Case) -> float:
+    """How far the particles came in the frames whose acceleration a case knows, of the way of the closed form."""
+    last = min(case.known_frames, trial.frame_count - 1)
+    known_3, seconds = np.asarray(case.known_3, np.float64), last / frame_rate_hz
     if not last or not known_3.any():
         return 1.0
     moved_N3 = trial.position_TN3[last].astype(np.float64) - trial.position_TN3[0] - seconds * scene.velocity_N3
     return float((moved_N3 @ known_3).mean() / (0.5 * seconds**2 * (known_3 @ known_3)))
 
 
-def snow_density(trials: Sequence[RolloutResult], scenes: Sequence[InitialState], settled: int) -> float | None:
-    """How many neighbours within a cell snow has in the last frame, of those in frame `settled`: all scenes together.
-
-    Snow is the one material that keeps a shape: water and sand spread for as long as there is floor. None where there
-    is no snow, or no simulation came so far with numbers for positions.
+def at_rest(trials: Sequence[RolloutResult], scenes: Sequence[InitialState], settled: int) -> dict[str, float] | None:
+    """Of all scenes, in obstacle cells: how far particles moved since frame `settled` (root mean square), their mean
+    heights then and at last, and the neighbours within a cell at last, of those then. None where a rollout ended early.
     """
-    before = after = 0.0
+    if any(trial.frame_count <= settled or trial.cause is not None for trial in trials):
+        return None
+    moved, heights, counts = [], [], []
     for trial, scene in zip(trials, scenes, strict=True):
-        snow_N = scene.material_N == MATERIALS.index("snow")
-        if trial.frame_count <= settled:
-            continue
-        first_N3, last_N3 = (trial.position_TN3[frame][snow_N] for frame in (settled, -1))
-        if np.isfinite(first_N3).all() and np.isfinite(last_N3).all():
-            before += neighbours(first_N3, scene.obstacle_grid.cell_size) * len(first_N3)
-            after += neighbours(last_N3, scene.obstacle_grid.cell_size) * len(last_N3)
-    return after / before if before > 0 else None
+        cell = scene.obstacle_grid.cell_size
+        pair_2N3 = trial.position_TN3[[settled, -1]].astype(np.float64) / cell
+        moved.append(np.square(pair_2N3[1] - pair_2N3[0]).sum(axis=1))
+        heights.append(pair_2N3[..., 1])
+        counts.append([neighbours(place_N3, 1.0) * len(place_N3) for place_N3 in pair_2N3])
+    before, after = np.concatenate(heights, axis=1).mean(axis=1)
+    first, last = np.sum(counts, axis=0)
+    return {
+        "drift": float(np.sqrt(np.concatenate(moved).mean())),
+        "height_before": float(before),
+        "height": float(after),
+        "density": float(last / max(first, 1.0)),
+    }
+
+
+def unrest(own: dict[str, float] | None, solvers: dict[str, float] | None) -> str | None:
+    """What of drift, density and height is beyond its bound beside the solver's; none where all hold."""
+    if own is None or solvers is None:
+        return f"the {'solver' if solvers is None else 'network'} did not come to the end"
+    drift = DRIFT_FACTOR * solvers["drift"] + DRIFT_CELLS
+    if not own["drift"] <= drift:
+        return f"moves {own['drift']:.2f} cells at rest, the solver {solvers['drift']:.2f}"
+    if not 1 / DENSITY_BOUND <= own["density"] <= DENSITY_BOUND:
+        return f"has {own['density']:.2g} times the neighbours that it had when it came to rest"
+    if not abs(own["height"] - solvers["height"]) <= HEIGHT_CELLS:
+        return f"lies {own['height']:.2f} cells high, the solver's {solvers['height']:.2f}"
+    return None
 
 
 def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:

@@ -19,8 +19,9 @@ from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require, require_one_of, require_positive
 
-CASES = ("free_fall", "long", "particles", "domain", "speed", "single", "slope", "material", "far", "guard")
-SLOPE_DEG = 45.0
+MOTION = ("throw", "gravity", "collision")  # tools/stability/network_motion.py
+CASES = (*MOTION, "rest", "particles", "domain", "speed", "single", "slope", "far", "guard")
+SLOPES_DEG = (15.0, 30.0, 45.0)
 SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope's, and what is slid along it
 FRAME_RATE_HZ = 60.0  # for how long cases are
 FALL_FRAMES = 12  # in which what falls meets nothing
@@ -32,10 +33,14 @@ class StabilityNetworkConfig:
     """The options of `python -m tools.stability network`."""
 
     weights: str  # a file of python -m hgn.export, or the name of shipped weights
-    # of free_fall, long, particles, domain, speed, single, slope, material, far, guard; null: all
+    # of throw, gravity, collision, rest, particles, domain, speed, single, slope, far, guard; null: all
     cases: tuple[str, ...] | None = None
     frames: int = 300
-    long_frames: int = 3000  # of the case long
+    long_frames: int = 3000  # of the case rest
+    scenes_at_once: int = 1  # in each rollout of throw, gravity and collision, at least
+    # also ask the solver, which needs Taichi: for slope, collision and rest; without it rest is left out
+    solver: bool = True
+    solver_device: str = "auto"  # or cpu, gpu
     particle_factor: float = 10.0
     # times the floor area, with as many more obstacles and groups; squares
     domain_factors: tuple[int, ...] = (4, 9, 16)
@@ -53,6 +58,8 @@ class StabilityNetworkConfig:
 
     def __post_init__(self) -> None:
         require_positive(self, "particle_factor", "speed_factor", "far_cells", "seeds", "energy_bound")
+        require_positive(self, "scenes_at_once")
+        require_one_of(self, "solver_device", ("auto", "cpu", "gpu"))
         require_one_of(self, "backend", BACKENDS)
         require_one_of(self, "precision", PRECISIONS)
         for name in ("frames", "long_frames"):
@@ -73,7 +80,8 @@ class Case:
     frames: int
     known_3: tuple[float, float, float] | None = None  # acceleration along which the particles' way is known
     known_frames: int = 0  # for so long
-    settled: int | None = None  # frame from which on snow rests, and has to keep its density
+    settled: int | None = None  # frame from which on all rests: drift, density and height are judged beside the solver
+    beside_solver: bool = False
 
 
 def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Case]:
@@ -89,9 +97,10 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
     def case(name: str, scene: SceneConfig) -> Case:
         return Case(name, tuple(_scene(scene, REPORT_SEED + i) for i in range(config.seeds)), config.frames)
 
-    if "long" in wanted:
-        long = case(f"{config.long_frames} frames", base)
-        yield replace(long, frames=config.long_frames, settled=min(config.frames, config.long_frames) - 1)
+    for material in base.materials if "rest" in wanted and config.solver else ():
+        rest = case(f"{config.long_frames} frames, {material}", replace(base, obstacle_count=0, materials=(material,)))
+        settled = min(config.frames, config.long_frames) - 1
+        yield replace(rest, frames=config.long_frames, settled=settled, beside_solver=True)
     if "particles" in wanted:
         size = base.group_size * config.particle_factor ** (1 / 3)
         yield case(f"particles x{config.particle_factor:g}", replace(base, group_size=size))
@@ -111,9 +120,8 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
     for material in base.materials if "single" in wanted else ():
         yield Case(f"single particle, {material}", (_single(base, material),), config.frames, base.gravity, FALL_FRAMES)
     for material in base.materials if "slope" in wanted and network.sees_obstacles else ():
-        yield _slope(base, material, config.frames)
-    for material in base.materials if "material" in wanted else ():
-        yield case(f"{material} alone", replace(base, materials=(material,)))
+        for degrees in SLOPES_DEG:
+            yield replace(_slope(base, material, config.frames, degrees), beside_solver=config.solver)
     if "far" in wanted:
         yield Case(
             f"at the end of {config.far_cells} cells",
@@ -144,12 +152,12 @@ def _single(config: SceneConfig, material: str) -> Scene:
     )
 
 
-def _slope(config: SceneConfig, material: str, frames: int) -> Case:
-    """A block just above the upper end of a square at SLOPE_DEG: without friction it slides as gravity along the slope
+def _slope(config: SceneConfig, material: str, frames: int, degrees: float) -> Case:
+    """A block just above the upper end of a tilted square: without friction it slides as gravity along the slope
     pulls, whatever the material."""
     length = min(config.domain_size)
     count = int(config.particles_per_cell * (config.group_size / config.cell_size) ** 3)
-    turn = euler_rotation((SLOPE_DEG, 0.0, 0.0))
+    turn = euler_rotation((degrees, 0.0, 0.0))
     up_3, down_3 = turn @ np.array([0.0, 1.0, 0.0]), turn @ np.array([0.0, 0.0, 1.0])
     middle_3 = 0.5 * np.array(config.domain_size)
     start_3 = middle_3 - 0.6 * SLOPE_WAY * length * down_3 + (0.5 * config.group_size + 0.75 * config.cell_size) * up_3
@@ -166,7 +174,7 @@ def _slope(config: SceneConfig, material: str, frames: int) -> Case:
     pull = float(np.array(config.gravity) @ down_3)
     last = int(FRAME_RATE_HZ * math.sqrt(2 * SLOPE_WAY * length / pull)) if pull > 0 else 0
     known_3 = tuple((pull * down_3).tolist())
-    return Case(f"slides down {SLOPE_DEG:g} degrees, {material}", (scene,), min(frames, last + 2), known_3, last)
+    return Case(f"slides down {degrees:g} degrees, {material}", (scene,), min(frames, last + 2), known_3, last)
 
 
 def _far(scene: Scene, cells: int) -> Scene:

@@ -1,0 +1,251 @@
+"""Motion whose right answer is known: flight in any direction and gravity, and bodies that meet without gravity.
+
+A cube of one material flies from the middle of the domain, every frame until the walls could act. Two cubes meet off
+centre: momentum and angular momentum are what they were. Judged are means over bodies, in float64.
+Shape legend: T frames, N particles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hgn.config import MpmConfig, SceneConfig
+from hgn.runtime.rollouts import RolloutResult, simulate_scenes
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.scene.material import MATERIALS
+from hgn.scene.scene import Scene
+from hgn.schema import ConfigError
+from tools.solver_rollouts import solver_trials
+from tools.stability.row import Row
+
+EARTH = 9.8  # domain units per second squared
+SPEEDS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)  # domain units per second
+ROOT = 3**-0.5
+DIRECTIONS = {
+    "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
+    "up": (0.0, 1.0, 0.0), "down": (0.0, -1.0, 0.0), "diagonal": (ROOT, ROOT, ROOT),
+}  # fmt: skip
+GRAVITIES = {
+    "none": (0.0, 0.0, 0.0),
+    "half, sideways": (0.5 * EARTH, 0.0, 0.0),
+    "one, upwards": (0.0, EARTH, 0.0),
+    "one, oblique": (-ROOT * EARTH, -ROOT * EARTH, ROOT * EARTH),
+    "two, downwards": (0.0, -2 * EARTH, 0.0),
+    "two, oblique": (1.2 * EARTH, 0.0, -1.6 * EARTH),
+}  # domain units per second squared, named in the earth's
+KEPT_AT_LEAST, GRAVITY_WITHIN = 0.99, 0.02
+FLIGHT_FRAMES = 60  # at most
+REACH = 2.0  # finest cells of the network from a wall: beyond what a network has of it, and what the solver's walls do
+MEETING = (1.5, -0.5)  # domain units per second along x, of the two cubes
+MEETING_FRAMES = 40
+# Beside the solver, what it loses itself comes on top for angular momentum: spin that particles carry within a cell,
+# and positions do not show. 0.04 for cubes of snow of 0.08, 0.06 for water, 0.07 for sand.
+MOMENTUM_WITHIN, ANGULAR_WITHIN = 0.01, 0.05
+MET_AT_LEAST = 0.1  # of the relative velocity, that must go over; beside the solver half of what goes over there
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What one flight shows at its worst: the share of its velocity kept across gravity (none for a drop), the error of
+    its acceleration along gravity in gravities (the earth's where there is none), and the frames of these."""
+
+    kept: float | None
+    error: float
+    kept_frame: int
+    error_frame: int
+    frames: int
+
+
+def motion_rows(
+    simulator: Simulator,
+    scene: SceneConfig,
+    materials: Sequence[str],
+    cases: Sequence[str],
+    together: int,
+    solver: MpmConfig | None,
+) -> Iterator[Row]:
+    """Rows of the cases throw, gravity and collision among `cases`, with at least so many scenes `together` in each
+    rollout. With settings of the solver that simulates collisions too.
+    """
+    for material in materials:
+        for speed in SPEEDS if "throw" in cases else ():
+            throws = {name: speed * np.array(way) for name, way in DIRECTIONS.items()} if speed else {"": np.zeros(3)}
+            name = f"thrown at {speed:g} a second, {material}" if speed else f"dropped, {material}"
+            yield flight_row(simulator, name, scene, material, throws, together)
+        for name, gravity in GRAVITIES.items() if "gravity" in cases else ():
+            throws = {"at rest": np.zeros(3), "+x": np.array(DIRECTIONS["+x"]), "up": np.array(DIRECTIONS["up"])}
+            other = replace(scene, gravity=gravity)
+            yield flight_row(simulator, f"gravity {name}, {material}", other, material, throws, together)
+        if "collision" in cases:
+            yield meeting_row(simulator, scene, material, together, solver)
+
+
+def cube(scene: SceneConfig, material: str, centre_3: np.ndarray, velocity_3: np.ndarray, seed: int = 0) -> Scene:
+    """A cube of a scene's group size at random places, without obstacles."""
+    count = int(scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3) + 1
+    place_N3 = centre_3 + scene.group_size * (np.random.default_rng(seed).random((count, 3)) - 0.5)
+    return Scene(
+        position_N3=place_N3.astype(np.float32),
+        velocity_N3=np.tile(np.float32(velocity_3), (count, 1)),
+        material_N=np.full(count, MATERIALS.index(material), np.uint8),
+        domain_size=scene.domain_size,
+        cell_size=scene.cell_size,
+        gravity=scene.gravity,
+        particles_per_cell=scene.particles_per_cell,
+    )
+
+
+def flight_row(
+    simulator: Simulator,
+    name: str,
+    scene: SceneConfig,
+    material: str,
+    throws: dict[str, np.ndarray],
+    together: int,
+) -> Row:
+    """Whether all throws keep their velocity and fall as gravity says, in each frame of the flight."""
+    middle_3 = 0.5 * np.array(scene.domain_size)
+    labels = list(throws) * -(-together // len(throws))  # the same again with other random places
+    scenes = [cube(scene, material, middle_3, throws[label], seed) for seed, label in enumerate(labels)]
+    reach = REACH * simulator.network.config.cell_size
+    frames = [flight_frames(item, simulator.frame_rate_hz, reach) for item in scenes]
+    trials = _rollouts(simulator, scenes, max(frames) + 1)
+    if isinstance(trials, str):
+        return Row(name, GRAVITY_WITHIN, "refused", False, trials)
+    causes = [trial.cause for trial, last in zip(trials, frames, strict=True) if trial.frame_count <= last]
+    if causes:
+        return Row(name, GRAVITY_WITHIN, "diverged", False, str(causes[0]))
+    flights = [flight(*item, simulator.frame_rate_hz) for item in zip(trials, scenes, frames, strict=True)]
+    at = max(range(len(flights)), key=lambda i: flights[i].error)
+    worst, error = flights[at], flights[at].error
+    beyond, held = f"gravities off in frame {worst.error_frame} {labels[at]}", error <= GRAVITY_WITHIN
+    more: dict[str, object] = {"scenes": len(scenes), "particles": sum(item.particle_count for item in scenes)}
+    kept = {i: found.kept for i, found in enumerate(flights) if found.kept is not None}
+    if kept:
+        at = min(kept, key=lambda i: kept[i])
+        beyond += f"; keeps {kept[at]:.1%} of its velocity in frame {flights[at].kept_frame} {labels[at]}"
+        held, more["kept"] = held and kept[at] >= KEPT_AT_LEAST, kept[at]
+    more["throws"] = {
+        label: {"kept": one.kept, "error": one.error, "frames": one.frames}
+        for label, one in zip(labels[: len(throws)], flights, strict=False)
+    }
+    return Row(name, GRAVITY_WITHIN, error, held, beyond, more)
+
+
+def flight_frames(scene: Scene, frame_rate_hz: float, reach: float) -> int:
+    """Frames until a particle of the closed form, or its way on for a frame, comes so near to a wall; at least 1."""
+    gravity_3, velocity_3 = np.array(scene.gravity) / frame_rate_hz**2, scene.velocity_N3[0] / frame_rate_hz
+    low_3 = scene.position_N3.min(axis=0) - reach - np.abs(gravity_3)
+    high_3 = np.array(scene.domain_size) - scene.position_N3.max(axis=0) - reach - np.abs(gravity_3)
+    for frame in range(1, FLIGHT_FRAMES + 1):
+        moved_3 = frame * velocity_3 + 0.5 * frame**2 * gravity_3
+        if (moved_3 < -low_3).any() or (moved_3 > high_3).any():
+            return max(frame - 1, 1)
+    return FLIGHT_FRAMES
+
+
+def flight(trial: RolloutResult, scene: Scene, frames: int, frame_rate_hz: float) -> Flight:
+    """The worst frames of a flight beside its closed form."""
+    gravity_3 = np.array(scene.gravity) / frame_rate_hz**2
+    thrown_3 = scene.velocity_N3[0].astype(np.float64) / frame_rate_hz
+    size, speed = float(np.linalg.norm(gravity_3)), float(np.linalg.norm(thrown_3))
+    centre_T3 = trial.position_TN3[: frames + 1].mean(axis=1, dtype=np.float64)
+    velocity_T3 = np.concatenate([[thrown_3 - 0.5 * gravity_3], np.diff(centre_T3, axis=0)])
+    error_T3 = np.diff(velocity_T3, axis=0) - gravity_3
+    error_T = (
+        np.abs(error_T3 @ gravity_3) / size**2 if size else np.linalg.norm(error_T3, axis=1) * frame_rate_hz**2 / EARTH
+    )
+    lost_T3 = velocity_T3[1:] - thrown_3
+    if size:  # across gravity alone
+        lost_T3 = lost_T3 - np.outer(lost_T3 @ gravity_3, gravity_3) / size**2
+    lost_T = np.linalg.norm(lost_T3, axis=1)
+    kept = 1 - float(lost_T.max()) / speed if speed else None
+    return Flight(kept, float(error_T.max()), int(lost_T.argmax()), int(error_T.argmax()), frames)
+
+
+def meeting_row(
+    simulator: Simulator, scene: SceneConfig, material: str, together: int, solver: MpmConfig | None
+) -> Row:
+    """Whether two cubes that meet off centre, without gravity, keep momentum and angular momentum."""
+    name = f"two bodies meet without gravity, {material}"
+    scenes = [meeting(scene, material, seed) for seed in range(together)]
+    trials = _rollouts(simulator, scenes, MEETING_FRAMES)
+    if isinstance(trials, str):
+        return Row(name, MOMENTUM_WITHIN, "refused", False, trials)
+    reach = REACH * simulator.network.config.cell_size
+    figures = np.array([conserved(*item, reach, simulator.frame_rate_hz) for item in zip(trials, scenes, strict=True)])
+    momentum, angular, met = figures[:, 0].max(), figures[:, 1].max(), figures[:, 2].min()
+    more: dict[str, Any] = {
+        "angular": float(angular),
+        "met": float(met),
+        "particles": sum(item.particle_count for item in scenes),
+    }
+    least, most = MET_AT_LEAST, ANGULAR_WITHIN
+    if solver is not None:
+        (trial,) = solver_trials(scenes[:1], solver, MEETING_FRAMES, simulator.frame_rate_hz)
+        named = dict(
+            zip(
+                ("momentum", "angular", "met"), conserved(trial, scenes[0], reach, simulator.frame_rate_hz), strict=True
+            )
+        )
+        more["solver"], least, most = named, 0.5 * named["met"], ANGULAR_WITHIN + named["angular"]
+    causes = [trial.cause for trial in trials if trial.cause is not None]
+    held = not causes and momentum <= MOMENTUM_WITHIN and angular <= most and met >= least
+    beyond = f"of momentum; {angular:.2%} of angular momentum; {met:.2f} of the relative velocity went over"
+    return Row(name, MOMENTUM_WITHIN, float(momentum), bool(held), causes[0] if causes else beyond, more)
+
+
+def meeting(scene: SceneConfig, material: str, seed: int = 0) -> Scene:
+    """Two cubes a fifth of their side apart, half of it off centre, that move towards each other along x."""
+    size, middle_3 = scene.group_size, 0.5 * np.array(scene.domain_size)
+    scene = replace(scene, gravity=(0.0, 0.0, 0.0))
+    one, other = (
+        cube(
+            scene, material, middle_3 + side * size * np.array([0.6, 0.25, 0.0]), np.array([speed, 0, 0]), 2 * seed + i
+        )
+        for i, (side, speed) in enumerate(zip((-1, 1), MEETING, strict=True))
+    )
+    return replace(
+        one,
+        position_N3=np.concatenate([one.position_N3, other.position_N3]),
+        velocity_N3=np.concatenate([one.velocity_N3, other.velocity_N3]),
+        material_N=np.concatenate([one.material_N, other.material_N]),
+    )
+
+
+def conserved(trial: RolloutResult, scene: Scene, reach: float, frame_rate_hz: float) -> tuple[float, float, float]:
+    """The largest errors of momentum and of angular momentum about the centre, in shares of the first ones, until a
+    particle comes so near to a wall; and the share of the relative velocity that went from one half of the particles to
+    the other.
+    """
+    path_TN3, high_3 = trial.position_TN3.astype(np.float64), np.array(scene.domain_size) - reach
+    free_T = ((path_TN3 > reach) & (path_TN3 < high_3)).all(axis=(1, 2))
+    path_TN3 = path_TN3[: int(free_T.argmin()) if not free_T.all() else None]
+    velocity_N3 = scene.velocity_N3.astype(np.float64) / frame_rate_hz
+
+    def angular(place_N3: np.ndarray, moving_N3: np.ndarray) -> np.ndarray:
+        return np.cross(place_N3 - place_N3.mean(axis=0), moving_N3 - moving_N3.mean(axis=0)).sum(axis=0)
+
+    moved_TN3 = np.diff(path_TN3, axis=0)
+    momentum_T3 = moved_TN3.mean(axis=1) - velocity_N3.mean(axis=0)
+    begun_3, half = angular(path_TN3[0], velocity_N3), len(velocity_N3) // 2
+    turned_T3 = np.array([angular(a + 0.5 * m, m) for a, m in zip(path_TN3[:-1], moved_TN3, strict=True)]) - begun_3
+    over_T3 = moved_TN3[:, half:].mean(axis=1) - velocity_N3[half:].mean(axis=0)
+    relative_3 = velocity_N3[:half].mean(axis=0) - velocity_N3[half:].mean(axis=0)
+    return (
+        float(np.linalg.norm(momentum_T3, axis=1).max() / np.linalg.norm(velocity_N3.mean(axis=0))),
+        float(np.linalg.norm(turned_T3, axis=1).max() / np.linalg.norm(begun_3)),
+        float(over_T3[-1] @ relative_3 / (relative_3 @ relative_3)),
+    )
+
+
+def _rollouts(simulator: Simulator, scenes: Sequence[Scene], frames: int) -> list[RolloutResult] | str:
+    """Rollouts side by side, or why the weights refuse the scenes."""
+    try:
+        return simulate_scenes(simulator, [InitialState.of_scene(scene) for scene in scenes], frames)
+    except ConfigError as error:
+        return str(error)
