@@ -150,6 +150,11 @@ EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "jso
         ("train", ["training.learning_rate=-1"], "training.learning_rate must be a finite number > 0, got -1.0"),
         ("train", ["training.noise_std=nan"], "training.noise_std must be a finite number >= 0, got nan"),
         ("train", ["network.materials=[lava]"], "network.materials[0] must be one of water, sand, snow, got 'lava'"),
+        (
+            "train",
+            ["scene.tilted_gravity_fraction=0.1"],
+            "network.inputs must be relative where scene.zero_gravity_fraction or scene.tilted_gravity_fraction",
+        ),
         ("train", ["+experiment=moon"], "Could not find 'experiment/moon'"),
         ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
         ("export", ["out=x"], "checkpoint is missing; it must be given, as in checkpoint=…"),
