@@ -197,7 +197,7 @@ def reference_gradients(network: ParticleNetwork, batch: Batch) -> tuple[torch.T
     """The float64 network's loss without noise and jitter, and the gradients of all parameters, end to end."""
     reference = _reference(network)
     reference.zero_grad()
-    target_N3 = reference.normaliser.normalise_acceleration(_double(batch).acceleration())
+    target_N3 = reference.target(_double(batch).acceleration(), batch.gravity_S3[batch.scene_N])
     predicted_N3 = reference_output(reference, batch.state())
     loss = batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
     loss.backward()
@@ -207,7 +207,7 @@ def reference_gradients(network: ParticleNetwork, batch: Batch) -> tuple[torch.T
 def reference_acceleration(network: ParticleNetwork, state: ParticleState) -> torch.Tensor:
     """What the float64 network predicts."""
     reference = _reference(network)
-    return reference.normaliser.restore_acceleration(reference_output(reference, state))
+    return reference.restored_acceleration(reference_output(reference, state), state)
 
 
 def _reference(network: ParticleNetwork) -> ParticleNetwork:

@@ -96,13 +96,14 @@ class TritonTrain:
         parts = zip(
             self.batch.window_WN3.split(counts, dim=1),
             self.batch.material_N.split(counts),
+            self.batch.gravity_S3.tolist(),
             self.batch.seeds_S,
             strict=True,
         )
         size = (work.domain_size,) * 3
         self.samples = [
-            (DeviceEpisode(window_WN3.contiguous(), material_N.int(), None, size), 0, seed)
-            for window_WN3, material_N, seed in parts
+            (DeviceEpisode(window_WN3.contiguous(), material_N.int(), None, size, tuple(gravity)), 0, seed)
+            for window_WN3, material_N, gravity, seed in parts
         ]
         training = TrainingConfig()
         self.updates = self._updates(training.noise_std, training.grid_jitter)
