@@ -15,7 +15,7 @@ from typing import Any
 from datagen.generate import StopSignal
 from hgn.command import run_command
 from hgn.config import UploadConfig
-from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
+from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.storage import is_remote, open_storage, verify_file, write_remote
 from hgn.schema import ConfigError, from_mapping, require
 from hgn.system.progress import bar
@@ -50,7 +50,7 @@ class Target:
         self._manifest: Manifest | None = None
         with contextlib.suppress(FileNotFoundError):
             content = open_storage(self._url).manifest(MANIFEST_NAME)
-            self._manifest = Manifest.parse(content, f"{self._url}/{MANIFEST_NAME}")
+            self._manifest = Manifest.parse(content, self._url)
 
     @property
     def shards(self) -> int:
@@ -63,7 +63,8 @@ class Target:
         return self._manifest is not None and self._manifest.complete
 
     def copy(self, folder: Path, stop: StopSignal) -> None:
-        """Copies the shards that are not there yet, then the manifest; leaves that out when asked to stop before.
+        """Copies the shards that are not there yet, then the index and the manifest; leaves these out when asked to
+        stop before.
 
         Raises: ConfigError when another data set is there, a shard here is altered, or nothing can be written;
         UnreachableError.
@@ -72,32 +73,38 @@ class Target:
             content = (folder / MANIFEST_NAME).read_bytes()
         except FileNotFoundError:
             raise ConfigError(f"data must be the folder of a data set, got {folder} without {MANIFEST_NAME}") from None
-        manifest = Manifest.parse(content, str(folder / MANIFEST_NAME))
-        new = self._missing(manifest)
-        with bar("copying", total=sum(shard.bytes for shard in new), unit="byte") as progress:
-            for shard in new:
+        manifest, there = Manifest.parse(content, folder), self._manifest
+        if there is not None:
+            self._require_beginning(there, manifest)
+        known = 0 if there is None else len(there.shards)
+        size = sum(total.bytes for total in manifest.totals.values()) - (
+            0 if there is None else sum(total.bytes for total in there.totals.values())
+        )
+        with bar("copying", total=size, unit="byte") as progress:
+            for shard in manifest.shards.since(known):
                 if stop.requested():
                     return
                 path = folder / shard.name
                 verify_file(path, shard.sha256, shard.bytes, "delete it and run the generator again")
                 write_remote(self._url, shard.name, path)
                 progress.update(shard.bytes)
-        if self._manifest != manifest:
+        if there is None or (there.revision, there.requested) != (manifest.revision, manifest.requested):
+            same = there is not None and there.shards.state.generation == manifest.shards.state.generation
+            have = set(there.shards.files()) if there is not None and same else set()
+            for name, size in manifest.shards.files():
+                if (name, size) not in have:
+                    write_remote(self._url, name, (folder / name).read_bytes()[:size])
             write_remote(self._url, MANIFEST_NAME, content)  # as it was read: the file may have grown since
-            self._manifest = manifest
+            self._manifest = Manifest.parse(content, folder)
 
-    def _missing(self, manifest: Manifest) -> tuple[ShardEntry, ...]:
-        there = self._manifest
-        if there is None:
-            return manifest.shards
+    def _require_beginning(self, there: Manifest, manifest: Manifest) -> None:
         if there.config_hash != manifest.config_hash:
             raise ConfigError(f"to must be empty or hold the same data set, got another one in {self._url}")
-        if there.shards != manifest.shards[: len(there.shards)]:
+        if not all(manifest.shards.continues(there.shards, split) for split in SPLITS):
             raise ConfigError(
                 f"to must hold shards that the data set here begins with, got others in {self._url}; was it generated "
                 "anew? choose another URL"
             )
-        return manifest.shards[len(there.shards) :]
 
 
 if __name__ == "__main__":

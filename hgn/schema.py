@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import inspect
 import math
 import re
@@ -20,6 +21,9 @@ from typing import Any, TypeVar
 from hgn.renamed import KEYS, current_names, key_remedy, value_remedy
 
 T = TypeVar("T")
+_Path = (
+    str | tuple[Any, str | int]
+)  # of a value: its owner's and its own name or place, joined where a message needs it
 
 
 class ConfigError(ValueError):
@@ -34,28 +38,46 @@ def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
 
     Raises: ConfigError.
     """
+    return _build(cls, mapping, path)
+
+
+def _build(cls: type[T], mapping: object, path: _Path) -> T:
     if not isinstance(mapping, Mapping):
-        raise ConfigError(f"{path or cls.__name__} must be a mapping of keys to values, got {mapping!r}")
-    hints = typing.get_type_hints(cls)
-    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}  # type: ignore[arg-type]
-    for key in mapping:
-        if key not in fields:
-            name = _join(path, str(key))
-            renamed = KEYS.get(name, "").rpartition(".")[2] in fields
-            remedy = key_remedy(name, mapping[key]) if renamed else known_keys(str(key), fields)
-            raise ConfigError(f"{name} is not a known key; {remedy}")
+        raise ConfigError(f"{_text(path) or cls.__name__} must be a mapping of keys to values, got {mapping!r}")
+    hints, fields = _fields(cls)  # type: ignore[arg-type]
     values: dict[str, Any] = {}
-    for name, field in fields.items():
-        if name in mapping:
-            values[name] = _convert(hints[name], mapping[name], _join(path, name))
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise ConfigError(f"{_join(path, name)} is missing; it must be given")
+    for key, value in mapping.items():
+        if key not in fields:
+            name = _text((path, str(key)))
+            renamed = KEYS.get(name, "").rpartition(".")[2] in fields
+            remedy = key_remedy(name, value) if renamed else known_keys(str(key), fields)
+            raise ConfigError(f"{name} is not a known key; {remedy}")
+        values[key] = _convert(hints[key], value, (path, key))
+    for name, needed in fields.items():
+        if needed and name not in values:
+            raise ConfigError(f"{_text((path, name))} is missing; it must be given")
     try:
         return cls(**values)
     except ConfigError as error:
         if path:
-            raise ConfigError(f"{path}.{error}") from None
+            raise ConfigError(f"{_text(path)}.{error}") from None
         raise
+
+
+@functools.cache
+def _fields(cls: type) -> tuple[dict[str, Any], dict[str, bool]]:
+    """The types of a dataclass's fields, and whether each must be given. Slow to find out, and asked for each value."""
+    given = {field.name: field for field in dataclasses.fields(cls) if field.init}
+    missing = dataclasses.MISSING
+    return typing.get_type_hints(cls), {
+        k: f.default is missing and f.default_factory is missing for k, f in given.items()
+    }
+
+
+@functools.cache
+def _shape(hint: Any) -> tuple[Any, tuple[Any, ...], bool]:
+    """What a type is made of, and whether it is a dataclass."""
+    return typing.get_origin(hint), typing.get_args(hint), dataclasses.is_dataclass(hint)
 
 
 def from_stored(cls: type[T], mapping: Mapping[str, Any], section: str) -> T:
@@ -72,6 +94,8 @@ def known_keys(key: str, known: Iterable[str]) -> str:
 
 def to_mapping(value: Any) -> Any:
     """The inverse of `from_mapping`: plain dicts, lists and scalars, ready for JSON or YAML."""
+    if type(value) in (int, float, str, bool):
+        return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: to_mapping(getattr(value, field.name)) for field in dataclasses.fields(value) if field.init}
     if isinstance(value, Mapping):
@@ -150,12 +174,19 @@ def require_one_of(owner: object, name: str, choices: Sequence[object]) -> None:
     require(value in choices, name, f"one of {', '.join(map(str, choices))}", value)
 
 
-def _join(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else name
+def _text(path: _Path) -> str:
+    if isinstance(path, str):
+        return path
+    owner, name = _text(path[0]), path[1]
+    if isinstance(name, int):
+        return f"{owner}[{name}]"
+    return f"{owner}.{name}" if owner else name
 
 
-def _convert(hint: Any, value: Any, path: str) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+def _convert(hint: Any, value: Any, path: _Path) -> Any:
+    if hint is type(value) and hint in (int, float, str, bool):
+        return value
+    origin, arguments, is_dataclass = _shape(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
@@ -167,36 +198,32 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
                 return _convert(option, value, path)
             except ConfigError:
                 continue
-        raise ConfigError(f"{path} must be {_name(hint)}, got {value!r}")
-    if dataclasses.is_dataclass(hint):
-        return from_mapping(typing.cast(type, hint), value, path)
+        raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {value!r}")
+    if is_dataclass:
+        return _build(hint, value, path)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{path} must be a list, got {value!r}")
+            raise ConfigError(f"{_text(path)} must be a list, got {value!r}")
         if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(_convert(arguments[0], item, f"{path}[{i}]") for i, item in enumerate(value))
+            return tuple([_convert(arguments[0], item, (path, i)) for i, item in enumerate(value)])
         if len(value) != len(arguments):
-            raise ConfigError(f"{path} must be a list of {len(arguments)} values, got {len(value)}: {value!r}")
+            raise ConfigError(f"{_text(path)} must be a list of {len(arguments)} values, got {len(value)}: {value!r}")
         pairs = zip(arguments, value, strict=True)
-        return tuple(_convert(item_hint, item, f"{path}[{i}]") for i, (item_hint, item) in enumerate(pairs))
+        return tuple([_convert(item_hint, item, (path, i)) for i, (item_hint, item) in enumerate(pairs)])
     if origin is dict:
         if not isinstance(value, Mapping):
-            raise ConfigError(f"{path} must be a mapping, got {value!r}")
+            raise ConfigError(f"{_text(path)} must be a mapping, got {value!r}")
         return {
-            _convert(arguments[0], key, path): _convert(arguments[1], item, _join(path, str(key)))
+            _convert(arguments[0], key, path): _convert(arguments[1], item, (path, str(key)))
             for key, item in value.items()
         }
     if hint is Any:
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
-    if hint is bool and isinstance(value, bool):
+    if hint in (bool, int, str) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool):
         return value
-    if hint is int and isinstance(value, int) and not isinstance(value, bool):
-        return value
-    if hint is str and isinstance(value, str):
-        return value
-    raise ConfigError(f"{path} must be {_name(hint)}, got {value!r} ({type(value).__name__})")
+    raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {value!r} ({type(value).__name__})")
 
 
 def _name(hint: Any) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from hgn.data.manifest import SPLITS
@@ -95,20 +95,22 @@ def shard_ranges(split: str, count: int, episodes_per_shard: int) -> list[ShardR
 
 
 def work_order(requested: Mapping[str, int], episodes_per_shard: int) -> list[ShardRange]:
-    """All shards of a data set, in the order in which `generation_order` completes them."""
-    place = {item: i for i, item in enumerate(generation_order(requested))}
+    """All shards of a data set, in the order in which they are completed."""
     shards = [shard for split in SPLITS for shard in shard_ranges(split, requested[split], episodes_per_shard)]
-    return sorted(shards, key=lambda shard: place[shard.split, shard.stop - 1])
+    return sorted(shards, key=lambda shard: generation_place(shard.split, shard.stop - 1))
 
 
-def missing_ranges(planned: Iterable[ShardRange], present: Iterable[ShardRange]) -> list[ShardRange]:
-    """The planned shards without the episodes that are present; a shard with a hole becomes several."""
-    have = {(shard.split, index) for shard in present for index in shard.indices}
+def missing_ranges(planned: Iterable[ShardRange], published: Mapping[str, Sequence[int]]) -> list[ShardRange]:
+    """The planned shards without the episodes that are published; a shard with a hole becomes several.
+
+    published: for each split, whether an episode is; those beyond the end are not.
+    """
     missing = []
     for shard in planned:
+        flags = published[shard.split]
         first: int | None = None
         for index in range(shard.first, shard.stop + 1):
-            wanted = index < shard.stop and (shard.split, index) not in have
+            wanted = index < shard.stop and not (index < len(flags) and flags[index])
             if wanted and first is None:
                 first = index
             elif not wanted and first is not None:
@@ -117,15 +119,8 @@ def missing_ranges(planned: Iterable[ShardRange], present: Iterable[ShardRange])
     return missing
 
 
-def generation_order(requested: Mapping[str, int]) -> list[tuple[str, int]]:
-    """All (split, index) in the order they are simulated: training and validation in turn until validation is done,
-    the rest of training, then test.
+def generation_place(split: str, index: int) -> tuple[bool, int, bool]:
+    """What episodes are sorted by to be simulated: training and validation in turn until validation is done, the rest
+    of training, then test.
     """
-    train, validation, test = (requested[split] for split in SPLITS)
-    order = []
-    for index in range(max(train, validation)):
-        if index < train:
-            order.append(("train", index))
-        if index < validation:
-            order.append(("validation", index))
-    return order + [("test", index) for index in range(test)]
+    return split == "test", index, split == "validation"

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from datagen.pool.plan import SceneTask, generation_order
+from datagen.pool.plan import SceneTask, generation_place
 from datagen.pool.progress import Progress
 from datagen.pool.worker import (
     Backend,
@@ -153,7 +153,6 @@ class Pool:
 
         Raises: Stopped; ConfigError, OSError or RuntimeError from a worker. Workers are gone in any case.
         """
-        self._order = {item: place for place, item in enumerate(generation_order(self._writer.requested))}
         self._todo: list[SceneTask] = []
         self._ready: list[MadeScene] = []
         self._gridless: list[MadeScene] = []  # what lacks its obstacle grid, and nobody builds it
@@ -390,8 +389,8 @@ class Pool:
         else:
             self._gridless.insert(0, MadeScene(item.task, item.scene, None))
 
-    def _place(self, task: SceneTask) -> int:
-        return self._order[task.split, task.index]
+    def _place(self, task: SceneTask) -> tuple[bool, int, bool]:
+        return generation_place(task.split, task.index)
 
 
 def _task(item: SceneTask | MadeScene | GridTask) -> SceneTask:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tarfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -90,12 +89,6 @@ def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
                 file.write(staged.read(min(_COPY_BYTES, length - start)))
         written += length
     file.write(_tar_end(written))
-
-
-def sync_file(file: BinaryIO) -> None:
-    """Brings what was written to the disk itself."""
-    file.flush()
-    os.fsync(file.fileno())
 
 
 def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:

@@ -8,11 +8,10 @@ first to publish an episode wins, and the manifest is only changed under its loc
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import errno
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,19 +22,20 @@ from datagen.pool.plan import (
     SceneTask,
     ShardRange,
     episode_key,
-    generation_order,
+    generation_place,
     missing_ranges,
     parse_episode_key,
     parse_shard_name,
     scene_seed,
     work_order,
 )
-from datagen.pool.shard import STAGING_NAME, inspect_shard, join_tars, staged_path, sync_file
+from datagen.pool.shard import STAGING_NAME, inspect_shard, join_tars, staged_path
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
+from hgn.data.index import ListedIndex
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest, QuarantinedScene, ShardEntry
 from hgn.schema import ConfigError
-from hgn.system.files import TEMPORARY_SUFFIX, sync_folder, temporary_file, temporary_target
+from hgn.system.files import TEMPORARY_SUFFIX, sync_file, sync_folder, temporary_file, temporary_target
 from hgn.system.machine import available_cpus
 
 # seeds tried for one episode before the scene distribution itself is held to be at fault
@@ -66,12 +66,18 @@ class DatasetWriter:
         self._report = report
         tasks, task = config.dataset.array_tasks or 1, config.dataset.array_task or 0
         self._share = work_order(self.requested, config.dataset.episodes_per_shard)[task::tasks]
-        self._pending = self._share  # what of it is not published
+        self._total = sum(len(shard.indices) for shard in self._share)
+        self._in_share = {split: bytearray(count) for split, count in self.requested.items()}  # a byte an episode
+        for shard in self._share:
+            self._in_share[shard.split][shard.first : shard.stop] = b"\1" * len(shard.indices)
+        self._begun = 0  # so many shards at the share's beginning are published
         self._claimed: list[ShardRange] = []  # what of that this writer makes
         self._staged: set[tuple[str, int]] = set()  # and what of these waits in .staging
         self._packers = ThreadPoolExecutor(PACKED_AT_ONCE, "packer")
         self._packing: dict[ShardRange, Future[_Packed]] = {}  # of the shards to be published next
-        self._stamp: tuple[int, ...] | None = None  # of the manifest file that `manifest` was read from or written to
+        self._content = b""  # of the manifest file that `manifest` was read from
+        self._failures: list[QuarantinedScene] = []
+        self._forget_published()
 
     def __enter__(self) -> DatasetWriter:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -109,17 +115,16 @@ class DatasetWriter:
         Its staged episodes are checked and kept. None when there is no such shard, or not yet: another generator may
         end without publishing what it has claimed.
         """
-        for shard in self._pending:
+        for shard in self._pending():
             if shard in self._claimed or not self._locks.take(shard):
                 continue
             # whoever had it may have published it, or ended before it could list it
             with self._locks.manifest():
                 self._reload()
-                self._list_unlisted()
-            self._plan()
-            if shard not in self._pending:
+                self._list_unlisted(self._packed_names(shard))
+            if missing_ranges([shard], self._published) != [shard]:
                 self._locks.free(shard)
-                return self.claim_next()
+                continue
             self._claimed.append(shard)
             self._find_staged(shard)
             return shard
@@ -128,12 +133,11 @@ class DatasetWriter:
     def remaining(self) -> list[tuple[str, int]]:
         """The episodes (split, index) of the claimed shards that are not staged, in the order to simulate them."""
         wanted = {(shard.split, index) for shard in self._claimed for index in shard.indices} - self._staged
-        return [item for item in generation_order(self.requested) if item in wanted]
+        return sorted(wanted, key=lambda item: generation_place(*item))
 
     def refresh(self) -> None:
         """Takes notice of what other generators have published."""
         self._reload()
-        self._plan()
 
     @property
     def holds(self) -> bool:
@@ -143,17 +147,17 @@ class DatasetWriter:
     @property
     def total(self) -> int:
         """How many episodes the share has."""
-        return sum(len(shard.indices) for shard in self._share)
+        return self._total
 
     @property
     def done(self) -> int:
         """How many of them are published, or staged in claimed shards."""
-        return self.total - sum(len(shard.indices) for shard in self._pending) + len(self._staged)
+        return self._published_of_share + len(self._staged)
 
     @property
     def complete(self) -> bool:
         """Whether the share is published, by whomever."""
-        return not self._pending
+        return self._published_of_share == self._total
 
     def task(self, split: str, index: int) -> SceneTask:
         """The scene to simulate for an episode: the first seed that is not quarantined.
@@ -161,7 +165,9 @@ class DatasetWriter:
         Raises: ConfigError when too many seeds in a row could not be simulated.
         """
         key = episode_key(split, index)
-        failures = [scene for scene in self.manifest.quarantined if scene.key == key]
+        if len(self._failures) < self.manifest.shards.state.quarantined:
+            self._failures = self.manifest.quarantined
+        failures = [scene for scene in self._failures if scene.key == key]
         attempt = 1 + max((scene.attempt for scene in failures), default=-1)
         if attempt >= MAXIMUM_REPLACEMENTS:
             raise ConfigError(
@@ -175,7 +181,7 @@ class DatasetWriter:
         failure = QuarantinedScene(task.key, task.attempt, task.seed, cause)
         with self._locks.manifest():
             self._reload()
-            self._save(dataclasses.replace(self.manifest, quarantined=(*self.manifest.quarantined, failure)))
+            self._publish_list(quarantined=(failure,))
         return self.task(task.split, task.index)
 
     def add_staged(self, split: str, index: int) -> None:
@@ -212,13 +218,12 @@ class DatasetWriter:
                 return None
         entry = self._publish(ready[0])
         self._forget(ready[0])
-        self._plan()
         return entry
 
     def _pack(self, shard: ShardRange) -> _Packed:
         """A shard's file under a temporary name, which is gone when the stack is closed, and its checked entry."""
         with ExitStack() as stack:
-            temporary = stack.enter_context(temporary_file(self.folder / shard.name))
+            temporary = stack.enter_context(temporary_file(self.folder / STAGING_NAME / shard.name))
             with temporary.open("wb") as file:
                 join_tars(file, (staged_path(self.folder, shard.split, index) for index in shard.indices))
                 sync_file(file)
@@ -239,35 +244,34 @@ class DatasetWriter:
             if not _link(temporary, target):
                 entry = inspect_shard(target, shard, self.config)
             sync_folder(self.folder)
-            self._publish_list((*self.manifest.shards, entry))
+            self._publish_list((entry,))
         return entry
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
         """What another generator has published of a claimed shard: only where a file system's locks do not hold."""
         self._reload()
-        for other in self.manifest.shards:
-            if _overlap(shard, other):
-                self._report(f"{other.name} was published by another generator; this copy is dropped")
-                return other
-        return None
+        if missing_ranges([shard], self._published) == [shard]:
+            return None
+        other = next(other for other in self.manifest.shards if _overlap(shard, other))
+        self._report(f"{other.name} was published by another generator; this copy is dropped")
+        return other
 
     def _recover(self) -> None:
         if (self.folder / MANIFEST_NAME).exists():
             self._reload()
             require_same_dataset(self.manifest.config, self.config, self.folder)
-        present = tuple(shard for shard in self.manifest.shards if self._is_present(shard))
-        if present != self.manifest.shards:
-            self._publish_list(present)
-        self._list_unlisted()
-        self._plan()
+        shards = list(self.manifest.shards)
+        present = [shard for shard in shards if self._is_present(shard)]
+        if len(present) < len(shards):
+            self._rewrite_list(present)
+        self._list_unlisted({path.name for path in self.folder.glob("*.tar")} - {shard.name for shard in present})
         # a complete folder that is asked for less, or for the same again, stays as it is
-        asks_anew = self.requested != self.manifest.requested and (self._pending or not self.manifest.complete)
+        asks_anew = self.requested != self.manifest.requested and not (self.complete and self.manifest.complete)
         if asks_anew or not (self.folder / MANIFEST_NAME).exists():
-            self._save(dataclasses.replace(self.manifest, requested=self.requested))
-        published = self._published_episodes()
+            self._publish_list()
         for path in (self.folder / STAGING_NAME).glob("*.tar"):
             episode = parse_episode_key(path.stem)
-            if episode is None or (episode.split, episode.first) in published:
+            if episode is None or not missing_ranges([episode], self._published):
                 path.unlink(missing_ok=True)  # its publisher may be about to do the same
 
     def _is_present(self, shard: ShardEntry) -> bool:
@@ -282,21 +286,25 @@ class DatasetWriter:
             )
         return True
 
-    def _list_unlisted(self) -> None:
-        """Lists the shards that were published by a generator that ended before it could say so."""
-        shards = list(self.manifest.shards)
-        listed = {shard.name for shard in shards}
-        for path in sorted(self.folder.glob("*.tar")):
-            shard = parse_shard_name(path.name)
-            if shard is None or path.name in listed:
+    def _packed_names(self, shard: ShardRange) -> set[str]:
+        """Shards with episodes of this range that somebody was publishing."""
+        names = {temporary_target(path) for path in (self.folder / STAGING_NAME).glob(f".*{TEMPORARY_SUFFIX}")}
+        ranges = {name: parse_shard_name(name) for name in names}
+        return {name for name, other in ranges.items() if other is not None and _overlap(shard, other)}
+
+    def _list_unlisted(self, names: set[str]) -> None:
+        """Lists those shards that were published by a generator that ended before it could say so."""
+        for name in sorted(names):
+            shard, path = parse_shard_name(name), self.folder / name
+            if shard is None or not path.exists():
                 continue
-            for other in shards:
-                if _overlap(shard, other):
-                    raise ConfigError(f"{path} overlaps {other.name}; move it out of the folder")
-            shards.append(inspect_shard(path, shard, self.config))
-            self._report(f"{path.name} was published but not yet listed; checked and listed")
-        if len(shards) > len(self.manifest.shards):
-            self._publish_list(tuple(shards))
+            if missing_ranges([shard], self._published) != [shard]:
+                other = next(other for other in self.manifest.shards if _overlap(shard, other))
+                if other.name == name:
+                    continue
+                raise ConfigError(f"{path} overlaps {other.name}; move it out of the folder")
+            self._publish_list((inspect_shard(path, shard, self.config),))
+            self._report(f"{name} was published but not yet listed; checked and listed")
 
     def _find_staged(self, shard: ShardRange) -> None:
         """Checks what earlier runs left of a shard that was just claimed, and removes what they were writing."""
@@ -327,32 +335,57 @@ class DatasetWriter:
                     if not any(_overlap(shard, claimed) for claimed in self._claimed):
                         self._locks.free(shard)
 
-    def _plan(self) -> None:
-        present = [ShardRange(shard.split, shard.first, shard.stop) for shard in self.manifest.shards]
-        self._pending = missing_ranges(self._share, present)
+    def _pending(self) -> Iterator[ShardRange]:
+        """What of the share is not published."""
+        for place in range(self._begun, len(self._share)):
+            missing = missing_ranges(self._share[place : place + 1], self._published)
+            if not missing and place == self._begun:
+                self._begun += 1
+            yield from missing
 
-    def _published_episodes(self) -> set[tuple[str, int]]:
-        return {(shard.split, entry.index) for shard in self.manifest.shards for entry in shard.episodes}
+    def _forget_published(self) -> None:
+        self._published = {split: bytearray(count) for split, count in self.requested.items()}  # a byte an episode
+        self._listed = self._begun = self._published_of_share = 0
+        self._failures = []
+
+    def _note_published(self) -> None:
+        """Takes notice of the shards that `manifest` has in addition."""
+        for shard in self.manifest.shards.since(self._listed):
+            published, in_share = self._published[shard.split], self._in_share[shard.split]
+            published.extend(bytes(max(shard.stop - len(published), 0)))
+            self._published_of_share += sum(in_share[shard.first : shard.stop])
+            published[shard.first : shard.stop] = b"\1" * (shard.stop - shard.first)
+        self._listed = len(self.manifest.shards)
 
     def _reload(self) -> None:
-        with contextlib.suppress(FileNotFoundError):  # removed by hand: it is written anew with the next shard
-            stamp = _stamp(self.folder / MANIFEST_NAME)
-            if stamp != self._stamp:
-                manifest = Manifest.load(self.folder)
-                if self._stamp is not None:
-                    require_same_dataset(manifest.config, self.config, self.folder)
-                self.manifest, self._stamp = manifest, stamp
+        try:
+            content = (self.folder / MANIFEST_NAME).read_bytes()
+        except FileNotFoundError:  # removed by hand: it is written anew with the next shard
+            return
+        if content != self._content:
+            manifest = Manifest.parse(content, self.folder)
+            if self._content:
+                require_same_dataset(manifest.config, self.config, self.folder)
+            known = self.manifest.shards
+            if self._listed and manifest.shards.state.generation != known.state.generation:
+                self._forget_published()
+            self.manifest = dataclasses.replace(manifest, shards=known.continued(manifest.shards))
+            self._note_published()
+            self._content = content
 
-    def _publish_list(self, shards: tuple[ShardEntry, ...]) -> None:
-        self._save(
-            dataclasses.replace(
-                self.manifest, shards=shards, revision=self.manifest.revision + 1, requested=self.requested
-            )
+    def _publish_list(self, shards: Sequence[ShardEntry] = (), quarantined: Sequence[QuarantinedScene] = ()) -> None:
+        revision = self.manifest.revision + len(shards)
+        self.manifest = self.manifest.extended(
+            self.folder, shards, quarantined, revision=revision, requested=self.requested
         )
+        self._note_published()
+        self._content = (self.folder / MANIFEST_NAME).read_bytes()
 
-    def _save(self, manifest: Manifest) -> None:
-        manifest.save(self.folder)
-        self.manifest, self._stamp = manifest, _stamp(self.folder / MANIFEST_NAME)
+    def _rewrite_list(self, shards: Sequence[ShardEntry]) -> None:
+        index = ListedIndex(shards, self.manifest.quarantined)
+        self.manifest = dataclasses.replace(self.manifest, shards=index, revision=self.manifest.revision + 1)
+        self._forget_published()
+        self._publish_list()
 
     def _forget(self, shard: ShardRange) -> None:
         for index in shard.indices:
@@ -364,11 +397,6 @@ class DatasetWriter:
 
 def _overlap(one: ShardRange | ShardEntry, other: ShardRange | ShardEntry) -> bool:
     return one.split == other.split and one.first < other.stop and other.first < one.stop
-
-
-def _stamp(path: Path) -> tuple[int, ...]:
-    status = path.stat()
-    return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _link(temporary: Path, target: Path) -> bool:

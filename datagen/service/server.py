@@ -2,7 +2,9 @@
 
 | path | what | |
 |---|---|---|
-| /manifest.json | the manifest | ETag: sha256 of its bytes |
+| /manifest.json | the manifest: what the data set is, and how much of it is published | ETag: sha256 of its bytes |
+| /index/... | the index's files, see `hgn.data.index` | Range |
+| /index?since=N | the next shards after the first N, a line of JSON each; at most 128 | |
 | /<shard>.tar | a published shard | ETag: its sha256; Range, If-Range |
 | /progress | counts and the pool's state, JSON | |
 | /metrics | the same for Prometheus | |
@@ -14,15 +16,18 @@ token each request must carry `Authorization: Bearer <token>`.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
-from collections import Counter
+import json
+from collections import Counter, defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import uvicorn
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
@@ -33,9 +38,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from datagen.service.sendfile import FileRange
 from datagen.service.supervisor import PoolState
 from datagen.service.uvicorn_compat import SendfileProtocol
-from hgn.data.manifest import MANIFEST_NAME, Manifest, ShardEntry
+from hgn.data.index import INDEX_NAME, SEGMENT_SHARDS, Index
+from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.storage import verify_file
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, to_mapping
 
 _OPEN_PATHS = ("/healthz",)
 _GRACE_S = 5  # for answers that are being sent when the service is stopped; readers go on where they were cut
@@ -49,20 +55,37 @@ class Snapshot:
     content: bytes
     etag: str
     manifest: Manifest
-    shards: dict[str, ShardEntry]
 
 
 class Published:
-    """The manifest of a folder, read again when the file has changed."""
+    """The manifest of a folder, and where its shards are.
+
+    It is read once when the file has changed, and index lines once when they are needed, however many ask; what a
+    request finds stays as it is.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._stamp: tuple[int, ...] | None = None
         self._snapshot: Snapshot | None = None
+        self._shards: dict[str, tuple[str, int]] = {}  # sha256, bytes
+        self._listed: Index | None = None  # whose shards these are
+        self._reading, self._listing = asyncio.Lock(), asyncio.Lock()
+        self._threads = CapacityLimiter(2)  # its own: others may wait for shards to be hashed
 
     async def snapshot(self) -> Snapshot:
         """Raises: ConfigError when there is no manifest that this version can read."""
-        return await to_thread.run_sync(self._read)
+        async with self._reading:
+            return await to_thread.run_sync(self._read, limiter=self._threads)
+
+    async def shard(self, name: str) -> tuple[str, int] | None:
+        """The sha256 and size of a published shard."""
+        index = (await self.snapshot()).manifest.shards
+        if name not in self._shards:
+            async with self._listing:
+                if index is not self._listed:
+                    await to_thread.run_sync(self._list, index, limiter=self._threads)
+        return self._shards.get(name)
 
     def _read(self) -> Snapshot:
         path = self.folder / MANIFEST_NAME
@@ -70,14 +93,24 @@ class Published:
             status = path.stat()
         except FileNotFoundError:
             raise ConfigError("the data set has no manifest yet; ask again in a moment") from None
-        stamp = (status.st_ino, status.st_mtime_ns, status.st_size)
+        stamp = (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
         if self._snapshot is None or stamp != self._stamp:
             content = path.read_bytes()
-            manifest = Manifest.parse(content, MANIFEST_NAME)
-            etag = f'"{hashlib.sha256(content).hexdigest()}"'
-            self._snapshot = Snapshot(content, etag, manifest, {shard.name: shard for shard in manifest.shards})
+            manifest = Manifest.parse(content, self.folder)
+            if self._snapshot is not None:
+                manifest = replace(manifest, shards=self._snapshot.manifest.shards.continued(manifest.shards))
+            self._snapshot = Snapshot(content, f'"{hashlib.sha256(content).hexdigest()}"', manifest)
             self._stamp = stamp
         return self._snapshot
+
+    def _list(self, index: Index) -> None:
+        known = self._listed
+        first = len(known) if known is not None and known.state.generation == index.state.generation else 0
+        new = {shard.name: (shard.sha256, shard.bytes) for shard in index.since(first)}
+        if not first:
+            self._shards.clear()
+        self._shards.update(new)
+        self._listed = index
 
 
 class Guard:
@@ -115,6 +148,7 @@ class Guard:
 def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> ASGIApp:
     """The service as an ASGI application."""
     published, counters = Published(folder), Counter[str]()
+    hashing: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
 
     async def manifest(request: Request) -> Response:
         snapshot = await published.snapshot()
@@ -123,22 +157,50 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
             return Response(status_code=304, headers=headers)
         return Response(snapshot.content, headers=headers, media_type="application/json")
 
+    async def index_file(request: Request) -> Response:
+        index = (await published.snapshot()).manifest.shards
+        name = f"{INDEX_NAME}/{request.path_params['name']}"
+        size = await to_thread.run_sync(index.size, name)
+        if size is None:
+            return PlainTextResponse("the index has no such file\n", 404)
+        # what was sent of it never changes: it may only be longer another time
+        headers = {"etag": f'"{request.path_params["name"]}"', "cache-control": "private, no-cache"}
+        return FileRange(folder / name, size, headers, "application/jsonl")
+
+    async def since(request: Request) -> Response:
+        asked = request.query_params.get("since", "0")
+        if not (asked.isascii() and asked.isdecimal() and len(asked) < 10):
+            return PlainTextResponse(f"since must be a number of shards, got {asked!r}\n", 400)
+        index = (await published.snapshot()).manifest.shards
+
+        def lines() -> str:
+            return "".join(
+                json.dumps(to_mapping(shard)) + "\n" for shard in islice(index.since(int(asked)), SEGMENT_SHARDS)
+            )
+
+        text = await to_thread.run_sync(lines)
+        return Response(text, headers={"cache-control": "no-cache"}, media_type="application/jsonl")
+
     async def shard(request: Request) -> Response:
-        entry = (await published.snapshot()).shards.get(request.path_params["name"])
+        name = request.path_params["name"]
+        entry = await published.shard(name)
         if entry is None:
             return PlainTextResponse("the manifest lists no such shard\n", 404)
-        path, etag = folder / entry.name, f'"{entry.sha256}"'
+        (sha256, size), path = entry, folder / name
         try:
-            await to_thread.run_sync(verify_file, path, entry.sha256, entry.bytes, _REMEDY)
+            # many ask for a new shard at once: its sha256 is taken by the first
+            async with hashing[name]:
+                await to_thread.run_sync(verify_file, path, sha256, size, _REMEDY)
         except FileNotFoundError:
-            return PlainTextResponse(f"{entry.name} is missing here; it must be generated again\n", 404)
+            return PlainTextResponse(f"{name} is missing here; it must be generated again\n", 404)
         except ConfigError:
-            return PlainTextResponse(f"{entry.name} is damaged here; {_REMEDY}\n", 410)
+            return PlainTextResponse(f"{name} is damaged here; {_REMEDY}\n", 410)
+        etag = f'"{sha256}"'
         # another data set may have a shard of this name, at this address, later
         headers = {"etag": etag, "cache-control": "private, no-cache"}
         if _unchanged(request, etag):
             return Response(status_code=304, headers=headers)
-        return FileRange(path, entry.bytes, headers, "application/x-tar")
+        return FileRange(path, size, headers, "application/x-tar")
 
     async def progress(request: Request) -> Response:
         return JSONResponse(
@@ -159,6 +221,8 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
     app = Starlette(
         routes=[
             Route(f"/{MANIFEST_NAME}", manifest),
+            Route(f"/{INDEX_NAME}", since),
+            Route(f"/{INDEX_NAME}/{{name}}", index_file),
             Route("/progress", progress),
             Route("/metrics", metrics),
             Route("/healthz", healthz),
@@ -204,8 +268,8 @@ def _progress(manifest: Manifest, pool: PoolState) -> dict[str, object]:
             for split, count in manifest.requested.items()
         },
         "shards": len(manifest.shards),
-        "bytes": sum(shard.bytes for shard in manifest.shards),
-        "quarantined": len(manifest.quarantined),
+        "bytes": sum(total.bytes for total in manifest.totals.values()),
+        "quarantined": manifest.shards.state.quarantined,
         "generator": {
             "status": pool.status,
             "starts": pool.starts,
@@ -228,9 +292,11 @@ def _metrics(manifest: Manifest, pool: PoolState, counters: Counter[str]) -> str
         ("hgn_episodes_published", "gauge", "Episodes that can be read.",
          [(label, manifest.published(split)) for split, label in splits]),
         ("hgn_shards_published", "gauge", "Shards that can be read.", [("", len(manifest.shards))]),
-        ("hgn_shard_bytes_published", "gauge", "Bytes of these.", [("", sum(s.bytes for s in manifest.shards))]),
+        ("hgn_shard_bytes_published", "gauge", "Bytes of these.",
+         [("", sum(totals.bytes for totals in manifest.totals.values()))]),
         ("hgn_manifest_revision", "counter", "Revision of the manifest.", [("", manifest.revision)]),
-        ("hgn_scenes_quarantined", "gauge", "Scenes that could not be simulated.", [("", len(manifest.quarantined))]),
+        ("hgn_scenes_quarantined", "gauge", "Scenes that could not be simulated.",
+         [("", manifest.shards.state.quarantined)]),
         ("hgn_generator_running", "gauge", "1 while the pool runs.", [("", int(pool.status == "running"))]),
         ("hgn_generator_failed", "gauge", "1 when it ended for good with an error.",
          [("", int(pool.status == "failed"))]),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from heapq import nsmallest
+from itertools import islice
 from pathlib import Path
 
 from hgn.data.manifest import SPLITS
@@ -12,8 +14,8 @@ from hgn.schema import ConfigError
 
 def first_indices(store: EpisodeStore, count: int, known: int | None = None) -> list[int]:
     """Where in the store the episodes of lowest index among the first `known` published (all of them if absent) are."""
-    entries = store.entries[:known]
-    return sorted(range(len(entries)), key=lambda i: entries[i].index)[:count]
+    places = ((entry.index, place) for place, entry in enumerate(islice(store.entries, known)))
+    return [place for _, place in nsmallest(count, places)]
 
 
 def first_episodes(store: EpisodeStore, count: int, known: int | None = None) -> list[Episode]:
@@ -35,7 +37,7 @@ def find_episode(folder: Path | str, key: str) -> Episode:
     if split not in SPLITS:
         raise ConfigError(f"episode must begin with one of {', '.join(SPLITS)}, got {key!r}; e.g. validation-000000")
     store = EpisodeStore(folder, split)
-    keys = [entry.key for entry in store.entries]
-    if key not in keys:
-        raise ConfigError(f"episode must be one of the {len(keys)} {split} episodes in {folder}, got {key!r}")
-    return store.episodes[keys.index(key)]
+    for place, entry in enumerate(store.entries):
+        if entry.key == key:
+            return store.episodes[place]
+    raise ConfigError(f"episode must be one of the {len(store)} {split} episodes in {folder}, got {key!r}")

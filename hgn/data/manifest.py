@@ -1,71 +1,69 @@
 """The manifest of a data set: which shards are published, what is in them, and how they were made.
 
-`manifest.json` is written last and atomically, so whatever it lists is there whole. Shards stay in the order they
-were published in, so a reader that knows revision r only ever sees shards appended.
+`manifest.json` is written last and atomically, so whatever it lists is there whole. It is of one size, whatever the
+number of shards: these are in the files of `hgn.data.index`, in the order they were published in, so a reader that
+knows some of them only ever sees others appended. Manifests of the first release list the shards themselves.
 """
 
 from __future__ import annotations
 
 import json
-import re
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hgn.data.statistics import Statistics, merge_statistics
+from hgn.data.identity import identity_hash
+from hgn.data.index import (
+    SPLITS,
+    EpisodeEntry,
+    Index,
+    IndexState,
+    ListedIndex,
+    QuarantinedScene,
+    ShardEntry,
+    SplitTotals,
+    Totals,
+    begin,
+    extend,
+    no_totals,
+    parse_json,
+    require_sound,
+)
+from hgn.data.statistics import Statistics
 from hgn.data.storage import PATIENCE_S, open_storage
 from hgn.scene.episode import SCHEMA_VERSION, require_schema_version
-from hgn.schema import ConfigError, from_mapping, require, require_non_negative, require_one_of, to_mapping
+from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import write_atomically
 
+__all__ = ["MANIFEST_NAME", "SPLITS", "EpisodeEntry", "Manifest", "QuarantinedScene", "ShardEntry"]
 MANIFEST_NAME = "manifest.json"
-SPLITS = ("train", "validation", "test")
-_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
-class EpisodeEntry:
-    """One episode inside a shard."""
+class _Head:
+    """`manifest.json`."""
 
-    key: str
-    index: int  # within its split
-    seed: int
-    attempt: int  # 0 unless earlier seeds of this index were quarantined
-    particles: int
-    frames: int
-    members: dict[str, tuple[int, int]]  # name after `<key>.` -> offset of its data in the tar, bytes
-
-
-@dataclass(frozen=True)
-class ShardEntry:
-    """One published tar file: episodes [first, stop) of a split."""
-
-    name: str
-    split: str
-    first: int
-    stop: int
-    sha256: str
-    bytes: int
-    episodes: tuple[EpisodeEntry, ...]
-    statistics: Statistics
-
-    def __post_init__(self) -> None:
-        # both become file names, and a manifest may come from anywhere
-        require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
-        require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
-        require_one_of(self, "split", SPLITS)
-        require_non_negative(self, "bytes")
+    config_hash: str
+    config: dict[str, Any]
+    requested: dict[str, int]
+    revision: int
+    index: IndexState
+    totals: dict[str, SplitTotals]
+    schema_version: int
 
 
 @dataclass(frozen=True)
-class QuarantinedScene:
-    """A scene that could not be simulated; the next attempt's seed took its place."""
+class _Listing:
+    """`manifest.json` of the first release."""
 
-    key: str
-    attempt: int
-    seed: int
-    cause: str
+    config_hash: str
+    config: dict[str, Any]
+    requested: dict[str, int]
+    revision: int = 0
+    shards: tuple[ShardEntry, ...] = ()
+    quarantined: tuple[QuarantinedScene, ...] = ()
+    schema_version: int = SCHEMA_VERSION
 
 
 @dataclass(frozen=True)
@@ -76,9 +74,8 @@ class Manifest:
     config: dict[str, Any]
     requested: dict[str, int]
     revision: int = 0  # grows by one with each publication
-    shards: tuple[ShardEntry, ...] = ()  # in publication order
-    quarantined: tuple[QuarantinedScene, ...] = ()
-    schema_version: int = field(default=SCHEMA_VERSION)
+    shards: Index = field(default_factory=lambda: ListedIndex(()))  # in publication order
+    schema_version: int = SCHEMA_VERSION
 
     @staticmethod
     def load(folder: Path | str, patience_s: float = PATIENCE_S) -> Manifest:
@@ -95,40 +92,88 @@ class Manifest:
                 f"{path} must be the manifest of a data set, got no such file; generate one with "
                 f"python -m datagen +experiment=... out={folder}"
             ) from None
-        return Manifest.parse(content, path)
+        return Manifest.parse(content, folder)
 
     @staticmethod
-    def parse(content: bytes, path: str) -> Manifest:
-        """The manifest in a file's bytes; messages name `path`.
+    def parse(content: bytes, folder: Path | str) -> Manifest:
+        """The manifest in a file's bytes; its index is read in `folder`.
 
         Raises: ConfigError when they are no JSON, of another schema version, or wrong in any field.
         """
-        try:
-            mapping = json.loads(content.decode("utf-8"))
-        except ValueError as error:
-            raise ConfigError(
-                f"{path} must be JSON written by python -m datagen, got {error}; delete it and run the same command "
-                "again: published shards are found and kept"
-            ) from None
+        path = f"{folder}/{MANIFEST_NAME}"
+        mapping = parse_json(content, path)
         require_schema_version(mapping, path)
-        return from_mapping(Manifest, mapping, path)
+        if "index" not in mapping:
+            listing = from_mapping(_Listing, mapping, path)
+            shards: Index = ListedIndex(listing.shards, listing.quarantined)
+            head = _Head(
+                **{k: v for k, v in vars(listing).items() if k not in ("shards", "quarantined")},
+                index=shards.state,
+                totals=shards.totals,
+            )
+        else:
+            head = from_mapping(_Head, mapping, path)
+            shards = Index(folder, head.index, no_totals() | head.totals)
+        for name in ("requested", "totals"):
+            splits = sorted(getattr(head, name))
+            require(set(splits) <= set(SPLITS), f"{path}.{name}", f"of {', '.join(SPLITS)}", splits)
+        for totals in shards.totals.values():
+            require_sound(totals.statistics or Statistics())
+        count = sum(totals.shards for totals in shards.totals.values())
+        require(count == len(shards), f"{path}.index.shards", f"{count}, as in totals", len(shards))
+        found = identity_hash(head.config)
+        require(head.config_hash == found, f"{path}.config_hash", f"{found}, as config has it", head.config_hash)
+        return Manifest(head.config_hash, head.config, head.requested, head.revision, shards, head.schema_version)
 
-    def save(self, folder: Path | str) -> None:
-        """Replaces `<folder>/manifest.json` atomically."""
-        text = json.dumps(to_mapping(self), sort_keys=True, allow_nan=False, separators=(",", ":"))
-        write_atomically(Path(folder) / MANIFEST_NAME, text.encode() + b"\n")
+    def save(self, folder: Path | str) -> Manifest:
+        """Replaces what the folder lists by this, in an index of a new generation; returns it as it is read there."""
+        return replace(self, shards=begin(Path(folder))).extended(
+            Path(folder), self.shards, self.quarantined, revision=self.revision
+        )
+
+    def extended(
+        self,
+        folder: Path,
+        shards: Sequence[ShardEntry] = (),
+        quarantined: Sequence[QuarantinedScene] = (),
+        **changes: Any,
+    ) -> Manifest:
+        """Publishes more in this manifest's folder, at a cost that does not depend on what is there; `changes` are
+        other fields.
+
+        Raises: OSError; ConfigError where the index is not what was read.
+        """
+        if isinstance(self.shards, ListedIndex):
+            whole = ListedIndex([*self.shards, *shards], [*self.quarantined, *quarantined])
+            return replace(self, shards=whole, **changes).save(folder)
+        manifest = replace(self, shards=extend(folder, self.shards, shards, quarantined), **changes)
+        mapping = {name: value for name, value in vars(manifest).items() if name != "shards"}
+        head = _Head(**mapping, index=manifest.shards.state, totals=manifest.shards.totals)
+        text = json.dumps(to_mapping(head), sort_keys=True, allow_nan=False, separators=(",", ":"))
+        write_atomically(folder / MANIFEST_NAME, text.encode() + b"\n")
+        return manifest
+
+    @property
+    def totals(self) -> Totals:
+        """What is published of each split."""
+        return self.shards.totals
+
+    @property
+    def quarantined(self) -> list[QuarantinedScene]:
+        """The scenes that could not be simulated, the first one first; read anew each time."""
+        return self.shards.quarantined()
 
     def statistics(self, split: str = "train") -> Statistics:
         """Velocity and acceleration over all published episodes of a split, in frame units."""
-        return merge_statistics(shard.statistics for shard in self.shards_of(split))
+        return self.totals[split].statistics or Statistics()
 
-    def shards_of(self, split: str) -> tuple[ShardEntry, ...]:
+    def shards_of(self, split: str) -> Iterator[ShardEntry]:
         """The published shards of a split, in publication order."""
-        return tuple(shard for shard in self.shards if shard.split == split)
+        return (shard for shard in self.shards if shard.split == split)
 
     def published(self, split: str) -> int:
         """How many episodes of a split can be read."""
-        return sum(len(shard.episodes) for shard in self.shards_of(split))
+        return self.totals[split].episodes
 
     @property
     def complete(self) -> bool:

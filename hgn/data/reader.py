@@ -10,7 +10,9 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -21,6 +23,8 @@ from hgn.data.statistics import Statistics
 from hgn.data.storage import UnreachableError, is_remote, open_storage
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, require
+
+MAPPED_SHARDS = 256  # at once; a process may have 1,024 files open where nothing else is said
 
 
 class EpisodeStore:
@@ -74,23 +78,21 @@ class EpisodeStore:
                 f"{self.folder} must keep holding the same data set, got config hash {manifest.config_hash[:12]} "
                 f"where {self.manifest.config_hash[:12]} was opened; start again"
             )
-        known, now = self.manifest.shards_of(self.split), manifest.shards_of(self.split)
-        if [shard.sha256 for shard in now[: len(known)]] != [shard.sha256 for shard in known]:
+        manifest = replace(manifest, shards=self.manifest.shards.continued(manifest.shards))
+        if not manifest.shards.continues(self.manifest.shards, self.split):
             raise ConfigError(
                 f"{self.folder} must keep the {self.split} shards already published, got a manifest (revision "
                 f"{manifest.revision}) without some of them; start again"
             )
-        self.manifest = manifest
-        for shard in now[len(known) :]:
-            self._append(shard)
-        return len(now) > len(known)
+        known, self.manifest = len(self), manifest
+        return len(self) > known
 
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
         """Whether these episodes can be read without waiting longer for a server; their shards are brought here.
 
         Raises: ConfigError when a shard is missing or altered.
         """
-        for shard in {shard.name: shard for shard, _ in (self._located[index] for index in indices)}.values():
+        for shard in {shard.name: shard for shard, _ in map(self._locate, indices)}.values():
             try:
                 open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, patience_s)
             except UnreachableError:
@@ -102,10 +104,18 @@ class EpisodeStore:
 
         Does nothing for a folder.
         """
-        shards = [shard for shard in self.manifest.shards_of(self.split) if shard.name not in self._maps]
-        if is_remote(self.folder) and shards and (self._fetcher is None or not self._fetcher.is_alive()):
-            self._fetcher = threading.Thread(target=_fetch, args=(self.folder, shards), name="shards", daemon=True)
+        known = len(self.manifest.shards)
+        if is_remote(self.folder) and self._fetched < known and (self._fetcher is None or not self._fetcher.is_alive()):
+            self._fetcher = threading.Thread(target=self._fetch, args=(self.manifest,), name="shards", daemon=True)
             self._fetcher.start()
+
+    def _fetch(self, manifest: Manifest) -> None:
+        # whoever needs a shard that cannot be had meets the same error again, and says so
+        with contextlib.suppress(ConfigError, OSError):
+            for shard in manifest.shards.since(self._fetched):
+                if shard.split == self.split:
+                    open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes)
+                self._fetched += 1
 
     @property
     def revision(self) -> int:
@@ -113,9 +123,19 @@ class EpisodeStore:
         return self.manifest.revision
 
     @property
-    def entries(self) -> list[EpisodeEntry]:
-        """What the manifest says of each episode (key, particles, frames), without opening any shard."""
-        return [entry for _, entry in self._located]
+    def entries(self) -> Iterator[EpisodeEntry]:
+        """What the index says of each episode (key, particles, frames), without opening any shard."""
+        return (entry for shard in self.manifest.shards_of(self.split) for entry in shard.episodes)
+
+    def frames(self, count: int | None = None) -> list[int]:
+        """Frames of each episode, of the first `count` only. Where all have as many the index is not read for it."""
+        count, config = len(self) if count is None else count, self.manifest.config
+        if "long_fraction" not in config:
+            return [config["frames"]] * count
+        for shard in self.manifest.shards.since(self._measured):
+            self._frames += [entry.frames for entry in shard.episodes if shard.split == self.split]
+            self._measured += 1
+        return self._frames[:count]
 
     @property
     def episodes(self) -> Sequence[Episode]:
@@ -130,7 +150,7 @@ class EpisodeStore:
         return self.manifest.statistics(self.split)
 
     def __len__(self) -> int:
-        return len(self._located)
+        return self.manifest.published(self.split)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"folder": self.folder, "split": self.split, "manifest": self.manifest}
@@ -140,41 +160,61 @@ class EpisodeStore:
         self._reset()
 
     def _reset(self) -> None:
-        self._located: list[tuple[ShardEntry, EpisodeEntry]] = []
-        self._maps: dict[str, np.ndarray] = {}
-        self._opened: dict[int, Episode] = {}
+        self._open_shards: OrderedDict[str, _OpenShard] = OrderedDict()
         self._episodes = _Episodes(self)
         self._fetcher = None
-        for shard in self.manifest.shards_of(self.split):
-            self._append(shard)
+        self._frames: list[int] = []  # of the episodes of the data set's first shards, where they may differ
+        self._measured = 0  # how many shards these are
+        self._fetched = 0  # of the data set's shards, how many were brought here one after the other
+        self._lock = threading.Lock()
 
-    def _append(self, shard: ShardEntry) -> None:
-        self._located.extend((shard, entry) for entry in shard.episodes)
+    def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
+        return self.manifest.shards.locate(self.split, index)
 
     def _open(self, index: int) -> Episode:
-        if index not in self._opened:
-            shard, entry = self._located[index]
-            if shard.name not in self._maps:
-                path = open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes)
-                # one map a shard, not one an episode: each map holds a file descriptor
-                self._maps[shard.name] = np.memmap(path, dtype=np.uint8, mode="r")
-            episode = read_episode(self._maps[shard.name], shard.name, entry.key, entry.members)
-            found = (episode.seed, episode.particle_count, episode.frame_count)
-            if found != (entry.seed, entry.particles, entry.frames):
+        shard, entry = self._locate(index)
+        path = None
+        if shard.name not in self._open_shards:  # outside of the lock: this may wait for a server
+            path = open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes)
+        with self._lock:
+            opened = self._open_shards.get(shard.name)
+            if opened is None:
+                assert path
+                opened = self._open_shards[shard.name] = _OpenShard(path)
+                # each map holds a file descriptor; episodes that are in use keep theirs
+                if len(self._open_shards) > MAPPED_SHARDS:
+                    self._open_shards.popitem(last=False)
+            self._open_shards.move_to_end(shard.name)
+            size = opened.path.stat().st_size
+            if size < shard.bytes:  # to read what is mapped there would end the process
                 raise ConfigError(
-                    f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames "
-                    f"{(entry.seed, entry.particles, entry.frames)}, got {found}; delete manifest.json and run the "
-                    "generator again"
+                    f"{opened.path} must have {shard.bytes} bytes, got {size}: it was cut while it was open"
                 )
-            self._opened[index] = episode
-        return self._opened[index]
+            if entry.key not in opened.episodes:
+                opened.episodes[entry.key] = self._read(opened.content, shard, entry)
+            return opened.episodes[entry.key]
+
+    def _read(self, content: np.ndarray, shard: ShardEntry, entry: EpisodeEntry) -> Episode:
+        episode = read_episode(content, shard.name, entry.key, entry.members)
+        found = (episode.seed, episode.particle_count, episode.frame_count)
+        expected = (entry.seed, entry.particles, entry.frames)
+        config = self.manifest.config
+        lengths = {config["frames"], config.get("long_frames", config["frames"])}
+        if found != expected or entry.frames not in lengths:
+            raise ConfigError(
+                f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames {expected}, and as many "
+                f"frames as the data set's ({lengths}), got {found}; delete manifest.json and run the generator again"
+            )
+        return episode
 
 
-def _fetch(folder: Path | str, shards: Sequence[ShardEntry]) -> None:
-    # whoever needs a shard that cannot be had meets the same error again, and says so
-    with contextlib.suppress(ConfigError, OSError):
-        for shard in shards:
-            open_storage(folder).shard(shard.name, shard.sha256, shard.bytes)
+class _OpenShard:
+    """One map a shard, not one an episode."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.content = np.memmap(path, dtype=np.uint8, mode="r")
+        self.episodes: dict[str, Episode] = {}
 
 
 class _Episodes(Sequence[Episode]):

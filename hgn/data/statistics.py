@@ -41,13 +41,14 @@ class Moments:
         if self.count == 0 or other.count == 0:
             return other if self.count == 0 else self
         count = self.count + other.count
-        mean, delta = np.array(self.mean), np.array(other.mean) - np.array(self.mean)
-        deviation = np.array(self.squared_deviation) + np.array(other.squared_deviation)
-        return Moments(
-            count,
-            _vector(mean + delta * (other.count / count)),
-            _vector(deviation + delta**2 * (self.count * other.count / count)),
+        share, weight = other.count / count, self.count * other.count / count
+        axes = list(zip(self.mean, other.mean, self.squared_deviation, other.squared_deviation, strict=True))
+        x, y, z = (mean + (their_mean - mean) * share for mean, their_mean, _, _ in axes)
+        u, v, w = (
+            (squares + their_squares) + (their_mean - mean) * (their_mean - mean) * weight
+            for mean, their_mean, squares, their_squares in axes
         )
+        return Moments(count, (x, y, z), (u, v, w))
 
     @property
     def std(self) -> Vector:

@@ -55,6 +55,10 @@ class Storage(Protocol):
         """The manifest's bytes. Raises: FileNotFoundError; UnreachableError; ConfigError (no access)."""
         ...
 
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        """Some bytes of a file. Raises: FileNotFoundError; UnreachableError; ConfigError (no access, too short)."""
+        ...
+
     def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
         """The path of a shard on this machine, verified. Raises: ConfigError; UnreachableError; OSError."""
         ...
@@ -163,6 +167,11 @@ class _Folder:
     def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
         return (self._folder / name).read_bytes()
 
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        with (self._folder / name).open("rb") as file:
+            file.seek(start)
+            return _whole(file.read(stop - start), f"{self._folder}/{name}", start, stop)
+
     def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
         path = self._folder / name
         try:
@@ -213,6 +222,12 @@ class _Remote:
                 return self._known[0]
             self._known = content, f'"{hashlib.sha256(content).hexdigest()}"'
             return content
+
+    def read(self, name: str, start: int, stop: int) -> bytes:
+        data = self._patiently(name, PATIENCE_S, _read_range(self._files, start, stop))
+        if len(data) > stop - start:  # from a server without ranges
+            data = data[start:stop]
+        return _whole(data, f"{self._url}/{name}", start, stop)
 
     def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
         path = cache_folder() / f"{sha256}.tar"
@@ -328,6 +343,12 @@ class _Remote:
                 # no two readers come back at the same moment
                 _without_patience.wait(pause * random.uniform(0.5, 1.0))
                 pause = min(2 * pause, _LONGEST_PAUSE_S)
+
+
+def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:
+    if len(data) != stop - start:
+        raise ConfigError(f"{path} must have {stop} bytes, got {start + len(data)}; it was cut: generate it again")
+    return data
 
 
 def _read_range(files: Any, start: int, stop: int) -> Callable[[str], bytes]:

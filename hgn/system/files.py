@@ -9,7 +9,7 @@ import os
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 TEMPORARY_SUFFIX = ".partial"
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems that know none
@@ -50,8 +50,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     with temporary_file(path) as temporary:
         with temporary.open("wb") as file:
             file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+            sync_file(file)
         temporary.replace(path)
     sync_folder(path.parent)
 
@@ -64,6 +63,12 @@ def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps(value, indent=1, allow_nan=allow_nan).encode() + b"\n")
+
+
+def sync_file(file: BinaryIO) -> None:
+    """Brings what was written to the disk itself."""
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:

@@ -260,7 +260,7 @@ class LogLines(Callback):
             "updates_per_second": speed,
             "scenes_per_second": speed * pl_module.training_config.batch_scenes * trainer.world_size,
             "data_wait_fraction": (waited_s - self._waited_s) / seconds,
-            "shards": float(len(self.feed.store.manifest.shards_of("train"))),
+            "shards": float(self.feed.store.manifest.totals["train"].shards),
             "episodes": float(pl_module.sampler_state.episodes),
             "epoch": float(pl_module.sampler_state.epoch),
         }

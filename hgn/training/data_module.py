@@ -129,7 +129,7 @@ class EpisodeDataModule(LightningDataModule):
         due = update == begun or update % self.training.pushforward_every == 0
         if self.training.pushforward_fraction == 0 or not due:
             return ()
-        frames = [entry.frames for entry in self.store.entries[: order.state.episodes]]
+        frames = self.store.frames(order.state.episodes)
         return drawn_starts(self.training, update, order.rank, frames)
 
     def _whole(self, indices: Sequence[int]) -> dict[int, EpisodeTensors]:
@@ -209,7 +209,7 @@ class EpisodeDataModule(LightningDataModule):
         self.store.refresh()
         self.store.fetch_ahead()
         count = agreed_count(self.store, self.trainer) if self.trainer is not None else len(self.store)
-        return [entry.frames for entry in self.store.entries[:count]]
+        return self.store.frames(count)
 
 
 def chunk_length(training: TrainingConfig, begun: int, update: int) -> int:

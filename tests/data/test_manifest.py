@@ -8,9 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from written_files import first_release
 
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_differences, identity_hash
+from hgn.data.index import ListedIndex
 from hgn.data.manifest import EpisodeEntry, Manifest, QuarantinedScene, ShardEntry
 from hgn.data.statistics import Moments, Statistics
 from hgn.schema import ConfigError
@@ -20,13 +22,13 @@ def make_manifest() -> Manifest:
     entry = EpisodeEntry("train-000000", 0, 2**62, 1, 4296, 300, {"position.npy": (512, 15_465_728)})
     moments = Moments(7, (0.1, -0.2, 1e-300), (1 / 3, 0.0, 2.0))
     shard = ShardEntry("train-000000-000001.tar", "train", 0, 1, "ab" * 32, 999, (entry,), Statistics(moments))
+    config = {"scene": {"gravity": [0.0, -9.8, 0.0]}}
     return Manifest(
-        config_hash="cd" * 32,
-        config={"scene": {"gravity": [0.0, -9.8, 0.0]}},
+        config_hash=identity_hash(config),
+        config=config,
         requested={"train": 1, "validation": 1, "test": 0},
         revision=3,
-        shards=(shard,),
-        quarantined=(QuarantinedScene("train-000000", 0, 5, "diverged"),),
+        shards=ListedIndex([shard], [QuarantinedScene("train-000000", 0, 5, "diverged")]),
     )
 
 
@@ -34,7 +36,8 @@ def test_roundtrip(tmp_path: Path) -> None:
     """Saving and loading returns every field, floats bitwise."""
     make_manifest().save(tmp_path)
     assert Manifest.load(tmp_path) == make_manifest()
-    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+    assert Manifest.load(tmp_path).quarantined == make_manifest().quarantined
+    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "index"}
 
 
 def test_counts() -> None:
@@ -58,15 +61,16 @@ def test_missing_manifest(tmp_path: Path) -> None:
 def test_garbled_manifest(tmp_path: Path, content: bytes) -> None:
     """A manifest that is no JSON is refused with the remedy."""
     (tmp_path / "manifest.json").write_bytes(content)
-    with pytest.raises(ConfigError, match=r"manifest\.json must be JSON .* delete it and run the same command again"):
+    with pytest.raises(
+        ConfigError, match=r"manifest\.json must be JSON .* delete manifest.json and run the generator again"
+    ):
         Manifest.load(tmp_path)
 
 
 def test_wrong_manifest(tmp_path: Path) -> None:
     """Another schema, an unknown key or a wrong type is refused by name."""
     make_manifest().save(tmp_path)
-    path = tmp_path / "manifest.json"
-    good = json.loads(path.read_text())
+    path, good = tmp_path / "manifest.json", first_release(tmp_path)
     for changes, message in (
         ({"schema_version": 2}, "schema_version must be 1, got 2"),
         ({"colour": 1}, "colour is not a known key"),

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from written_files import first_release
 
 import hgn.data.storage
 from datagen.pool.shard import locate_members
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, SceneConfig
+from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.schema import ConfigError
@@ -48,7 +50,7 @@ def test_one_map_a_shard(folder: Path) -> None:
     """A thousand episodes do not need a thousand open files: a shard is mapped once."""
     store = EpisodeStore(folder, "train")
     _ = list(store.episodes)
-    assert len(store._maps) == len(store.manifest.shards_of("train")) == 4
+    assert len(store._open_shards) == store.manifest.totals["train"].shards == 4
     assert store.episodes[2] is store.episodes[2]
 
 
@@ -144,8 +146,7 @@ def test_shards_are_hashed_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -
 )
 def test_manifest_that_does_not_fit_its_shard(folder: Path, changes: dict[str, object], message: str) -> None:
     """Offsets or facts that the shard contradicts are refused, never read out of range."""
-    path = folder / "manifest.json"
-    mapping = json.loads(path.read_text())
+    path, mapping = folder / "manifest.json", first_release(folder)
     mapping["shards"][0]["episodes"][0] |= changes
     path.write_text(json.dumps(mapping))
     with pytest.raises(ConfigError, match=message):
@@ -158,11 +159,11 @@ def test_refresh_refuses_another_dataset(
     """A folder whose data set was replaced, or lost shards, is not read on as if nothing had happened."""
     store = EpisodeStore(folder, "train")
     manifest = Manifest.load(folder)
-    dataclasses.replace(manifest, shards=manifest.shards[1:]).save(folder)
+    dataclasses.replace(manifest, shards=ListedIndex(manifest.shards[1:])).save(folder)
     with pytest.raises(ConfigError, match="must keep the train shards already published"):
         store.refresh()
     other = make_config(folder=str(tmp_path / "other"))
     made = make_dataset(dataclasses.replace(other, scene=SceneConfig(obstacle_count=1)))
-    (folder / "manifest.json").write_bytes((made / "manifest.json").read_bytes())
+    Manifest.load(made).save(folder)
     with pytest.raises(ConfigError, match="must keep holding the same data set"):
         store.refresh()

@@ -21,6 +21,7 @@ import fsspec
 import numpy as np
 import pytest
 import uvicorn
+from written_files import first_release
 
 import hgn.data.storage
 from datagen.service.server import make_app, make_server
@@ -53,8 +54,8 @@ def folder(make_config: MakeConfig, make_dataset: MakeDataset) -> Path:
 def in_memory(folder: Path, name: str) -> str:
     """A copy of a data set in fsspec's memory."""
     files = fsspec.filesystem("memory")
-    for path in (*folder.glob("*.tar"), folder / "manifest.json"):
-        files.pipe(f"/{name}/{path.name}", path.read_bytes())
+    for path in (*folder.glob("*.tar"), folder / "manifest.json", *folder.glob("index/*")):
+        files.pipe(f"/{name}/{path.relative_to(folder)}", path.read_bytes())
     return f"memory://{name}"
 
 
@@ -163,7 +164,8 @@ def test_ranks_share_the_cache(folder: Path, serve: Callable[..., str], cache: P
     with urllib.request.urlopen(f"{url}/metrics") as answer:
         text = answer.read().decode()
     (line,) = [line for line in text.splitlines() if line.startswith('hgn_http_responses_total{code="206"}')]
-    assert int(line.split()[-1]) == len(Manifest.load(folder).shards_of("train"))
+    segments = len(keys)  # which each reads for itself
+    assert int(line.split()[-1]) == Manifest.load(folder).totals["train"].shards + segments
     assert not list(cache.glob("*.partial"))
 
 
@@ -205,7 +207,7 @@ def test_damaged_cache_is_mended(folder: Path, cache: Path, capsys: pytest.Captu
 def test_altered_or_cut_shards_are_refused(folder: Path, cache: Path) -> None:
     """A shard that is not what the manifest says is refused, and never gets into the cache."""
     url, files = in_memory(folder, "altered"), fsspec.filesystem("memory")
-    first, second = Manifest.load(url).shards_of("train")[:2]
+    first, second, *_ = Manifest.load(url).shards_of("train")
     content = (folder / first.name).read_bytes()
     files.pipe(f"/altered/{first.name}", content[:700] + b"?" + content[701:])
     files.pipe(f"/altered/{second.name}", content[: second.bytes // 2])
@@ -232,7 +234,7 @@ def test_altered_or_cut_shards_are_refused(folder: Path, cache: Path) -> None:
 )
 def test_manifest_cannot_name_other_files(folder: Path, key: str, value: object, message: str) -> None:
     """Names and hashes of a manifest become paths: what could lead elsewhere is refused."""
-    mapping = json.loads((folder / "manifest.json").read_text())
+    mapping = first_release(folder)
     mapping["shards"][0][key] = value
     (folder / "manifest.json").write_text(json.dumps(mapping))
     with pytest.raises(ConfigError, match=message):
@@ -329,7 +331,7 @@ def test_what_is_within_reach(folder: Path, serve: Callable[..., str], cache: Pa
     url = serve()
     store = EpisodeStore(url, "train")
     assert store.within_reach([0, 1], patience_s=0)
-    third = store.manifest.shards_of("train")[2]
+    third = list(store.manifest.shards_of("train"))[2]
     with (cache / f".{third.sha256}.tar.partial").open("wb") as partial:
         fcntl.flock(partial, fcntl.LOCK_EX)
         assert not store.within_reach([2], patience_s=0)

@@ -79,7 +79,7 @@ def shards(folder: Path) -> dict[str, str]:
 def main(folder: Path, kills: int) -> None:
     lines = [run(folder / f"peaceful-{i}", files)[1] for i, files in enumerate(TRACED)]
     peaceful = folder / "peaceful-0"
-    expected = {path.name for path in peaceful.iterdir()}
+    expected = {path.name for path in peaceful.rglob("*")}
     met: dict[str, int] = {"partial": 0, "staged": 0, "unlisted": 0}
     wrong = []
     for i in range(kills):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from datagen.pool.plan import (
     ShardRange,
     episode_key,
-    generation_order,
+    generation_place,
     missing_ranges,
     parse_shard_name,
     scene_seed,
@@ -48,17 +48,21 @@ def test_ranges_cover_each_episode_once(split: str, count: int, size: int) -> No
 def test_growth_makes_just_what_is_missing(split: str, before: int, after: int, sizes: tuple[int, int]) -> None:
     """A data set that grows, even with another shard size, gains the new episodes once and no others."""
     present = shard_ranges(split, before, sizes[0])
-    missing = missing_ranges(shard_ranges(split, after, sizes[1]), present)
+    missing = missing_ranges(shard_ranges(split, after, sizes[1]), {split: b"\1" * before})
     assert [index for shard in missing for index in shard.indices] == list(range(before, after))
     assert len({shard.name for shard in (*present, *missing)}) == len(present) + len(missing)
 
 
 def test_missing_ranges_split_around_holes() -> None:
     """Only the episodes that are not there are planned, as one shard a gap."""
-    planned = [ShardRange("train", 0, 8)]
-    present = [ShardRange("train", 2, 3), ShardRange("train", 5, 6), ShardRange("test", 0, 8)]
-    gaps = [(shard.first, shard.stop) for shard in missing_ranges(planned, present)]
+    published = {"train": [0, 0, 1, 0, 0, 1], "test": [1] * 8}
+    gaps = [(shard.first, shard.stop) for shard in missing_ranges([ShardRange("train", 0, 8)], published)]
     assert gaps == [(0, 2), (3, 5), (6, 8)]
+
+
+def generation_order(requested: dict[str, int]) -> list[tuple[str, int]]:
+    items = [(split, index) for split, count in requested.items() for index in range(count)]
+    return sorted(items, key=lambda item: generation_place(*item))
 
 
 @given(train=COUNTS, validation=COUNTS, test=COUNTS)

@@ -10,6 +10,8 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ import pytest
 from processes import processes_of_session, wait_until
 
 import datagen.service.supervisor
+import hgn.data.storage
 from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend
 from datagen.service.__main__ import main
@@ -26,8 +29,8 @@ from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState, Supervisor
 from hgn.command import run_command
 from hgn.config import DatagenConfig
-from hgn.data.manifest import Manifest
-from hgn.data.storage import TOKEN_VARIABLE
+from hgn.data.manifest import Manifest, ShardEntry
+from hgn.data.storage import TOKEN_VARIABLE, file_sha256
 
 MakeConfig = Callable[..., DatagenConfig]
 MakeDataset = Callable[[DatagenConfig], Path]
@@ -47,35 +50,44 @@ def folder(make_config: MakeConfig, make_dataset: MakeDataset) -> Path:
     return make_dataset(make_config())
 
 
+Answer = tuple[int, dict[str, str], bytes]
+
+
+async def request(app: Any, path: str, method: str = "GET", **headers: str) -> Answer:
+    """Sends a request to a service, without a network: status, headers, body."""
+    sent: list[dict[str, Any]] = []
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": b"", "more_body": False}
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    path, _, query = path.partition("?")
+    scope = {
+        "type": "http",
+        "asgi": {"version": "3.0", "spec_version": "2.4"},
+        "method": method,
+        "path": unquote(path),
+        "raw_path": path.encode(),
+        "query_string": query.encode(),
+        "root_path": "",
+        "headers": [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()],
+    }
+    await app(scope, receive, send)
+    body = b"".join(message.get("body", b"") for message in sent[1:])
+    return sent[0]["status"], {k.decode(): v.decode() for k, v in sent[0]["headers"]}, body
+
+
 @pytest.fixture
 def ask(folder: Path) -> Ask:
-    """Sends a request to the service of `folder`, without a network: status, headers, body."""
+    """Sends a request to a service of `folder` that has just begun."""
 
-    def request(path: str, method: str = "GET", token: str | None = None, **headers: str):
+    def ask(path: str, method: str = "GET", token: str | None = None, **headers: str) -> Answer:
         app = make_app(folder, token, lambda: PoolState("running", 2, 3, 8, 6, {0: (4, 2)}))
-        sent: list[dict[str, Any]] = []
+        return asyncio.run(request(app, path, method, **headers))
 
-        async def receive() -> dict[str, Any]:
-            return {"type": "http.request", "body": b"", "more_body": False}
-
-        async def send(message: Any) -> None:
-            sent.append(message)
-
-        scope = {
-            "type": "http",
-            "asgi": {"version": "3.0", "spec_version": "2.4"},
-            "method": method,
-            "path": unquote(path),
-            "raw_path": path.encode(),
-            "query_string": b"",
-            "root_path": "",
-            "headers": [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()],
-        }
-        asyncio.run(app(scope, receive, send))
-        body = b"".join(message.get("body", b"") for message in sent[1:])
-        return sent[0]["status"], {k.decode(): v.decode() for k, v in sent[0]["headers"]}, body
-
-    return request
+    return ask
 
 
 def test_manifest_and_its_etag(ask: Ask, folder: Path) -> None:
@@ -85,6 +97,52 @@ def test_manifest_and_its_etag(ask: Ask, folder: Path) -> None:
     assert ask("/manifest.json", if_none_match=headers["etag"])[::2] == (304, b"")
     assert ask("/manifest.json", if_none_match='"other"')[0] == 200
     assert ask("/manifest.json", method="HEAD")[1] == headers
+
+
+def test_index_and_what_is_new(ask: Ask, folder: Path) -> None:
+    """The index's files come as far as the manifest says, whole or in part; and its shards from any number on."""
+    path = folder / "index" / "1-000000.jsonl"
+    content = path.read_bytes()
+    path.write_bytes(content + b"not yet published")
+    assert ask("/index/1-000000.jsonl")[::2] == (200, content)
+    assert ask("/index/1-000000.jsonl", range="bytes=100-")[::2] == (206, content[100:])
+    for name in ("1-000001.jsonl", "2-000000.jsonl", "1-segments.jsonl", "..%2fmanifest.json", "1-x.jsonl"):
+        assert ask(f"/index/{name}")[0] == 404
+    lines = [json.loads(line) for line in content.splitlines()]
+    for since in (0, 3, 7, 99):
+        assert [json.loads(line) for line in ask(f"/index?since={since}")[2].splitlines()] == lines[since:]
+    assert ask("/index?since=-1")[::2] == (400, b"since must be a number of shards, got '-1'\n")
+
+
+def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a publication the manifest is read once and each line of the index once; a shard that many want is hashed
+    once; and who asks whether the service lives waits for none of these."""
+    work: Counter[str] = Counter()
+    hash_may_end = threading.Event()
+
+    def counted(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *arguments: (work.update([name]), real(*arguments))[1]
+
+    def slow(path: Path) -> str:
+        assert hash_may_end.wait(60)
+        return file_sha256(path)
+
+    monkeypatch.setattr(Manifest, "parse", staticmethod(counted("parse", Manifest.parse)))
+    monkeypatch.setattr(ShardEntry, "__post_init__", counted("line", ShardEntry.__post_init__))
+    monkeypatch.setattr(hgn.data.storage, "file_sha256", counted("hash", slow))
+
+    async def crowd() -> list[Answer]:
+        app = make_app(folder, None, PoolState)
+        await asyncio.gather(*(request(app, path) for path in 16 * ["/manifest.json", "/progress"]))
+        readers = [asyncio.create_task(request(app, SHARD)) for _ in range(60)]
+        while not work["hash"]:
+            await asyncio.sleep(0)
+        assert (await request(app, "/healthz"))[0] == 200 and not any(reader.done() for reader in readers)
+        hash_may_end.set()
+        return await asyncio.gather(*readers)
+
+    assert {answer[::2] for answer in asyncio.run(crowd())} == {(200, (folder / SHARD[1:]).read_bytes())}
+    assert work == {"parse": 1, "line": 7, "hash": 1}
 
 
 def test_shards_with_ranges(ask: Ask, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import sys
@@ -54,7 +55,8 @@ def test_copy_is_the_data_set(make_config: MakeConfig, make_dataset: MakeDataset
     assert keys("memory://bucket/set") == keys(folder) and len(keys(folder)) == 5
     changed = {name for name, file in files.store.items() if before.get(name) != file.modified}
     assert changed == {
-        f"/bucket/set/{name}" for name in ("manifest.json", "train-000002-000004.tar", "train-000004-000005.tar")
+        f"/bucket/set/{name}"
+        for name in ("manifest.json", "index/1-000000.jsonl", "train-000002-000004.tar", "train-000004-000005.tar")
     }
 
 
@@ -91,9 +93,7 @@ def test_following_a_data_set_that_grows(
     config = make_config()
     folder = make_dataset(make_config(training_scenes=1))
     manifest = Manifest.load(folder)
-    Manifest(manifest.config_hash, manifest.config, {"train": 5, "validation": 2, "test": 1}, 9, manifest.shards).save(
-        folder
-    )
+    dataclasses.replace(manifest, requested={"train": 5, "validation": 2, "test": 1}, revision=9).save(folder)
     follow = {"data": str(folder), "to": "memory://growing", "follow": True, "poll_s": 0.01}
     threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
     assert main(follow) == 143 and len(keys("memory://growing")) == 1

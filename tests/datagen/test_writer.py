@@ -43,7 +43,7 @@ def test_dataset_is_complete_and_in_order(make_config: MakeConfig, make_dataset:
         "train-000004-000005.tar",
         "test-000000-000001.tar",
     ]
-    assert {path.name for path in folder.iterdir()} == {*hashes(folder), "manifest.json", ".lock"}
+    assert {path.name for path in folder.iterdir()} == {*hashes(folder), "manifest.json", "index", ".lock"}
 
 
 def test_same_input_gives_same_bytes(make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path) -> None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig
+from hgn.data.manifest import Manifest
+from hgn.schema import to_mapping
 
 MakeConfig = Callable[..., DatagenConfig]
 MakeDataset = Callable[[DatagenConfig], Path]
@@ -24,6 +28,15 @@ def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.name != ".lock"
     }
+
+
+def first_release(folder: Path) -> dict[str, Any]:
+    """Writes the manifest as the first release had it, and returns its content."""
+    manifest = Manifest.load(folder)
+    mapping = {name: value for name, value in vars(manifest).items() if name != "shards"}
+    mapping |= {"shards": to_mapping(list(manifest.shards)), "quarantined": to_mapping(manifest.quarantined)}
+    (folder / "manifest.json").write_text(json.dumps(mapping))
+    return mapping
 
 
 def claim_all(writer: DatasetWriter) -> list[tuple[str, int]]:

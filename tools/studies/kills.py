@@ -22,6 +22,7 @@ import numpy as np
 from datagen.generate import KEYS, datagen_config
 from datagen.pool.locks import LOCK_NAME
 from hgn.command import run_command
+from hgn.data.index import INDEX_NAME
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import verify_file
@@ -175,7 +176,8 @@ def differences(peaceful: Path, killed: Path) -> list[str]:
         if first.keys() != second.keys():
             found.append(f"{split}: other episodes")
         found += [f"{key}: another scene" for key in first.keys() & second.keys() if not _same(first[key], second[key])]
-    expected = {MANIFEST_NAME, LOCK_NAME, *(shard.name for shard in other.shards)}
+    index = {Path(name).name for name, _ in other.shards.files()}
+    expected = {MANIFEST_NAME, INDEX_NAME, LOCK_NAME, *index, *(shard.name for shard in other.shards)}
     left = sorted(path.name for path in killed.rglob("*") if path.name not in expected)
     return found + [f"{name} was left behind" for name in left]
 

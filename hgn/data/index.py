@@ -1,0 +1,454 @@
+"""The index of a data set: one line of JSON a shard, in publication order, in files that are only ever appended to.
+
+| file in `index/` | what | |
+|---|---|---|
+| `G-NNNNNN.jsonl` | segment N of generation G: its shards | SEGMENT_SHARDS lines, but the last one |
+| `G-segments.jsonl` | what is published up to the end of each full segment | a line a segment |
+| `G-quarantined.jsonl` | scenes that could not be simulated | |
+
+`manifest.json`, the head, says how many bytes of the last segment and of the other two count. What is behind these was
+not yet published, and is written over. So a publication costs the same whatever the number of shards, and a reader
+that knows some shards reads only what came after. A list that loses a shard is written anew, as the next generation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import threading
+from bisect import bisect_left, bisect_right
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+from hgn.data.statistics import Moments, Statistics
+from hgn.data.storage import open_storage
+from hgn.schema import ConfigError, from_mapping, require, require_non_negative, require_one_of, to_mapping
+from hgn.system.files import sync_file, sync_folder
+
+SPLITS = ("train", "validation", "test")
+INDEX_NAME = "index"
+SEGMENT_SHARDS = 128
+_IN_MEMORY = 0  # a generation that has no files
+_SEGMENTS_HELD = 64  # of the segments that were read: 8,192 shards
+_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,200}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_REMEDY = "delete manifest.json and run the generator again: published shards are found and kept"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class EpisodeEntry:
+    """One episode inside a shard."""
+
+    key: str
+    index: int  # within its split
+    seed: int
+    attempt: int  # 0 unless earlier seeds of this index were quarantined
+    particles: int
+    frames: int
+    members: dict[str, tuple[int, int]]  # name after `<key>.` -> offset of its data in the tar, bytes
+
+
+@dataclass(frozen=True)
+class ShardEntry:
+    """One published tar file: episodes [first, stop) of a split."""
+
+    name: str
+    split: str
+    first: int
+    stop: int
+    sha256: str
+    bytes: int
+    episodes: tuple[EpisodeEntry, ...]
+    statistics: Statistics
+
+    def __post_init__(self) -> None:
+        # both become file names, and an index may come from anywhere
+        require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
+        require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
+        require_one_of(self, "split", SPLITS)
+        require_non_negative(self, "bytes")
+        numbers = [episode.index for episode in self.episodes]
+        if numbers != list(range(self.first, self.stop)):
+            raise ConfigError(f"episodes must be numbers {self.first} to {self.stop - 1}, got {numbers}; {_REMEDY}")
+        require_sound(self.statistics)
+
+
+@dataclass(frozen=True)
+class QuarantinedScene:
+    """A scene that could not be simulated; the next attempt's seed took its place."""
+
+    key: str
+    attempt: int
+    seed: int
+    cause: str
+
+
+@dataclass(frozen=True)
+class SplitTotals:
+    """What is published of a split."""
+
+    shards: int = 0
+    episodes: int = 0
+    bytes: int = 0
+    digest: str = ""  # over the shards' sha256, in publication order: what the order of samples stands on
+    statistics: Statistics | None = None  # in the head alone
+
+    def plus(self, shard: ShardEntry) -> SplitTotals:
+        """With one more shard; statistics are kept where there are some."""
+        return SplitTotals(
+            self.shards + 1,
+            self.episodes + len(shard.episodes),
+            self.bytes + shard.bytes,
+            hashlib.sha256(f"{self.digest}{shard.sha256}".encode()).hexdigest(),
+            self.statistics and self.statistics.merge(shard.statistics),
+        )
+
+
+Totals = dict[str, SplitTotals]
+
+
+@dataclass(frozen=True)
+class IndexState:
+    """How much of the index's files counts."""
+
+    generation: int = 1
+    shards: int = 0
+    segment_bytes: int = 0  # of the last segment
+    table_bytes: int = 0
+    quarantined: int = 0
+    quarantine_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        require_non_negative(
+            self, "generation", "shards", "segment_bytes", "table_bytes", "quarantined", "quarantine_bytes"
+        )
+
+    def path(self, kind: int | str) -> str:
+        """The name of segment number `kind`, or of another file."""
+        return f"{INDEX_NAME}/{self.generation}-{kind if isinstance(kind, str) else f'{kind:06d}'}.jsonl"
+
+
+def require_sound(statistics: Statistics) -> None:
+    """Raises ConfigError where a number of the statistics is not finite, or a count or a square is below zero."""
+    for name in ("velocity", "acceleration"):
+        moments: Moments = getattr(statistics, name)
+        numbers = (moments.count, *moments.mean, *moments.squared_deviation)
+        if not (all(map(math.isfinite, numbers)) and min(moments.count, *moments.squared_deviation) >= 0):
+            raise ConfigError(
+                f"statistics.{name} must be finite, with count and squares >= 0, got {moments}; {_REMEDY}"
+            )
+
+
+def no_totals() -> Totals:
+    """Of an empty data set."""
+    return {split: SplitTotals(statistics=Statistics()) for split in SPLITS}
+
+
+def totals_of(shards: Iterable[ShardEntry], totals: Totals | None = None) -> Totals:
+    """What these add up to, on top of `totals`."""
+    totals = dict(totals or no_totals())
+    for shard in shards:
+        totals[shard.split] = totals[shard.split].plus(shard)
+    return totals
+
+
+@dataclass(frozen=True)
+class _SegmentEnd:
+    """A line of `segments.jsonl`."""
+
+    bytes: int  # of the segment
+    totals: dict[str, SplitTotals]  # up to its end, without statistics
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """What was read of a segment."""
+
+    shards: list[ShardEntry]
+    bytes: int
+    totals: Totals  # up to its end, without statistics
+
+
+class _Read:
+    """What was read of an index; one for all that continue it."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.ends: list[_SegmentEnd] = []  # of the full segments
+        self.ends_bytes = 0
+        self.segments: OrderedDict[int, _Segment] = OrderedDict()
+        self.ranges: dict[str, list[tuple[int, int]]] = {split: [] for split in SPLITS}  # of the shards seen, in order
+        self.seen: dict[int, int] = {}  # how many of a segment's shards are among these
+
+    def see(self, segment: int, shards: Sequence[ShardEntry]) -> None:
+        """Raises: ConfigError where an episode is listed twice."""
+        for shard in shards[self.seen.get(segment, 0) :]:
+            ranges, own = self.ranges[shard.split], (shard.first, shard.stop)
+            place = bisect_left(ranges, own)
+            for other in ranges[max(place - 1, 0) : place + 1]:
+                if max(other[0], own[0]) < min(other[1], own[1]) or other == own:
+                    raise ConfigError(f"{shard.name} must be listed once, got its episodes twice; {_REMEDY}")
+            ranges.insert(place, own)
+        self.seen[segment] = len(shards)
+
+
+class Index(Sequence[ShardEntry]):
+    """The published shards of a data set, in publication order; read as they are asked for.
+
+    Raises on access: ConfigError where a line is wrong, or the lines do not add up to what the head says;
+    UnreachableError.
+    """
+
+    def __init__(self, folder: Path | str, state: IndexState, totals: Totals) -> None:
+        self.folder, self.state, self.totals = folder, state, totals
+        self._read = _Read()
+
+    def continued(self, later: Index) -> Index:
+        """`later`, with what was read here, where that was only appended to."""
+        if later.state.generation == self.state.generation != _IN_MEMORY and len(later) >= len(self):
+            later._read = self._read
+        return later
+
+    def __len__(self) -> int:
+        return self.state.shards
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @overload
+    def __getitem__(self, place: int) -> ShardEntry: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> list[ShardEntry]: ...
+
+    def __getitem__(self, place: int | slice) -> ShardEntry | list[ShardEntry]:
+        if isinstance(place, slice):
+            return [self[i] for i in range(len(self))[place]]
+        place = range(len(self))[place]
+        return self._segment(place // SEGMENT_SHARDS)[place % SEGMENT_SHARDS]
+
+    def __iter__(self) -> Iterator[ShardEntry]:
+        return self.since(0)
+
+    def since(self, count: int) -> Iterator[ShardEntry]:
+        """All shards but the first `count`."""
+        while count < len(self):
+            rest = self._segment(count // SEGMENT_SHARDS)[count % SEGMENT_SHARDS :][: len(self) - count]
+            yield from rest
+            count += len(rest)
+
+    def locate(self, split: str, episode: int) -> tuple[ShardEntry, EpisodeEntry]:
+        """The episode at this place of the split, in publication order. Raises: IndexError."""
+        if not 0 <= episode < self.totals[split].episodes:
+            raise IndexError(episode)
+        segment = self._first_beyond(split, episode)
+        before = self._before(segment)[split].episodes
+        shards = (shard for shard in self._segment(segment) if shard.split == split)
+        for shard in shards:
+            if episode < before + len(shard.episodes):
+                break
+            before += len(shard.episodes)
+        return shard, shard.episodes[episode - before]
+
+    def digest(self, split: str, episodes: int) -> str | None:
+        """The digest of the shards that hold the first `episodes` of a split; none where no shard ends there."""
+        totals = self.totals[split]
+        if episodes < totals.episodes:
+            segment = self._first_beyond(split, episodes)
+            totals = self._before(segment)[split]
+            for shard in self._segment(segment):
+                if totals.episodes < episodes and shard.split == split:
+                    totals = totals.plus(shard)
+        return totals.digest if totals.episodes == episodes else None
+
+    def continues(self, earlier: Index, split: str) -> bool:
+        """Whether the shards of a split begin with those of `earlier`."""
+        known = earlier.totals[split]
+        return self.digest(split, known.episodes) == known.digest
+
+    def quarantined(self) -> list[QuarantinedScene]:
+        """The scenes that could not be simulated, the first one first."""
+        return self._rows(QuarantinedScene, "quarantined", 0, self.state.quarantine_bytes, self.state.quarantined)
+
+    def files(self) -> Iterator[tuple[str, int]]:
+        """Names and sizes of the files that hold it, what is read first last."""
+        state = self.state
+        for kind in (*range(len(self) // SEGMENT_SHARDS + 1), "segments", "quarantined"):
+            if size := self.size(state.path(kind)):
+                yield state.path(kind), size
+
+    def size(self, name: str) -> int | None:
+        """How many bytes of a file count; none where the index has no such file. Slow once, for a full segment."""
+        state, full = self.state, len(self) // SEGMENT_SHARDS
+        sizes: dict[int | str, int] = {full: state.segment_bytes, "segments": state.table_bytes}
+        match = re.fullmatch(r".*-(\d{6,})\.jsonl", name)
+        if match and int(match[1]) < full and name == state.path(int(match[1])):
+            return self._ends()[int(match[1])].bytes
+        sizes["quarantined"] = state.quarantine_bytes
+        return {state.path(kind): size for kind, size in sizes.items()}.get(name) or None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_read"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _read=_Read())
+
+    def _rows(self, cls: type[T], kind: int | str, start: int, stop: int, count: int) -> list[T]:
+        name = self.state.path(kind)
+        try:
+            content = open_storage(self.folder).read(name, start, stop) if stop > start else b""
+        except FileNotFoundError:
+            raise ConfigError(f"{self.folder}/{name} must be there, got no such file; {_REMEDY}") from None
+        rows = [from_mapping(cls, parse_json(line, name), name) for line in content.splitlines()]
+        if len(rows) != count:
+            raise ConfigError(
+                f"{self.folder}/{name} must have {count} lines from byte {start}, got {len(rows)}; {_REMEDY}"
+            )
+        return rows
+
+    def _ends(self) -> list[_SegmentEnd]:
+        """Of the full segments, and of later ones that are known already."""
+        read, full = self._read, len(self) // SEGMENT_SHARDS
+        with read.lock:
+            if len(read.ends) < full:
+                read.ends += self._rows(
+                    _SegmentEnd, "segments", read.ends_bytes, self.state.table_bytes, full - len(read.ends)
+                )
+                read.ends_bytes = self.state.table_bytes
+            return read.ends
+
+    def _before(self, segment: int) -> Totals:
+        return self._ends()[segment - 1].totals if segment else {split: SplitTotals() for split in SPLITS}
+
+    def _first_beyond(self, split: str, episode: int) -> int:
+        """The segment with the episode at this place of the split."""
+        return bisect_right(self._ends(), episode, key=lambda end: end.totals[split].episodes)
+
+    def _segment(self, number: int) -> list[ShardEntry]:
+        """The shards of a segment, and perhaps later ones."""
+        read, count = self._read, min(SEGMENT_SHARDS, len(self) - number * SEGMENT_SHARDS)
+        with read.lock:
+            segment = read.segments.get(number) or _Segment([], 0, self._before(number))
+            if len(segment.shards) < count:
+                end = self._ends()[number] if count == SEGMENT_SHARDS else None
+                stop = end.bytes if end else self.state.segment_bytes
+                new = self._rows(ShardEntry, number, segment.bytes, stop, count - len(segment.shards))
+                segment = _Segment(segment.shards + new, stop, totals_of(new, segment.totals))
+                for split, expected in (end.totals if end else self.totals).items():
+                    if replace(expected, statistics=None) != segment.totals[split]:
+                        raise ConfigError(
+                            f"{self.folder}/{self.state.path(number)} must hold the {split} shards that were "
+                            f"published, got others; {_REMEDY}"
+                        )
+                read.see(number, segment.shards)
+                read.segments[number] = segment
+            read.segments.move_to_end(number)
+            if len(read.segments) > _SEGMENTS_HELD:
+                read.segments.popitem(last=False)
+            return segment.shards
+
+
+class ListedIndex(Index):
+    """One that is in memory as a whole, from a manifest of the first release say."""
+
+    def __init__(self, shards: Sequence[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()) -> None:
+        state = IndexState(_IN_MEMORY, len(shards), quarantined=len(quarantined))
+        super().__init__("", state, totals_of(shards))
+        self._shards, self._quarantined = list(shards), list(quarantined)
+        self._read.see(0, self._shards)
+
+    def quarantined(self) -> list[QuarantinedScene]:
+        return self._quarantined
+
+    def size(self, name: str) -> int | None:
+        return None
+
+    def _ends(self) -> list[_SegmentEnd]:
+        ends = self._read.ends
+        for stop in range((len(ends) + 1) * SEGMENT_SHARDS, len(self) + 1, SEGMENT_SHARDS):
+            before = ends[-1].totals if ends else {split: SplitTotals() for split in SPLITS}
+            ends.append(_SegmentEnd(0, totals_of(self._shards[stop - SEGMENT_SHARDS : stop], before)))
+        return ends
+
+    def _segment(self, number: int) -> list[ShardEntry]:
+        return self._shards[number * SEGMENT_SHARDS :][:SEGMENT_SHARDS]
+
+
+def extend(
+    folder: Path, index: Index, shards: Iterable[ShardEntry], quarantined: Sequence[QuarantinedScene] = ()
+) -> Index:
+    """Appends to the files of an index. What is appended counts once a head with the state returned is written.
+
+    Raises: OSError; ConfigError where the files are shorter than the index says.
+    """
+    state, totals = index.state, index.totals
+    (folder / INDEX_NAME).mkdir(exist_ok=True)
+    rest = list(shards)
+    while rest:
+        number = state.shards // SEGMENT_SHARDS
+        part, rest = (
+            rest[: SEGMENT_SHARDS - state.shards % SEGMENT_SHARDS],
+            rest[SEGMENT_SHARDS - state.shards % SEGMENT_SHARDS :],
+        )
+        size = _append(folder / state.path(number), state.segment_bytes, part)
+        totals = totals_of(part, totals)
+        state = replace(state, shards=state.shards + len(part), segment_bytes=size)
+        if state.shards % SEGMENT_SHARDS == 0:
+            plain = {split: replace(value, statistics=None) for split, value in totals.items()}
+            table = _append(folder / state.path("segments"), state.table_bytes, [_SegmentEnd(size, plain)])
+            state = replace(state, segment_bytes=0, table_bytes=table)
+    if quarantined:
+        size = _append(folder / state.path("quarantined"), state.quarantine_bytes, quarantined)
+        state = replace(state, quarantined=state.quarantined + len(quarantined), quarantine_bytes=size)
+    return index.continued(Index(folder, state, totals))
+
+
+def begin(folder: Path) -> Index:
+    """An empty index beside those that are there. The last but one of these goes: nobody reads it any more."""
+    generations: dict[int, list[Path]] = {}
+    for path in (folder / INDEX_NAME).glob("[0-9]*-*.jsonl"):
+        generations.setdefault(int(path.name.partition("-")[0]), []).append(path)
+    last = max(generations, default=0)
+    for path in (path for generation, paths in generations.items() if generation < last for path in paths):
+        path.unlink()
+    return Index(folder, IndexState(last + 1), no_totals())
+
+
+def parse_json(content: bytes, path: str) -> Any:
+    """Strict JSON. Raises: ConfigError, for NaN and infinities too."""
+    try:
+        return json.loads(content, parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path} must be JSON written by python -m datagen, got {error}; {_REMEDY}") from None
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(constant)
+
+
+def _append(path: Path, at: int, rows: Sequence[Any]) -> int:
+    """Writes lines at a place of a file, where it then ends, to the disk; returns its size."""
+    content = b"".join(
+        json.dumps(to_mapping(row), sort_keys=True, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+        for row in rows
+    )
+    new = not path.exists()
+    with path.open("xb" if new else "r+b") as file:
+        if file.seek(0, 2) < at:
+            raise ConfigError(f"{path} must have {at} bytes or more, got {file.tell()}; {_REMEDY}")
+        file.truncate(at)
+        file.seek(at)
+        file.write(content)
+        sync_file(file)
+    if new:
+        sync_folder(path.parent)
+    return at + len(content)

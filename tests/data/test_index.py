@@ -1,0 +1,219 @@
+"""The index of a data set: what a publication, a claim and a reader's start cost does not grow with the data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from written_files import MakeConfig, MakeDataset, Stage, first_release, hashes
+
+import hgn.data.index
+import hgn.data.reader
+from datagen.pool.writer import DatasetWriter
+from hgn.config import DatagenConfig
+from hgn.data.identity import dataset_identity, identity_hash
+from hgn.data.index import EpisodeEntry, Index, ListedIndex, ShardEntry, begin, extend
+from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.data.statistics import Moments, Statistics
+from hgn.schema import ConfigError
+
+MANY = 10_000
+STATISTICS = Statistics(*2 * [Moments(10**6, (0.1, 0.2, 1 / 3), (0.1, 0.2, 1 / 3))])
+MEMBERS = {f"{name}.npy": (512, 10_000_000) for name in ("position", "material")}
+
+
+def shard(index: int) -> ShardEntry:
+    entry = EpisodeEntry(f"train-{index:06d}", index, 2**62 + index, 0, 4296, 6, MEMBERS)
+    name = f"train-{index:06d}-{index + 1:06d}.tar"
+    return ShardEntry(name, "train", index, index + 1, f"{index:064x}", 0, (entry,), STATISTICS)
+
+
+def listed(config: DatagenConfig, count: int) -> Path:
+    """A folder that lists so many shards, which are not there."""
+    folder, identity = Path(config.dataset.folder), dataset_identity(config)
+    folder.mkdir(parents=True)
+    requested = {"train": config.dataset.training_scenes, "validation": 0, "test": 0}
+    shards = ListedIndex([shard(i) for i in range(count)])
+    Manifest(identity_hash(identity), identity, requested, count, shards).save(folder)
+    return folder
+
+
+class Count:
+    """Lines of ours that are run, and bytes that are read and written, while it is entered."""
+
+    def __enter__(self) -> Count:
+        self.lines, self._before = 0, self._bytes()
+        sys.settrace(self._trace)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        sys.settrace(None)
+        self.read, self.written = (b - a for a, b in zip(self._before, self._bytes(), strict=True))
+
+    def _trace(self, frame: Any, event: str, argument: object) -> Any:
+        self.lines += event == "line"
+        return self._trace if f"{os.sep}data" in frame.f_code.co_filename else None
+
+    def _bytes(self) -> tuple[int, int]:
+        numbers = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
+        return int(numbers["rchar"]), int(numbers["wchar"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts bytes in /proc")
+def test_costs_do_not_grow(
+    make_config: MakeConfig, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A claim, a publication and a look at what is new cost the same in an empty data set and behind 10,000 shards; a
+    reader of these starts after reading a hundredth of their index."""
+    monkeypatch.setattr(DatasetWriter, "_is_present", lambda self, shard: True)
+    costs = []
+    for published in (1, MANY):
+        config = make_config(
+            folder=str(tmp_path / str(published)), training_scenes=MANY + 3, validation_scenes=0, test_scenes=0,
+            episodes_per_shard=1,
+        )  # fmt: skip
+        folder = listed(config, published)
+        with DatasetWriter(config) as writer:
+            store = EpisodeStore(folder, "train")
+            stage(writer, "train", published)  # what runs for the first time costs more
+            assert writer.publish_next() and store.refresh()
+            with Count() as claim:
+                assert writer.claim_next()
+            stage(writer, "train", published + 1)
+            with Count() as publication:
+                assert writer.publish_next()
+            with Count() as look:
+                assert store.refresh()
+            assert store.episodes[-1].key == f"train-{published + 1:06d}"
+        costs.append([(count.lines, count.read, count.written) for count in (claim, publication, look)])
+        with Count() as start:
+            assert sum(EpisodeStore(folder, "train").frames()) == 6 * (published + 2)
+    for first, last in zip(*costs, strict=True):
+        assert last == pytest.approx(first, rel=0.2, abs=400)
+    assert start.read < 1e6 * MANY / 100_000
+    assert sum(path.stat().st_size for path in folder.glob("index/*")) > 50 * start.read
+
+
+@pytest.fixture
+def small_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hgn.data.index, "SEGMENT_SHARDS", 3)
+    monkeypatch.setattr(hgn.data.index, "_SEGMENTS_HELD", 2)
+
+
+def test_every_way_to_read(tmp_path: Path, small_segments: None) -> None:
+    """However it was appended to and from wherever it is read, an index has the shards in their order; each episode is
+    found; what was known is a beginning of what came later, and of nothing else."""
+    shards = [shard(i) for i in range(11)]
+    for step in (1, 2, 4, 11):
+        folder = tmp_path / str(step)
+        folder.mkdir()
+        index, earlier = begin(folder), []
+        for first in range(0, 11, step):
+            index = extend(folder, index, shards[first : first + step])
+            earlier.append(index)
+        fresh = Index(folder, index.state, index.totals)
+        assert list(fresh) == list(index) == shards and fresh[-1] == shards[-1] and fresh[2:5] == shards[2:5]
+        assert list(fresh.since(7)) == shards[7:]
+        assert [fresh.locate("train", i)[1].index for i in (10, 0, 5, 6)] == [10, 0, 5, 6]
+        whole = ListedIndex(shards)
+        assert [fresh.digest("train", i) for i in range(12)] == [whole.digest("train", i) for i in range(12)]
+        assert all(fresh.continues(before, "train") for before in earlier)
+        assert {name: (folder / name).stat().st_size for name, _ in fresh.files()} == dict(fresh.files())
+    other = ListedIndex([*shards[:4], dataclasses.replace(shards[4], sha256="a" * 64)])
+    assert whole.continues(ListedIndex(shards[:4]), "train") and not whole.continues(other, "train")
+    assert whole.locate("train", 10)[0] == shards[10]
+
+
+def test_what_was_not_published_is_written_over(tmp_path: Path, small_segments: None) -> None:
+    """Lines behind what the head says, of a writer that ended before it wrote the head, do not count."""
+    index = extend(tmp_path, begin(tmp_path), [shard(0), shard(1)])
+    extend(tmp_path, index, [shard(7), shard(8)])
+    index = extend(tmp_path, index, [shard(2), shard(3)])
+    assert [entry.first for entry in Index(tmp_path, index.state, index.totals)] == [0, 1, 2, 3]
+
+
+def test_first_releases_manifest_is_gone_on_with(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+    """A manifest that lists the shards itself reads like one with an index; the next publication writes that."""
+    folder = make_dataset(make_config(training_scenes=3))
+    indexed = Manifest.load(folder)
+    first_release(folder)
+    manifest = Manifest.load(folder)
+    assert manifest == indexed and manifest.totals == indexed.totals and manifest.complete
+    assert [episode.key for episode in EpisodeStore(folder, "train").episodes] == [f"train-{i:06d}" for i in range(3)]
+    before = hashes(folder)
+    make_dataset(make_config())
+    assert before.items() <= hashes(folder).items() and Manifest.load(folder).published("train") == 5
+    assert "shards" not in json.loads((folder / "manifest.json").read_text())
+
+
+Edit = Callable[[Any], None]
+
+
+def edits() -> Iterator[tuple[Edit, str]]:
+    def statistics(value: float) -> Edit:
+        return lambda content: content["shards"][0]["statistics"]["velocity"].update(mean=[value, 0, 0])
+
+    yield lambda content: content["shards"].append(content["shards"][0]), "must be listed once, got its episodes twice"
+    yield lambda content: content["shards"][4]["episodes"].pop(), r"episodes must be numbers 2 to 3, got \[2\]"
+    yield statistics(math.nan), "must be JSON .* got NaN"
+    yield lambda content: content["shards"][0]["statistics"]["velocity"].update(count=-1), "must be finite, with count"
+    yield lambda content: content.update(config_hash="0" * 64), "config_hash must be"
+    yield lambda content: content["requested"].update(dev=1), "requested must be of train, validation, test"
+
+
+@pytest.mark.parametrize(("edit", "message"), list(edits()))
+def test_manifest_that_contradicts_itself(
+    make_config: MakeConfig, make_dataset: MakeDataset, edit: Edit, message: str
+) -> None:
+    """A shard listed twice, an episode left out, numbers that are none, a hash that is another configuration's."""
+    folder = make_dataset(make_config())
+    content = first_release(folder)
+    edit(content)
+    (folder / "manifest.json").write_text(json.dumps(content))
+    with pytest.raises(ConfigError, match=message):
+        Manifest.load(folder)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "text", "message"),
+    [
+        (r'"sha256":"..', '"sha256":"00', "must hold the .* shards that were published, got others"),
+        (r"^.*\n", "", "must have [0-9]+ bytes, got"),
+        (r"\Z", "{}\n", ""),
+        (r"}\n", " \n", "must be JSON"),
+    ],
+)
+def test_index_that_was_altered(
+    make_config: MakeConfig, make_dataset: MakeDataset, pattern: str, text: str, message: str
+) -> None:
+    """Lines that do not add up to what the manifest says are refused; what is behind them is not read."""
+    folder = make_dataset(make_config())
+    path = folder / "index" / "1-000000.jsonl"
+    path.write_text(re.sub(pattern, text, path.read_text(), count=1))
+    store = EpisodeStore(folder, "train")
+    if not message:
+        assert len(store.episodes[:]) == 5
+        return
+    with pytest.raises(ConfigError, match=message):
+        store.episodes[0]
+
+
+def test_maps_are_bounded(make_config: MakeConfig, make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many shards need few open files; one that is cut while it is mapped is an error, not the end of the process."""
+    monkeypatch.setattr(hgn.data.reader, "MAPPED_SHARDS", 2)
+    folder = make_dataset(make_config())
+    store = EpisodeStore(folder, "train")
+    assert [episode.key for _ in range(2) for episode in store.episodes] == [f"train-{i:06d}" for i in range(5)] * 2
+    assert len(store._open_shards) == 2
+    os.truncate(folder / "train-000004-000005.tar", 1000)
+    with pytest.raises(ConfigError, match=r"000005\.tar must have 10240 bytes, got 1000: it was cut while it was open"):
+        store.episodes[4]
