@@ -84,6 +84,16 @@ def test_store_opens_before_the_first_episode(make_config: MakeConfig) -> None:
         assert len(EpisodeStore(writer.folder, "train").episodes) == 0
 
 
+def test_frames_of_episodes(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+    """The number of frames is known of each episode, also where some are longer and the data set grows."""
+    make_dataset(make_config(training_scenes=3, long_fraction=0.4, long_frames=9))
+    store = EpisodeStore(make_config().dataset.folder, "train")
+    assert store.frames() == [6, 6, 9]
+    make_dataset(make_config(long_fraction=0.4, long_frames=9))
+    assert store.refresh() and store.frames(4) == [6, 6, 9, 6]
+    assert store.frames() == [episode.frame_count for episode in store.episodes] == [6, 6, 9, 6, 9]
+
+
 def test_no_dataset(tmp_path: Path) -> None:
     """A folder without a manifest is told apart, and opening it names the remedy."""
     assert not EpisodeStore.available(tmp_path) and not EpisodeStore.available(tmp_path / "nowhere")

@@ -303,9 +303,9 @@ def test_command_without_its_server(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     """A command whose server stays away ends with one line that says what to do, and exit code 1."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    monkeypatch.setattr(sys, "argv", ["load"])
+    monkeypatch.setattr(sys, "argv", ["kills"])
     with pytest.raises(SystemExit, match="1"):
-        run_command(lambda mapping: Manifest.load(url, patience_s=0.01) and None, "load")
+        run_command(lambda mapping: Manifest.load(url, patience_s=0.01) and None, "kills")
     error = capsys.readouterr().err
     assert error.startswith("error: no answer for 0 s (at last: ") and error.count("\n") == 1
     assert error.endswith(f"{url}/manifest.json; see that its server runs and run the same command again to go on\n")

@@ -160,7 +160,7 @@ def test_scene_that_kills_its_worker_is_quarantined(make_config: MakeConfig, bac
     (failure,) = manifest.quarantined
     assert (failure.key, failure.seed, failure.cause) == ("train-000002", seed, "its process was ended by SIGKILL")
     assert manifest.complete
-    assert EpisodeStore(config.dataset.folder, "train").entries[2].attempt == 1
+    assert list(EpisodeStore(config.dataset.folder, "train").entries)[2].attempt == 1
     assert simulated(control).count(seed) == 4  # with the others, with a half of them, twice alone
 
 
