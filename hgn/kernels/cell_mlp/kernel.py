@@ -33,37 +33,12 @@ from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_ke
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def cell_mlp_forward(
-    cell,
-    total,
-    count_ptr,
-    weights,
-    values,
-    first_at,
-    sum_first_at,
-    bias_at,
-    second_at,
-    second_bias_at,
-    norm_weight_at,
-    norm_bias_at,
-    next_at_0,
-    next_at_1,
-    next_bias_at,
-    cell_out,
-    hidden,
-    normalised,
-    rstd,
-    next_0,
-    next_1,
-    NEXT: tl.constexpr,
-    SAVE: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-    RESIDENT: tl.constexpr,
-    LOOP: tl.constexpr,
-    OVERLAP: tl.constexpr,
-    PREFETCH: tl.constexpr,
-):
+    cell, total, count_ptr, weights, values, first_at, sum_first_at, bias_at, second_at, second_bias_at,
+    norm_weight_at, norm_bias_at, next_at_0, next_at_1, next_bias_at, cell_out, hidden, normalised, rstd,
+    next_0, next_1,
+    NEXT: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+    RESIDENT: tl.constexpr, LOOP: tl.constexpr, OVERLAP: tl.constexpr, PREFETCH: tl.constexpr,
+):  # fmt: skip
     """Paper steps 2, 4, … (fig. 5): the cells' new features from theirs and their edges' sums, all [C, W], and up to
     two products of them, of which the second with a bias.
 
@@ -155,38 +130,12 @@ def cell_mlp_forward(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def cell_mlp_backward(
-    gradient,
-    later_hidden_gradient,
-    later_receive_gradient,
-    neighbour,
-    count_ptr,
-    weights,
-    values,
-    totals,
-    later_send_at,
-    later_receive_at,
-    first_at,
-    sum_first_at,
-    second_at,
-    norm_weight_at,
-    norm_bias_at,
-    hidden,
-    normalised,
-    rstd,
-    send_gradient,
-    hidden_gradient,
-    second_gradient,
-    sum_gradient,
-    capacity,
-    unscale,
-    LAST: tl.constexpr,
-    GATHER: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-    RESIDENT: tl.constexpr,
-    OVERLAP: tl.constexpr,
-):
+    gradient, later_hidden_gradient, later_receive_gradient, neighbour, count_ptr, weights, values, totals,
+    later_send_at, later_receive_at, first_at, sum_first_at, second_at, norm_weight_at, norm_bias_at, hidden,
+    normalised, rstd, send_gradient, hidden_gradient, second_gradient, sum_gradient, capacity, unscale,
+    LAST: tl.constexpr, GATHER: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+    RESIDENT: tl.constexpr, OVERLAP: tl.constexpr,
+):  # fmt: skip
     """In place: `gradient` [C, W] comes in as the gradient of cell_out, less what reaches it through `send` and
     `receive` of the following iteration (added here unless LAST; what comes from the edges that start in a cell is left
     in send_gradient), and leaves as that of `cell`, again less what goes through its own.

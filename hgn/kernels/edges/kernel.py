@@ -59,20 +59,9 @@ def _senders(neighbour, slot, owner, used, count, capacity):
 
 @triton.jit
 def _edge_rows(
-    send,
-    receive,
-    edge_in,
-    tile,
-    owner,
-    slot,
-    other,
-    count,
-    FIRST: tl.constexpr,
-    BY_PRODUCT: tl.constexpr,
-    WIDTH: tl.constexpr,
-    SUMS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    send, receive, edge_in, tile, owner, slot, other, count,
+    FIRST: tl.constexpr, BY_PRODUCT: tl.constexpr, WIDTH: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """A tile's rows: of `receive` (by cell if BY_PRODUCT, else by edge), of `send`, and of the edges unless FIRST."""
     column = tl.arange(0, WIDTH)
     there = (other >= 0)[:, None]
@@ -95,35 +84,12 @@ def _edge_rows(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def edge_forward(
-    send,
-    receive,
-    edge_in,
-    neighbour,
-    count_ptr,
-    weights,
-    values,
-    own_at,
-    second_at,
-    second_bias_at,
-    norm_weight_at,
-    norm_bias_at,
-    edge_out,
-    sum_out,
-    hidden,
-    normalised,
-    rstd,
-    capacity,
-    FIRST: tl.constexpr,
-    STORE_EDGE: tl.constexpr,
-    SAVE: tl.constexpr,
-    WIDTH: tl.constexpr,
-    ROWS: tl.constexpr,
-    DENSE: tl.constexpr,
-    PRECISION: tl.constexpr,
-    OVERLAP: tl.constexpr,
-    PREFETCH: tl.constexpr,
+    send, receive, edge_in, neighbour, count_ptr, weights, values, own_at, second_at, second_bias_at,
+    norm_weight_at, norm_bias_at, edge_out, sum_out, hidden, normalised, rstd, capacity,
+    FIRST: tl.constexpr, STORE_EDGE: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, ROWS: tl.constexpr,
+    DENSE: tl.constexpr, PRECISION: tl.constexpr, OVERLAP: tl.constexpr, PREFETCH: tl.constexpr,
     AHEAD: tl.constexpr,
-):
+):  # fmt: skip
     """Paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W]; send and
     receive [C, W] are the cells' products with the edge MLP's first two parts, receive with the bias.
 
@@ -224,20 +190,9 @@ def edge_forward(
                 z += edge.to(tl.float32)
         if AHEAD:
             received, sent, edge = _edge_rows(
-                send,
-                receive,
-                edge_in,
-                tile + tl.num_programs(0),
-                later_owner,
-                slot,
-                later,
-                count,
-                FIRST,
-                BY_PRODUCT,
-                WIDTH,
-                SUMS,
-                BLOCK,
-            )
+                send, receive, edge_in, tile + tl.num_programs(0), later_owner, slot, later, count, FIRST,
+                BY_PRODUCT, WIDTH, SUMS, BLOCK,
+            )  # fmt: skip
         if STORE_EDGE:
             if SAVE:
                 tl.store(edge_out + edge_at, z, mask=holds[:, None])
@@ -264,31 +219,11 @@ def edge_forward(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def edge_backward(
-    sum_gradient,
-    edge_gradient,
-    count_ptr,
-    weights,
-    values,
-    totals,
-    own_at,
-    second_at,
-    norm_weight_at,
-    norm_bias_at,
-    hidden,
-    normalised,
-    rstd,
-    hidden_gradient,
-    second_gradient,
-    receive_gradient,
-    unscale,
-    FIRST: tl.constexpr,
-    LAST: tl.constexpr,
-    WIDTH: tl.constexpr,
-    ROWS: tl.constexpr,
-    DENSE: tl.constexpr,
-    PRECISION: tl.constexpr,
-    OVERLAP: tl.constexpr,
-):
+    sum_gradient, edge_gradient, count_ptr, weights, values, totals, own_at, second_at, norm_weight_at,
+    norm_bias_at, hidden, normalised, rstd, hidden_gradient, second_gradient, receive_gradient, unscale,
+    FIRST: tl.constexpr, LAST: tl.constexpr, WIDTH: tl.constexpr, ROWS: tl.constexpr, DENSE: tl.constexpr,
+    PRECISION: tl.constexpr, OVERLAP: tl.constexpr,
+):  # fmt: skip
     """In place: edge_gradient [C, 6, W] comes in as that of edge_out, less the sums' part (there is none if LAST), and
     leaves as that of edge_in (if there is one: not FIRST). receive_gradient [C, W] is that of `receive`.
 

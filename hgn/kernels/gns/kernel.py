@@ -52,22 +52,10 @@ def _encoder_hidden(position, sender, receiver, row, live, first, first_bias, WI
 
 @triton.jit
 def gns_encode_forward(
-    position,
-    sender,
-    receiver,
-    offset,
-    particles,
-    first,
-    first_bias,
-    second,
-    second_bias,
-    norm_weight,
-    norm_bias,
-    edge,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
+    position, sender, receiver, offset, particles, first, first_bias, second, second_bias, norm_weight,
+    norm_bias, edge,
+    WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """edge [E, W] from sender minus receiver and their distance.
 
     Reference: hgn.kernels.gns.reference; test: tests/kernels/test_kernels_alone.py.
@@ -85,24 +73,10 @@ def gns_encode_forward(
 
 @triton.jit
 def gns_encode_norm_backward(
-    gradient,
-    position,
-    sender,
-    receiver,
-    offset,
-    particles,
-    first,
-    first_bias,
-    second,
-    second_bias,
-    norm_weight,
-    activation,
-    second_gradient,
-    partial,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
+    gradient, position, sender, receiver, offset, particles, first, first_bias, second, second_bias,
+    norm_weight, activation, second_gradient, partial,
+    WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """The encoder backward through its norm, from the edges' gradient [E, W]: activation and second_gradient [E, W] are
     the second layer's input and the gradient of its output; rows 0 and 1 of `partial` [programs, 8, W] are the norm's
     weight's and bias's.
@@ -139,19 +113,9 @@ def gns_encode_norm_backward(
 
 @triton.jit
 def gns_encode_layers_backward(
-    second_gradient,
-    activation,
-    position,
-    sender,
-    receiver,
-    offset,
-    particles,
-    second,
-    partial,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
+    second_gradient, activation, position, sender, receiver, offset, particles, second, partial,
+    WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """The rest of the encoder backward: in `partial` [programs, 8, W] come last the gradients of the second bias, the
     first layer's four columns and its bias.
 
@@ -190,25 +154,10 @@ def gns_encode_layers_backward(
 
 @triton.jit
 def gns_step_forward(
-    edge,
-    edge_out,
-    message_out,
-    send,
-    receive,
-    sender,
-    receiver,
-    offset,
-    particles,
-    own,
-    second,
-    second_bias,
-    norm_weight,
-    norm_bias,
-    LAST: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
+    edge, edge_out, message_out, send, receive, sender, receiver, offset, particles, own, second, second_bias,
+    norm_weight, norm_bias,
+    LAST: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """message_out [E, W]: the edges' messages. edge_out [E, W] is edge with the messages added, unless LAST.
 
     send and receive [N, W], stored like edges, are the particles' products with the first layer, its bias in `receive`.
@@ -246,27 +195,10 @@ def gns_step_forward(
 
 @triton.jit
 def gns_norm_backward(
-    sum_gradient,
-    gradient,
-    edge,
-    send,
-    receive,
-    sender,
-    receiver,
-    offset,
-    particles,
-    own,
-    second,
-    second_bias,
-    norm_weight,
-    activation,
-    second_gradient,
-    partial,
-    LAST: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
+    sum_gradient, gradient, edge, send, receive, sender, receiver, offset, particles, own, second, second_bias,
+    norm_weight, activation, second_gradient, partial,
+    LAST: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """A step backward through its norm, from the gradients of the sums [N, W] and of edge_out (none if LAST).
 
     activation and second_gradient [E, W] are the second layer's input and the gradient of its output; rows 0 and 1 of
@@ -319,21 +251,10 @@ def gns_norm_backward(
 
 @triton.jit
 def gns_layers_backward(
-    second_gradient,
-    activation,
-    gradient,
-    offset,
-    particles,
-    own,
-    second,
-    hidden_gradient,
-    edge_gradient,
+    second_gradient, activation, gradient, offset, particles, own, second, hidden_gradient, edge_gradient,
     partial,
-    LAST: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
+    LAST: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """The rest of the step backward: hidden_gradient [E, W] is that before the activation, edge_gradient [E, W] that of
     the edges that came in; in `partial` [programs, 3, W] comes last the second bias's.
 
@@ -366,16 +287,9 @@ def gns_layers_backward(
 
 @triton.jit
 def gns_edge_sums(
-    value,
-    order,
-    offset,
-    total,
-    scale_ptr,
-    ORDERED: tl.constexpr,
-    SCALED: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    value, order, offset, total, scale_ptr,
+    ORDERED: tl.constexpr, SCALED: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """total [N, W]: the sum of each particle's rows of `value` [E, W], those from its offset to the next one's, or with
     ORDERED those that `order` [E] has there; SCALED: divided by the scale. A program a particle.
 
@@ -424,18 +338,9 @@ def _weight_product(left, right, count, partial, WIDTH: tl.constexpr, STEP: tl.c
 
 @triton.jit
 def gns_weight_products(
-    second_gradient,
-    activation,
-    hidden_gradient,
-    edge,
-    offset,
-    particles,
-    partial,
-    BOTH: tl.constexpr,
-    WIDTH: tl.constexpr,
-    STEP: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
+    second_gradient, activation, hidden_gradient, edge, offset, particles, partial,
+    BOTH: tl.constexpr, WIDTH: tl.constexpr, STEP: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """partial [programs, 1 or 2, W, W]: the gradients of the second and, with BOTH, of the first layer's part for the
     edge, of the program's share of the edges.
 

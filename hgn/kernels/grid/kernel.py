@@ -50,18 +50,9 @@ def _slot(x, y, z, scene, slots):
 
 @triton.jit
 def mark_cells(
-    position,
-    scene_of,
-    origin,
-    particle_count,
-    low,
-    geometry,
-    occupied,
-    status,
-    cell_size,
-    LEVELS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    position, scene_of, origin, particle_count, low, geometry, occupied, status, cell_size,
+    LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Sets the slots of the cells that particles reach, and of their ancestors; one pass for all levels.
 
     Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
@@ -145,20 +136,9 @@ def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity
 
 @triton.jit
 def fill_tables(
-    occupied,
-    prefix_sum,
-    geometry,
-    slot_of_cell,
-    neighbour,
-    parent,
-    octant,
-    children,
-    counts,
-    needed,
-    status,
-    LEVELS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    occupied, prefix_sum, geometry, slot_of_cell, neighbour, parent, octant, children, counts, needed, status,
+    LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Each active slot writes its cell's neighbours, parent and children, int32, -1 where there is none.
 
     Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
@@ -303,25 +283,10 @@ def _with_column(value, number, x):
 
 @triton.jit
 def prepare_particles(
-    position,
-    velocity,
-    scene_of,
-    origin,
-    particle_count,
-    low,
-    geometry,
-    occupied,
-    prefix_sum,
-    cell_of,
-    weight_of,
-    fraction_of,
-    motion,
-    cell_size,
-    capacity,
-    HISTORY: tl.constexpr,
-    MOTION: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
+    weight_of, fraction_of, motion, cell_size, capacity,
+    HISTORY: tl.constexpr, MOTION: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Each particle's 8 cells, their weights, and its fraction; with MOTION its parts of the finest cells' mass and
     momentum are added to `motion` [.., 4].
 
@@ -394,25 +359,11 @@ def sum_motion(motion, parent, geometry, counts, LEVELS: tl.constexpr, BLOCK: tl
 
 @triton.jit
 def prepare_features(
-    position,
-    velocity,
-    scene_of,
-    material_of,
-    domain,
-    particle_count,
-    mean,
-    std,
-    obstacle_table,
-    obstacle_cell_size,
-    features,
-    wall_maximum,
-    HISTORY: tl.constexpr,
-    NORMALS: tl.constexpr,
-    OBSTACLES: tl.constexpr,
-    SYMMETRY: tl.constexpr,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    position, velocity, scene_of, material_of, domain, particle_count, mean, std, obstacle_table,
+    obstacle_cell_size, features, wall_maximum,
+    HISTORY: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
+    FEATURES: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES].
     Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in _normals.
 
@@ -467,31 +418,11 @@ def _asinh(x):
 
 @triton.jit
 def prepare_relative_features(
-    position,
-    velocity,
-    scene_of,
-    material_of,
-    domain,
-    gravity,
-    particle_count,
-    scale,
-    obstacle_table,
-    obstacle_cell_size,
-    cell_of,
-    weight_of,
-    motion,
-    parent,
-    geometry,
-    features,
-    reach,
-    HISTORY: tl.constexpr,
-    LEVELS: tl.constexpr,
-    NORMALS: tl.constexpr,
-    OBSTACLES: tl.constexpr,
-    SYMMETRY: tl.constexpr,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    position, velocity, scene_of, material_of, domain, gravity, particle_count, scale, obstacle_table,
+    obstacle_cell_size, cell_of, weight_of, motion, parent, geometry, features, reach,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr,
+    SYMMETRY: tl.constexpr, FEATURES: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
     velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
     near a surface velocity, walls, and the normals here and ahead if NORMALS; one-hot material. Differences of

@@ -59,48 +59,13 @@ def _three_rows(pointer, WIDTH: tl.constexpr):
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def mlp_forward(
-    x,
-    count_ptr,
-    weights,
-    values,
-    first_weights,
-    first_at,
-    offset_at,
-    bias_at,
-    second_at,
-    second_bias_at,
-    norm_weight_at,
-    norm_bias_at,
-    gathered,
-    index,
-    octant,
-    next_at_0,
-    next_at_1,
-    next_bias_at_0,
-    next_bias_at_1,
-    fraction,
-    fraction_at_0,
-    fraction_at_1,
-    y,
-    hidden,
-    next_0,
-    next_1,
-    INPUT: tl.constexpr,
-    WIDTH: tl.constexpr,
-    OUT: tl.constexpr,
-    GATHER: tl.constexpr,
-    OFFSET: tl.constexpr,
-    BIAS: tl.constexpr,
-    NORM: tl.constexpr,
-    RESIDUAL: tl.constexpr,
-    NEXT: tl.constexpr,
-    FRACTION: tl.constexpr,
-    SAVE: tl.constexpr,
-    FINE: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-    LOOP: tl.constexpr,
-):
+    x, count_ptr, weights, values, first_weights, first_at, offset_at, bias_at, second_at, second_bias_at,
+    norm_weight_at, norm_bias_at, gathered, index, octant, next_at_0, next_at_1, next_bias_at_0, next_bias_at_1,
+    fraction, fraction_at_0, fraction_at_1, y, hidden, next_0, next_1,
+    INPUT: tl.constexpr, WIDTH: tl.constexpr, OUT: tl.constexpr, GATHER: tl.constexpr, OFFSET: tl.constexpr,
+    BIAS: tl.constexpr, NORM: tl.constexpr, RESIDUAL: tl.constexpr, NEXT: tl.constexpr, FRACTION: tl.constexpr,
+    SAVE: tl.constexpr, FINE: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr, LOOP: tl.constexpr,
+):  # fmt: skip
     """y [R, OUT] of x [R, INPUT] as above: the encoder (paper step 0, with the products that steps 1 and 11 take),
     messages to parents (3, 5, …) and from them (7, 9, …; GATHER), the decoder (12).
 
@@ -212,39 +177,13 @@ def mlp_forward(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def mlp_backward(
-    gradient,
-    gradient_index,
-    from_0,
-    from_1,
-    x_gradient,
-    count_ptr,
-    weights,
-    values,
-    totals,
-    first_at,
-    offset_at,
-    second_at,
-    second_bias_at,
-    norm_weight_at,
-    norm_bias_at,
-    octant,
-    next_at_0,
-    next_at_1,
-    hidden,
-    hidden_gradient,
-    second_gradient,
-    unscale,
-    WIDTH: tl.constexpr,
-    OUT: tl.constexpr,
-    GATHER: tl.constexpr,
-    OFFSET: tl.constexpr,
-    NORM: tl.constexpr,
-    RESIDUAL: tl.constexpr,
-    NEXT: tl.constexpr,
-    INTO: tl.constexpr,
-    BLOCK: tl.constexpr,
+    gradient, gradient_index, from_0, from_1, x_gradient, count_ptr, weights, values, totals, first_at,
+    offset_at, second_at, second_bias_at, norm_weight_at, norm_bias_at, octant, next_at_0, next_at_1, hidden,
+    hidden_gradient, second_gradient, unscale,
+    WIDTH: tl.constexpr, OUT: tl.constexpr, GATHER: tl.constexpr, OFFSET: tl.constexpr, NORM: tl.constexpr,
+    RESIDUAL: tl.constexpr, NEXT: tl.constexpr, INTO: tl.constexpr, BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
-):
+):  # fmt: skip
     """Gradients of all inputs of mlp_forward.
 
     The gradient of y is `gradient` (row gradient_index_r if GATHER) plus from_0, from_1 times their products' weights
@@ -321,16 +260,9 @@ def clear_rows(x, count_ptr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def gather_sums(
-    x,
-    table,
-    count_ptr,
-    y,
-    capacity,
-    SUM: tl.constexpr,
-    EDGES: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    x, table, count_ptr, y, capacity,
+    SUM: tl.constexpr, EDGES: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """y = the sum of x's rows listed in the table [SUM, capacity] (-1: none), as gathered_sum takes them.
 
     In a kernel of its own where there are many rows: its programs are small enough that many wait at once, while a
@@ -350,24 +282,9 @@ def gather_sums(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def gather_project(
-    x,
-    table,
-    count_ptr,
-    weights,
-    values,
-    at_0,
-    at_1,
-    bias_at,
-    y,
-    next_0,
-    next_1,
-    capacity,
-    SUM: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PRECISION: tl.constexpr,
-    LOOP: tl.constexpr,
-):
+    x, table, count_ptr, weights, values, at_0, at_1, bias_at, y, next_0, next_1, capacity,
+    SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr, LOOP: tl.constexpr,
+):  # fmt: skip
     """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products of y, the
     second with a bias. LOOP as in mlp_forward.
 
@@ -406,23 +323,10 @@ def gather_project(
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
 def gather_project_backward(
-    x,
-    table,
-    count_ptr,
-    weights,
-    at_0,
-    summed,
-    other,
-    other_at,
-    gradient,
-    capacity,
-    SUM: tl.constexpr,
-    EDGES: tl.constexpr,
-    ADD: tl.constexpr,
-    WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
+    x, table, count_ptr, weights, at_0, summed, other, other_at, gradient, capacity,
+    SUM: tl.constexpr, EDGES: tl.constexpr, ADD: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
     PRECISION: tl.constexpr,
-):
+):  # fmt: skip
     """summed = x, or the sum of x's rows listed in the table [SUM, capacity]; gradient (+)= summed W.
 
     With EDGES, x is [capacity, SUM, W], of the row listed for a direction the opposite direction's part is taken, and

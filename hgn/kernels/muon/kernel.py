@@ -11,18 +11,9 @@ from hgn.kernels.triton_compat import settle_keys
 
 @triton.jit
 def momentum_directions(
-    starts,
-    pitch,
-    gradient,
-    share,
-    first_moment,
-    direction,
-    status,
-    norm,
-    momentum,
-    epsilon,
+    starts, pitch, gradient, share, first_moment, direction, status, norm, momentum, epsilon,
     WIDTH: tl.constexpr,
-):
+):  # fmt: skip
     """Momentum of square blocks (hgn.network.orthogonal), which begin at `starts`, their rows `pitch` apart;
     Nesterov's, normalised, goes to direction [blocks, WIDTH, WIDTH]. A program a block; nothing where `adam` does
     nothing.
@@ -48,19 +39,9 @@ def momentum_directions(
 
 @triton.jit
 def step_blocks(
-    starts,
-    pitch,
-    direction,
-    value,
-    weight,
-    rates,
-    update,
-    status,
-    norm,
-    step_size,
-    PRECISION: tl.constexpr,
-    WIDTH: tl.constexpr,
-):
+    starts, pitch, direction, value, weight, rates, update, status, norm, step_size,
+    PRECISION: tl.constexpr, WIDTH: tl.constexpr,
+):  # fmt: skip
     """Moves square blocks against their directions by rate times `step_size`; values and weights are written as `adam`
     does.
 

@@ -82,21 +82,9 @@ def find_runs(
 
 @triton.jit
 def walk_neighbours(
-    position,
-    run_end,
-    run_shift,
-    counts,
-    offset,
-    sender_of,
-    receiver_of,
-    particles,
-    capacity,
-    square_radius,
-    FILL: tl.constexpr,
-    SIDE: tl.constexpr,
-    BLOCK: tl.constexpr,
-    CANDIDATES: tl.constexpr,
-):
+    position, run_end, run_shift, counts, offset, sender_of, receiver_of, particles, capacity, square_radius,
+    FILL: tl.constexpr, SIDE: tl.constexpr, BLOCK: tl.constexpr, CANDIDATES: tl.constexpr,
+):  # fmt: skip
     """counts [N], int64, of each sorted particle, itself among them; with FILL sender and receiver [E] of each edge,
     int64, grouped by receiver, none beyond `capacity`. Positions are in the sorted order.
 

@@ -82,29 +82,11 @@ def _first_layer(choice, rows, of_cells, TO_CELL: tl.constexpr, PRECISION: tl.co
 
 @triton.jit
 def particle_cell_forward(
-    by_particle,
-    by_cell,
-    particle,
-    cell_of,
-    weight_of,
-    count_ptr,
-    weights,
-    values,
-    offset_at,
-    second_at,
-    second_bias_at,
-    norm_weight_at,
-    norm_bias_at,
-    hidden,
-    normalised,
-    rstd,
-    out,
-    TO_CELL: tl.constexpr,
-    SAVE: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PARTICLES: tl.constexpr,
+    by_particle, by_cell, particle, cell_of, weight_of, count_ptr, weights, values, offset_at, second_at,
+    second_bias_at, norm_weight_at, norm_bias_at, hidden, normalised, rstd, out,
+    TO_CELL: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr,
     PRECISION: tl.constexpr,
-):
+):  # fmt: skip
     """Paper step 1 (TO_CELL): out [C, W] += weight * MLP(by_particle_n + offset). Paper step 11: out [N, W] =
     particle + sum over the corners of weight * MLP(by_cell_c + by_particle_n - offset). The by_… are products with
     first-layer weights, by_particle with the particle's part of the offset: what is left of it are the corner's bits.
@@ -208,32 +190,11 @@ def _pairs_of(tile, count, cell_of, weight_of, fraction, ROWS: tl.constexpr):
 
 @triton.jit
 def particle_cell_backward(
-    gradient,
-    by_particle,
-    by_cell,
-    cell_of,
-    weight_of,
-    fraction,
-    count_ptr,
-    weights,
-    values,
-    totals,
-    offset_at,
-    second_at,
-    norm_weight_at,
-    norm_bias_at,
-    hidden,
-    normalised,
-    rstd,
-    second_gradient,
-    by_particle_gradient,
-    by_cell_gradient,
-    unscale,
-    TO_CELL: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PARTICLES: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
+    gradient, by_particle, by_cell, cell_of, weight_of, fraction, count_ptr, weights, values, totals, offset_at,
+    second_at, norm_weight_at, norm_bias_at, hidden, normalised, rstd, second_gradient, by_particle_gradient,
+    by_cell_gradient, unscale,
+    TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, PRECISION: tl.constexpr,
+):  # fmt: skip
     """From the gradient of `out` ([C, W] if TO_CELL, else [N, W]) to those of by_particle, and of by_cell by atomics.
 
     second_gradient [8 N, W] is left for the weight product. Where the hidden layer was not kept it is computed again,
@@ -318,23 +279,10 @@ def particle_cell_backward(
 
 @triton.jit
 def _weight_tile(
-    total,
-    lines,
-    cell,
-    tile,
-    count,
-    second_gradient,
-    by_particle,
-    by_cell,
-    cell_of,
-    choice,
-    offsets,
-    TO_CELL: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PARTICLES: tl.constexpr,
-    SUMS: tl.constexpr,
+    total, lines, cell, tile, count, second_gradient, by_particle, by_cell, cell_of, choice, offsets,
+    TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, SUMS: tl.constexpr,
     PRECISION: tl.constexpr,
-):
+):  # fmt: skip
     """`total` and `lines` with a tile's part of the gradients added, and the cells of the program's next tile."""
     ROWS: tl.constexpr = PARTICLES * 8
     column = tl.arange(0, WIDTH)
@@ -354,23 +302,11 @@ def _weight_tile(
 
 @triton.jit
 def particle_cell_weight_gradient(
-    second_gradient,
-    by_particle,
-    by_cell,
-    cell_of,
-    count_ptr,
-    values,
-    totals,
-    offset_at,
-    second_at,
-    second_bias_at,
-    unscale,
-    TO_CELL: tl.constexpr,
-    WIDTH: tl.constexpr,
-    PARTICLES: tl.constexpr,
-    PRECISION: tl.constexpr,
+    second_gradient, by_particle, by_cell, cell_of, count_ptr, values, totals, offset_at, second_at,
+    second_bias_at, unscale,
+    TO_CELL: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr, PRECISION: tl.constexpr,
     PIPELINED: tl.constexpr,
-):
+):  # fmt: skip
     """Gradients of the second layer and its bias, as weight_gradient makes them, where the hidden layer was not kept:
     it is computed again, to the same bits, from an eighth of the bytes. Tiles come from behind: what
     particle_cell_backward wrote last is still in the L2 cache.
@@ -395,44 +331,16 @@ def particle_cell_weight_gradient(
     if PIPELINED:
         for number in tl.range(tl.program_id(0), last + 1, tl.num_programs(0), num_stages=3):
             total, lines, cell = _weight_tile(
-                total,
-                lines,
-                cell,
-                last - number,
-                count,
-                second_gradient,
-                by_particle,
-                by_cell,
-                cell_of,
-                choice,
-                offsets,
-                TO_CELL,
-                WIDTH,
-                PARTICLES,
-                SUMS,
-                PRECISION,
-            )
+                total, lines, cell, last - number, count, second_gradient, by_particle, by_cell, cell_of,
+                choice, offsets, TO_CELL, WIDTH, PARTICLES, SUMS, PRECISION,
+            )  # fmt: skip
     else:
         tile = last - tl.program_id(0)
         while tile >= 0:
             total, lines, cell = _weight_tile(
-                total,
-                lines,
-                cell,
-                tile,
-                count,
-                second_gradient,
-                by_particle,
-                by_cell,
-                cell_of,
-                choice,
-                offsets,
-                TO_CELL,
-                WIDTH,
-                PARTICLES,
-                SUMS,
-                PRECISION,
-            )
+                total, lines, cell, tile, count, second_gradient, by_particle, by_cell, cell_of, choice,
+                offsets, TO_CELL, WIDTH, PARTICLES, SUMS, PRECISION,
+            )  # fmt: skip
             tile -= tl.num_programs(0)
     tl.atomic_add(totals + second_bias_at + column, tl.sum(lines, 0) * unscale, sem="relaxed")
     at = totals + second_at + column[:, None] * WIDTH + column[None, :]

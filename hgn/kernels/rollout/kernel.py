@@ -15,24 +15,9 @@ DIVERGED = tl.constexpr(4)
 
 @triton.jit
 def integrate(
-    output,
-    position,
-    velocity,
-    scene_of,
-    domain,
-    gravity,
-    mean,
-    std,
-    particle_count,
-    status,
-    lost,
-    frame,
-    path,
-    OUT: tl.constexpr,
-    HISTORY: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    output, position, velocity, scene_of, domain, gravity, mean, std, particle_count, status, lost, frame, path,
+    OUT: tl.constexpr, HISTORY: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """v += a, x += v, and the new positions into path [T, N, 3] at `frame`; a is gravity and the restored output.
 
     Where the status is not zero, nothing changes. Particles that are not finite or farther from the domain than its

@@ -28,16 +28,9 @@ EPSILON = tl.constexpr(1e-8)
 
 @triton.jit
 def draw_waves(
-    samples,
-    update,
-    waves,
-    amplitude_step,
-    largest_number,
-    log_range,
-    scenes,
-    HISTORY: tl.constexpr,
-    WAVES: tl.constexpr,
-):
+    samples, update, waves, amplitude_step, largest_number, log_range, scenes,
+    HISTORY: tl.constexpr, WAVES: tl.constexpr,
+):  # fmt: skip
     """The plane waves of a scene's smooth velocity noise, from its sample's seed; a program a scene.
 
     waves [S, WAVES, 4 + 3 HISTORY]: wave vector (direction uniform, length log-uniform), phase, and what the amplitude
@@ -66,34 +59,12 @@ def draw_waves(
 
 @triton.jit
 def assemble_batch(
-    samples,
-    sample_vectors,
-    update,
-    position,
-    velocity,
-    scene_of,
-    material_of,
-    target,
-    share_of,
-    origin,
-    domain,
-    gravity,
-    obstacle_table,
-    particle_count,
-    mean,
-    std,
-    noise_step,
-    waves,
-    jitter,
-    scenes,
+    samples, sample_vectors, update, position, velocity, scene_of, material_of, target, share_of, origin,
+    domain, gravity, obstacle_table, particle_count, mean, std, noise_step, waves, jitter, scenes,
     obstacle_cell_size,
-    HISTORY: tl.constexpr,
-    SYMMETRY: tl.constexpr,
-    NOISE: tl.constexpr,
-    WAVES: tl.constexpr,
-    SCENES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, NOISE: tl.constexpr, WAVES: tl.constexpr,
+    SCENES: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
     with NOISE each particle has its own, with WAVES a part comes from the waves of its scene, see draw_waves.
 
@@ -238,22 +209,10 @@ def square_norm(gradient, size, share, flag, status, norm, BLOCK: tl.constexpr):
 
 @triton.jit
 def adam(
-    value,
-    weight,
-    gradient,
-    share,
-    first_moment,
-    second_moment,
-    rates,
-    update,
-    step,
-    status,
-    norm,
-    size,
+    value, weight, gradient, share, first_moment, second_moment, rates, update, step, status, norm, size,
     others,
-    PRECISION: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    PRECISION: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Adam (Kingma & Ba 2015) on flat buffers, unless the status is not zero or the gradient not finite.
 
     rates [updates]; step, float64 [1], counts the steps made. `weight` is the copy that products at

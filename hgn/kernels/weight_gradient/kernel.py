@@ -17,20 +17,10 @@ JOB_COLUMNS = 8
 
 @triton.jit
 def weight_gradient(
-    left,
-    right,
-    totals,
-    jobs,
-    chunk_job,
-    chunk_first,
-    counts,
-    unscale,
-    TILE: tl.constexpr,
-    CHUNK: tl.constexpr,
-    STEP: tl.constexpr,
-    PRECISION: tl.constexpr,
+    left, right, totals, jobs, chunk_job, chunk_first, counts, unscale,
+    TILE: tl.constexpr, CHUNK: tl.constexpr, STEP: tl.constexpr, PRECISION: tl.constexpr,
     PIPELINED: tl.constexpr,
-):
+):  # fmt: skip
     """Program i adds its chunk's part of A^T B [width A, width B] to totals; widths are at most TILE.
 
     PIPELINED: the compiler has tiles copied to shared memory two ahead, as it has not in the interpreter.
