@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import FrameType
 from typing import Any
 
@@ -13,6 +14,7 @@ from datagen.pool.worker import Backend
 from datagen.pool.writer import DatasetWriter
 from hgn.command import section
 from hgn.config import DatagenConfig
+from hgn.data.fresh import draw_fresh
 from hgn.schema import from_mapping, require
 from hgn.system.machine import available_cpus, available_memory
 
@@ -26,6 +28,7 @@ KEYS = {
     "pool": "dataset.pool",
     "array_task": "dataset.array_task",
     "array_tasks": "dataset.array_tasks",
+    "frozen": None,
     "name": None,
     "network": None,
     "training": None,
@@ -61,8 +64,16 @@ class StopSignal:
 
 
 def datagen_config(mapping: Mapping[str, Any], keys: Mapping[str, str | None] = KEYS) -> DatagenConfig:
-    """The generator's configuration out of a composed one. Raises: ConfigError."""
-    return from_mapping(DatagenConfig, section(mapping, keys))
+    """The generator's configuration out of a composed one; with `frozen` its seed is drawn. Raises: ConfigError."""
+    config = from_mapping(DatagenConfig, section(mapping, keys))
+    weights = mapping.get("frozen")
+    if not weights:
+        return config
+    require(isinstance(weights, list), "frozen", "a list of weights files, as in [a.safetensors]", weights)
+    require(config.dataset.seed == 0, "dataset.seed", "left out with frozen: it is drawn", config.dataset.seed)
+    require_local_folder(config)
+    seed = draw_fresh(config.dataset.folder, weights).seed
+    return replace(config, dataset=replace(config.dataset, seed=seed))
 
 
 def require_local_folder(config: DatagenConfig) -> None:

@@ -10,12 +10,13 @@ import numpy as np
 
 from hgn.command import run_command
 from hgn.config import EvaluateConfig
+from hgn.data.fresh import set_record
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.backend import Backend
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.runtime.weights import require_frame_rate
+from hgn.runtime.weights import find_weights, require_frame_rate
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
@@ -49,7 +50,9 @@ def main(mapping: dict[str, Any]) -> int:
     print(table(rows, config, len(episodes)))
     if config.json is not None:
         report = {
-            "meta": provenance(simulator.device) | {"weights": Path(config.weights).name, "updates": info.updates},
+            "meta": provenance(simulator.device)
+            | {"weights": Path(config.weights).name, "updates": info.updates, "split": config.split}
+            | {"set": set_record(config.data, store.manifest.config["seed"], [find_weights(config.weights)])},
             "rows": rows,
         }
         write_json(config.json, report)

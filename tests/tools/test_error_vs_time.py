@@ -32,6 +32,7 @@ from tools.error_vs_time import score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
 from tools.error_vs_time.comparisons import comparisons
 from tools.error_vs_time.contenders import FastPredictor, TrivialContender
+from tools.error_vs_time.paired import paired_difference, paired_lines, paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergence, sinkhorn_divergences
@@ -107,6 +108,13 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert 1e-13 < floor["perturbed by 1e-06"] < 3e-12
     assert floor["twice the step"] == pytest.approx(mpm[64, 0.5]["position_mse"]["5"])
     assert rows[0]["training_hours"] == 1.5 and "pay_back_rollouts" in rows[0]
+    assert report["meta"]["set"]["drawn"] is None and len(report["meta"]["set"]["not_frozen_before"]) == 2
+    assert rows[0]["by_scene"].keys() == {"one-step MSE", "position MSE", "Sinkhorn"} != rows[-1]["by_scene"].keys()
+    for row in rows:
+        for error, mean in (("position MSE", row["position_mse"]["5"]), ("one-step MSE", row["one_step_mse"])):
+            for values in row["by_scene"].get(error, {}).values():
+                assert np.mean([value for value in values if value is not None]) == pytest.approx(mean, rel=0.1)
+    assert {row["other"].split(",")[0] for row in report["paired"]} == {"GNS M = 3", "MPM 32³", "MPM 64³"}
     for end in ("", "_batched", "_frames"):
         with Image.open(f"{out}{end}.png") as picture:
             assert picture.width > 500
@@ -382,6 +390,8 @@ def test_scenes_that_failed_leave_the_means(data: str) -> None:
     trials = [RolloutResult(paths[0] + np.float32(0.1)), RolloutResult(paths[1][:3] + np.float32(0.2), "why")]
     row = score.rollout_figures(trials, episodes, config, CPU)
     np.testing.assert_allclose(row["curve"], [*[0.075] * 3, *[0.03] * 3], rtol=1e-4)
+    assert row["by_scene"]["position MSE"]["5"] == [pytest.approx(0.03, rel=1e-3), None]
+    assert row["by_scene"]["Sinkhorn"]["5"][1] is None
     assert row["scenes_reached"] == {"5": 1} and row["first_failure_frame"] == 3 and row["first_failure"] == "why"
 
 
@@ -564,6 +574,42 @@ def test_comparisons_in_words() -> None:
     assert "for the error after 50 frames 200.0 times as fast as MPM 64³, step 0.5" in told
     assert "2.000% in test-000003, where the solver has 1.000%; the solver 0.500%, 1.500% in its worst scene" in told
     assert comparisons([]) == []
+
+
+def test_paired_differences() -> None:
+    """A constant difference is its own interval; noise about zero carries no word; a few scenes far off take the word
+    from the mean and leave it to the median; scenes without a value of either do not count."""
+    rng = np.random.default_rng(3)
+    base = rng.uniform(1, 2, 60)
+    lower = paired_difference(base - 0.5, base)
+    assert lower is not None and lower["median"] == pytest.approx([-0.5] * 3) == lower["mean"]
+    assert lower["median_says"] == lower["mean_says"] == "nearer"
+    higher = paired_difference([*(base + 0.5), None, 9.0], [*base, 0.0, None])
+    assert higher is not None and higher["mean_says"] == "farther" and higher["scenes"] == 60
+    noise = paired_difference(base + rng.normal(0, 1, 60), base)
+    assert noise is not None and noise["mean_says"] == noise["median_says"] == "no difference shown"
+    _, low, high = noise["mean"]
+    assert high - low == pytest.approx(2 * 1.96 / 60**0.5, rel=0.25)
+    far = base - 0.1
+    far[:2] += 20
+    few = paired_difference(far, base)
+    assert few is not None and (few["median_says"], few["mean_says"]) == ("nearer", "no difference shown")
+    assert paired_difference([1.0], [2.0]) is None
+
+
+def test_paired_rows_are_told() -> None:
+    """A network stands beside GNS and each setting of the solver, in the errors and frames that both have of scenes."""
+    rows = report_rows()
+    for row, values in ((rows[0], [1.0, 2.0, 3.0]), (rows[2], [2.0, 3.0, 4.0]), (rows[5], [0.0, 2.0, 4.0])):
+        row["by_scene"] = {"position MSE": {"50": values}}
+    rows[0]["by_scene"]["one-step MSE"] = rows[2]["by_scene"]["one-step MSE"] = {"0": [1.0, 1.0]}
+    made = paired_rows(rows)
+    of_hgn = [(row["other"].split(",")[0], row["error"]) for row in made if row["one"].startswith("HGN")]
+    assert of_hgn == [("GNS M = 4", "one-step MSE"), ("GNS M = 4", "position MSE"), ("MPM 64³", "position MSE")]
+    told = "\n".join(paired_lines(made))
+    assert "position MSE after 50 frames, 3 scenes: nearer in the median (-1.00e+00, -1.00e+00 to -1.00e+00)" in told
+    assert "MPM 64³, step 0.5, position MSE after 50 frames, 3 scenes: no difference shown in the median" in told
+    assert paired_lines([]) == []
 
 
 def test_the_figures_show_what_diverged(tmp_path: Path) -> None:

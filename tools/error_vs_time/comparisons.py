@@ -72,7 +72,7 @@ def _beside_solver(networks: Sequence[Row], solvers: Sequence[Row]) -> list[str]
                 least = min(good, key=lambda other: other["ms"])
                 told.append(f"for the error after {frame} frames {_speed(least['ms'] / row['ms'])} as {label(least)}")
             else:
-                told.append(f"after {frame} frames no setting is as near")
+                told.append(f"after {frame} frames no setting's mean is as low")
         lines.append(f"  {label(row)}: {', '.join(told)}")
     return lines
 

@@ -85,6 +85,7 @@ class NetworkContender:
 
         Raises: ConfigError where the backend does not take the network or the precision.
         """
+        self.file = file
         self.network, info = load_weights(file, device)
         require_frame_rate(info, frame_rate_hz)
         config = info.network

@@ -19,6 +19,7 @@ from hgn.schema import ConfigError
 from hgn.system.files import write_atomically, write_json
 from hgn.system.progress import bar
 from tools.error_vs_time.contenders import GNS_FIRST, Contender, SolverContender, TrivialContender
+from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, report, score
 from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
@@ -100,7 +101,7 @@ class Run:
             label(row) for row in self.rows if row["system"] not in UNTIMED and row.get("ms") is None
         ]
         self.meta["seconds"] = time.monotonic() - self.begun
-        written = report(self.meta, self.rows)
+        written = report(self.meta, self.rows, paired_rows(self.rows) if drawn else ())
         write_json(self.file, written, allow_nan=False)
         if drawn:
             draw(self.out, written["rows"], written["meta"])

@@ -41,7 +41,10 @@ def score(
         some = references[first : first + together]
         trials += contender.trials(some, frames, None)
     row = contender.row | one_step_figures([step for step in steps if step is not None])
-    return row | rollout_figures(trials, references, config, device)
+    row |= rollout_figures(trials, references, config, device)
+    known = [None if step is None else _rounded(step.error.mse) for step in steps]
+    row["by_scene"] = ({"one-step MSE": {"0": known}} if any(v is not None for v in known) else {}) | row["by_scene"]
+    return row
 
 
 def one_step_figures(steps: Sequence[OneStep]) -> dict[str, Any]:
@@ -76,15 +79,20 @@ def rollout_figures(
     reported = sorted({frame for frame in (*REPORTED_FRAMES, frames - 1) if frame < frames})
     told = [frame for frame in reported if reached_T[frame]]
     failures = [trial for trial in trials if trial.cause is not None]
+    sinkhorn_S = _sinkhorn(
+        trials[: config.sinkhorn_scenes], references[: config.sinkhorn_scenes], reported, config, device
+    )
     row: dict[str, Any] = {
         "position_mse": {str(frame): float(curve_T[frame]) for frame in told},
         "position_quartiles": {str(frame): quartiles(mse_ST[:, frame]) for frame in told},
         "position_by_material": _by_material(trials, references, told),
         "curve": [float(f"{value:.4g}") for value in curve_T],
         "scenes_reached": {str(frame): int(reached_T[frame]) for frame in reported},
-        "sinkhorn": _sinkhorn(
-            trials[: config.sinkhorn_scenes], references[: config.sinkhorn_scenes], reported, config, device
-        ),
+        "sinkhorn": _means([found for of_scene in sinkhorn_S for found in of_scene.items()]),
+        "by_scene": {
+            "position MSE": {str(frame): [_rounded(value) for value in mse_ST[:, frame]] for frame in told},
+            "Sinkhorn": {str(frame): [_of_frame(found, str(frame)) for found in sinkhorn_S] for frame in told},
+        },
         "failed_scenes": len(failures),
         "first_failure_frame": min((trial.frame_count for trial in failures), default=None),
         "first_failure": failures[0].cause if failures else None,
@@ -144,9 +152,11 @@ def label(row: Mapping[str, Any]) -> str:
     return f"{row['system'].upper().replace('_', ' ')} {size}, {row['backend']} {row['precision']} ({row['weights']})"
 
 
-def report(meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def report(
+    meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], paired: Sequence[Mapping[str, Any]] = ()
+) -> dict[str, Any]:
     """What the report's JSON holds; numbers that are none are null, for JSON knows no NaN."""
-    return {"meta": meta, "rows": _plain(list(rows))}
+    return {"meta": meta, "rows": _plain(list(rows)), "paired": list(paired)}
 
 
 def _position_mse(trial: RolloutResult, reference: Episode) -> np.ndarray:
@@ -211,9 +221,10 @@ def _sinkhorn(
     frames: Sequence[int],
     config: ErrorVsTimeConfig,
     device: torch.device,
-) -> dict[str, dict[str, float]]:
+) -> list[dict[tuple[str, str], float]]:
+    """Of each scene, by material and frame."""
     named, pairs = [], []
-    for trial, reference in zip(trials, references, strict=True):
+    for scene, (trial, reference) in enumerate(zip(trials, references, strict=True)):
         for index in np.unique(reference.material_N):
             of_material = np.flatnonzero(reference.material_N == index)
             # The same particles of both: as near to the whole clouds as so few can be.
@@ -224,12 +235,29 @@ def _sinkhorn(
                         torch.from_numpy(np.ascontiguousarray(path[frame, chosen])).to(device)
                         for path in (trial.position_TN3, reference.position_TN3)
                     )
-                    named.append((MATERIALS[index], str(frame)))
+                    named.append((scene, MATERIALS[index], str(frame)))
                     pairs.append((first, second))
+    found: list[dict[tuple[str, str], float]] = [{} for _ in trials]
+    for (scene, *kind), value in zip(named, sinkhorn_divergences(pairs, config.sinkhorn_blur), strict=True):
+        found[scene][kind[0], kind[1]] = value
+    return found
+
+
+def _means(values: Sequence[tuple[tuple[str, str], float]]) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, list[float]]] = {}
-    for (material, frame_text), value in zip(named, sinkhorn_divergences(pairs, config.sinkhorn_blur), strict=True):
-        found.setdefault(material, {}).setdefault(frame_text, []).append(value)
-    return {name: {frame: float(np.mean(v)) for frame, v in values.items()} for name, values in found.items()}
+    for (material, frame), value in values:
+        found.setdefault(material, {}).setdefault(frame, []).append(value)
+    return {name: {frame: float(np.mean(v)) for frame, v in frames.items()} for name, frames in found.items()}
+
+
+def _of_frame(values: Mapping[tuple[str, str], float], frame: str) -> float | None:
+    """The mean over materials; none for a scene that did not come so far."""
+    found = [value for (_, other), value in values.items() if other == frame]
+    return _rounded(np.mean(found)) if found else None
+
+
+def _rounded(value: float | np.floating[Any]) -> float | None:
+    return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
 def quartiles(values: Sequence[float] | np.ndarray) -> list[float] | None:

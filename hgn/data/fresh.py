@@ -1,0 +1,72 @@
+"""A test set that no choice has seen: its seed is drawn when the weights are frozen, and kept with their hashes.
+
+`fresh.json` in the data set's folder is written before the first scene is made, and never again.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from hgn.data.manifest import MANIFEST_NAME
+from hgn.data.storage import file_sha256, is_remote
+from hgn.schema import ConfigError, from_mapping, require, to_mapping
+from hgn.system.files import write_json
+
+FRESH_NAME = "fresh.json"
+
+
+@dataclass(frozen=True)
+class FreshSeed:
+    """A seed, when it was drawn (UTC, ISO 8601), and the sha256 of the weights that were frozen then, by file name."""
+
+    seed: int
+    drawn: str
+    weights: dict[str, str]
+
+
+def draw_fresh(folder: Path | str, weights: Sequence[str]) -> FreshSeed:
+    """Draws the seed of a data set that is to be made in a folder, or reads it where it was drawn for these weights.
+
+    Raises: ConfigError for a file that is not there, for a data set that is there already, and for other weights.
+    """
+    files = [Path(name) for name in weights]
+    for i, file in enumerate(files):
+        require(file.is_file(), f"frozen[{i}]", "an existing file of weights", str(file))
+    hashes = {file.name: file_sha256(file) for file in files}
+    known = read_fresh(folder)
+    if known is None:
+        there = (Path(folder) / MANIFEST_NAME).exists()
+        require(not there, "frozen", f"left out: {folder} holds a data set whose seed was chosen before", list(weights))
+        known = FreshSeed(secrets.randbelow(2**31), datetime.now(UTC).isoformat(timespec="seconds"), hashes)
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        write_json(Path(folder) / FRESH_NAME, to_mapping(known))
+    remedy = "weights that changed need another folder, and so another seed"
+    require(known.weights == hashes, "frozen", f"the weights of {folder}/{FRESH_NAME}", list(weights), remedy)
+    return known
+
+
+def read_fresh(folder: Path | str) -> FreshSeed | None:
+    """What a folder says of its seed; none where it was chosen, or the folder is a URL."""
+    path = Path(folder) / FRESH_NAME
+    if is_remote(folder) or not path.is_file():
+        return None
+    try:
+        return from_mapping(FreshSeed, json.loads(path.read_text()), str(path))
+    except ValueError as error:
+        raise ConfigError(f"{path} must be what python -m datagen frozen=… wrote, got {error}") from error
+
+
+def set_record(folder: Path | str, seed: int, files: Iterable[Path]) -> dict[str, Any]:
+    """For a report's meta: the seed, when it was drawn (none: chosen), and which weights were not frozen then."""
+    fresh, drawn = read_fresh(folder), None
+    later = [file.name for file in files if fresh is None or fresh.weights.get(file.name) != file_sha256(file)]
+    if fresh is not None:
+        require(fresh.seed == seed, f"{folder}/{FRESH_NAME}: seed", "the data set's own", fresh.seed)
+        drawn = fresh.drawn
+    return {"seed": seed, "drawn": drawn, "not_frozen_before": later}

@@ -1,0 +1,79 @@
+"""Fresh test sets: the seed is drawn once weights are frozen, and reports say so."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from datagen.generate import datagen_config
+from hgn.config import DatagenConfig
+from hgn.data.fresh import draw_fresh, read_fresh, set_record
+from hgn.data.manifest import Manifest
+from hgn.data.storage import file_sha256
+from hgn.schema import ConfigError
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    path = tmp_path / "own.safetensors"
+    path.write_bytes(b"frozen")
+    return path
+
+
+def test_the_seed_is_drawn_once(weights: Path, tmp_path: Path) -> None:
+    """A folder keeps its seed, its time and the hashes through further starts; another folder has another seed."""
+    mapping = {"out": str(tmp_path / "fresh"), "frozen": [str(weights)], "dataset": {"training_scenes": 0}}
+    first, again = datagen_config(mapping), datagen_config(mapping)
+    other = datagen_config(mapping | {"out": str(tmp_path / "other")})
+    assert first.dataset.seed == again.dataset.seed != other.dataset.seed
+    fresh = read_fresh(tmp_path / "fresh")
+    assert fresh is not None and fresh.weights == {"own.safetensors": file_sha256(weights)}
+    assert re.fullmatch(r"20\d\d-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", fresh.drawn)
+    assert datagen_config({"out": str(tmp_path / "plain"), "frozen": None}).dataset.seed == 0
+    assert read_fresh(tmp_path / "plain") is None and not (tmp_path / "plain").exists()
+
+
+def test_what_reports_say_of_a_set(weights: Path, tmp_path: Path) -> None:
+    """Seed and time of a fresh set, and which weights are younger or others than those frozen; none of a chosen set."""
+    folder = tmp_path / "fresh"
+    fresh = draw_fresh(folder, [str(weights)])
+    said = set_record(folder, fresh.seed, [weights])
+    assert said == {"seed": fresh.seed, "drawn": fresh.drawn, "not_frozen_before": []}
+    weights.write_bytes(b"trained on")
+    assert set_record(folder, fresh.seed, [weights])["not_frozen_before"] == ["own.safetensors"]
+    chosen = set_record(tmp_path, 3, [weights])
+    assert chosen == {"seed": 3, "drawn": None, "not_frozen_before": ["own.safetensors"]}
+    with pytest.raises(ConfigError, match=r"fresh\.json: seed must be the data set's own"):
+        set_record(folder, fresh.seed + 1, [weights])
+    (folder / "fresh.json").write_text(json.dumps({"seed": "x"}))
+    with pytest.raises(
+        ConfigError, match=r"fresh\.json must be what python -m datagen frozen=… wrote, got .*seed must be"
+    ):
+        read_fresh(folder)
+
+
+def test_what_is_no_fresh_set_is_refused(
+    weights: Path, tmp_path: Path, make_config: Callable[..., DatagenConfig], make_dataset: Callable[..., Path]
+) -> None:
+    """A data set that is there, weights that changed since, files that are not there, a seed that is given, a URL."""
+    folder = make_dataset(make_config())
+    assert Manifest.load(folder).complete
+    with pytest.raises(ConfigError, match=r"frozen must be left out: .* holds a data set whose seed was chosen before"):
+        draw_fresh(folder, [str(weights)])
+    draw_fresh(tmp_path / "fresh", [str(weights)])
+    weights.write_bytes(b"changed")
+    with pytest.raises(ConfigError, match="weights that changed need another folder"):
+        draw_fresh(tmp_path / "fresh", [str(weights)])
+    with pytest.raises(ConfigError, match=r"frozen\[0\] must be an existing file of weights, got 'none'"):
+        draw_fresh(tmp_path / "fresh", ["none"])
+    for change, message in (
+        ({"frozen": "all"}, "frozen must be a list of weights files"),
+        ({"dataset": {"seed": 4}}, "dataset.seed must be left out with frozen"),
+        ({"out": "http://host/set"}, "out must be a folder to write to"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            datagen_config({"out": str(tmp_path / "new"), "frozen": [str(weights)]} | change)

@@ -1,0 +1,74 @@
+"""Two contenders on the same scenes: by how much one's error is below the other's, with intervals that carry a word.
+
+Differences are taken scene by scene, their median and mean resampled over scenes (bootstrap, percentile intervals).
+Shape legend: S scenes, B resamplings.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hgn.config import NETWORK_KINDS
+from tools.error_vs_time.score import label
+
+RESAMPLINGS, COVERED = 10_000, 0.95
+NO_DIFFERENCE = "no difference shown"
+Row = Mapping[str, Any]
+
+
+def paired_difference(one_S: Sequence[float | None], other_S: Sequence[float | None]) -> dict[str, Any] | None:
+    """{"scenes", "median": [value, low, high], "mean": …, and what each carries} of `one` less `other`, over the scenes
+    that both have a value of; none for fewer than two of them.
+    """
+    pairs = [(a, b) for a, b in zip(one_S, other_S, strict=False) if a is not None and b is not None]
+    if len(pairs) < 2:
+        return None
+    difference_S = np.array([a - b for a, b in pairs])
+    drawn_BS = difference_S[_draws(len(pairs))]
+    result: dict[str, Any] = {"scenes": len(pairs)}
+    for name, statistic in (("median", np.median), ("mean", np.mean)):
+        tails = np.percentile(statistic(drawn_BS, axis=1), (50 * (1 - COVERED), 50 * (1 + COVERED)))
+        low, high = float(tails[0]), float(tails[1])
+        result[name] = [float(statistic(difference_S)), low, high]
+        result[f"{name}_says"] = "nearer" if high < 0 else "farther" if low > 0 else NO_DIFFERENCE
+    return result
+
+
+def paired_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Every network at every precision beside every GNS and every setting of the solver, for each error that both have
+    of scenes: {"one", "other", "error", "frame", …} and `paired_difference`.
+    """
+    told = [row for row in rows if row.get("by_scene")]
+    made = []
+    for one in (row for row in told if row["system"] in NETWORK_KINDS):
+        for other in (row for row in told if row["system"] in (*NETWORK_KINDS[1:], "mpm") and row is not one):
+            for error, values in one["by_scene"].items():
+                for frame in values.keys() & other["by_scene"].get(error, {}).keys():
+                    found = paired_difference(values[frame], other["by_scene"][error][frame])
+                    if found is not None:
+                        made.append({"one": label(one), "other": label(other), "error": error, "frame": frame} | found)
+    return sorted(made, key=lambda row: (row["one"], row["other"], row["error"], int(row["frame"])))
+
+
+def paired_lines(rows: Sequence[Row]) -> list[str]:
+    """Lines for people, from paired rows."""
+    lines = ["", f"scene by scene: difference, and its {COVERED:.0%} interval over scenes"] if rows else []
+    for row in rows:
+        at = f" after {row['frame']} frames" if row["frame"] != "0" else ""
+        parts = []
+        for name in ("median", "mean"):
+            value, low, high = row[name]
+            parts.append(f"{row[f'{name}_says']} in the {name} ({value:+.2e}, {low:+.2e} to {high:+.2e})")
+        lines.append(
+            f"  {row['one']} beside {row['other']}, {row['error']}{at}, {row['scenes']} scenes: {'; '.join(parts)}"
+        )
+    return lines
+
+
+@functools.cache
+def _draws(scenes: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, scenes, (RESAMPLINGS, scenes))
