@@ -11,13 +11,16 @@ from pathlib import Path
 
 from hgn.scene.material import MATERIALS, material_index
 from hgn.schema import (
+    BelowOne,
     ConfigError,
+    Fraction,
+    NonNegative,
+    OneOrMore,
+    Positive,
+    TwoOrMore,
     require,
-    require_below_one,
-    require_fraction,
-    require_non_negative,
+    require_bounds,
     require_one_of,
-    require_positive,
 )
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
@@ -57,38 +60,34 @@ class SceneConfig:
     """The distribution that random scenes are drawn from (paper sec. 3.3). Lengths in domain units."""
 
     domain_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    cell_size: float = 1 / 64  # of the solver
+    cell_size: Positive[float] = 1 / 64  # of the solver
     gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
-    obstacle_count: int = 5
+    obstacle_count: NonNegative[int] = 5
     obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, scaled so that the longest side is the size
     obstacle_size: tuple[float, float] = (0.1, 0.5)
-    group_count: int = 4
+    group_count: NonNegative[int] = 4
     group_shapes: tuple[str, ...] = GROUP_SHAPES
-    group_size: float = 0.08  # side or diameter
+    group_size: Positive[float] = 0.08  # side or diameter
     materials: tuple[str, ...] = MATERIALS
-    particles_per_cell: float = 8.0
-    clearance_cells: float = 2.0  # between obstacles, groups and walls, in solver cells
-    maximum_initial_speed: float = 0.0  # domain units per second; each group draws one velocity
+    particles_per_cell: Positive[float] = 8.0
+    clearance_cells: NonNegative[float] = 2.0  # between obstacles, groups and walls, in solver cells
+    maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; each group draws one velocity
     # of the groups, that begin with a velocity where maximum_initial_speed is above 0
-    moving_group_fraction: float = 1.0
-    lone_particles: int = 0  # far from all others; else a network learns that what is alone lies on the floor
+    moving_group_fraction: Fraction[float] = 1.0
+    lone_particles: NonNegative[int] = 0  # far from all others; else a network learns that what is alone lies still
     # of the groups that begin with a velocity, those whose is exactly along gravity or against it, or across it
-    pure_direction_fraction: float = 0.0
-    colliding_scene_fraction: float = 0.0  # of the scenes: no obstacles, and the groups are thrown at each other
-    zero_gravity_fraction: float = 0.0  # of the scenes
-    tilted_gravity_fraction: float = 0.0  # of the scenes, with gravity of any direction and …
-    maximum_tilted_gravity: float = 19.6  # … any size up to this, domain units per second squared
+    pure_direction_fraction: Fraction[float] = 0.0
+    colliding_scene_fraction: Fraction[float] = 0.0  # of scenes without obstacles and with groups thrown at each other
+    zero_gravity_fraction: Fraction[float] = 0.0  # of the scenes
+    tilted_gravity_fraction: Fraction[float] = 0.0  # of the scenes, with gravity of any direction and …
+    maximum_tilted_gravity: NonNegative[float] = 19.6  # … any size up to this, domain units per second squared
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         for axis, length in zip("xyz", self.domain_size, strict=True):
             require(length > 0 and math.isfinite(length), f"domain_size ({axis})", "a finite number > 0", length)
         for axis, value in zip("xyz", self.gravity, strict=True):
             require(math.isfinite(value), f"gravity ({axis})", "finite", value)
-        require_positive(self, "cell_size", "group_size", "particles_per_cell")
-        require_non_negative(self, "obstacle_count", "group_count", "clearance_cells", "maximum_initial_speed")
-        require_non_negative(self, "lone_particles", "maximum_tilted_gravity")
-        require_fraction(self, "moving_group_fraction", "pure_direction_fraction", "colliding_scene_fraction")
-        require_fraction(self, "zero_gravity_fraction", "tilted_gravity_fraction")
         other = self.zero_gravity_fraction + self.tilted_gravity_fraction
         rule = f"at most 1 - zero_gravity_fraction ({self.zero_gravity_fraction:g})"
         require(other <= 1, "tilted_gravity_fraction", rule, self.tilted_gravity_fraction)
@@ -118,68 +117,46 @@ class SceneConfig:
 class MpmConfig:
     """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml restores it."""
 
-    youngs_modulus_pa: float = 1e6
+    youngs_modulus_pa: Positive[float] = 1e6
     poisson_ratio: float = 0.2
-    density_kg_m3: float = 1000.0
-    sand_friction_angle_deg: float = 31.0
+    density_kg_m3: Positive[float] = 1000.0
+    sand_friction_angle_deg: NonNegative[float] = 31.0
     # matsuoka_nakai: 31 degrees in triaxial compression and extension, 34.8 in plane strain, as sand has; or a cone
     # (Drucker-Prager) that has the angle in triaxial compression alone (Taichi Elements, with 45) or in plane_strain
     sand_friction_law: str = "matsuoka_nakai"  # or compression, plane_strain
     sand_volume_correction: str = "tampubolon"  # or taichi_elements
-    snow_hardening: float = 10.0
-    snow_critical_compression: float = 0.025
-    snow_critical_stretch: float = 0.0045
-    snow_maximum_hardening: float = 20.0  # bound on exp(hardening * (1 - Jp)), counted; beyond 5 m/s raise it
+    snow_hardening: NonNegative[float] = 10.0
+    snow_critical_compression: NonNegative[float] = 0.025
+    snow_critical_stretch: NonNegative[float] = 0.0045
+    snow_maximum_hardening: Positive[float] = 20.0  # bound on exp(hardening * (1 - Jp)), counted; beyond 5 m/s raise it
     water_equation: str = "linear"  # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
     water_volume_update: str = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
-    water_tension: float = 1.0  # share of the tension that stretched water bears, as Taichi Elements' does; 0: none
-    water_viscosity_pa_s: float = 0.0  # beside that of the grid, which is larger than real water's
+    water_tension: NonNegative[float] = 1.0  # fraction of its tension that stretched water bears; 1: Taichi Elements'
+    water_viscosity_pa_s: NonNegative[float] = 0.0  # beside that of the grid, which is larger than real water's
     # to be as its particles lie, below a free surface: else water at rest sinks in a random filling; null: never
     water_density_relaxation_s: float | None = 1.0
-    water_minimum_volume_ratio: float = 0.1  # floor on J; hits are counted
-    minimum_singular_value: float = 0.05  # floor on the singular values of F; hits are counted
+    water_minimum_volume_ratio: Positive[float] = 0.1  # floor on J; hits are counted
+    minimum_singular_value: Positive[float] = 0.05  # floor on the singular values of F; hits are counted
     time_integration: str = "leapfrog"  # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
     time_step: str = "adaptive"  # or fixed
-    fixed_time_step_s: float = 0.02 / 64
-    stability_fraction: float = 0.5  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
-    speed_fraction: float = 0.3  # of a cell that the fastest particle may cross between two transfers
+    fixed_time_step_s: Positive[float] = 0.02 / 64
+    stability_fraction: Positive[float] = 0.5  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
+    speed_fraction: Positive[float] = 0.3  # of a cell that the fastest particle may cross between two transfers
     # particles and grid exchange velocities every cell_size / this: 32 times a frame of 1/60 s at 64 cells,
     # whatever the materials, with as many steps of stress between as they need; null: at every step. Fewer
     # transfers smooth less.
     transfer_speed_m_s: float | None = 30.0
     wall_cells: int = 3  # grid nodes at each face of the domain that stop outgoing motion
     wall_contact: str = "slip"  # or stick
-    collider_band_cells: float = 0.5  # from a sheet, where nodes stop motion; more keeps material further off
-    collider_friction: float = 0.0  # Coulomb coefficient; 0 separates without friction
+    collider_band_cells: NonNegative[float] = 0.5  # from a sheet, where nodes stop motion; more keeps it further off
+    collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
     device: str = "auto"  # or cpu, gpu
-    scenes_per_launch: int | None = None  # null: 1 on a CPU, 832 on a GPU
-    maximum_substeps_per_frame: int = 20_000  # beyond it a scene is stopped and reported
+    scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 832 on a GPU
+    maximum_substeps_per_frame: Positive[int] = 20_000  # beyond it a scene is stopped and reported
 
     def __post_init__(self) -> None:
-        require_positive(
-            self,
-            "youngs_modulus_pa",
-            "density_kg_m3",
-            "fixed_time_step_s",
-            "stability_fraction",
-            "speed_fraction",
-            "snow_maximum_hardening",
-            "water_minimum_volume_ratio",
-            "minimum_singular_value",
-            "maximum_substeps_per_frame",
-        )
-        require_non_negative(
-            self,
-            "snow_hardening",
-            "snow_critical_compression",
-            "snow_critical_stretch",
-            "collider_band_cells",
-            "collider_friction",
-            "sand_friction_angle_deg",
-            "water_tension",
-            "water_viscosity_pa_s",
-        )
+        require_bounds(self)
         speed = self.transfer_speed_m_s
         require(speed is None or 0 < speed < math.inf, "transfer_speed_m_s", "> 0 or none", speed)
         require(self.stability_fraction <= 1, "stability_fraction", "at most 1", self.stability_fraction)
@@ -204,8 +181,6 @@ class MpmConfig:
         require_one_of(self, "time_step", ("adaptive", "fixed"))
         require_one_of(self, "wall_contact", ("slip", "stick"))
         require_one_of(self, "device", ("auto", "cpu", "gpu"))
-        if self.scenes_per_launch is not None:
-            require(self.scenes_per_launch >= 1, "scenes_per_launch", "at least 1", self.scenes_per_launch)
 
 
 def _spread(number: int, fraction: float) -> bool:
@@ -218,19 +193,19 @@ class DatasetConfig:
     """How many episodes, how long, where they are kept, and who makes them."""
 
     folder: str = "data/obstacles"
-    training_scenes: int = 800
-    validation_scenes: int = 5
-    test_scenes: int = 20
-    frames: int = 300  # frame 0 is the initial state
-    long_fraction: float = 0.0  # of the episodes of each split, evenly spread, that have long_frames
-    long_frames: int = 300
-    frame_rate_hz: float = 60.0
-    seed: int = 0
+    training_scenes: NonNegative[int] = 800
+    validation_scenes: NonNegative[int] = 5
+    test_scenes: NonNegative[int] = 20
+    frames: TwoOrMore = 300  # frame 0 is the initial state
+    long_fraction: Fraction[float] = 0.0  # of the episodes of each split, evenly spread, that have long_frames
+    long_frames: TwoOrMore = 300
+    frame_rate_hz: Positive[float] = 60.0
+    seed: NonNegative[int] = 0
     # true: a GPU begins with few scenes, which takes longer in all; training and the service set it
     early_episodes: bool = False
-    episodes_per_shard: int = 8  # the first training shards are smaller, so that training can start early
-    workers: int | None = None  # null: one for each GPU, or for two cores of a CPU; 1 leaves other GPUs alone
-    maximum_attempts: int = 3  # per scene before it is quarantined and replaced
+    episodes_per_shard: Positive[int] = 8  # the first training shards are smaller, so that training can start early
+    workers: OneOrMore | None = None  # null: one for each GPU, or for two cores of a CPU; 1 leaves other GPUs alone
+    maximum_attempts: Positive[int] = 3  # per scene before it is quarantined and replaced
     pool: str = "local"  # processes of this machine; or ray: of a Ray cluster
     # of the cluster, as in 10.0.0.1:6379; null: $RAY_ADDRESS, else the cluster that this machine is in
     ray_address: str | None = None
@@ -239,14 +214,8 @@ class DatasetConfig:
     array_tasks: int | None = None
 
     def __post_init__(self) -> None:
-        require_positive(self, "frame_rate_hz", "episodes_per_shard", "maximum_attempts")
-        require_non_negative(self, "training_scenes", "validation_scenes", "test_scenes", "seed")
-        for name in ("frames", "long_frames"):
-            require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
-        require_fraction(self, "long_fraction")
+        require_bounds(self)
         require(self.folder != "", "folder", "a folder name", self.folder)
-        if self.workers is not None:
-            require(self.workers >= 1, "workers", "at least 1", self.workers)
         require_one_of(self, "pool", ("local", "ray"))
         require(self.ray_address is None or self.pool == "ray", "ray_address", "left out without pool=ray", self.pool)
         task, tasks = self.array_task, self.array_tasks
@@ -288,11 +257,11 @@ class ServiceConfig:
 
     host: str = "127.0.0.1"
     port: int = 8000  # 0: any free one
-    connections: int = 1024  # at once; more are told to come back
+    connections: Positive[int] = 1024  # at once; more are told to come back
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         require(0 <= self.port < 65536, "port", "0 to 65535", self.port)
-        require_positive(self, "connections")
 
 
 @dataclass(frozen=True)
@@ -301,13 +270,12 @@ class SolveConfig:
 
     scene: str  # a scene file, or the name of one in conf/example, for example funnel
     out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
-    frames: int = 300
-    frame_rate_hz: float = 60.0
+    frames: TwoOrMore = 300
+    frame_rate_hz: Positive[float] = 60.0
     mpm: MpmConfig = field(default_factory=MpmConfig)
 
     def __post_init__(self) -> None:
-        require(self.frames >= 2, "frames", "at least 2", self.frames)
-        require_positive(self, "frame_rate_hz")
+        require_bounds(self)
         require_rollout_name("out", self.out)
 
 
@@ -318,10 +286,10 @@ class UploadConfig:
     data: str  # folder of a data set
     to: str  # URL; training reads it with dataset.folder=URL
     follow: bool = False  # go on while the data set grows, until it is complete
-    poll_s: float = 5.0  # between looks at it then
+    poll_s: Positive[float] = 5.0  # between looks at it then
 
     def __post_init__(self) -> None:
-        require_positive(self, "poll_s")
+        require_bounds(self)
 
 
 @dataclass(frozen=True)
@@ -329,37 +297,26 @@ class NetworkConfig:
     """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
 
     kind: str = "hgn"  # or gns; or gns_particles, which sees obstacles as static particles
-    cell_size: float = 0.035  # R: the finest level; the connectivity radius of GNS
-    levels: int = 4  # L; GNS has one, the particles
-    message_passing_steps: int = 4  # M, in each of the 2 L - 1 blocks
-    width: int = 128  # latent and hidden
-    velocity_history: int = 5  # m
-    material_embedding: int = 16  # E
-    wall_distance_cells: float = 8.0  # d_max / R
+    cell_size: Positive[float] = 0.035  # R: the finest level; the connectivity radius of GNS
+    levels: Positive[int] = 4  # L; GNS has one, the particles
+    message_passing_steps: Positive[int] = 4  # M, in each of the 2 L - 1 blocks
+    width: Positive[int] = 128  # latent and hidden
+    velocity_history: Positive[int] = 5  # m
+    material_embedding: Positive[int] = 16  # E
+    wall_distance_cells: Positive[float] = 8.0  # d_max / R
     obstacle_features: bool = True
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
     # gravity are exact
     inputs: str = "absolute"
-    contact_reach_cells: float = 1.5  # of relative inputs: walls are seen from so many R on
+    contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
     materials: tuple[str, ...] = MATERIALS
-    maximum_neighbours: int | None = None  # of a particle of GNS, the nearest; null: all within R
+    maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
     # of gns_particles: how far apart static particles are, at least, in obstacle cells
-    static_spacing_cells: float = 0.25
+    static_spacing_cells: Positive[float] = 0.25
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         require_one_of(self, "kind", NETWORK_KINDS)
-        require_positive(
-            self,
-            "cell_size",
-            "levels",
-            "message_passing_steps",
-            "width",
-            "velocity_history",
-            "material_embedding",
-            "wall_distance_cells",
-            "contact_reach_cells",
-            "static_spacing_cells",
-        )
         require_one_of(self, "inputs", NETWORK_INPUTS)
         for i, name in enumerate(self.materials):
             material_index(name, f"materials[{i}]")
@@ -372,8 +329,6 @@ class NetworkConfig:
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
         else:
             require(self.levels == 1, "levels", f"1 for {self.kind}: the particles themselves", self.levels)
-        if self.maximum_neighbours is not None:
-            require(self.maximum_neighbours >= 1, "maximum_neighbours", "at least 1", self.maximum_neighbours)
         require(
             not (self.obstacle_particles and self.obstacle_features),
             "obstacle_features",
@@ -414,75 +369,55 @@ SMOOTH_WAVES, SMOOTH_CELLS = 16, (4, 64)
 class TrainingConfig:
     """How a network is trained (paper sec. 3.3)."""
 
-    maximum_updates: int = 20_000_000
-    maximum_minutes: float | None = None  # wall time of this start; null: no limit
-    batch_scenes: int = 1  # frames of random scenes in one update, on each device
+    maximum_updates: Positive[int] = 20_000_000
+    maximum_minutes: Positive[float] | None = None  # wall time of this start; null: no limit
+    batch_scenes: Positive[int] = 1  # frames of random scenes in one update, on each device
     # or muon (Jordan 2024): hidden matrices step along their orthogonalised momentum, everything else as in Adam
     optimizer: str = "adam"
-    learning_rate: float = 1e-4
-    final_learning_rate: float = 1e-6  # reached at maximum_updates, exponentially
-    warmup_updates: int = 0  # first updates, over which the rate grows linearly to what it is without
+    learning_rate: Positive[float] = 1e-4
+    final_learning_rate: Positive[float] = 1e-6  # reached at maximum_updates, exponentially
+    warmup_updates: NonNegative[int] = 0  # first updates, over which the rate grows linearly to what it is without
     # what a new run begins with: a file of python -m hgn.export, or shipped weights by name; a run that goes on
     # takes its checkpoint
     init_weights: str | None = None
     # of a moving average of the weights, an update, for example 0.9999; monitored and exported; 0: none
-    ema_decay: float = 0.0
-    noise_std: float = 0.000848528  # of the last velocity, domain units per frame
+    ema_decay: BelowOne[float] = 0.0
+    noise_std: NonNegative[float] = 0.000848528  # of the last velocity, domain units per frame
     # fraction of the noise's variance that neighbours have in common, in waves of 4 to 64 cells; the paper's: 0
-    noise_correlated_fraction: float = 0.1
+    noise_correlated_fraction: Fraction[float] = 0.1
     # in a frame whose rms acceleration is a below noise_std, the noise's scale is drawn down to max(a /
     # noise_std, this), and errors count by it; 1: the same noise everywhere
     noise_min_scale: float = 1.0
     grid_jitter: bool = True
     # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
     # all frames alike
-    frame_importance: float = 0.0
+    frame_importance: BelowOne[float] = 0.0
     symmetry: str = "none"  # gravity: a sample is turned and mirrored at random, by what keeps gravity and domain
     # of the scenes of an update, taken from the network's own simulations, for example 0.25; 0: none are made
-    pushforward_fraction: float = 0.0
-    pushforward_every: int = 500  # updates between such simulations
-    pushforward_scenes: int = 64  # simulated at once, on each device, from random frames of the training data on …
-    pushforward_frames: int = 16  # … for so many frames, each of which can be trained on
-    pushforward_pull: float = 0.1  # fraction of its distance from the truth that the network is to take back in a frame
-    seed: int = 0
+    pushforward_fraction: BelowOne[float] = 0.0
+    pushforward_every: Positive[int] = 500  # updates between such simulations
+    pushforward_scenes: Positive[int] = 64  # simulated at once, on each device, from random frames of the data on …
+    pushforward_frames: Positive[int] = 16  # … for so many frames, each of which can be trained on
+    pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the truth to be taken back in a frame
+    seed: NonNegative[int] = 0
     accelerator: str = "auto"  # or cpu, gpu
-    devices: int | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
-    nodes: int | None = None  # machines; null: as launched, without a launcher one
+    devices: OneOrMore | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
+    nodes: OneOrMore | None = None  # machines; null: as launched, without a launcher one
     precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
     backend: str = "auto"  # torch, triton (kernels in CUDA graphs); auto: triton where it runs
-    minimum_episodes: int = 1  # training starts once that many training episodes are published
+    minimum_episodes: Positive[int] = 1  # training starts once that many training episodes are published
     generate: bool = True  # start the generator where the data set is missing or incomplete
-    maximum_skipped_updates: int = 100  # in a row, for gradients that are not finite; then training ends
-    log_every: int = 50  # updates
-    checkpoint_every: int = 1_000  # updates
-    monitor_every: int = 100_000  # updates between measurements of one-step and rollout errors
-    monitor_scenes: int = 5  # fixed scenes of each split
-    monitor_frame_stride: int = 1  # every frame
-    monitor_rollout_frames: int = 300  # 0: no rollouts
-    monitor_particles_per_batch: int = 32_768
+    maximum_skipped_updates: Positive[int] = 100  # in a row, for gradients that are not finite; then training ends
+    log_every: Positive[int] = 50  # updates
+    checkpoint_every: Positive[int] = 1_000  # updates
+    monitor_every: Positive[int] = 100_000  # updates between measurements of one-step and rollout errors
+    monitor_scenes: Positive[int] = 5  # fixed scenes of each split
+    monitor_frame_stride: Positive[int] = 1  # every frame
+    monitor_rollout_frames: NonNegative[int] = 300  # 0: no rollouts
+    monitor_particles_per_batch: Positive[int] = 32_768
 
     def __post_init__(self) -> None:
-        require_positive(
-            self,
-            "maximum_updates",
-            "batch_scenes",
-            "learning_rate",
-            "final_learning_rate",
-            "minimum_episodes",
-            "maximum_skipped_updates",
-            "log_every",
-            "checkpoint_every",
-            "monitor_every",
-            "monitor_scenes",
-            "monitor_frame_stride",
-            "monitor_particles_per_batch",
-            "pushforward_every",
-            "pushforward_scenes",
-            "pushforward_frames",
-        )
-        require_non_negative(self, "noise_std", "seed", "monitor_rollout_frames", "warmup_updates")
-        require_fraction(self, "pushforward_pull", "noise_correlated_fraction")
-        require_below_one(self, "pushforward_fraction", "ema_decay", "frame_importance")
+        require_bounds(self)
         require(0 < self.noise_min_scale <= 1, "noise_min_scale", "above 0 and at most 1", self.noise_min_scale)
         require_one_of(self, "symmetry", SYMMETRIES)
         require_one_of(self, "optimizer", ("adam", "muon"))
@@ -495,11 +430,6 @@ class TrainingConfig:
             f"at most learning_rate ({self.learning_rate})",
             self.final_learning_rate,
         )
-        if self.maximum_minutes is not None:
-            require_positive(self, "maximum_minutes")
-        for name in ("devices", "nodes"):
-            if getattr(self, name) is not None:
-                require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -582,16 +512,16 @@ class RolloutConfig:
     render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene …
     scene: str | None = None
-    seed: int = 0  # … drawn with this number, as the training's scenes are
+    seed: NonNegative[int] = 0  # … drawn with this number, as the training's scenes are
     data: str | None = None  # or a data set …
     episode: str | None = None  # … and an episode of it, for example validation-000000
-    frames: int = 300
+    frames: TwoOrMore = 300
     device: str = "auto"  # or cpu, cuda, cuda:1, …
     backend: str = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest that runs
     precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
 
     def __post_init__(self) -> None:
-        require(self.frames >= 2, "frames", "at least 2", self.frames)
+        require_bounds(self)
         require_one_of(self, "backend", BACKENDS)
         require_one_of(self, "precision", PRECISIONS)
         require(
@@ -602,7 +532,6 @@ class RolloutConfig:
             "for example data=data/obstacles episode=validation-000000",
         )
         require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
-        require_non_negative(self, "seed")
         require_rollout_name("out", self.out)
 
 
@@ -613,18 +542,17 @@ class EvaluateConfig:
     weights: str  # a file of python -m hgn.export, or the name of shipped weights
     data: str
     split: str = "validation"  # or train, test
-    scenes: int = 5
-    frame_stride: int = 1
-    rollout_frames: int = 300  # 0: none
-    particles_per_batch: int = 32_768
+    scenes: Positive[int] = 5
+    frame_stride: Positive[int] = 1
+    rollout_frames: NonNegative[int] = 300  # 0: none
+    particles_per_batch: Positive[int] = 32_768
     device: str = "auto"  # or cpu, cuda, cuda:1
     backend: str = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
     precision: str = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
     json: str | None = None  # also write the figures to this file
 
     def __post_init__(self) -> None:
-        require_positive(self, "scenes", "frame_stride", "particles_per_batch")
-        require_non_negative(self, "rollout_frames")
+        require_bounds(self)
         require_one_of(self, "split", ("train", "validation", "test"))
         require_one_of(self, "backend", BACKENDS)
         require_one_of(self, "precision", PRECISIONS)

@@ -15,8 +15,8 @@ import math
 import re
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, Any, TypeVar
 
 from hgn.renamed import KEYS, current_names, key_remedy, value_remedy
 
@@ -24,6 +24,23 @@ T = TypeVar("T")
 _Path = (
     str | tuple[Any, str | int]
 )  # of a value: its owner's and its own name or place, joined where a message needs it
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """A rule for a number, beside its type: in words, and as what holds (of NaN none does); see `require_bounds`."""
+
+    rule: str
+    holds: Callable[[float], bool]
+
+
+N = TypeVar("N", int, float)
+Positive = Annotated[N, Bound("a finite number > 0", lambda value: 0 < value < math.inf)]
+NonNegative = Annotated[N, Bound("a finite number >= 0", lambda value: 0 <= value < math.inf)]
+Fraction = Annotated[N, Bound("from 0 to 1", lambda value: 0 <= value <= 1)]
+BelowOne = Annotated[N, Bound("0 or more and below 1", lambda value: 0 <= value < 1)]
+OneOrMore = Annotated[int, Bound("at least 1", lambda value: value >= 1)]
+TwoOrMore = Annotated[int, Bound("at least 2", lambda value: value >= 2)]
 
 
 class ConfigError(ValueError):
@@ -140,32 +157,32 @@ def require(rule_holds: bool, field: str, rule: str, value: object, remedy: str 
         raise ConfigError(f"{field} must be {rule}, got {value!r}" + (f"; {remedy}" if remedy else ""))
 
 
-def require_positive(owner: object, *names: str) -> None:
-    """Each named field of `owner` is a finite number above zero (NaN is refused)."""
-    for name in names:
-        value = getattr(owner, name)
-        require(value > 0 and math.isfinite(value), name, "a finite number > 0", value)
+def require_bounds(owner: object) -> None:
+    """Each field of a dataclass, and each item of its tuples, is within the `Bound` of its annotation, or none."""
+    cls: Any = type(owner)
+    for name, hint in _bounded_hints(cls).items():
+        _require_bound(hint, getattr(owner, name), name)
 
 
-def require_non_negative(owner: object, *names: str) -> None:
-    """Each named field of `owner` is a finite number of at least zero (NaN is refused)."""
-    for name in names:
-        value = getattr(owner, name)
-        require(value >= 0 and math.isfinite(value), name, "a finite number >= 0", value)
+@functools.cache
+def _bounded_hints(cls: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(cls, include_extras=True)
+    return {name: hint for name, hint in hints.items() if _is_bounded(hint)}
 
 
-def require_fraction(owner: object, *names: str) -> None:
-    """Each named field of `owner` is from 0 to 1 (NaN is refused)."""
-    for name in names:
-        value = getattr(owner, name)
-        require(0 <= value <= 1, name, "from 0 to 1", value)
+def _is_bounded(hint: Any) -> bool:
+    return hasattr(hint, "__metadata__") or any(map(_is_bounded, typing.get_args(hint)))
 
 
-def require_below_one(owner: object, *names: str) -> None:
-    """Each named field of `owner` is at least 0 and below 1 (NaN is refused)."""
-    for name in names:
-        value = getattr(owner, name)
-        require(0 <= value < 1, name, "0 or more and below 1", value)
+def _require_bound(hint: Any, value: Any, name: str) -> None:
+    for bound in getattr(hint, "__metadata__", ()):
+        require(bound.holds(value), name, bound.rule, value)
+    options = [option for option in typing.get_args(hint) if _is_bounded(option)]
+    if typing.get_origin(hint) is tuple:
+        for i, item in enumerate(value):
+            _require_bound(options[0], item, f"{name}[{i}]")
+    elif options and value is not None:  # of an optional one
+        _require_bound(options[0], value, name)
 
 
 def require_one_of(owner: object, name: str, choices: Sequence[object]) -> None:

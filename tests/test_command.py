@@ -48,9 +48,9 @@ def test_composed_once(command: str, arguments: list[str], monkeypatch: pytest.M
 )
 def test_names_that_hydra_refuses(given: str, meant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files and folders are called what people call them; what stands beside them is taken as ever."""
-    monkeypatch.setattr("sys.argv", ["drift", f"data={given}", "out=x", "weights=null", "displacements=[1e-6]"])
-    (composed,) = _compose("drift")
-    assert composed["data"] == meant and composed["weights"] is None and composed["displacements"] == [1e-6]
+    monkeypatch.setattr("sys.argv", ["error_vs_time", f"data={given}", "out=x", "weights=null", "mpm_steps=[0.1]"])
+    (composed,) = _compose("error_vs_time")
+    assert composed["data"] == meant and composed["weights"] is None and composed["mpm_steps"] == [0.1]
 
 
 def test_names_in_lists(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.schema import ConfigError, from_mapping, require, require_positive, to_mapping
+from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds, to_mapping
 from hgn.system.files import write_json
 from hgn.system.provenance import provenance, without_folders
 from tools.bench.contenders import PASS
@@ -41,14 +41,14 @@ class CompareConfig:
     # ["HEAD~1",.]); the first is what the others are compared with
     trees: tuple[str, ...]
     out: str  # the JSON file, written after each run
-    rounds: int = 3  # runs of each tree
+    rounds: Positive[int] = 3  # runs of each tree
     # options of each run, as python -m tools.bench takes them: ["cases=[frame,train]","scenes=[1,8]"]
     bench: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         require(len(self.trees) > 0, "trees", "a list with at least one tree", [], "as in 'trees=[main,.]'")
         require(len(set(self.trees)) == len(self.trees), "trees", "a list of different trees", list(self.trees))
-        require_positive(self, "rounds")
         for i, option in enumerate(self.bench):
             ours = option.startswith(("json=", "--json"))
             require("=" in option and not ours, f"bench[{i}]", "KEY=VALUE other than json", option)

@@ -28,7 +28,7 @@ from hgn.render.pictures import (
     write_picture,
 )
 from hgn.scene.rollout_file import Rollout, read_rollout
-from hgn.schema import ConfigError, from_mapping, require, require_positive
+from hgn.schema import ConfigError, OneOrMore, Positive, from_mapping, require, require_bounds
 from hgn.system.progress import bar
 
 PICTURES = 4  # in the PNG, where frames does not say
@@ -49,11 +49,12 @@ class RenderConfig:
     episode: str | None = None  # and the key of an episode in it, as in validation-000000
     frames: tuple[int, ...] | None = None  # in the PNG, as in [0,50,100]; null: four, evenly spread
     gif: bool = True
-    every: int = 3  # frames of the rollout for one picture of the animation
-    fps: float | None = None  # pictures per second of the animation; null: real time
+    every: OneOrMore = 3  # frames of the rollout for one picture of the animation
+    fps: Positive[float] | None = None  # pictures per second of the animation; null: real time
     size: int = 360  # width of one panel, pixels
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         require(self.out != "", "out", "a folder or a file name", self.out)
         if self.rollout is None:
             require(
@@ -74,10 +75,7 @@ class RenderConfig:
             count = 1 + len(self.others)
             rule = f"{count} different ones, of rollout and of each of others"
             require(len(set(self.names)) == len(self.names) == count, "names", rule, self.names)
-        require(self.every >= 1, "every", "at least 1", self.every)
         require(64 <= self.size <= 4096, "size", "64 to 4096 pixels", self.size)
-        if self.fps is not None:
-            require_positive(self, "fps")
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from typing import Any, TypeVar, overload
 
 from hgn.data.statistics import Moments, Statistics
 from hgn.data.storage import open_storage
-from hgn.schema import ConfigError, from_mapping, require, require_non_negative, require_one_of, to_mapping
+from hgn.schema import ConfigError, NonNegative, from_mapping, require, require_bounds, require_one_of, to_mapping
 from hgn.system.files import sync_file, sync_folder
 
 SPLITS = ("train", "validation", "test")
@@ -64,16 +64,16 @@ class ShardEntry:
     first: int
     stop: int
     sha256: str
-    bytes: int
+    bytes: NonNegative[int]
     episodes: tuple[EpisodeEntry, ...]
     statistics: Statistics
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         # both become file names, and an index may come from anywhere
         require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
         require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
         require_one_of(self, "split", SPLITS)
-        require_non_negative(self, "bytes")
         numbers = [episode.index for episode in self.episodes]
         if numbers != list(range(self.first, self.stop)):
             raise ConfigError(f"episodes must be numbers {self.first} to {self.stop - 1}, got {numbers}; {_REMEDY}")
@@ -118,17 +118,15 @@ Totals = dict[str, SplitTotals]
 class IndexState:
     """How much of the index's files counts."""
 
-    generation: int = 1
-    shards: int = 0
-    segment_bytes: int = 0  # of the last segment
-    table_bytes: int = 0
-    quarantined: int = 0
-    quarantine_bytes: int = 0
+    generation: NonNegative[int] = 1
+    shards: NonNegative[int] = 0
+    segment_bytes: NonNegative[int] = 0  # of the last segment
+    table_bytes: NonNegative[int] = 0
+    quarantined: NonNegative[int] = 0
+    quarantine_bytes: NonNegative[int] = 0
 
     def __post_init__(self) -> None:
-        require_non_negative(
-            self, "generation", "shards", "segment_bytes", "table_bytes", "quarantined", "quarantine_bytes"
-        )
+        require_bounds(self)
 
     def path(self, kind: int | str) -> str:
         """The name of segment number `kind`, or of another file."""

@@ -21,7 +21,7 @@ from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
-from hgn.schema import ConfigError, from_mapping, require, require_positive, to_mapping
+from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds, to_mapping
 
 GROUP_SHAPES = ("cube", "sphere", "box")
 MAXIMUM_PARTICLES = 50_000_000
@@ -34,25 +34,23 @@ class ObstacleEntry:
     """Either `mesh` (a file, with `scale`) or `shape` (a built-in one, with `size`)."""
 
     mesh: str | None = None  # path relative to the scene file
-    scale: float | None = None  # of the mesh; 1 if absent
+    scale: Positive[float] | None = None  # of the mesh; 1 if absent
     shape: str | None = None
-    size: float | None = None  # side, diameter, or base width and height
+    size: Positive[float] | None = None  # side, diameter, or base width and height
     position: Vector | None = None  # moves a mesh (origin if absent); the centre of a shape
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         if (self.mesh is None) == (self.shape is None):
             seen = "neither" if self.mesh is None else "both"
             raise ConfigError(f"mesh or shape must be given, one of the two, got {seen}")
         if self.mesh is not None:
             require(self.size is None, "size", "left out beside mesh", self.size, "meshes take scale")
-            if self.scale is not None:
-                require_positive(self, "scale")
         else:
             require(self.shape in OBSTACLE_SHAPES, "shape", f"one of {', '.join(OBSTACLE_SHAPES)}", self.shape)
             require(self.scale is None, "scale", "left out beside shape", self.scale, "shapes take size")
             require(self.size is not None, "size", "given beside shape", self.size)
-            require_positive(self, "size")
             require(self.position is not None, "position", "given beside shape", self.position)
         _require_finite("position", self.position or (0.0, 0.0, 0.0))
         _require_finite("rotation", self.rotation)
@@ -109,14 +107,14 @@ class SceneFile:
     groups: tuple[GroupEntry, ...]
     obstacles: tuple[ObstacleEntry, ...] = ()
     domain_size: Vector = (1.0, 1.0, 1.0)
-    cell_size: float = 1 / 64  # of the solver's grid and of the obstacle cells
+    cell_size: Positive[float] = 1 / 64  # of the solver's grid and of the obstacle cells
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
-    particles_per_cell: float = 8.0
+    particles_per_cell: Positive[float] = 8.0
     seed: int = 0  # of the particles and of the obstacle samples
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         require(len(self.groups) > 0, "groups", "a list with at least one group", [])
-        require_positive(self, "cell_size", "particles_per_cell")
         for axis, length in zip("xyz", self.domain_size, strict=True):
             require(0 < length < math.inf, f"domain_size ({axis})", "a finite number > 0", length)
         _require_finite("gravity", self.gravity)

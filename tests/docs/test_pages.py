@@ -192,7 +192,7 @@ def test_every_command_is_listed() -> None:
     for cls in (config.SceneConfig, config.MpmConfig, config.TrainingConfig, config.EvaluateConfig):
         section = text.split(f"## {cls.__name__}\n")[1].split("\n## ")[0]
         assert re.findall(r"^\| `(\w+)`", section, re.MULTILINE) == [field.name for field in dataclasses.fields(cls)]
-    assert "| `seed` | `int` | `0` |" in text and "domain units per frame |" in text
+    assert "| `seed` | `NonNegative[int]` | `0` |" in text and "domain units per frame |" in text
 
 
 def test_scene_files_are_described_whole() -> None:

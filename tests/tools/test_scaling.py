@@ -200,7 +200,7 @@ def test_fit_finds_the_link() -> None:
         ({"update_ms": 0}, "update_ms must be"),
         ({"update_ms": 5, "backward_ms": 6}, "backward_ms must be at most update_ms, got 6"),
         ({"backends": ["slow"]}, r"backends\[0\] must be torch or triton"),
-        ({"message_mb": [0]}, r"message_mb\[0\] must be > 0"),
+        ({"message_mb": [0]}, r"message_mb\[0\] must be a finite number > 0"),
         ({"particle_spread": -1}, "particle_spread must be"),
         ({"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),
     ],

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hgn.config import PRECISIONS
 from hgn.data.manifest import SPLITS
-from hgn.schema import require, require_non_negative, require_one_of, require_positive
+from hgn.schema import NonNegative, Positive, TwoOrMore, require, require_bounds, require_one_of
 
 UNTIMED = ("trivial", "chaos")  # rows without run times
 
@@ -29,9 +29,9 @@ class ErrorVsTimeConfig:
     # data
     weights: tuple[str, ...] | None = None
     split: str = "test"
-    scenes: int = 20
-    frames: int = 300
-    frame_stride: int = 10  # every tenth frame for the one-step error
+    scenes: Positive[int] = 20
+    frames: TwoOrMore = 300
+    frame_stride: Positive[int] = 10  # every tenth frame for the one-step error
     # fp32, tf32, fp16 where a network's backend knows it; null: all on a GPU (tf32 and fp16 of GNS), fp32 on a
     # CPU
     precisions: tuple[str, ...] | None = None
@@ -41,30 +41,31 @@ class ErrorVsTimeConfig:
     reference_step: float = 0.25  # share of the limit of stability of the reference, on the data's own grid
     # of rollouts of a network's further precisions on backend torch (GNS in tf32, HGN in fp32), which take
     # minutes
-    repeated_frames: int = 51
-    mpm_frames: int = 300  # of the solver's rollouts, which take most of the time
+    repeated_frames: TwoOrMore = 51
+    mpm_frames: TwoOrMore = 300  # of the solver's rollouts, which take most of the time
     mpm_timed_frames: int = 12  # of the solver, where networks are timed over timed_frames
     resimulate: bool = True  # false: the data itself is the reference; with mpm_grids=[] perturbation=0 no solver runs
     # domain units, at most, of each coordinate: how far the solver departs from itself; 0: not asked
-    perturbation: float = 1e-6
-    batch_scenes: int = 8  # simulated side by side for the second run time
-    timed_scenes: int = 3
+    perturbation: NonNegative[float] = 1e-6
+    batch_scenes: Positive[int] = 8  # simulated side by side for the second run time
+    timed_scenes: Positive[int] = 3
     timed_frames: int = 100  # at most
-    timed_seconds: float = 0.5  # of each timed rollout, about: slow contenders take fewer frames, six at the least
-    rounds: int = 2  # of each timed scene
-    sinkhorn_points: int = 1024  # of each material at most
-    sinkhorn_scenes: int = 20  # of the test scenes
-    sinkhorn_blur: float = 0.01  # domain units
-    rest_speed: float = 1e-4  # domain units a frame; what is slower is at rest
+    timed_seconds: Positive[float] = 0.5  # of each timed rollout, about: the slow take fewer frames, at least six
+    rounds: Positive[int] = 2  # of each timed scene
+    sinkhorn_points: Positive[int] = 1024  # of each material at most
+    sinkhorn_scenes: NonNegative[int] = 20  # of the test scenes
+    sinkhorn_blur: Positive[float] = 0.01  # domain units
+    rest_speed: NonNegative[float] = 1e-4  # domain units a frame; what is slower is at rest
     # of each weights file, for the number of rollouts that pay for it; null: not told
     training_hours: tuple[float, ...] | None = None
     generation_hours: float | None = None  # of the data set
     # when they are over, what has not begun is left out, and said; the most important comes first
-    seconds: float | None = None
+    seconds: Positive[float] | None = None
     device: str = "auto"
     json: str | None = None  # another name for OUT.json; --json FILE does the same
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         require(self.out != "", "out", "a file name without its ending", self.out)
         require(
             bool(self.data or self.earlier),
@@ -74,26 +75,8 @@ class ErrorVsTimeConfig:
             "make one with python -m datagen, or give earlier=[report.json] to draw a report again",
         )
         require_one_of(self, "split", SPLITS)
-        require_positive(
-            self,
-            "scenes",
-            "frame_stride",
-            "batch_scenes",
-            "timed_scenes",
-            "timed_seconds",
-            "rounds",
-            "sinkhorn_points",
-            "sinkhorn_blur",
-        )
-        require_non_negative(self, "perturbation", "rest_speed")
-        require(self.frames >= 2, "frames", "at least 2", self.frames)
         for name in ("timed_frames", "mpm_timed_frames"):
             require(getattr(self, name) >= 4, name, "at least 4", getattr(self, name))
-        for name in ("mpm_frames", "repeated_frames"):
-            require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
-        require_non_negative(self, "sinkhorn_scenes")
-        if self.seconds is not None:
-            require_positive(self, "seconds")
         require(0 < self.reference_step <= 1, "reference_step", "above 0 and at most 1", self.reference_step)
         for i, step in enumerate(self.mpm_steps):
             require(0 < step <= 1, f"mpm_steps[{i}]", "above 0 and at most 1", step)

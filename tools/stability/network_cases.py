@@ -17,7 +17,7 @@ from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
-from hgn.schema import ConfigError, require, require_one_of, require_positive
+from hgn.schema import ConfigError, Positive, require, require_bounds, require_one_of
 
 MOTION = ("throw", "gravity", "collision")  # tools/stability/network_motion.py
 CASES = (*MOTION, "rest", "particles", "domain", "speed", "single", "slope", "far", "guard")
@@ -37,17 +37,17 @@ class StabilityNetworkConfig:
     cases: tuple[str, ...] | None = None
     frames: int = 300
     long_frames: int = 3000  # of the case rest
-    scenes_at_once: int = 1  # in each rollout of throw, gravity and collision, at least
+    scenes_at_once: Positive[int] = 1  # in each rollout of throw, gravity and collision, at least
     # also ask the solver, which needs Taichi: for slope, collision and rest; without it rest is left out
     solver: bool = True
     solver_device: str = "auto"  # or cpu, gpu
-    particle_factor: float = 10.0
+    particle_factor: Positive[float] = 10.0
     # times the floor area, with as many more obstacles and groups; squares
     domain_factors: tuple[int, ...] = (4, 9, 16)
-    speed_factor: float = 3.0  # times the speed of a fall through the domain
-    far_cells: int = 64_000  # how long the domain is that particles lie at the far end of, in obstacle cells
-    seeds: int = 1  # scenes of each case
-    energy_bound: float = 0.02  # how much energy may come from nowhere, of a fall through the domain
+    speed_factor: Positive[float] = 3.0  # times the speed of a fall through the domain
+    far_cells: Positive[int] = 64_000  # how long the domain is that particles lie at the far end of, in obstacle cells
+    seeds: Positive[int] = 1  # scenes of each case
+    energy_bound: Positive[float] = 0.02  # how much energy may come from nowhere, of a fall through the domain
     # the scenes as they are in training; obstacles only where the network sees them
     scene: SceneConfig = field(default_factory=SceneConfig)
     backend: str = "auto"  # torch, triton, cpu; auto: the fastest that runs
@@ -57,8 +57,7 @@ class StabilityNetworkConfig:
     json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
-        require_positive(self, "particle_factor", "speed_factor", "far_cells", "seeds", "energy_bound")
-        require_positive(self, "scenes_at_once")
+        require_bounds(self)
         require_one_of(self, "solver_device", ("auto", "cpu", "gpu"))
         require_one_of(self, "backend", BACKENDS)
         require_one_of(self, "precision", PRECISIONS)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hgn.config import MpmConfig
-from hgn.schema import from_mapping, require, require_one_of, require_positive, to_mapping
+from hgn.schema import Positive, from_mapping, require, require_bounds, require_one_of, to_mapping
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
@@ -37,15 +37,15 @@ class StabilitySolverConfig:
     # steps, stiffness, impact, convergence, contact, leak, long, validation, grid; null: all
     cases: tuple[str, ...] | None = None
     device: str = "auto"  # or cpu, gpu
-    leak_seconds: float = 5.0  # simulated, for each row of the table of leaks
-    leak_block_cells: float = 4.0  # side of the blocks that hit the obstacles, eight particles a cell
+    leak_seconds: Positive[float] = 5.0  # simulated, for each row of the table of leaks
+    leak_block_cells: Positive[float] = 4.0  # side of the blocks that hit the obstacles, eight particles a cell
     leak_offsets: int = len(OFFSETS)  # of an obstacle within a cell, at most 8; 54 scenes each
     leak_band_cells: float | None = None  # mpm.collider_band_cells for the table of leaks; null: the solver's own
     picture: str | None = None  # also draw stable and unstable steps against the formula, as PNG
     json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
-        require_positive(self, "leak_seconds", "leak_block_cells")
+        require_bounds(self)
         require(1 <= self.leak_offsets <= len(OFFSETS), "leak_offsets", f"1 to {len(OFFSETS)}", self.leak_offsets)
         band = self.leak_band_cells
         require(band is None or band > 0, "leak_band_cells", "> 0", band)

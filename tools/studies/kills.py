@@ -27,14 +27,7 @@ from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import verify_file
 from hgn.scene.episode import Episode
-from hgn.schema import (
-    ConfigError,
-    from_mapping,
-    require,
-    require_non_negative,
-    require_positive,
-    to_mapping,
-)
+from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require, require_bounds, to_mapping
 from hgn.system.files import TEMPORARY_SUFFIX, write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
@@ -50,14 +43,13 @@ _PATIENCE_S = 600.0  # with a generation in which nothing gets published
 class KillsConfig:
     """`python -m tools.studies.kills`: how often and when, beside what `python -m datagen` takes."""
 
-    kills: int = 50
-    interval_s: float = 3.0  # between two, on average
-    kill_seed: int = 0
+    kills: Positive[int] = 50
+    interval_s: Positive[float] = 3.0  # between two, on average
+    kill_seed: NonNegative[int] = 0
     json: str | None = None
 
     def __post_init__(self) -> None:
-        require_positive(self, "kills", "interval_s")
-        require_non_negative(self, "kill_seed")
+        require_bounds(self)
 
 
 @dataclass(frozen=True)

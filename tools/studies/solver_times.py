@@ -21,7 +21,7 @@ from hgn.command import run_command
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.scene import Scene
-from hgn.schema import from_mapping, require, require_one_of, to_mapping
+from hgn.schema import OneOrMore, from_mapping, require, require_bounds, require_one_of, to_mapping
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
@@ -35,16 +35,15 @@ EXIT_RED = 1
 class SolverTimesConfig:
     """`python -m tools.studies.solver_times`: what is timed."""
 
-    scenes: tuple[int, ...] = (1, 64, 256)  # random scenes with obstacles, side by side
-    particles: tuple[int, ...] = (4_296, 40_000, 400_000, 1_000_000)  # of one scene
+    scenes: tuple[OneOrMore, ...] = (1, 64, 256)  # random scenes with obstacles, side by side
+    particles: tuple[OneOrMore, ...] = (4_296, 40_000, 400_000, 1_000_000)  # of one scene
     scene_frames: int = 60  # of the random scenes; the second half is timed
     particle_frames: int = 6
     device: str = "auto"  # or cpu, gpu
     json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
-        for name in ("scenes", "particles"):
-            require(all(value >= 1 for value in getattr(self, name)), name, "at least 1 each", getattr(self, name))
+        require_bounds(self)
         for name in ("scene_frames", "particle_frames"):
             require(getattr(self, name) >= 3, name, "at least 3", getattr(self, name))
         require_one_of(self, "device", ("auto", "cpu", "gpu"))
