@@ -9,11 +9,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.kernels.buffers import OUT, Block, StoredPairs
+from hgn.kernels.buffers import OUT, Block, Stored
 from hgn.kernels.cell_mlp.kernel import cell_mlp_backward
 from hgn.kernels.edges.kernel import edge_backward
 from hgn.kernels.forward import FusedNetwork
@@ -173,14 +174,14 @@ class FusedTrainingNetwork(FusedNetwork):
         for block, gradients in self._blocks_of_steps():
             for m, step in enumerate(gradients):
                 edge, cell = block.packed.edge[m], block.packed.cell[m]
-                job(step.edge.output, block.edge_hidden[m], edge.second, block.level, edge.second_bias)
+                job(step.edge.output, block.edge_stored[m].hidden, edge.second, block.level, edge.second_bias)
                 if m > 0:
                     job(step.edge.hidden, block.edge[m - 1], edge.parts[2], block.level)
                 job(step.send, block.cell[m], edge.parts[0], block.level)
                 job(step.receive, block.cell[m], edge.parts[1], block.level, edge.first_bias)
                 job(step.cell.hidden, block.cell[m], cell.parts[0], block.level, cell.first_bias)
                 job(step.cell.hidden, block.sum[m], cell.parts[1], block.level)
-                job(step.cell.output, block.cell_hidden[m], cell.second, block.level, cell.second_bias)
+                job(step.cell.output, block.cell_stored[m].hidden, cell.second, block.level, cell.second_bias)
         for i in range(grid.levels):
             block = self.down[i] if i == grid.levels - 1 else self.up[i]
             job(g.product[i], block.cell[-1], block.next_at, i)
@@ -223,28 +224,15 @@ class FusedTrainingNetwork(FusedNetwork):
         self.counts[: grid.levels].copy_(grid.counts_L)
         self.counts[grid.levels :].copy_(self.particle_count)
         self._mlp_backward(
-            packed.decode,
-            self.output_gradient,
-            self.particle_count,
-            self.decode_hidden,
-            g.decode.hidden,
-            g.decode.output,
-            into=(self.latent_gradient, 1),
-            norm=False,
-        )
+            packed.decode, self.output_gradient, self.particle_count, self.decode_hidden, g.decode.hidden,
+            g.decode.output, into=(self.latent_gradient, 1), norm=False,
+        )  # fmt: skip
         top = self.up[0] if levels > 1 else self.down[0]
         assert top.product is not None
         self._particle_cell_backward(
-            packed.cell_to_particle,
-            self.latent_gradient,
-            self.by_particle_up,
-            top.product,
-            self.pairs_up,
-            g.cell_to_particle.output,
-            g.cell_to_particle.by_particle,
-            self.product_gradient,
-            False,
-        )
+            packed.cell_to_particle, self.latent_gradient, self.by_particle_up, top.product, self.pairs_up,
+            g.cell_to_particle.output, g.cell_to_particle.by_particle, self.product_gradient, False,
+        )  # fmt: skip
         self._gather_backward(
             0, self.product_gradient, grid.children(0), 0, top.next_at, g.product[0], self._gradient_of(top)
         )
@@ -252,84 +240,47 @@ class FusedTrainingNetwork(FusedNetwork):
             block, mlp = self.up[i], packed.coarse_to_fine[i]
             self._passing_backward(block, g.up[i])
             self._mlp_backward(
-                mlp,
-                self.cell_gradient_up[i],
-                grid.count(i),
-                self.transfer_hidden_up[i],
-                g.coarse_to_fine[i].hidden,
-                g.coarse_to_fine[i].output,
-                first_at=mlp.parts[1],
-                offset=(mlp.parts[2], -1),
-                octant=grid.octant(i),
-                into=(self.cell_gradient_down[i], 1),
+                mlp, self.cell_gradient_up[i], grid.count(i), self.transfer_hidden_up[i],
+                g.coarse_to_fine[i].hidden, g.coarse_to_fine[i].output, first_at=mlp.parts[1],
+                offset=(mlp.parts[2], -1), octant=grid.octant(i), into=(self.cell_gradient_down[i], 1),
                 residual=True,
-            )
+            )  # fmt: skip
             coarse = self.up[i + 1] if i + 1 < levels - 1 else self.down[-1]
             self._gather_backward(
-                i + 1,
-                g.coarse_to_fine[i].hidden,
-                grid.children(i + 1),
-                8,
-                coarse.next_at,
-                g.product[i + 1],
+                i + 1, g.coarse_to_fine[i].hidden, grid.children(i + 1), 8, coarse.next_at, g.product[i + 1],
                 self._gradient_of(coarse),
-            )
+            )  # fmt: skip
         for i in reversed(range(levels)):
             if i < levels - 1:
                 mlp = packed.fine_to_coarse[i]
                 self._mlp_backward(
-                    mlp,
-                    self.cell_gradient_down[i + 1],
-                    grid.count(i),
-                    self.transfer_hidden_down[i],
-                    g.fine_to_coarse[i].hidden,
-                    g.fine_to_coarse[i].output,
-                    gradient_index=grid.parent(i),
-                    offset=(mlp.parts[1], 1),
-                    octant=grid.octant(i),
-                    into=(self.cell_gradient_down[i], 2),
-                )
+                    mlp, self.cell_gradient_down[i + 1], grid.count(i), self.transfer_hidden_down[i],
+                    g.fine_to_coarse[i].hidden, g.fine_to_coarse[i].output, gradient_index=grid.parent(i),
+                    offset=(mlp.parts[1], 1), octant=grid.octant(i), into=(self.cell_gradient_down[i], 2),
+                )  # fmt: skip
             self._passing_backward(self.down[i], g.down[i])
         self._particle_cell_backward(
-            packed.particle_to_cell,
-            self.cell_gradient_down[0],
-            self.by_particle_down,
-            self.by_particle_down,
-            self.pairs_down,
-            g.particle_to_cell.output,
-            g.particle_to_cell.by_particle,
-            self.product_gradient,
+            packed.particle_to_cell, self.cell_gradient_down[0], self.by_particle_down, self.by_particle_down,
+            self.pairs_down, g.particle_to_cell.output, g.particle_to_cell.by_particle, self.product_gradient,
             True,
-        )
+        )  # fmt: skip
         self._mlp_backward(
-            packed.encode,
-            self.latent_gradient,
-            self.particle_count,
-            self.encode_hidden,
-            g.encode.hidden,
-            g.encode.output,
-            following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
+            packed.encode, self.latent_gradient, self.particle_count, self.encode_hidden, g.encode.hidden,
+            g.encode.output, following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
             products=(g.particle_to_cell.by_particle, g.cell_to_particle.by_particle),
-        )
+        )  # fmt: skip
         for chunk, base, jobs, chunk_job, chunk_first in self._weight_jobs:
             weight_gradient[(len(chunk_job),)](
-                left=self.left,
-                right=base,
-                totals=self.totals,
-                jobs=jobs,
-                chunk_job=chunk_job,
-                chunk_first=chunk_first,
-                counts=self.counts,
-                unscale=self.unscale,
-                TILE=max(self.width, grid.features, OUT),
-                CHUNK=chunk,
-                STEP=self._rows_at_once(),
-                PRECISION=self.precision,
-                PIPELINED=not interpreting(),
-                num_warps=8,
+                left=self.left, right=base, totals=self.totals, jobs=jobs, chunk_job=chunk_job,
+                chunk_first=chunk_first, counts=self.counts, unscale=self.unscale,
+                TILE=max(self.width, grid.features, OUT), CHUNK=chunk, STEP=self._rows_at_once(),
+                PRECISION=self.precision, PIPELINED=not interpreting(), num_warps=8,
                 maxnreg=self.tuning.weight_registers,
-            )
+            )  # fmt: skip
         self._encode_gradients()
+
+    def _gradient_operands(self) -> dict[str, Any]:
+        return self._operands() | {"totals": self.totals, "unscale": self.unscale}
 
     def _rows_at_once(self) -> int:
         """Of a weight's product; in the interpreter, whose time goes by operations, more."""
@@ -377,40 +328,15 @@ class FusedTrainingNetwork(FusedNetwork):
         block, warps = self.tuning.row_tile(len(hidden), True)
         at, given = (*following, 0, 0), (*products, hidden, hidden)
         mlp_backward[self._blocks(len(hidden), block)](
-            gradient=gradient,
-            gradient_index=gradient_index if gradient_index is not None else count,
-            from_0=given[0],
-            from_1=given[1],
-            x_gradient=into[0] if into[0] is not None else gradient,
-            count_ptr=count,
-            weights=self.weights,
-            values=self.values,
-            totals=self.totals,
-            first_at=mlp.parts[0] if first_at is None else first_at,
-            offset_at=offset[0],
-            second_at=mlp.second,
-            second_bias_at=mlp.second_bias,
-            norm_weight_at=mlp.norm_weight,
-            norm_bias_at=mlp.norm_bias,
-            octant=octant if octant is not None else count,
-            next_at_0=at[0],
-            next_at_1=at[1],
-            hidden=hidden,
-            hidden_gradient=hidden_gradient,
-            second_gradient=second_gradient,
-            unscale=self.unscale,
-            WIDTH=self.width,
-            OUT=mlp.out,
-            GATHER=gradient_index is not None,
-            OFFSET=offset[1],
-            NORM=norm,
-            RESIDUAL=residual,
-            NEXT=len(following),
-            INTO=into[1],
-            BLOCK=block,
-            PRECISION=self.precision,
-            num_warps=warps,
-        )
+            gradient=gradient, gradient_index=gradient_index if gradient_index is not None else count,
+            from_0=given[0], from_1=given[1], x_gradient=into[0] if into[0] is not None else gradient,
+            count_ptr=count, **self._gradient_operands(),
+            first_at=mlp.parts[0] if first_at is None else first_at, offset_at=offset[0], **mlp.layers(),
+            octant=octant if octant is not None else count, next_at_0=at[0], next_at_1=at[1], hidden=hidden,
+            hidden_gradient=hidden_gradient, second_gradient=second_gradient, OUT=mlp.out,
+            GATHER=gradient_index is not None, OFFSET=offset[1], NORM=norm, RESIDUAL=residual,
+            NEXT=len(following), INTO=into[1], BLOCK=block, num_warps=warps,
+        )  # fmt: skip
 
     def _particle_cell_backward(
         self,
@@ -418,7 +344,7 @@ class FusedTrainingNetwork(FusedNetwork):
         gradient: torch.Tensor,
         by_particle: torch.Tensor,
         by_cell: torch.Tensor,
-        stored: StoredPairs,
+        stored: Stored,
         second_gradient: torch.Tensor,
         by_particle_gradient: torch.Tensor,
         by_cell_gradient: torch.Tensor,
@@ -427,51 +353,21 @@ class FusedTrainingNetwork(FusedNetwork):
         grid = self.grid
         programs = self.tuning.programs(grid.particles, self.tuning.pair_particles)
         particle_cell_backward[programs](
-            gradient=gradient,
-            by_particle=by_particle,
-            by_cell=by_cell,
-            cell_of=grid.cell_N8,
-            weight_of=grid.weight_N8,
-            fraction=grid.fraction_N3,
-            count_ptr=self.particle_count,
-            weights=self.weights,
-            values=self.values,
-            totals=self.totals,
-            offset_at=mlp.parts[-1],
-            second_at=mlp.second,
-            norm_weight_at=mlp.norm_weight,
-            norm_bias_at=mlp.norm_bias,
-            **stored._asdict(),
-            second_gradient=second_gradient,
-            by_particle_gradient=by_particle_gradient,
-            by_cell_gradient=by_cell_gradient,
-            unscale=self.unscale,
-            TO_CELL=to_cell,
-            WIDTH=self.width,
-            PARTICLES=self.tuning.pair_particles,
-            PRECISION=self.precision,
+            gradient=gradient, by_particle=by_particle, by_cell=by_cell, cell_of=grid.cell_N8,
+            weight_of=grid.weight_N8, fraction=grid.fraction_N3, count_ptr=self.particle_count,
+            **self._gradient_operands(), offset_at=mlp.parts[-1], **mlp.layers(second_bias=False),
+            **stored._asdict(), second_gradient=second_gradient, by_particle_gradient=by_particle_gradient,
+            by_cell_gradient=by_cell_gradient, TO_CELL=to_cell, PARTICLES=self.tuning.pair_particles,
             num_warps=self.tuning.pair_warps,
-        )
+        )  # fmt: skip
         if not self.stores_pair_hidden():
             particle_cell_weight_gradient[programs](
-                second_gradient=second_gradient,
-                by_particle=by_particle,
-                by_cell=by_cell,
-                cell_of=grid.cell_N8,
-                count_ptr=self.particle_count,
-                values=self.values,
-                totals=self.totals,
-                offset_at=mlp.parts[-1],
-                second_at=mlp.second,
-                second_bias_at=mlp.second_bias,
-                unscale=self.unscale,
-                TO_CELL=to_cell,
-                WIDTH=self.width,
-                PARTICLES=self.tuning.pair_particles,
-                PRECISION=self.precision,
-                PIPELINED=not interpreting(),
-                num_warps=self.tuning.pair_warps,
-            )
+                second_gradient=second_gradient, by_particle=by_particle, by_cell=by_cell, cell_of=grid.cell_N8,
+                count_ptr=self.particle_count, values=self.values, totals=self.totals, offset_at=mlp.parts[-1],
+                second_at=mlp.second, second_bias_at=mlp.second_bias, unscale=self.unscale, TO_CELL=to_cell,
+                WIDTH=self.width, PARTICLES=self.tuning.pair_particles, PRECISION=self.precision,
+                PIPELINED=not interpreting(), num_warps=self.tuning.pair_warps,
+            )  # fmt: skip
 
     def _gather_backward(
         self,
@@ -493,24 +389,11 @@ class FusedTrainingNetwork(FusedNetwork):
             self._gather(level, x, table, summed, received is not None)
             x, summands = summed, 0
         gather_project_backward[self._blocks(rows, size)](
-            x=x,
-            table=table,
-            count_ptr=self.grid.count(level),
-            weights=self.weights,
-            at_0=at,
-            summed=summed,
-            other=other,
-            other_at=other_at,
-            gradient=gradient,
-            capacity=rows,
-            SUM=summands,
-            EDGES=received is not None,
-            ADD=add,
-            WIDTH=self.width,
-            BLOCK=size,
-            PRECISION=self.precision,
+            x=x, table=table, count_ptr=self.grid.count(level), weights=self.weights, at_0=at, summed=summed,
+            other=other, other_at=other_at, gradient=gradient, capacity=rows, SUM=summands,
+            EDGES=received is not None, ADD=add, WIDTH=self.width, BLOCK=size, PRECISION=self.precision,
             num_warps=warps,
-        )
+        )  # fmt: skip
 
     def _passing_backward(self, block: Block, gradients: list[StepGradients]) -> None:
         grid, level, steps = self.grid, block.level, self.config.message_passing_steps
@@ -532,68 +415,23 @@ class FusedTrainingNetwork(FusedNetwork):
             if gathers:
                 self._gather(level, later.edge.hidden, table, later.send, True)
             cell_mlp_backward[self._blocks(rows, size)](
-                gradient=gradient,
-                later_hidden_gradient=later.edge.hidden,
-                later_receive_gradient=later.receive,
-                neighbour=table,
-                count_ptr=grid.count(level),
-                weights=self.weights,
-                values=self.values,
-                totals=self.totals,
-                later_send_at=later_edge.parts[0],
-                later_receive_at=later_edge.parts[1],
-                first_at=cell.parts[0],
-                sum_first_at=cell.parts[1],
-                second_at=cell.second,
-                norm_weight_at=cell.norm_weight,
-                norm_bias_at=cell.norm_bias,
-                hidden=block.cell_hidden[m],
-                normalised=block.cell_normalised[m],
-                rstd=block.cell_rstd[m],
-                send_gradient=later.send,
-                hidden_gradient=step.cell.hidden,
-                second_gradient=step.cell.output,
-                sum_gradient=sum_gradient,
-                capacity=rows,
-                unscale=self.unscale,
-                LAST=last,
-                GATHER=not gathers,
-                WIDTH=self.width,
-                BLOCK=size,
-                PRECISION=self.precision,
-                RESIDENT=overlap and not many(rows),
-                OVERLAP=overlap and not many(rows),
-                num_warps=warps,
-                launch_pdl=overlap and not many(rows),
-            )
+                gradient=gradient, later_hidden_gradient=later.edge.hidden,
+                later_receive_gradient=later.receive, neighbour=table, count_ptr=grid.count(level),
+                **self._gradient_operands(), later_send_at=later_edge.parts[0],
+                later_receive_at=later_edge.parts[1], first_at=cell.parts[0], sum_first_at=cell.parts[1],
+                **cell.layers(second_bias=False), **block.cell_stored[m]._asdict(), send_gradient=later.send,
+                hidden_gradient=step.cell.hidden, second_gradient=step.cell.output, sum_gradient=sum_gradient,
+                capacity=rows, LAST=last, GATHER=not gathers, BLOCK=size, RESIDENT=overlap and not many(rows),
+                OVERLAP=overlap and not many(rows), num_warps=warps, launch_pdl=overlap and not many(rows),
+            )  # fmt: skip
             edge_backward[self.tuning.programs(rows, self.tuning.edge_cells(edge_size))](
-                sum_gradient=sum_gradient,
-                edge_gradient=edge_gradient,
-                count_ptr=grid.count(level),
-                weights=self.weights,
-                values=self.values,
-                totals=self.totals,
-                own_at=edge.parts[2],
-                second_at=edge.second,
-                norm_weight_at=edge.norm_weight,
-                norm_bias_at=edge.norm_bias,
-                hidden=block.edge_hidden[m],
-                normalised=block.edge_normalised[m],
-                rstd=block.edge_rstd[m],
-                hidden_gradient=step.edge.hidden,
-                second_gradient=step.edge.output,
-                receive_gradient=step.receive,
-                unscale=self.unscale,
-                FIRST=m == 0,
-                LAST=last,
-                WIDTH=self.width,
-                ROWS=8 * edge_size,
-                DENSE=self.tuning.dense,
-                PRECISION=self.precision,
-                OVERLAP=overlap,
-                num_warps=edge_warps,
+                sum_gradient=sum_gradient, edge_gradient=edge_gradient, count_ptr=grid.count(level),
+                **self._gradient_operands(), own_at=edge.parts[2], **edge.layers(second_bias=False),
+                **block.edge_stored[m]._asdict(), hidden_gradient=step.edge.hidden,
+                second_gradient=step.edge.output, receive_gradient=step.receive, FIRST=m == 0, LAST=last,
+                ROWS=8 * edge_size, DENSE=self.tuning.dense, OVERLAP=overlap, num_warps=edge_warps,
                 launch_pdl=overlap,
-            )
+            )  # fmt: skip
         first = block.packed.edge[0]
         into, received = gradients[0].send, (gradients[0].receive, first.parts[1])
         self._gather_backward(level, gradients[0].edge.hidden, table, 6, first.parts[0], into, gradient, True, received)

@@ -282,17 +282,6 @@ def gathered_sum(x, summands, SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.
 
 
 @triton.jit
-def prefetch(x, row, live, WIDTH: tl.constexpr):
-    """Has the rows of x [.., W] that are live brought to the L2 cache; no register waits for them."""
-    LINE: tl.constexpr = 1024 // x.dtype.element_ty.primitive_bitwidth  # elements that memory delivers together
-    line = tl.arange(0, (WIDTH + LINE - 1) // LINE) * LINE
-    where = x + tl.where(live, row, 0)[:, None] * WIDTH + line[None, :]
-    tl.inline_asm_elementwise(
-        "prefetch.global.L2 [$1]; mov.b32 $0, 0;", "=r,l", [where.to(tl.int64)], dtype=tl.int32, is_pure=False, pack=1
-    )
-
-
-@triton.jit
 def settled(total):
     """A product as it is, in a loop whose next tiles are copied to shared memory meanwhile; no instruction.
 

@@ -18,6 +18,14 @@ from hgn.kernels.tuning import Tuning
 OUT = 16  # the decoder's three outputs, padded
 
 
+class Stored(NamedTuple):
+    """What a kernel stores for the backward pass, by its names; one row where it stores nothing."""
+
+    hidden: torch.Tensor  # [R, W]: R are pairs [8 N], edges [C, 6] or cells [C]
+    normalised: torch.Tensor  # [R, W]
+    rstd: torch.Tensor  # one over the deviation, float32 [R]
+
+
 @dataclass
 class Block:
     """One message-passing block: its level, weights, and buffers (lists over iterations)."""
@@ -26,25 +34,13 @@ class Block:
     packed: PackedMessagePassing
     cell: list[torch.Tensor] = field(default_factory=list)  # M + 1 of [C, W]
     edge: list[torch.Tensor] = field(default_factory=list)  # M - 1 of [C, 6, W]
-    edge_hidden: list[torch.Tensor] = field(default_factory=list)
-    edge_normalised: list[torch.Tensor] = field(default_factory=list)
-    edge_rstd: list[torch.Tensor] = field(default_factory=list)  # one over the rstd, float32 [C, 6]
+    edge_stored: list[Stored] = field(default_factory=list)
     sum: list[torch.Tensor] = field(default_factory=list)
-    cell_hidden: list[torch.Tensor] = field(default_factory=list)
-    cell_normalised: list[torch.Tensor] = field(default_factory=list)
-    cell_rstd: list[torch.Tensor] = field(default_factory=list)
+    cell_stored: list[Stored] = field(default_factory=list)
     send: list[torch.Tensor] = field(default_factory=list)  # 2, by turns; in inference one, read before it is written
     receive: list[torch.Tensor] = field(default_factory=list)
     product: torch.Tensor | None = None  # of the block's output, for the step that follows
     next_at: int = 0  # weights of that product
-
-
-class StoredPairs(NamedTuple):
-    """What particle_cell_forward stores for the backward pass, by its names; one row where it stores nothing."""
-
-    hidden: torch.Tensor  # [8 N, W]
-    normalised: torch.Tensor  # [8 N, W]
-    rstd: torch.Tensor  # one over the deviation, float32 [8 N]
 
 
 class Buffers:
@@ -74,8 +70,8 @@ class Buffers:
     decode_hidden: torch.Tensor
     transfer_hidden_down: list[torch.Tensor]
     transfer_hidden_up: list[torch.Tensor]
-    pairs_down: StoredPairs
-    pairs_up: StoredPairs
+    pairs_down: Stored
+    pairs_up: Stored
     down: list[Block]
     up: list[Block]
 
@@ -84,6 +80,9 @@ class Buffers:
 
     def _float(self, *shape: int) -> torch.Tensor:
         return torch.zeros(shape, device=self.device)
+
+    def _stored(self, *rows: int) -> Stored:
+        return Stored(self._operand(*rows, self.width), self._operand(*rows, self.width), self._float(*rows))
 
     def _cell(self, *shape: int) -> torch.Tensor:
         return self._operand(*shape) if self.tuning.half_cells else self._float(*shape)
@@ -104,7 +103,7 @@ class Buffers:
         pairs = 8 * self.grid.particles if self.training else 1
         hidden = pairs if stores_pair_hidden else 1
         self.pairs_down, self.pairs_up = (
-            StoredPairs(self._operand(hidden, self.width), self._operand(pairs, self.width), self._float(pairs))
+            Stored(self._operand(hidden, self.width), self._operand(pairs, self.width), self._float(pairs))
             for _ in range(2)
         )
         if self.training:
@@ -131,13 +130,9 @@ class Buffers:
             block.send, block.receive = ([self._operand(capacity, width) for _ in range(2)] for _ in range(2))
             block.cell = [start(capacity, width)] + [self._cell(capacity, width) for _ in range(steps)]
             block.edge = [self._operand(capacity, 6, width) for _ in range(steps - 1)]
-            block.edge_hidden = [self._operand(capacity, 6, width) for _ in range(steps)]
-            block.edge_normalised = [self._operand(capacity, 6, width) for _ in range(steps)]
-            block.edge_rstd = [self._float(capacity, 6) for _ in range(steps)]
+            block.edge_stored = [self._stored(capacity, 6) for _ in range(steps)]
             block.sum = [self._operand(capacity, width) for _ in range(steps)]
-            block.cell_hidden = [self._operand(capacity, width) for _ in range(steps)]
-            block.cell_normalised = [self._operand(capacity, width) for _ in range(steps)]
-            block.cell_rstd = [self._float(capacity) for _ in range(steps)]
+            block.cell_stored = [self._stored(capacity) for _ in range(steps)]
         for level, capacity in enumerate(capacities):
             self._last(level).product = self._operand(capacity, width)
 
@@ -172,8 +167,7 @@ class Buffers:
                 block.cell = [turns[m % 2] for m in range(steps + 1)]
                 block.edge = [shared[: 6 * capacity].view(capacity, 6, width)] * (steps - 1)
                 # not kept
-                block.edge_hidden = block.edge_normalised = block.cell_hidden = block.cell_normalised = [send] * steps
-                block.edge_rstd = block.cell_rstd = [total] * steps
+                block.edge_stored = block.cell_stored = [Stored(send, send, total)] * steps
             self._last(level).product = shared[:capacity]
         if self.tuning.half_cells and not self.tuning.half_sums:
             self.down[0].cell[0] = self._first_cell(finest, width)

@@ -6,11 +6,13 @@ paper's (sec. 3.2). Shape legend: N particles, C cells, W width.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import triton
 
 from hgn.config import NetworkConfig
-from hgn.kernels.buffers import Block, Buffers, StoredPairs
+from hgn.kernels.buffers import Block, Buffers, Stored
 from hgn.kernels.cell_mlp.kernel import cell_mlp_forward
 from hgn.kernels.edges.kernel import edge_forward
 from hgn.kernels.grid.op import DeviceGrid
@@ -105,62 +107,39 @@ class FusedNetwork(Buffers):
         """From the grid's features and tables to `output` [N, OUT]: normalised accelerations in columns 0 to 2."""
         packed, grid, levels = self.packed, self.grid, self.config.levels
         self._mlp(
-            packed.encode,
-            grid.feature_NF,
-            self.particle_count,
-            self.latent,
-            self.encode_hidden,
-            first=(self.encode_weights, 0),
-            bias=False,
+            packed.encode, grid.feature_NF, self.particle_count, self.latent, self.encode_hidden,
+            first=(self.encode_weights, 0), bias=False,
             following=(packed.particle_to_cell.parts[0], packed.cell_to_particle.parts[1]),
             following_bias=(packed.particle_to_cell.first_bias, packed.cell_to_particle.first_bias),
             products=(self.by_particle_down, self.by_particle_up),
-            fractions=(packed.particle_to_cell.parts[-1], packed.cell_to_particle.parts[-1]),
-            fine=self.fine,
-        )
+            fractions=(packed.particle_to_cell.parts[-1], packed.cell_to_particle.parts[-1]), fine=self.fine,
+        )  # fmt: skip
         self._clear(self.down[0].cell[0])
         self._particle_cell(
-            packed.particle_to_cell,
-            self.by_particle_down,
-            self.by_particle_down,
-            self.pairs_down,
-            self.down[0].cell[0],
-            True,
-        )
+            packed.particle_to_cell, self.by_particle_down, self.by_particle_down, self.pairs_down,
+            self.down[0].cell[0], True,
+        )  # fmt: skip
         for i, block in enumerate(self.down):
             self._begin(block, i > 0)
             self._passing(block)
             if i < levels - 1:
                 self._mlp(
-                    packed.fine_to_coarse[i],
-                    block.cell[-1],
-                    grid.count(i),
-                    self.message[i],
-                    self.transfer_hidden_down[i],
-                    offset=(packed.fine_to_coarse[i].parts[1], 1),
+                    packed.fine_to_coarse[i], block.cell[-1], grid.count(i), self.message[i],
+                    self.transfer_hidden_down[i], offset=(packed.fine_to_coarse[i].parts[1], 1),
                     octant=grid.octant(i),
-                )
+                )  # fmt: skip
         coarse = self.down[-1]
         for i in reversed(range(levels - 1)):
             block = self.up[i]
             edge = block.packed.edge[0]
             assert coarse.product is not None
             self._mlp(
-                packed.coarse_to_fine[i],
-                self.down[i].cell[-1],
-                grid.count(i),
-                block.cell[0],
-                self.transfer_hidden_up[i],
-                first=(self.weights, packed.coarse_to_fine[i].parts[1]),
-                gathered=coarse.product,
-                index=grid.parent(i),
-                offset=(packed.coarse_to_fine[i].parts[2], -1),
-                octant=grid.octant(i),
-                residual=True,
-                following=(edge.parts[0], edge.parts[1]),
-                following_bias=(NONE, edge.first_bias),
-                products=(block.send[0], block.receive[0]),
-            )
+                packed.coarse_to_fine[i], self.down[i].cell[-1], grid.count(i), block.cell[0],
+                self.transfer_hidden_up[i], first=(self.weights, packed.coarse_to_fine[i].parts[1]),
+                gathered=coarse.product, index=grid.parent(i), offset=(packed.coarse_to_fine[i].parts[2], -1),
+                octant=grid.octant(i), residual=True, following=(edge.parts[0], edge.parts[1]),
+                following_bias=(NONE, edge.first_bias), products=(block.send[0], block.receive[0]),
+            )  # fmt: skip
             self._passing(block)
             coarse = block
         assert coarse.product is not None
@@ -168,6 +147,10 @@ class FusedNetwork(Buffers):
             packed.cell_to_particle, self.by_particle_up, coarse.product, self.pairs_up, self.decoder_input, False
         )
         self._mlp(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
+
+    def _operands(self) -> dict[str, Any]:
+        """What every kernel with products takes."""
+        return {"weights": self.weights, "values": self.values, "WIDTH": self.width, "PRECISION": self.precision}
 
     def _clear(self, x: torch.Tensor) -> None:
         """Zeros into the finest cells' rows of x."""
@@ -213,101 +196,43 @@ class FusedNetwork(Buffers):
         into = (*products, hidden, hidden)
         loops = self.tuning.loops_over(len(x), block, 4)
         mlp_forward[self.tuning.row_programs(len(x), block, loops, 1 if norm else 2)](
-            x=x,
-            count_ptr=count,
-            weights=self.weights,
-            values=self.values,
-            first_weights=first[0],
-            first_at=first[1],
-            offset_at=offset[0],
-            bias_at=mlp.first_bias,
-            second_at=mlp.second,
-            second_bias_at=mlp.second_bias,
-            norm_weight_at=mlp.norm_weight,
-            norm_bias_at=mlp.norm_bias,
-            gathered=gathered if gathered is not None else x,
-            index=index if index is not None else count,
-            octant=octant if octant is not None else count,
-            next_at_0=at[0],
-            next_at_1=at[1],
-            next_bias_at_0=bias_at[0],
-            next_bias_at_1=bias_at[1],
-            fraction=self.grid.fraction_N3,
-            fraction_at_0=fractions[0],
-            fraction_at_1=fractions[1],
-            y=y,
-            hidden=hidden,
-            next_0=into[0],
-            next_1=into[1],
-            INPUT=x.shape[-1],
-            WIDTH=self.width,
-            OUT=mlp.out,
-            GATHER=gathered is not None,
-            OFFSET=offset[1],
-            BIAS=bias,
-            NORM=norm,
-            RESIDUAL=residual,
-            NEXT=len(following),
-            FRACTION=fractions != (0, 0),
-            SAVE=self.training,
-            FINE=fine,
-            BLOCK=block,
-            PRECISION=self.precision,
-            LOOP=loops,
-            num_warps=warps,
-        )
+            x=x, count_ptr=count, **self._operands(), first_weights=first[0], first_at=first[1],
+            offset_at=offset[0], bias_at=mlp.first_bias, **mlp.layers(),
+            gathered=gathered if gathered is not None else x, index=index if index is not None else count,
+            octant=octant if octant is not None else count, next_at_0=at[0], next_at_1=at[1],
+            next_bias_at_0=bias_at[0], next_bias_at_1=bias_at[1], fraction=self.grid.fraction_N3,
+            fraction_at_0=fractions[0], fraction_at_1=fractions[1], y=y, hidden=hidden, next_0=into[0],
+            next_1=into[1], INPUT=x.shape[-1], OUT=mlp.out, GATHER=gathered is not None, OFFSET=offset[1],
+            BIAS=bias, NORM=norm, RESIDUAL=residual, NEXT=len(following), FRACTION=fractions != (0, 0),
+            SAVE=self.training, FINE=fine, BLOCK=block, LOOP=loops, num_warps=warps,
+        )  # fmt: skip
 
     def _particle_cell(
         self,
         mlp: PackedMLP,
         by_particle: torch.Tensor,
         by_cell: torch.Tensor,
-        stored: StoredPairs,
+        stored: Stored,
         out: torch.Tensor,
         to_cell: bool,
     ) -> None:
         grid, tuning = self.grid, self.tuning
         at_once, registers = tuning.light_programs, tuning.light_registers
         particle_cell_forward[self.tuning.programs(grid.particles, tuning.pair_particles, at_once)](
-            by_particle=by_particle,
-            by_cell=by_cell,
-            particle=self.latent,
-            cell_of=grid.cell_N8,
-            weight_of=grid.weight_N8,
-            count_ptr=self.particle_count,
-            weights=self.weights,
-            values=self.values,
-            offset_at=mlp.parts[-1],
-            second_at=mlp.second,
-            second_bias_at=mlp.second_bias,
-            norm_weight_at=mlp.norm_weight,
-            norm_bias_at=mlp.norm_bias,
-            **stored._asdict(),
-            out=out,
-            TO_CELL=to_cell,
-            SAVE=self.training,
-            WIDTH=self.width,
-            PARTICLES=self.tuning.pair_particles,
-            PRECISION=self.precision,
-            num_warps=self.tuning.pair_warps,
+            by_particle=by_particle, by_cell=by_cell, particle=self.latent, cell_of=grid.cell_N8,
+            weight_of=grid.weight_N8, count_ptr=self.particle_count, **self._operands(),
+            offset_at=mlp.parts[-1], **mlp.layers(), **stored._asdict(), out=out, TO_CELL=to_cell,
+            SAVE=self.training, PARTICLES=self.tuning.pair_particles, num_warps=self.tuning.pair_warps,
             maxnreg=registers,
-        )
+        )  # fmt: skip
 
     def _gather(self, level: int, x: torch.Tensor, table: torch.Tensor, y: torch.Tensor, edges: bool = False) -> None:
         """y = the sums of x's rows that the table lists."""
         rows, size = self.grid.capacities[level], self.tuning.gather_block
         gather_sums[self._blocks(rows, size)](
-            x=x,
-            table=table,
-            count_ptr=self.grid.count(level),
-            y=y,
-            capacity=rows,
-            SUM=len(table),
-            EDGES=edges,
-            WIDTH=self.width,
-            BLOCK=size,
-            num_warps=4,
-        )
+            x=x, table=table, count_ptr=self.grid.count(level), y=y, capacity=rows, SUM=len(table), EDGES=edges,
+            WIDTH=self.width, BLOCK=size, num_warps=4,
+        )  # fmt: skip
 
     def _begin(self, block: Block, from_children: bool) -> None:
         """The block's input and its products for the first iteration."""
@@ -321,25 +246,11 @@ class FusedNetwork(Buffers):
         if loops:
             size, warps = LIGHT_BLOCK
         gather_project[self.tuning.row_programs(rows, size, loops, 2)](
-            x=self.message[level - 1] if from_children else block.cell[0],
-            table=grid.children(level),
-            count_ptr=grid.count(level),
-            weights=self.weights,
-            values=self.values,
-            at_0=edge.parts[0],
-            at_1=edge.parts[1],
-            bias_at=edge.first_bias,
-            y=block.cell[0],
-            next_0=block.send[0],
-            next_1=block.receive[0],
-            capacity=rows,
-            SUM=8 if from_children else 0,
-            WIDTH=self.width,
-            BLOCK=size,
-            PRECISION=self.precision,
-            LOOP=loops,
-            num_warps=warps,
-        )
+            x=self.message[level - 1] if from_children else block.cell[0], table=grid.children(level),
+            count_ptr=grid.count(level), **self._operands(), at_0=edge.parts[0], at_1=edge.parts[1],
+            bias_at=edge.first_bias, y=block.cell[0], next_0=block.send[0], next_1=block.receive[0],
+            capacity=rows, SUM=8 if from_children else 0, BLOCK=size, LOOP=loops, num_warps=warps,
+        )  # fmt: skip
 
     def _passing(self, block: Block) -> None:
         grid, level, steps = self.grid, block.level, self.config.message_passing_steps
@@ -360,69 +271,20 @@ class FusedNetwork(Buffers):
             light = m == 0 and many(rows)
             at_once = self.tuning.light_programs if light else 2
             edge_forward[self.tuning.programs(rows, self.tuning.edge_cells(edge_size), at_once)](
-                send=block.send[m % 2],
-                receive=block.receive[m % 2],
-                edge_in=block.edge[m - 1] if m > 0 else block.cell[m],
-                neighbour=grid.neighbour(level),
-                count_ptr=grid.count(level),
-                weights=self.weights,
-                values=self.values,
-                own_at=edge.parts[2],
-                second_at=edge.second,
-                second_bias_at=edge.second_bias,
-                norm_weight_at=edge.norm_weight,
-                norm_bias_at=edge.norm_bias,
-                edge_out=block.edge[m] if not last else block.cell[m],
-                sum_out=block.sum[m],
-                hidden=block.edge_hidden[m],
-                normalised=block.edge_normalised[m],
-                rstd=block.edge_rstd[m],
-                capacity=rows,
-                FIRST=m == 0,
-                STORE_EDGE=not last,
-                SAVE=self.training,
-                WIDTH=self.width,
-                ROWS=8 * edge_size,
-                DENSE=self.tuning.dense,
-                PRECISION=self.precision,
-                OVERLAP=overlap,
-                PREFETCH=self.tuning.prefetches(rows),
-                AHEAD=self.tuning.dense and many(rows),
-                num_warps=edge_warps,
-                maxnreg=self.tuning.light_registers if light else None,
-                launch_pdl=overlap,
-            )
+                send=block.send[m % 2], receive=block.receive[m % 2],
+                edge_in=block.edge[m - 1] if m > 0 else block.cell[m], neighbour=grid.neighbour(level),
+                count_ptr=grid.count(level), **self._operands(), own_at=edge.parts[2], **edge.layers(),
+                edge_out=block.edge[m] if not last else block.cell[m], sum_out=block.sum[m],
+                **block.edge_stored[m]._asdict(), capacity=rows, FIRST=m == 0, STORE_EDGE=not last,
+                SAVE=self.training, ROWS=8 * edge_size, DENSE=self.tuning.dense, OVERLAP=overlap,
+                AHEAD=self.tuning.dense and many(rows), num_warps=edge_warps,
+                maxnreg=self.tuning.light_registers if light else None, launch_pdl=overlap,
+            )  # fmt: skip
             cell_mlp_forward[self.tuning.row_programs(rows, size, loops)](
-                cell=block.cell[m],
-                total=block.sum[m],
-                count_ptr=grid.count(level),
-                weights=self.weights,
-                values=self.values,
-                first_at=cell.parts[0],
-                sum_first_at=cell.parts[1],
-                bias_at=cell.first_bias,
-                second_at=cell.second,
-                second_bias_at=cell.second_bias,
-                norm_weight_at=cell.norm_weight,
-                norm_bias_at=cell.norm_bias,
-                next_at_0=next_at[0],
-                next_at_1=next_at[1],
-                next_bias_at=next_bias,
-                cell_out=block.cell[m + 1],
-                hidden=block.cell_hidden[m],
-                normalised=block.cell_normalised[m],
-                rstd=block.cell_rstd[m],
-                next_0=into[0],
-                next_1=into[1],
-                NEXT=products,
-                SAVE=self.training,
-                WIDTH=self.width,
-                BLOCK=size,
-                PRECISION=self.precision,
-                RESIDENT=overlap or loops,
-                LOOP=loops,
-                OVERLAP=overlap,
-                PREFETCH=self.tuning.prefetches(rows),
-                num_warps=warps,
-                launch_pdl=overlap,
-            )
+                cell=block.cell[m], total=block.sum[m], count_ptr=grid.count(level), **self._operands(),
+                first_at=cell.parts[0], sum_first_at=cell.parts[1], bias_at=cell.first_bias, **cell.layers(),
+                next_at_0=next_at[0], next_at_1=next_at[1], next_bias_at=next_bias, cell_out=block.cell[m + 1],
+                **block.cell_stored[m]._asdict(), next_0=into[0], next_1=into[1], NEXT=products,
+                SAVE=self.training, BLOCK=size, RESIDENT=overlap or loops, LOOP=loops, OVERLAP=overlap,
+                num_warps=warps, launch_pdl=overlap,
+            )  # fmt: skip

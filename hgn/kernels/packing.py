@@ -30,6 +30,12 @@ class PackedMLP:
     norm_bias: int
     out: int
 
+    def layers(self, second_bias: bool = True) -> dict[str, int]:
+        """Where the second layer and the norm are, by the kernels' names of it."""
+        bias = {"second_bias_at": self.second_bias} if second_bias else {}
+        norm = {"norm_weight_at": self.norm_weight, "norm_bias_at": self.norm_bias}
+        return {"second_at": self.second, **bias, **norm}
+
 
 @dataclass(frozen=True)
 class PackedMessagePassing:
@@ -129,18 +135,9 @@ def pack_network(network: HierarchicalGraphNetwork) -> PackedNetwork:
     decode = packer.mlp(network.decode)
     embedding = packer.add(packer.positions(network.embedding.weight))
     return PackedNetwork(
-        encode,
-        particle_to_cell,
-        down,
-        fine_to_coarse,
-        coarse_to_fine,
-        up,
-        cell_to_particle,
-        decode,
-        embedding,
-        packer.size,
-        torch.cat(packer.pieces),
-    )
+        encode, particle_to_cell, down, fine_to_coarse, coarse_to_fine, up, cell_to_particle, decode, embedding,
+        packer.size, torch.cat(packer.pieces),
+    )  # fmt: skip
 
 
 def rounded_to_tf32(weights: torch.Tensor) -> torch.Tensor:

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 
 import triton
 
-from hgn.kernels.triton_compat import interpreting
-
 PROCESSORS = 132  # an H100's
 RESIDENT_PROGRAMS = 2 * PROCESSORS
 FEW_ROWS = 64 * PROCESSORS
@@ -40,7 +38,6 @@ class Tuning:
     small_warps: int = 8
     dense: bool = False  # six rows a cell in the tiles of edges, not eight
     overlap: bool = False  # kernels of a message step read their weights before their turn
-    prefetch: bool = False  # where there are many rows, the next tile's are brought to the L2 cache on the way forward
     loops: bool = False  # where there are many rows, a program keeps all weights and takes one block after the other
     gather_block: int = 0  # of a kernel for the sums of many rows' neighbours; 0: whoever needs them makes them
     cell_backward_block: int = 0  # where there are many rows; 0: as of other rows
@@ -68,7 +65,6 @@ class Tuning:
             cell_backward_block=64,
             cell_backward_warps=4,
             weight_registers=128,
-            prefetch=True,
             half_cells=True,
             half_sums=True,
         )
@@ -91,10 +87,6 @@ class Tuning:
     def gathers(self, rows: int) -> bool:
         """Whether sums of so many rows' neighbours have a kernel of their own."""
         return self.gather_block > 0 and many(rows)
-
-    def prefetches(self, rows: int) -> bool:
-        """Whether the kernels on so many rows bring the next tile's to the L2 cache: an instruction of the GPU's."""
-        return self.prefetch and many(rows) and not interpreting()
 
     def loops_over(self, rows: int, block: int, least: int = 1) -> bool:
         """Whether a program keeps all its weights and takes one block after the other, where each has `least`."""

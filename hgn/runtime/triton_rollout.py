@@ -180,15 +180,9 @@ class TritonRollout:
         limits = [min(limit, 8 * self.particles) for limit in limits]
         rounded = tuple(16 * math.ceil(max(1, min(c, m)) / 16) for c, m in zip(capacities, limits, strict=True))
         self.grid = DeviceGrid(
-            window,
-            self.scenes,
-            rounded,
-            self.particles,
-            feature_columns(config),
-            config.cell_size,
-            self.device,
-            config.relative,
-        )
+            window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size,
+            self.device, config.relative,
+        )  # fmt: skip
         self.fused = FusedNetwork(config, self.packed, self.values, self.grid, self.count, self.precision)
         if self.device.type == "cuda":
             self.graph = self._capture()
@@ -229,41 +223,19 @@ class TritonRollout:
         config, grid = self.config, self.grid
         grid.build(self.position_N3, self.scene_N, self.origin_S3, self.count)
         grid.prepare(
-            config,
-            self.position_N3,
-            self.velocity_NV,
-            self.scene_N,
-            self.material_N,
-            self.origin_S3,
-            self.domain_S3,
-            self.gravity_S3,
-            self.count,
-            self.velocity_mean,
-            self.velocity_std,
-            self.obstacles,
-        )
+            config, self.position_N3, self.velocity_NV, self.scene_N, self.material_N, self.origin_S3,
+            self.domain_S3, self.gravity_S3, self.count, self.velocity_mean, self.velocity_std, self.obstacles,
+        )  # fmt: skip
         self.fused.forward()
 
     def _integrate(self) -> None:
         integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
-            output=self.fused.output,
-            position=self.position_N3,
-            velocity=self.velocity_NV,
-            scene_of=self.scene_N,
-            domain=self.domain_S3,
-            gravity=self.gravity_S3,
-            mean=self.mean,
-            std=self.std,
-            particle_count=self.count,
-            status=self.grid.status,
-            lost=self.lost,
-            frame=self.frame,
-            path=self.path_TN3,
-            OUT=OUT,
-            HISTORY=self.config.velocity_history,
-            COLUMNS=1 << (3 * self.config.velocity_history - 1).bit_length(),
-            BLOCK=INTEGRATE_BLOCK,
-        )
+            output=self.fused.output, position=self.position_N3, velocity=self.velocity_NV,
+            scene_of=self.scene_N, domain=self.domain_S3, gravity=self.gravity_S3, mean=self.mean, std=self.std,
+            particle_count=self.count, status=self.grid.status, lost=self.lost, frame=self.frame,
+            path=self.path_TN3, OUT=OUT, HISTORY=self.config.velocity_history,
+            COLUMNS=1 << (3 * self.config.velocity_history - 1).bit_length(), BLOCK=INTEGRATE_BLOCK,
+        )  # fmt: skip
         advance[(1,)](status=self.grid.status, lost=self.lost, frame=self.frame)
 
     def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The cells of one message-passing iteration on a level (paper fig. 5), forward and backward, once its edges are done.
 
-OVERLAP and PREFETCH as in hgn.kernels.edges.kernel. Shape legend: C cells, W width.
+OVERLAP as in hgn.kernels.edges.kernel. Shape legend: C cells, W width.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from hgn.kernels.blocks import (
     normalise_once,
     nothing_to_do,
     once_both,
-    prefetch,
     product,
     transposed,
     vector,
@@ -37,7 +36,7 @@ def cell_mlp_forward(
     norm_weight_at, norm_bias_at, next_at_0, next_at_1, next_bias_at, cell_out, hidden, normalised, rstd,
     next_0, next_1,
     NEXT: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
-    RESIDENT: tl.constexpr, LOOP: tl.constexpr, OVERLAP: tl.constexpr, PREFETCH: tl.constexpr,
+    RESIDENT: tl.constexpr, LOOP: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
     """Paper steps 2, 4, … (fig. 5): the cells' new features from theirs and their edges' sums, all [C, W], and up to
     two products of them, of which the second with a bias.
@@ -83,10 +82,6 @@ def cell_mlp_forward(
         at = row[:, None] * WIDTH + column[None, :]
         feature = tl.load(cell + at, mask=here, other=0.0)
         summed = tl.load(total + at, mask=here, other=0.0)
-        if PREFETCH and LOOP:
-            later = row + tl.num_programs(0) * BLOCK
-            prefetch(cell, later, later < count, WIDTH)
-            prefetch(total, later, later < count, WIDTH)
         if not IN_PLACE:
             feature = once_both(feature, summed, count < 0)
         if not RESIDENT:

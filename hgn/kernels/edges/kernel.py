@@ -9,7 +9,6 @@ neighbours; at least one kernel without OVERLAP lies between), and waits for tha
 anything else; a program that has rows, and the first one always, waits, so that a kernel has ended only when all before
 it have. The wait is inside the loop over tiles, where it costs nothing once it is over: the compiler then lays out the
 weights for the matrix units before it.
-PREFETCH: while a program works on a tile, what it reads of the next one is brought to the L2 cache.
 AHEAD: the next tile's rows are asked for as soon as this one's have left their registers, so that
 they are there when it begins; the kernel before is waited for, and the first tile's rows are read, ahead of the loop.
 Shape legend: C cells, W width.
@@ -33,7 +32,6 @@ from hgn.kernels.blocks import (
     normalise_backward,
     normalise_once,
     nothing_to_do,
-    prefetch,
     product,
     transposed,
     weighted_sums,
@@ -87,8 +85,7 @@ def edge_forward(
     send, receive, edge_in, neighbour, count_ptr, weights, values, own_at, second_at, second_bias_at,
     norm_weight_at, norm_bias_at, edge_out, sum_out, hidden, normalised, rstd, capacity,
     FIRST: tl.constexpr, STORE_EDGE: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, ROWS: tl.constexpr,
-    DENSE: tl.constexpr, PRECISION: tl.constexpr, OVERLAP: tl.constexpr, PREFETCH: tl.constexpr,
-    AHEAD: tl.constexpr,
+    DENSE: tl.constexpr, PRECISION: tl.constexpr, OVERLAP: tl.constexpr, AHEAD: tl.constexpr,
 ):  # fmt: skip
     """Paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W]; send and
     receive [C, W] are the cells' products with the edge MLP's first two parts, receive with the bias.
@@ -158,9 +155,6 @@ def edge_forward(
             received, sent, edge = _edge_rows(
                 send, receive, edge_in, tile, owner, slot, other, count, FIRST, BY_PRODUCT, WIDTH, SUMS, BLOCK
             )
-        if PREFETCH and not FIRST:
-            later_place = place + tl.num_programs(0) * (6 * BLOCK)
-            prefetch(edge_in, later_place, later >= 0, WIDTH)
         if BY_PRODUCT:
             if FIRST:
                 received = received.to(tl.float32) + sides

@@ -64,14 +64,9 @@ class FusedEdges(Edges):
         edge_EW = torch.empty(edges, width, dtype=self._dtype, device=weights.second.device)
         if edges:
             gns_encode_forward[(triton.cdiv(edges, self.tuning.block),)](
-                **self._encoder(graph, first_bias_W, weights),
-                norm_bias=weights.shift,
-                edge=edge_EW,
-                WIDTH=width,
-                BLOCK=self.tuning.block,
-                PRECISION=self.precision,
-                num_warps=self.tuning.warps,
-            )
+                **self._encoder(graph, first_bias_W, weights), norm_bias=weights.shift, edge=edge_EW,
+                WIDTH=width, BLOCK=self.tuning.block, PRECISION=self.precision, num_warps=self.tuning.warps,
+            )  # fmt: skip
         return edge_EW
 
     def encode_backward(
@@ -84,26 +79,16 @@ class FusedEdges(Edges):
         partial_P8W = weights.second.new_empty(programs, 8, width)
         encoder = self._encoder(graph, first_bias_W, weights)
         gns_encode_norm_backward[(programs,)](
-            gradient=gradient_EW,
-            **encoder,
-            activation=activation_EW,
-            second_gradient=second_EW,
-            partial=partial_P8W,
-            WIDTH=width,
-            BLOCK=tuning.backward_block,
-            PRECISION=self.precision,
+            gradient=gradient_EW, **encoder, activation=activation_EW, second_gradient=second_EW,
+            partial=partial_P8W, WIDTH=width, BLOCK=tuning.backward_block, PRECISION=self.precision,
             num_warps=tuning.backward_warps,
-        )
+        )  # fmt: skip
         gns_encode_layers_backward[(programs,)](
-            second_gradient=second_EW,
-            activation=activation_EW,
+            second_gradient=second_EW, activation=activation_EW,
             **{name: encoder[name] for name in encoder.keys() - {"first", "first_bias", "second_bias", "norm_weight"}},
-            partial=partial_P8W,
-            WIDTH=width,
-            BLOCK=tuning.backward_block,
-            PRECISION=self.precision,
+            partial=partial_P8W, WIDTH=width, BLOCK=tuning.backward_block, PRECISION=self.precision,
             num_warps=tuning.backward_warps,
-        )
+        )  # fmt: skip
         total_8W = partial_P8W.sum(0) / graph.scale
         (second_WW,) = self._weight_products(graph, second_EW, activation_EW, None)
         gradients = Weights(total_8W[3:7].T.contiguous(), second_WW, total_8W[2], total_8W[0], total_8W[1])
@@ -117,17 +102,10 @@ class FusedEdges(Edges):
         edges, width = edge_EW.shape
         programs = self._programs(self.tuning.programs, triton.cdiv(edges, self.tuning.block), edge_EW.device)
         gns_step_forward[(programs,)](
-            edge=edge_EW,
-            edge_out=edge_EW if out_EW is None else out_EW,
-            message_out=message_EW,
-            **self._step(graph, ends, weights),
-            norm_bias=weights.shift,
-            LAST=last,
-            WIDTH=width,
-            BLOCK=self.tuning.block,
-            PRECISION=self.precision,
-            num_warps=self.tuning.warps,
-        )
+            edge=edge_EW, edge_out=edge_EW if out_EW is None else out_EW, message_out=message_EW,
+            **self._step(graph, ends, weights), norm_bias=weights.shift, LAST=last, WIDTH=width,
+            BLOCK=self.tuning.block, PRECISION=self.precision, num_warps=self.tuning.warps,
+        )  # fmt: skip
         return self._sums(graph, message_EW, None, ends.receive_NW, scaled=False), out_EW
 
     def step_backward(
@@ -149,36 +127,16 @@ class FusedEdges(Edges):
         gradient_EW = edge_EW if gradient_EW is None else gradient_EW.contiguous()
         step = self._step(graph, ends, weights)
         gns_norm_backward[(programs,)](
-            sum_gradient=self._stored(sum_gradient_NW * graph.scale),
-            gradient=gradient_EW,
-            edge=edge_EW,
-            **step,
-            activation=activation_EW,
-            second_gradient=second_EW,
-            partial=partial_P3W,
-            LAST=last,
-            WIDTH=width,
-            BLOCK=tuning.backward_block,
-            PRECISION=self.precision,
-            num_warps=tuning.backward_warps,
-        )
+            sum_gradient=self._stored(sum_gradient_NW * graph.scale), gradient=gradient_EW, edge=edge_EW,
+            **step, activation=activation_EW, second_gradient=second_EW, partial=partial_P3W, LAST=last,
+            WIDTH=width, BLOCK=tuning.backward_block, PRECISION=self.precision, num_warps=tuning.backward_warps,
+        )  # fmt: skip
         gns_layers_backward[(programs,)](
-            second_gradient=second_EW,
-            activation=activation_EW,
-            gradient=gradient_EW,
-            offset=step["offset"],
-            particles=step["particles"],
-            own=step["own"],
-            second=step["second"],
-            hidden_gradient=hidden_EW,
-            edge_gradient=result_EW,
-            partial=partial_P3W,
-            LAST=last,
-            WIDTH=width,
-            BLOCK=tuning.backward_block,
-            PRECISION=self.precision,
-            num_warps=tuning.backward_warps,
-        )
+            second_gradient=second_EW, activation=activation_EW, gradient=gradient_EW, offset=step["offset"],
+            particles=step["particles"], own=step["own"], second=step["second"], hidden_gradient=hidden_EW,
+            edge_gradient=result_EW, partial=partial_P3W, LAST=last, WIDTH=width, BLOCK=tuning.backward_block,
+            PRECISION=self.precision, num_warps=tuning.backward_warps,
+        )  # fmt: skip
         receive_NW = self._sums(graph, hidden_EW, None, ends.receive_NW, scaled=True)
         send_NW = self._sums(graph, hidden_EW, graph.by_sender, ends.receive_NW, scaled=True)
         second_WW, own_WW = self._weight_products(graph, second_EW, activation_EW, (hidden_EW, edge_EW))
@@ -238,17 +196,10 @@ class FusedEdges(Edges):
         order_E, offset_N1 = by_sender or (receivers.segment_E, receivers.offset_N1)
         total_NW = torch.empty_like(like_NW, memory_format=torch.contiguous_format)
         gns_edge_sums[(receivers.count,)](
-            value=value_EW,
-            order=order_E,
-            offset=offset_N1,
-            total=total_NW,
-            scale_ptr=graph.scale if scaled else total_NW,
-            ORDERED=by_sender is not None,
-            SCALED=scaled,
-            WIDTH=value_EW.shape[1],
-            BLOCK=SUM_BLOCK,
-            num_warps=SUM_WARPS,
-        )
+            value=value_EW, order=order_E, offset=offset_N1, total=total_NW,
+            scale_ptr=graph.scale if scaled else total_NW, ORDERED=by_sender is not None, SCALED=scaled,
+            WIDTH=value_EW.shape[1], BLOCK=SUM_BLOCK, num_warps=SUM_WARPS,
+        )  # fmt: skip
         return total_NW
 
     def _weight_products(
@@ -264,19 +215,11 @@ class FusedEdges(Edges):
         shape = (programs, 1 if own is None else 2, width, width)
         partial_PCWW = torch.empty(shape, dtype=torch.float32, device=second_EW.device)
         gns_weight_products[(programs,)](
-            second_gradient=second_EW,
-            activation=activation_EW,
-            hidden_gradient=second_EW if own is None else own[0],
-            edge=activation_EW if own is None else own[1],
-            offset=receivers.offset_N1,
-            particles=receivers.count,
-            partial=partial_PCWW,
-            BOTH=own is not None,
-            WIDTH=width,
-            STEP=tuning.product_rows,
-            PRECISION=self.precision,
-            num_warps=tuning.product_warps,
-        )
+            second_gradient=second_EW, activation=activation_EW,
+            hidden_gradient=second_EW if own is None else own[0], edge=activation_EW if own is None else own[1],
+            offset=receivers.offset_N1, particles=receivers.count, partial=partial_PCWW, BOTH=own is not None,
+            WIDTH=width, STEP=tuning.product_rows, PRECISION=self.precision, num_warps=tuning.product_warps,
+        )  # fmt: skip
         return (partial_PCWW.sum(0) / graph.scale).unbind(0)
 
     @staticmethod

@@ -186,34 +186,17 @@ class DeviceGrid:
         """Marks, numbers and tabulates the cells of all levels."""
         self.occupied.zero_()
         kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
-            position=position,
-            scene_of=scene_N,
-            origin=origin_S3,
-            particle_count=count,
-            low=self.low,
-            geometry=self.geometry,
-            occupied=self.occupied,
-            status=self.status,
-            cell_size=self.cell_size,
-            LEVELS=self.levels,
-            BLOCK=MARK_BLOCK,
-        )
+            position=position, scene_of=scene_N, origin=origin_S3, particle_count=count, low=self.low,
+            geometry=self.geometry, occupied=self.occupied, status=self.status, cell_size=self.cell_size,
+            LEVELS=self.levels, BLOCK=MARK_BLOCK,
+        )  # fmt: skip
         torch.cumsum(self.occupied, 0, dtype=torch.int32, out=self.prefix_sum)
         kernel.fill_tables[(triton.cdiv(self.largest, FILL_BLOCK), self.levels)](
-            occupied=self.occupied,
-            prefix_sum=self.prefix_sum,
-            geometry=self.geometry,
-            slot_of_cell=self.slot_of_cell,
-            neighbour=self._neighbour,
-            parent=self._parent,
-            octant=self._octant,
-            children=self._children,
-            counts=self.counts_L,
-            needed=self.needed_L,
-            status=self.status,
-            LEVELS=self.levels,
-            BLOCK=FILL_BLOCK,
-        )
+            occupied=self.occupied, prefix_sum=self.prefix_sum, geometry=self.geometry,
+            slot_of_cell=self.slot_of_cell, neighbour=self._neighbour, parent=self._parent, octant=self._octant,
+            children=self._children, counts=self.counts_L, needed=self.needed_L, status=self.status,
+            LEVELS=self.levels, BLOCK=FILL_BLOCK,
+        )  # fmt: skip
 
     def prepare(
         self,
@@ -240,25 +223,12 @@ class DeviceGrid:
         if config.relative:
             self.motion_C4.zero_()
         kernel.prepare_particles[blocks](
-            position=position,
-            velocity=velocity,
-            scene_of=scene_N,
-            origin=origin_S3,
-            particle_count=count,
-            low=self.low,
-            geometry=self.geometry,
-            occupied=self.occupied,
-            prefix_sum=self.prefix_sum,
-            cell_of=self.cell_N8,
-            weight_of=self.weight_N8,
-            fraction_of=self.fraction_N3,
-            motion=self.motion_C4,
-            cell_size=self.cell_size,
-            capacity=self.capacities[0],
-            HISTORY=config.velocity_history,
-            MOTION=config.relative,
-            BLOCK=PARTICLE_BLOCK,
-        )
+            position=position, velocity=velocity, scene_of=scene_N, origin=origin_S3, particle_count=count,
+            low=self.low, geometry=self.geometry, occupied=self.occupied, prefix_sum=self.prefix_sum,
+            cell_of=self.cell_N8, weight_of=self.weight_N8, fraction_of=self.fraction_N3, motion=self.motion_C4,
+            cell_size=self.cell_size, capacity=self.capacities[0], HISTORY=config.velocity_history,
+            MOTION=config.relative, BLOCK=PARTICLE_BLOCK,
+        )  # fmt: skip
         arguments = feature_arguments(
             config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
         )
@@ -268,25 +238,14 @@ class DeviceGrid:
             return
         if self.levels > 1:
             kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK),)](
-                motion=self.motion_C4,
-                parent=self._parent,
-                geometry=self.geometry,
-                counts=self.counts_L,
-                LEVELS=self.levels,
-                BLOCK=MARK_BLOCK,
-            )
+                motion=self.motion_C4, parent=self._parent, geometry=self.geometry, counts=self.counts_L,
+                LEVELS=self.levels, BLOCK=MARK_BLOCK,
+            )  # fmt: skip
         kernel.prepare_relative_features[blocks](
-            **arguments,
-            gravity=gravity_S3,
-            scale=std_3,
-            cell_of=self.cell_N8,
-            weight_of=self.weight_N8,
-            motion=self.motion_C4,
-            parent=self._parent,
-            geometry=self.geometry,
-            reach=config.contact_reach_cells * config.cell_size,
-            LEVELS=self.levels,
-        )
+            **arguments, gravity=gravity_S3, scale=std_3, cell_of=self.cell_N8, weight_of=self.weight_N8,
+            motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
+            reach=config.contact_reach_cells * config.cell_size, LEVELS=self.levels,
+        )  # fmt: skip
 
 
 def feature_arguments(

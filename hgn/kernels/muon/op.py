@@ -54,31 +54,12 @@ class SquareBlocks:
         """
         count, width, _ = self._direction_KWW.shape
         momentum_directions[(count,)](
-            starts=self.starts,
-            pitch=self.pitch,
-            gradient=gradient,
-            share=share,
-            first_moment=momentum,
-            direction=self._direction_KWW,
-            status=status,
-            norm=norm,
-            momentum=MOMENTUM,
-            epsilon=EPSILON,
-            WIDTH=width,
-            num_warps=WARPS,
-        )
+            starts=self.starts, pitch=self.pitch, gradient=gradient, share=share, first_moment=momentum,
+            direction=self._direction_KWW, status=status, norm=norm, momentum=MOMENTUM, epsilon=EPSILON,
+            WIDTH=width, num_warps=WARPS,
+        )  # fmt: skip
         step_blocks[(count,)](
-            starts=self.starts,
-            pitch=self.pitch,
-            direction=orthogonalised(self._direction_KWW),
-            value=values,
-            weight=weights,
-            rates=rates,
-            update=update,
-            status=status,
-            norm=norm,
-            step_size=step_size(width),
-            PRECISION=precision,
-            WIDTH=width,
-            num_warps=WARPS,
-        )
+            starts=self.starts, pitch=self.pitch, direction=orthogonalised(self._direction_KWW), value=values,
+            weight=weights, rates=rates, update=update, status=status, norm=norm, step_size=step_size(width),
+            PRECISION=precision, WIDTH=width, num_warps=WARPS,
+        )  # fmt: skip

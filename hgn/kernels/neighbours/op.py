@@ -50,27 +50,16 @@ class DeviceNeighbours:
         """Of the first `count` particles, int32 [1]. There is no grid for an origin to move."""
         list_, receivers, capacity = self.neighbours, self.neighbours.receivers, self.capacity
         kernel.pack_cells[(triton.cdiv(self.particles, KEY_BLOCK),)](
-            position=position_N3,
-            scene_of=scene_N,
-            particle_count=count,
-            key=self._key_N,
-            status=self.status,
-            size=0.5 * SLACK * self.radius,
-            particles=self.particles,
-            BLOCK=KEY_BLOCK,
-        )
+            position=position_N3, scene_of=scene_N, particle_count=count, key=self._key_N, status=self.status,
+            size=0.5 * SLACK * self.radius, particles=self.particles, BLOCK=KEY_BLOCK,
+        )  # fmt: skip
         torch.sort(self._key_N, stable=True, out=(self._sorted_N, list_.order_N))
         torch.index_select(position_N3, 0, list_.order_N, out=self.position_N3)
         kernel.find_runs[(triton.cdiv(self.particles, RUN_BLOCK),)](
-            key=self._sorted_N,
-            particle_count=count,
-            run_end=self._run_end,
-            run_shift=self._run_shift,
-            particles=self.particles,
-            SIDE=SIDE,
-            STEPS=max(LEAST_STEPS, self.particles.bit_length()),
+            key=self._sorted_N, particle_count=count, run_end=self._run_end, run_shift=self._run_shift,
+            particles=self.particles, SIDE=SIDE, STEPS=max(LEAST_STEPS, self.particles.bit_length()),
             BLOCK=RUN_BLOCK,
-        )
+        )  # fmt: skip
         self._walk(fill=False)
         torch.cumsum(self._counts_N, 0, out=receivers.offset_N1[1:])
         kernel.check_room[(1,)](
@@ -87,18 +76,8 @@ class DeviceNeighbours:
     def _walk(self, fill: bool) -> None:
         list_, receivers = self.neighbours, self.neighbours.receivers
         kernel.walk_neighbours[(triton.cdiv(self.particles, WALK_BLOCK),)](
-            position=self.position_N3,
-            run_end=self._run_end,
-            run_shift=self._run_shift,
-            counts=self._counts_N,
-            offset=receivers.offset_N1,
-            sender_of=list_.sender_E,
-            receiver_of=receivers.segment_E,
-            particles=self.particles,
-            capacity=self.capacity,
-            square_radius=self.radius * self.radius,
-            FILL=fill,
-            SIDE=SIDE,
-            BLOCK=WALK_BLOCK,
-            CANDIDATES=CANDIDATES,
-        )
+            position=self.position_N3, run_end=self._run_end, run_shift=self._run_shift, counts=self._counts_N,
+            offset=receivers.offset_N1, sender_of=list_.sender_E, receiver_of=receivers.segment_E,
+            particles=self.particles, capacity=self.capacity, square_radius=self.radius * self.radius,
+            FILL=fill, SIDE=SIDE, BLOCK=WALK_BLOCK, CANDIDATES=CANDIDATES,
+        )  # fmt: skip

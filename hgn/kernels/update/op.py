@@ -106,14 +106,9 @@ class UpdateSettings:
     @staticmethod
     def of(training: TrainingConfig, obstacle_cell_size: float) -> UpdateSettings:
         return UpdateSettings(
-            training.batch_scenes,
-            training.noise_std,
-            training.grid_jitter,
-            obstacle_cell_size,
-            training.symmetry != "none",
-            training.noise_correlated_fraction,
-            optimizer=training.optimizer,
-        )
+            training.batch_scenes, training.noise_std, training.grid_jitter, obstacle_cell_size,
+            training.symmetry != "none", training.noise_correlated_fraction, optimizer=training.optimizer,
+        )  # fmt: skip
 
 
 class Layout(Protocol):
@@ -333,16 +328,10 @@ class Updates:
         fused = self.fused
         fused.forward()
         kernel.loss_gradient[(triton.cdiv(self.particles, BLOCK),)](
-            output=fused.output,
-            target=self.target_N3,
-            share_of=self.share_N,
-            particle_count=self.particle_count,
-            gradient=fused.output_gradient,
-            loss=self.loss,
-            scale=1.0 / fused.unscale,
-            OUT=fused.output.shape[1],
-            BLOCK=BLOCK,
-        )
+            output=fused.output, target=self.target_N3, share_of=self.share_N,
+            particle_count=self.particle_count, gradient=fused.output_gradient, loss=self.loss,
+            scale=1.0 / fused.unscale, OUT=fused.output.shape[1], BLOCK=BLOCK,
+        )  # fmt: skip
         fused.backward()
         if self.reduce is not None:
             kernel.tell_overflow[(1,)](status=self.grid.status, flag=fused.totals[-TAIL:])
@@ -352,64 +341,31 @@ class Updates:
         fused, size, share = self.fused, self.packed.size, 1.0 / self.ranks
         blocks = (triton.cdiv(size, FLAT_BLOCK),)
         kernel.square_norm[blocks](
-            gradient=fused.totals,
-            size=size,
-            share=share,
-            flag=fused.totals[-TAIL:],
-            status=self.grid.status,
-            norm=self.norm,
-            BLOCK=FLAT_BLOCK,
-        )
+            gradient=fused.totals, size=size, share=share, flag=fused.totals[-TAIL:], status=self.grid.status,
+            norm=self.norm, BLOCK=FLAT_BLOCK,
+        )  # fmt: skip
         kernel.adam[blocks](
-            value=self.values,
-            weight=fused.weights,
-            gradient=fused.totals,
-            share=share,
-            first_moment=self.first_moment,
-            second_moment=self.second_moment,
-            rates=self._rates,
-            update=self.update,
-            step=self.step,
-            status=self.grid.status,
-            norm=self.norm,
-            size=size,
-            others=self.blocks.member if self.blocks else None,
-            PRECISION=fused.copy_precision,
+            value=self.values, weight=fused.weights, gradient=fused.totals, share=share,
+            first_moment=self.first_moment, second_moment=self.second_moment, rates=self._rates,
+            update=self.update, step=self.step, status=self.grid.status, norm=self.norm, size=size,
+            others=self.blocks.member if self.blocks else None, PRECISION=fused.copy_precision,
             BLOCK=FLAT_BLOCK,
-        )
+        )  # fmt: skip
         if self.blocks is not None:
             self.blocks.step(
-                self.values,
-                fused.weights,
-                self.first_moment,
-                fused.totals,
-                share,
-                self._rates,
-                self.update,
-                self.grid.status,
-                self.norm,
-                fused.copy_precision,
-            )
+                self.values, fused.weights, self.first_moment, fused.totals, share, self._rates, self.update,
+                self.grid.status, self.norm, fused.copy_precision,
+            )  # fmt: skip
         if self.average is not None:
             kernel.average_values[blocks](
-                value=self.values,
-                average=self.average,
-                shares=self._shares,
-                update=self.update,
-                status=self.grid.status,
-                size=size,
-                BLOCK=FLAT_BLOCK,
-            )
+                value=self.values, average=self.average, shares=self._shares, update=self.update,
+                status=self.grid.status, size=size, BLOCK=FLAT_BLOCK,
+            )  # fmt: skip
         fused.refresh_encoder()
         kernel.finish_update[(1,)](
-            status=self.grid.status,
-            update=self.update,
-            step=self.step,
-            loss=self.loss,
-            norm=self.norm,
-            loss_sum=self.loss_sum,
-            counters=self.counters,
-        )
+            status=self.grid.status, update=self.update, step=self.step, loss=self.loss, norm=self.norm,
+            loss_sum=self.loss_sum, counters=self.counters,
+        )  # fmt: skip
 
     def _assemble(self) -> None:
         """Windows, symmetry, noise and jitter of the update's samples; see hgn.training.noise for the torch backend."""
@@ -420,45 +376,21 @@ class Updates:
         if wave_step > 0:
             shortest, longest = (cells * config.cell_size for cells in SMOOTH_CELLS)
             kernel.draw_waves[(settings.scenes,)](
-                samples=self._samples,
-                update=self.update,
-                waves=self.waves_SKC,
-                amplitude_step=wave_step,
-                largest_number=2 * math.pi / shortest,
-                log_range=math.log(longest / shortest),
-                scenes=settings.scenes,
-                HISTORY=config.velocity_history,
-                WAVES=SMOOTH_WAVES,
-            )
+                samples=self._samples, update=self.update, waves=self.waves_SKC, amplitude_step=wave_step,
+                largest_number=2 * math.pi / shortest, log_range=math.log(longest / shortest),
+                scenes=settings.scenes, HISTORY=config.velocity_history, WAVES=SMOOTH_WAVES,
+            )  # fmt: skip
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
-            samples=self._samples,
-            sample_vectors=self._vectors,
-            update=self.update,
-            position=self.position_N3,
-            velocity=self.velocity_NV,
-            scene_of=self.scene_N,
-            material_of=self.material_N,
-            target=self.target_N3,
-            share_of=self.share_N,
-            origin=self.origin_S3,
-            domain=self.domain_S3,
-            gravity=self.gravity_S3,
-            obstacle_table=self._obstacle_row,
-            particle_count=self.particle_count,
-            mean=self.mean,
-            std=self.std,
-            noise_step=own_step,
-            waves=self.waves_SKC,
-            jitter=config.cell_size if settings.grid_jitter else 0.0,
-            scenes=settings.scenes,
-            obstacle_cell_size=settings.obstacle_cell_size,
-            HISTORY=config.velocity_history,
-            SYMMETRY=settings.symmetry,
-            NOISE=own_step > 0,
-            WAVES=SMOOTH_WAVES if wave_step > 0 else 0,
-            SCENES=triton.next_power_of_2(settings.scenes),
-            BLOCK=BLOCK,
-        )
+            samples=self._samples, sample_vectors=self._vectors, update=self.update, position=self.position_N3,
+            velocity=self.velocity_NV, scene_of=self.scene_N, material_of=self.material_N,
+            target=self.target_N3, share_of=self.share_N, origin=self.origin_S3, domain=self.domain_S3,
+            gravity=self.gravity_S3, obstacle_table=self._obstacle_row, particle_count=self.particle_count,
+            mean=self.mean, std=self.std, noise_step=own_step, waves=self.waves_SKC,
+            jitter=config.cell_size if settings.grid_jitter else 0.0, scenes=settings.scenes,
+            obstacle_cell_size=settings.obstacle_cell_size, HISTORY=config.velocity_history,
+            SYMMETRY=settings.symmetry, NOISE=own_step > 0, WAVES=SMOOTH_WAVES if wave_step > 0 else 0,
+            SCENES=triton.next_power_of_2(settings.scenes), BLOCK=BLOCK,
+        )  # fmt: skip
 
     def _grid(self) -> None:
         """What follows from where the particles are."""
@@ -466,20 +398,10 @@ class Updates:
         assert isinstance(grid, DeviceGrid)
         grid.build(self.position_N3, self.scene_N, self.origin_S3, self.particle_count)
         grid.prepare(
-            self.config,
-            self.position_N3,
-            self.velocity_NV,
-            self.scene_N,
-            self.material_N,
-            self.origin_S3,
-            self.domain_S3,
-            self.gravity_S3,
-            self.particle_count,
-            self.velocity_mean,
-            self.velocity_std,
-            self.obstacles,
-            self.settings.symmetry,
-        )
+            self.config, self.position_N3, self.velocity_NV, self.scene_N, self.material_N, self.origin_S3,
+            self.domain_S3, self.gravity_S3, self.particle_count, self.velocity_mean, self.velocity_std,
+            self.obstacles, self.settings.symmetry,
+        )  # fmt: skip
 
     # room
 
@@ -532,15 +454,9 @@ class Updates:
     def _device_grid(self, capacities: tuple[int, ...]) -> Tables:
         config = self.config
         return DeviceGrid(
-            self._window(),
-            self.settings.scenes,
-            capacities,
-            self.particles,
-            feature_columns(config),
-            config.cell_size,
-            self.device,
-            config.relative,
-        )
+            self._window(), self.settings.scenes, capacities, self.particles, feature_columns(config),
+            config.cell_size, self.device, config.relative,
+        )  # fmt: skip
 
     def _make_room(self, status: int, needed: list[int]) -> None:
         if status & OUT_OF_WINDOW:
