@@ -18,6 +18,8 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # a simulation makes no ne
 
 import taichi as ti
 
+from datagen.mpm.taichi_compat import name_lines_alone
+
 
 @dataclass(frozen=True)
 class Device:
@@ -55,6 +57,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
                 "use another process"
             )
         return _started
+    name_lines_alone()
     ti.set_logging_level(ti.ERROR)  # the search for CUDA warns where there is none
     has_gpu = device != "cpu" and ti.lang.misc.is_arch_supported(ti.cuda)
     if device == "gpu" and not has_gpu:

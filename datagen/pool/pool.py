@@ -170,6 +170,8 @@ class Pool:
                 self._hand_out()
                 published = self._publish()
                 if not published and self._writer.complete:
+                    for solver in self._solvers:
+                        solver.dismiss()
                     return
                 self._receive(0.0 if published else _PACKING_SECONDS if self._writer.packing else _WAIT_SECONDS)
         finally:

@@ -41,6 +41,7 @@ from hgn.system.processes import die_with_parent
 
 _FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
 _STAGING_THREADS = 8
+_END_SECONDS = 10.0  # which a dismissed worker has
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,9 @@ class Worker(ABC):
         """Sends what belongs to work that it has. Only workers that leave something to be sent later are told."""
         raise NotImplementedError
 
+    def dismiss(self) -> None:  # noqa: B027 - Ray ends its actors itself
+        """Tells an idle one that nothing comes any more; `kill` waits a little for its end then."""
+
     @abstractmethod
     def kill(self) -> None:
         """Ends it at once."""
@@ -122,7 +126,7 @@ class LocalWorker(Worker):
         with _terminal_signals_blocked():
             self.process.start()
         child.close()
-        self.idle = True
+        self.idle, self._patience_s = True, 0.0
 
     def give(self, message: object) -> None:
         self.idle = False
@@ -132,8 +136,14 @@ class LocalWorker(Worker):
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send(message)
 
+    def dismiss(self) -> None:
+        # Taichi writes what it compiled to its cache as the process ends
+        self.connection.close()
+        self._patience_s = _END_SECONDS
+
     def kill(self) -> None:
         # staged files appear whole or not at all, so nothing is half-written
+        self.process.join(self._patience_s)
         self.process.kill()
         self.process.join()
         self.connection.close()

@@ -2,11 +2,12 @@
 
 Loaded by name inside spawned workers. A file `simulated.log` in the working folder of a test records each key that
 was simulated; files named `kill-<seed>`, `fail-<seed>` and `late-<seed>` there make the solver die or fail at that
-seed, or its scene come late.
+seed, or its scene come late; in a folder `ending` each process that ends in order leaves a file.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import time
@@ -97,6 +98,8 @@ def simulate(
             time.sleep(0.5)
         while control(f"hold-{scene.seed}").exists():
             time.sleep(0.02)
+        if control("ending").exists():
+            atexit.register((control("ending") / str(os.getpid())).touch)
         if control("raise").exists():
             raise RuntimeError("a fault in the solver")
         kill = control(f"kill-{scene.seed}")

@@ -8,6 +8,26 @@ import sys
 from pathlib import Path
 
 import pytest
+import taichi as ti
+
+from datagen.mpm.device import initialise
+
+
+@ti.kernel
+def faulty():
+    ti.no_such_function()
+
+
+def test_a_fault_in_a_kernel_names_its_line() -> None:
+    """File, line and function, once; Taichi's drawing of the line is left out, for it draws as many as expressions."""
+    initialise("cpu", 2)
+    with pytest.raises(ti.TaichiCompilationError) as fault:
+        faulty()
+    line = faulty._primal.func.__code__.co_firstlineno + 2
+    assert f'File "{__file__}", line {line}, in faulty:\n' in str(fault.value) and "no_such_function()" not in str(
+        fault.value
+    )
+
 
 PROGRAM = """
 from datagen.mpm.device import initialise, ti
