@@ -23,7 +23,8 @@ from typing import Any
 PRELOADED = (
     *("lightning.pytorch", "lightning.pytorch.loggers", "tensorboard.compat.proto.summary_pb2", "hydra", "h5py"),
     *("torch.distributed.run", "torch.distributed.elastic.rendezvous.c10d_rendezvous_backend", "scipy.spatial"),
-    *("hgn.rollout", "hgn.evaluate", "hgn.export", "hgn.train", "hgn.training.session"),
+    *("torch.distributed.algorithms.ddp_comm_hooks.debugging_hooks", "hgn.hydra_compat", "hgn.training.callbacks"),
+    *("hgn.rollout", "hgn.evaluate", "hgn.export", "hgn.train", "hgn.training.session", "hgn.training.tensorboard"),
 )
 REQUEST_BYTES = 1 << 20
 
@@ -117,6 +118,9 @@ def run(request: dict[str, Any]) -> None:
 if __name__ == "__main__":
     import importlib
 
+    from hydra.core.plugins import Plugins
+
     for name in PRELOADED:
         importlib.import_module(name)
+    Plugins.instance()  # Hydra's own, of which each command would look for all
     run(serve(sys.argv[1]))
