@@ -206,6 +206,7 @@ class DatasetConfig:
     episodes_per_shard: Positive[int] = 8  # the first training shards are smaller, so that training can start early
     workers: OneOrMore | None = None  # null: one for each GPU, or for two cores of a CPU; 1 leaves other GPUs alone
     maximum_attempts: Positive[int] = 3  # per scene before it is quarantined and replaced
+    worker_silence_s: Positive[float] = 600.0  # after which a process of this machine that has work is replaced
     pool: str = "local"  # processes of this machine; or ray: of a Ray cluster
     # of the cluster, as in 10.0.0.1:6379; null: $RAY_ADDRESS, else the cluster that this machine is in
     ray_address: str | None = None

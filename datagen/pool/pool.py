@@ -277,12 +277,19 @@ class Pool:
 
     def _receive(self, timeout: float) -> None:
         for worker, message in self._crew.receive((*self._makers, *self._solvers), timeout):
+            worker.heard_at = time.monotonic()
             if message is not None:
                 self._handle(worker, *message)
             elif self._should_stop():  # a signal to the whole process group ends workers too
                 raise Stopped
             else:
-                self._replace(worker)
+                self._replace(worker, worker.cause_of_death())
+        # a process that is stopped, or waits for a device for ever; actors of a cluster speak at the end alone
+        silence = self._config.dataset.worker_silence_s
+        for worker in (*self._makers, *self._solvers):
+            silent = isinstance(worker, LocalWorker) and time.monotonic() - worker.heard_at > silence
+            if silent and worker.tasks:
+                self._replace(worker, f"it said nothing for {silence:.0f} s")
 
     def _handle(self, worker: Worker, kind: str, *values: Any) -> None:
         if kind == "idle":
@@ -347,8 +354,8 @@ class Pool:
         self._todo.append(task)
         self._todo.sort(key=self._place)
 
-    def _replace(self, worker: Worker) -> None:
-        cause, blamable = worker.cause_of_death(), worker.blamable()
+    def _replace(self, worker: Worker, cause: str) -> None:
+        blamable = worker.blamable()
         self._deaths_in_a_row += blamable
         attempts = self._config.dataset.maximum_attempts
         halvings = self._plan.scenes_per_launch.bit_length()

@@ -90,6 +90,7 @@ class Worker(ABC):
         self.idle = False
         self.tasks: dict[str, SceneTask | MadeScene | GridTask] = {}  # what it has and has not answered for, by key
         self.given = 0  # scenes to simulate, in all
+        self.heard_at = time.monotonic()  # when it was last given or said something
 
     @abstractmethod
     def give(self, message: object) -> None:
@@ -129,7 +130,7 @@ class LocalWorker(Worker):
         self.idle, self._patience_s = True, 0.0
 
     def give(self, message: object) -> None:
-        self.idle = False
+        self.idle, self.heard_at = False, time.monotonic()
         self.tell(message)
 
     def tell(self, message: object) -> None:

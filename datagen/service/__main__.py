@@ -22,7 +22,9 @@ from hgn.data.identity import require_same_dataset
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.storage import TOKEN_VARIABLE, dataset_token
 from hgn.schema import ConfigError, from_mapping, require
+from hgn.system.machine import allow_open_files
 
+_OPEN_FILES = 65536
 _SERVICE_KEYS = ("host", "port", "connections")
 
 
@@ -44,7 +46,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
         progress = make_progress(kind)
         with Supervisor(config.awaited, progress, backend) as supervisor:
             app = make_app(folder, token, lambda: supervisor.state)
-            server = make_server(app, service.connections)
+            server = make_server(app, service.connections, allow_open_files(_OPEN_FILES))
 
             def end() -> None:
                 server.should_exit = True

@@ -45,6 +45,9 @@ from hgn.schema import ConfigError, to_mapping
 
 _OPEN_PATHS = ("/healthz",)
 _GRACE_S = 5  # for answers that are being sent when the service is stopped; readers go on where they were cut
+_BACKLOG = 256  # connections that are accepted before any of them is looked at
+_OTHER_FILES = 64
+OPEN_FILES = 1024  # of a process, where nothing else is said
 _REMEDY = "delete it and run the generator again"
 
 
@@ -128,6 +131,12 @@ class Guard:
             self._counters["bytes"] += len(message.get("body", b"")) + message.get("count", 0)
 
         if scope["type"] != "http":
+            return
+        if any(
+            name == b"transfer-encoding" or (name == b"content-length" and value != b"0")
+            for name, value in scope["headers"]
+        ):
+            await PlainTextResponse("nothing can be sent here\n", 413, {"connection": "close"})(scope, receive, counted)
             return
         if not self._allowed(scope):
             refusal = PlainTextResponse(
@@ -235,19 +244,24 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
     return app
 
 
-def make_server(app: ASGIApp, connections: int) -> uvicorn.Server:
-    """Serves `app` to as many connections at once; more are told to come back."""
+def make_server(
+    app: ASGIApp, connections: int, open_files: int = OPEN_FILES, patience_s: float = SendfileProtocol.patience_s
+) -> uvicorn.Server:
+    """Serves `app` to as many connections at once, or as `open_files` are enough for; more are told to come back."""
+    most = max(1, min(connections, (open_files - _BACKLOG - _OTHER_FILES) // 2))  # a socket and a shard each
+    limits = {"most_connections": most, "patience_s": patience_s}
     return uvicorn.Server(
         uvicorn.Config(
             app,
-            http=SendfileProtocol,
+            http=type("Protocol", (SendfileProtocol,), limits),
+            backlog=_BACKLOG,
             loop="asyncio",  # uvloop, which Uvicorn takes where it is installed, cannot send files
             lifespan="off",
             ws="none",
             log_level="warning",
             access_log=False,
             server_header=False,
-            limit_concurrency=connections,
+            limit_concurrency=most + 1,
             timeout_graceful_shutdown=_GRACE_S,
         )
     )

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from functools import partial
 from typing import Any, BinaryIO, cast
 
@@ -13,6 +14,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from datagen.service.sendfile import EXTENSION
+
+_PIECE_BYTES = 2**20  # a reader must take so much in `patience_s`
 
 
 class _Length:
@@ -26,11 +29,46 @@ class _Length:
 
 
 class SendfileProtocol(H11Protocol):
-    """Uvicorn's HTTP on asyncio's own loop with `http.response.zerocopysend`."""
+    """Uvicorn's HTTP on asyncio's own loop with `http.response.zerocopysend`, and with an end to all waiting.
+
+    A connection on which no whole request comes for `patience_s`, or whose answer is not taken, is cut. Where there are
+    more than `most_connections`, the one that has been without a request for longest makes room. Uvicorn's own limits
+    are silent until a first answer was sent, and count connections without a request as load.
+    """
+
+    patience_s = 30.0
+    most_connections = 1024
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.app = cast(Any, partial(self._with_extension, self.app))
+        self._seen: tuple[int, int] | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.made_at = self.loop.time()
+        if len(self.connections) > self.most_connections:
+            waiting = [other for other in self.connections if isinstance(other, SendfileProtocol) and not other.busy]
+            if oldest := min(waiting, key=lambda other: other.made_at, default=None):
+                oldest.transport.abort()
+                self.connections.discard(oldest)
+        self._look()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a request is being answered."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _look(self) -> None:
+        if self not in self.connections:
+            return
+        unsent = self.transport.get_write_buffer_size()
+        seen = id(self.cycle), unsent
+        if seen == self._seen and (unsent or not self.busy):
+            self.transport.abort()
+        else:
+            self._seen = seen
+            self.loop.call_later(self.patience_s, self._look)
 
     async def _with_extension(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
         async def send_all(message: Message) -> None:
@@ -46,10 +84,15 @@ class SendfileProtocol(H11Protocol):
 
     async def _send_file(self, file: BinaryIO, offset: int, count: int) -> bool:
         """Whether the bytes are on their way; not so when the reader has gone, or the file is too short."""
-        if self.transport.is_closing():
-            return False
         self.conn.send_with_data_passthrough(h11.Data(data=cast(bytes, _Length(count))))
         try:
-            return await self.loop.sendfile(self.transport, file, offset, count) == count
-        except ConnectionError:
+            for start in range(offset, offset + count, _PIECE_BYTES):
+                if self.transport.is_closing():
+                    return False
+                piece = min(_PIECE_BYTES, offset + count - start)
+                sending = self.loop.sendfile(self.transport, file, start, piece)
+                if await asyncio.wait_for(sending, self.patience_s) != piece:
+                    return False
+        except (ConnectionError, TimeoutError):
             return False
+        return True

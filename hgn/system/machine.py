@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import resource
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -79,3 +80,11 @@ def _read(file: Path) -> str | None:
         return file.read_text(encoding="ascii").strip()
     except OSError:
         return None
+
+
+def allow_open_files(wanted: int) -> int:
+    """Raises this process's limit of open files towards `wanted`, as far as it may; returns the limit."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    limit = max(soft, min(wanted, hard)) if hard != resource.RLIM_INFINITY else max(soft, wanted)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
+    return limit

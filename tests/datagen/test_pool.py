@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datagen.pool.plan import scene_seed
+from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import LocalCrew, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
 from datagen.pool.progress import Progress
-from datagen.pool.worker import Backend, Worker
+from datagen.pool.worker import Backend, LocalWorker, MadeScene, Worker
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
@@ -313,3 +313,46 @@ def test_tars_are_those_of_tarfile(make_config: MakeConfig, backend: Backend, tm
                 plain.size, plain.mode = info.size, 0o644
                 own.addfile(plain, given.extractfile(info))
         assert path.read_bytes() == (tmp_path / "own.tar").read_bytes()
+
+
+class StoppedWorker(LocalWorker):
+    """One that says nothing."""
+
+    def __init__(self) -> None:
+        Worker.__init__(self)
+        self.killed, self.idle = False, True
+
+    def tell(self, message: object) -> None:
+        pass
+
+    def kill(self) -> None:
+        self.killed = True
+
+
+def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A solver that has work and says nothing for too long (SIGSTOP, a device that hangs) is ended; one without work
+    is left alone. Its scene is tried again by another."""
+    now = [1000.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    solvers: list[StoppedWorker] = []
+
+    class Crew:
+        def start_maker(self) -> Worker:
+            return StoppedWorker()
+
+        def start_solver(self, number: int) -> Worker:
+            solvers.append(StoppedWorker())
+            return solvers[-1]
+
+        def receive(self, workers: Any, timeout: float) -> Any:
+            now[0] += 301
+            if len(solvers) > 1:
+                raise TimeoutError("the test ends")
+            made = [(worker, task) for worker in workers for task in worker.tasks.values()]
+            return [(worker, ("made", MadeScene(t, None, None))) for worker, t in made if isinstance(t, SceneTask)]
+
+    config, recorder = make_config(training_scenes=1, validation_scenes=0, test_scenes=0), Recorder()
+    with DatasetWriter(config) as writer, pytest.raises(TimeoutError):
+        Pool(config, writer, recorder, ONE, Crew()).run()  # type: ignore[arg-type]
+    assert recorder.messages[0].startswith("a worker died (it said nothing for 600 s); it is replaced")
+    assert solvers[0].killed and solvers[0].heard_at > 1000

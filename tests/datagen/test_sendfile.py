@@ -9,18 +9,24 @@ import logging
 import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import uvicorn
+from processes import wait_until
 from starlette.applications import Starlette
+from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
 from datagen.service.sendfile import EXTENSION, FileRange
-from datagen.service.server import make_server
+from datagen.service.server import Guard, make_server
 
 SIZE = 5_000_001
 
@@ -32,19 +38,34 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
+Port = Callable[..., tuple[int, uvicorn.Server]]
+
+
 @pytest.fixture
-def port(file: Path) -> Iterator[int]:
+def serve(file: Path) -> Iterator[Port]:
     async def answer(request: Request) -> Response:
         assert EXTENSION in request.scope["extensions"]
         return FileRange(file, SIZE, {"etag": '"tag"'}, "application/octet-stream")
 
-    listener = socket.create_server(("127.0.0.1", 0))
-    server = make_server(Starlette(routes=[Route("/file", answer)]), connections=8)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    yield listener.getsockname()[1]
-    server.should_exit = True
-    thread.join()
+    begun: list[tuple[uvicorn.Server, threading.Thread]] = []
+
+    def serve(**limits: Any) -> tuple[int, uvicorn.Server]:
+        listener = socket.create_server(("127.0.0.1", 0))
+        app = Starlette(routes=[Route("/file", answer)], middleware=[Middleware(Guard, token=None, counters=Counter())])
+        server = make_server(app, **limits)
+        begun.append((server, threading.Thread(target=server.run, kwargs={"sockets": [listener]})))
+        begun[-1][1].start()
+        return listener.getsockname()[1], server
+
+    yield serve
+    for server, thread in begun:
+        server.should_exit = True
+        thread.join()
+
+
+@pytest.fixture
+def port(serve: Port) -> int:
+    return serve(connections=8)[0]
 
 
 class LoopOfUvloop(asyncio.SelectorEventLoop):
@@ -120,3 +141,43 @@ def test_file_that_became_shorter(port: int, file: Path) -> None:
     with pytest.raises((http.client.IncompleteRead, ConnectionError)):
         connection.getresponse().read()
     connection.close()
+
+
+HALF = b"GET /file HTTP/1.1\r\n"
+EIGHT = {"connections": 1000, "open_files": 256 + 64 + 16}  # by the limit of open files
+
+
+def waiting(port: int, sent: bytes) -> socket.socket:
+    connection = socket.create_connection(("127.0.0.1", port))
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    connection.sendall(sent)
+    return connection
+
+
+@pytest.mark.parametrize("sent", [b"", HALF])
+def test_who_only_waits_keeps_nobody_out(serve: Port, sent: bytes, file: Path) -> None:
+    """More connections than the limit that send nothing, or half a request, make room for one that asks."""
+    port, server = serve(**EIGHT)
+    with ExitStack() as stack:
+        for _ in range(40):
+            stack.enter_context(waiting(port, sent))
+        with closing(http.client.HTTPConnection("127.0.0.1", port)) as connection:
+            connection.request("GET", "/file", headers={"Range": "bytes=0-9"})
+            assert connection.getresponse().read() == file.read_bytes()[:10]
+        assert len(server.server_state.connections) <= 8
+
+
+def test_waiting_comes_to_an_end(serve: Port) -> None:
+    """Connections that send nothing, half a request, or never read their answer, are cut."""
+    port, server = serve(**EIGHT, patience_s=0.2)
+    with waiting(port, b""), waiting(port, HALF), waiting(port, HALF + b"Host: x\r\n\r\n"):
+        wait_until(lambda: len(server.server_state.connections) == 3)
+        wait_until(lambda: not server.server_state.connections)
+
+
+def test_bodies_are_refused(port: int) -> None:
+    """A request with a body, perhaps without an end, is answered and its connection closed."""
+    with socket.create_connection(("127.0.0.1", port)) as endless:
+        endless.sendall(b"GET /file HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n")
+        answer = b"".join(iter(lambda: endless.recv(4096), b""))
+    assert answer.startswith(b"HTTP/1.1 413") and b"nothing can be sent here" in answer

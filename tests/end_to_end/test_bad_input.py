@@ -266,7 +266,7 @@ def test_damaged_shards(
     ("change", "message"),
     [
         ({"schema_version": 99}, "schema_version must be 1, got 99"),
-        ({"shards": "none"}, "shards must be a list, got 'none'"),
+        ({"index": "none"}, "index must be a mapping of keys to values, got 'none'"),
         ({"invented": 1}, "invented is not a known key"),
     ],
 )

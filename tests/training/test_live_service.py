@@ -133,8 +133,7 @@ def test_stopped_while_its_service_is_away(
     monkeypatch.setattr(hgn.training.data_module, "LOOK_S", 0.05)
     make_dataset(make_config())
     files = fsspec.filesystem("memory")
-    for path in (tmp_path / "data").glob("*.*"):
-        files.pipe(f"/leaving/{path.name}", path.read_bytes())
+    files.put(str(tmp_path / "data"), "/leaving", recursive=True)
     real, opened, asked = EpisodeStore._open, [], []
 
     def gone(*arguments: object, **options: object) -> bytes:
