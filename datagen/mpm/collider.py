@@ -3,20 +3,23 @@
 The paper's cell normals leak when used as a collider, so the solver builds its own from the triangles.
 Shape legend: K contact nodes, P points, F triangles, V vertices.
 
-Closed bodies: nodes inside, 0.4 cells below the surface, with the normal outward; where the body is thinner
-than a cell, so that no node may lie there, those nearer to the surface and outside too, in a band of one cell at least.
+Nodes inside a closed body and up to a quarter of a cell above its surface stop what moves inward; where the body is
+thinner than a cell, so that no node may lie there, those nearer to the surface and outside too, in a band of one cell
+at least.
 
 Sheets (open meshes): particles on both sides reach the same nodes, and would hold each other through them. So a node
 near a sheet has two fields of mass and velocity (Bardenhagen et al. 2000): one for the particles that see it, one for
 those that the sheet hides it from (the "colours" of Hu et al. 2018, by line of sight). For the latter the node lies
 beyond the surface, as the inside of a body does: there the same rule holds, with the normal toward the sheet.
 
+A particle's spline reaches 1.5 cells, so a node stops material that is still far off. That is a gap, and therefore
+nodes near the surface stop none until they have the mass that they have where material lies within 0.75 cells of the
+surface. Without nodes at the surface itself nothing bears the three quarters of the load that come to them: the lowest
+cell of sand falls into a single layer, whose particles the swept test stops one by one, and the sand is braked as if
+it were thinner than it is.
+
 Where two obstacles claim a node, the closest surface wins. What nodes leave open the swept test stops, with the same
 friction.
-
-A particle's spline reaches 1.5 cells, so a solid block stops well above the uppermost node that stops it: 0.85 cells
-where there is one layer of such nodes, up to 1.38 where there are more below. For it to rest within a cell of the
-surface those nodes must lie 0.4 cells below it.
 """
 
 from __future__ import annotations
@@ -33,12 +36,15 @@ from hgn.schema import ConfigError
 
 SEEN, HIDDEN = 0, 1  # the two fields of a node
 ON_SURFACE_CELLS = 0.05  # nearer than this, the direction to the surface is rounding
-BARE_CELLS = 0.4  # below a surface, where nodes stop nothing
+BEARING_CELLS = 0.25  # above a surface, up to where nodes stop motion
+GAP_CELLS = 0.75  # from a surface, where material is that nodes begin to stop
 STENCIL_CELLS = 1.501  # from a particle to its nodes, along each axis, with rounding
 ON_EDGE = 1e-6  # of a triangle's edge: as near to it a place lies on it
 WIDENED = 1 + 1e-3  # triangles, since kernels look a ten-thousandth beyond their edges
 # squared area over fourth power of the longest edge, below which a triangle has no direction
 FLAT_TRIANGLE = 1e-20
+# of nodes, flat index [P]: signed distance from the surface in cells [P], free direction [P, 3], least mass [P]
+Contacts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +54,8 @@ class Collider:
     node_K3: np.ndarray  # int32, unique
     normal_K23: np.ndarray  # float32, of both fields: what is free, unit length; zero where all motion is
     obstacle_K2: np.ndarray  # int32, whose contact it is in either field
+    # float32: the share of a full cell's mass from which on the node stops that field's motion
+    least_K2: np.ndarray
     doubled_K: np.ndarray  # bool: sheets hide the node from some particles
     closed: tuple[Obstacle, ...]
     sweep: Sweep
@@ -82,7 +90,8 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
         if obstacle.closed:
             surfaces[SEEN].merge(index, _closed_contacts(obstacle, triangle_F33, band_cells, shape, scene.cell_size))
         else:
-            surfaces[HIDDEN].merge(index, _sheet_contacts(triangle_F33, rim_F6, shape))
+            for surface, contacts in zip(surfaces, _sheet_contacts(triangle_F33, rim_F6, shape), strict=True):
+                surface.merge(index, contacts)
             centre_F13 = triangle_F33.mean(axis=1, keepdims=True)
             for node, _ in near_slabs(centre_F13 + WIDENED * (triangle_F33 - centre_F13), STENCIL_CELLS, shape):
                 doubled[np.ravel_multi_index(node.T, shape)] = True
@@ -91,6 +100,7 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
         np.stack(np.unravel_index(node, shape), axis=1).astype(np.int32),
         np.stack([surface.normal[node] for surface in surfaces], axis=1),
         np.stack([surface.obstacle[node] for surface in surfaces], axis=1),
+        np.stack([surface.least[node] for surface in surfaces], axis=1),
         doubled[node],
         tuple(obstacle for obstacle in scene.obstacles if obstacle.closed and len(obstacle.triangle_F3)),
         build_sweep(
@@ -109,12 +119,26 @@ class _Surface:
         self.distance = np.full(count, np.inf)
         self.normal = np.zeros((count, 3), np.float32)
         self.obstacle = np.zeros(count, np.int32)
+        self.least = np.zeros(count, np.float32)
 
-    def merge(self, obstacle: int, contacts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-        node, distance, normal = contacts
+    def merge(self, obstacle: int, contacts: Contacts) -> None:
+        node, height, normal, least = contacts
+        distance = np.abs(height)
         nearer = distance < self.distance[node]
         node = node[nearer]
-        self.distance[node], self.normal[node], self.obstacle[node] = distance[nearer], normal[nearer], obstacle
+        self.distance[node], self.normal[node], self.least[node] = distance[nearer], normal[nearer], least[nearer]
+        self.obstacle[node] = obstacle
+
+
+def reached(height: np.ndarray) -> np.ndarray:
+    """The share of a full cell's mass that nodes at such heights above a surface, in cells, have where material fills
+    the half-space from GAP_CELLS above it on: the spline's integral.
+    """
+    below = GAP_CELLS - height
+    far = np.clip(1.5 - np.abs(below), 0, 1) ** 3 / 6
+    near = 0.5 - np.abs(below) * (0.75 - below**2 / 3)
+    share = np.where(np.abs(below) < 0.5, near, far)
+    return np.asarray(np.where(below < 0, 1 - share, share))
 
 
 def _triangles(obstacle: Obstacle, index: int, cell_size: float) -> tuple[np.ndarray, np.ndarray]:
@@ -194,20 +218,20 @@ def _points(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.stack(np.unravel_index(flat, shape), axis=1).astype(np.float64)
 
 
-def _sheet_contacts(
-    triangle_F33: np.ndarray, rim_F6: np.ndarray, shape: tuple[int, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes that a sheet may hide: flat index [P], distance [P], and what is free for a particle on its other side."""
+def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, shape: tuple[int, ...]) -> tuple[Contacts, Contacts]:
+    """Nodes near a sheet: what is free for particles on their own side of it, and on the other."""
     node, distance, foot, owner = _rasterise(triangle_F33, WIDENED * STENCIL_CELLS * np.sqrt(3.0), shape)
     face = _face_normals(triangle_F33)[owner]
     offset = _points(node, shape) - foot
     height = (offset * face).sum(axis=1)
     away = offset / np.where(distance < ON_SURFACE_CELLS, 1.0, distance)[:, None]
     # around the rim the way to the foot leads along the sheet, not through it
-    across = (distance < ON_SURFACE_CELLS) | _on_rim(foot, triangle_F33[owner], rim_F6[owner])
+    on_rim = _on_rim(foot, triangle_F33[owner], rim_F6[owner])
+    across = (distance < ON_SURFACE_CELLS) | on_rim
     away[across] = face[across] * np.where(height[across] < 0, -1.0, 1.0)[:, None]
     depth = np.where(across, np.abs(height), distance)
-    return node, distance, np.where((depth >= BARE_CELLS)[:, None], -away, 0.0)
+    own = (distance <= BEARING_CELLS) & ~on_rim
+    return (node[own], distance[own], away[own], reached(distance[own])), (node, -distance, -away, reached(-depth))
 
 
 def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -> np.ndarray:
@@ -226,7 +250,7 @@ def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -
 
 def _closed_contacts(
     obstacle: Obstacle, triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], cell_size: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> Contacts:
     # one cell at least: a line of nodes that crosses the surface then meets a node of the band
     band = max(band, 1.0)
     node, distance, foot, owner = _rasterise(triangle_F33, band, shape)
@@ -249,11 +273,17 @@ def _closed_contacts(
     normal = np.where(on_surface[:, None], face, away)
 
     # thin: a cell further on, past the surface, lies outside again
+    height = sign * distance
     thin = np.zeros(len(node), bool)
-    between = np.flatnonzero((sign * distance > -BARE_CELLS) & (distance <= band))
-    thin[between] = ~contains((foot[between] - normal[between]) * cell_size, obstacle)
-    chosen = (sign * distance <= -BARE_CELLS) | thin
-    node, distance, normal = node[chosen], distance[chosen], normal[chosen]
+    outside = np.flatnonzero(height > -BEARING_CELLS)
+    thin[outside] = ~contains((foot[outside] - normal[outside]) * cell_size, obstacle)
+    chosen = (height <= BEARING_CELLS) | thin
+    node, height, normal, least = (
+        node[chosen],
+        height[chosen],
+        normal[chosen],
+        np.where(thin, 0.0, reached(height))[chosen],
+    )
 
     deep = np.flatnonzero(inside.ravel() & ~near.ravel())
     if len(deep):  # the way out leads to the surface that is nearest to the nearest node of the band
@@ -263,9 +293,10 @@ def _closed_contacts(
         source = np.ravel_multi_index([axis.ravel()[deep] for axis in nearest], shape)
         out = feet[source] - _points(deep, shape)
         depth = np.linalg.norm(out, axis=1)
-        node, distance = np.concatenate([node, deep]), np.concatenate([distance, depth])
+        node, height = np.concatenate([node, deep]), np.concatenate([height, -depth])
         normal = np.concatenate([normal, out / depth[:, None]])
-    return node, distance, normal
+        least = np.concatenate([least, np.zeros(len(deep))])
+    return node, height, normal, least
 
 
 def _fill_inside(inside: np.ndarray, near: np.ndarray, obstacle: Obstacle, cell_size: float) -> None:

@@ -78,6 +78,15 @@ def particle_bounds(scene: Scene, config: MpmConfig) -> tuple[np.ndarray, np.nda
     return (low * (1 + 1e-6)).astype(np.float32), (high * (1 - 1e-6)).astype(np.float32)
 
 
+def cell_mass(scene: Scene) -> float:
+    """The particles that fill a cell: as the scene says, or else the median of those that share one with a particle."""
+    if scene.particles_per_cell is not None:
+        return scene.particles_per_cell
+    cell = np.floor(np.asarray(scene.position_N3, np.float64) / scene.cell_size).astype(np.int64)
+    _, own, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    return float(np.median(count[own.ravel()]))
+
+
 def fixed_substeps(config: MpmConfig, frame_rate_hz: float) -> int:
     """Substeps a frame of a fixed time step: as many as it takes to reach the frame's end."""
     return max(1, math.ceil(1 / (frame_rate_hz * config.fixed_time_step_s) - 1e-6))
@@ -284,6 +293,8 @@ class Launch(ABC):
         vector = np.zeros((len(order), NODE_VECTORS, 3), np.float32)
         vector[:, :2] = np.concatenate([collider.normal_K23 for collider in self.colliders])[order]
         vector[:, 2, :2] = self.config.collider_friction
+        least = [cell_mass(scene) * own.least_K2 for scene, own in zip(self.scenes, self.colliders, strict=True)]
+        vector[:, 3, :2] = np.concatenate(least)[order]
         return places[order], np.arange(len(order), dtype=np.int32), vector.reshape(-1, 3)
 
     def _places(self, node_K3: np.ndarray) -> np.ndarray:

@@ -347,9 +347,12 @@ def node_velocity(
                 entry = facing // 2
                 field = facing - 2 * entry
                 friction = contact_normal[NODE_VECTORS * entry + 2][0]
+                least = contact_normal[NODE_VECTORS * entry + 3][0]
                 if field == 1:
                     friction = contact_normal[NODE_VECTORS * entry + 2][1]
-                v = meet(v, contact_normal[NODE_VECTORS * entry + field], friction)
+                    least = contact_normal[NODE_VECTORS * entry + 3][1]
+                if mass >= least:
+                    v = meet(v, contact_normal[NODE_VECTORS * entry + field], friction)
         # walls last: whatever a collider leaves, nothing leaves the domain
         index = ti.Vector(
             [

@@ -8,8 +8,8 @@ CLEARANCE = 1e-3  # cells from a triangle, nearer than which a particle may not 
 STOP = 1.5 * CLEARANCE  # where it is put, so that rounding does not bring it nearer
 EDGE = 1e-4  # of a triangle's edge: how far past it a crossing still counts, so that none slips between two
 # Vectors of a node's contact: what is free for particles that see it, and for those that a sheet hides it from (zero
-# where all motion is), and the friction of each
-NODE_VECTORS = 3
+# where all motion is), the friction of each, and the mass from which on the node stops each
+NODE_VECTORS = 4
 TRIANGLE_VECTORS = 5  # those of datagen.mpm.sweep.Sweep, and its friction
 LIST_HEAD = 2  # of a list of triangles: how many, and how many of them sheets', which come first
 STENCIL = 27  # nodes of a particle

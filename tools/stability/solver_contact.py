@@ -36,9 +36,13 @@ SLOPE_DEG = 35.0
 FLIGHT_ERROR = 0.02  # of the way of free flight, at most
 FRICTION_ERRORS = {SAND: 0.05, SNOW: 0.10}
 FLYING_CELLS, SLIDING_CELLS, FALLING_CELLS = (3.0, 2.0, 3.0), (5.0, 2.0, 5.0), (7.0, 3.0, 7.0)  # of blocks
-START_CELLS = -5.0  # up the slope from the middle, where sliding blocks begin
+START_CELLS = -9.0  # up the slope from the middle, where sliding blocks begin
 SETTLING_S, SLIDING_S = 0.3, 0.2  # until a block that came to lie on a surface slides steadily; then
+# at first down the slope: friction opposes each particle's own motion, and what spreads across the slope is not braked
+# along it
+SLIDING_SPEED = 0.5  # m/s
 FALLING_S = 0.6
+RIM_CELLS = 0.5  # snow that hangs over the rim of a sheet reaches so far below it
 QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
 
@@ -155,7 +159,7 @@ def glued_below(cases: Sequence[tuple[Setting, int]], config: MpmConfig) -> list
             raise RuntimeError(outcome.cause)
         middle = rotate(setting.place(np.zeros((1, 3))), setting.rotation.T)
         place = (rotate(outcome.position_TN3[-1].astype(np.float64), setting.rotation.T) - middle) / setting.cell_size
-        below = (np.abs(place[:, [0, 2]]) < half).all(axis=1) & (place[:, 1] < 0) & (place[:, 1] > -2)
+        below = (np.abs(place[:, [0, 2]]) < half - RIM_CELLS).all(axis=1) & (place[:, 1] < 0) & (place[:, 1] > -2)
         fractions.append(float(below.mean()))
     return fractions
 
@@ -170,7 +174,8 @@ def acting_frictions(cases: Sequence[tuple[Setting, bool, int]], friction: float
     low = (START_CELLS - SLIDING_CELLS[0] / 2, 0.5, -SLIDING_CELLS[2] / 2)
     scenes = [
         block(
-            setting, material, low, SLIDING_CELLS, (body(setting) if closed else sheet(setting),), gravity=gravity
+            setting, material, low, SLIDING_CELLS, (body(setting) if closed else sheet(setting),),
+            (SLIDING_SPEED, 0.0, 0.0), gravity,
         )
         for setting, closed, material in cases
     ]  # fmt: skip

@@ -22,6 +22,7 @@ NO_NODES = {
     "node_K3": np.zeros((0, 3), np.int32),
     "normal_K23": np.zeros((0, 2, 3), np.float32),
     "obstacle_K2": np.zeros((0, 2), np.int32),
+    "least_K2": np.zeros((0, 2), np.float32),
     "doubled_K": np.zeros(0, bool),
 }
 
@@ -57,8 +58,9 @@ BESIDE = scene_of(
 
 
 def test_sheet_nodes() -> None:
-    """All nodes that a particle beyond a sheet reaches have two fields: none stops what sees the node; what does not
-    is stopped from 0.4 cells beyond the sheet on, with the normal toward it.
+    """All nodes that a particle beyond a sheet reaches have two fields. What does not see the node is stopped, with the
+    normal toward the sheet; what sees it up to a quarter of a cell from the sheet, with the normal away from it; both
+    from the mass on that a node has where material lies 0.75 cells from the sheet.
     """
     for offset in (0.0, 0.1, 0.3, 0.39, 0.41, 0.5, 0.9):
         y = 5 + offset
@@ -66,10 +68,19 @@ def test_sheet_nodes() -> None:
         height = collider.node_K3[:, 1] - y
         assert len(collider.node_K3) == 16 * 16 * len(set(height))
         assert set(collider.node_K3[:, 1]) == {n for n in range(16) if abs(n - y) <= 1.5}
-        assert collider.doubled_K.all() and not collider.normal_K23[:, SEEN].any()
-        stops = np.abs(height) >= 0.4
-        expected = np.where(stops, -np.sign(height), 0.0)
-        assert np.allclose(collider.normal_K23[:, HIDDEN], np.stack([0 * height, expected, 0 * height], 1), atol=1e-6)
+        assert collider.doubled_K.all()
+        side = np.where(height > 0, 1.0, -1.0)  # what lies on the sheet is on the side of its normal, below
+        near = np.abs(height) <= 0.25
+        for field, expected in ((SEEN, np.where(near, side, 0.0)), (HIDDEN, -side)):
+            assert np.allclose(
+                collider.normal_K23[:, field], np.stack([0 * height, expected, 0 * height], 1), atol=1e-6
+            )
+        # a spline's share of what lies more than 0.75 cells from the sheet, by summing
+        place = np.arange(-2, 2, 1e-3) + 5e-4
+        weight = 1e-3 * np.where(np.abs(place) < 0.5, 0.75 - place**2, 0.5 * np.clip(1.5 - np.abs(place), 0, None) ** 2)
+        for field, own in ((SEEN, np.abs(height)), (HIDDEN, -np.abs(height))):
+            share = [weight[place > 0.75 - h].sum() if h <= 0.25 else 0.0 for h in own]
+            assert np.allclose(collider.least_K2[:, field], share, atol=2e-3)
 
 
 def test_nodes_around_a_rim() -> None:
@@ -86,11 +97,12 @@ def test_nodes_around_a_rim() -> None:
 
 @pytest.mark.parametrize("flip", [False, True], ids=["outward", "inward"])
 def test_body_nodes(flip: bool) -> None:
-    """A closed body claims its inside but for 0.4 cells, normals outward, whichever way its faces turn."""
-    low, high = 4.2 * CELL, 11.1 * CELL
+    """A closed body claims its inside and a quarter of a cell around, normals outward, whichever way its faces turn."""
+    low, high = 4.2 * CELL, 10.8 * CELL
     collider = build_collider(scene_of(box((low,) * 3, (high,) * 3, flip)), 1.5)
     node = collider.node_K3 * CELL
-    assert ((node > low + 0.4 * CELL) & (node < high - 0.4 * CELL)).all(axis=1).sum() == len(node) == 6**3
+    reach = np.linalg.norm(np.clip(node, low, high) - node, axis=1)
+    assert len(node) == 6**3 + 6 * 6**2 and reach.max() <= 0.25 * CELL
     centre = (low + high) / 2
     assert ((node - centre) * collider.normal_K23[:, SEEN]).sum(axis=1).min() > 0
     assert not collider.doubled_K.any() and not collider.normal_K23[:, HIDDEN].any()
@@ -119,10 +131,9 @@ def test_sheet_nodes_of_a_crumpled_mesh() -> None:
     index = np.ravel_multi_index(collider.node_K3.T, (16,) * 3)
     assert collider.doubled_K.all() and set(np.flatnonzero(reached)) <= set(index)
     normal = collider.normal_K23[:, HIDDEN]
-    assert not normal[distance[index] < 0.39 * CELL].any()
     # those of a rim lie across the nearest triangle instead
     toward = (foot - node * CELL)[index]
-    assert (((toward * normal).sum(axis=1) > 0) | ~normal.any(axis=1)).all()
+    assert ((toward * normal).sum(axis=1) >= -1e-6 * CELL).all()
 
 
 def test_closest_obstacle_wins() -> None:
@@ -130,8 +141,8 @@ def test_closest_obstacle_wins() -> None:
     both = build_collider(scene_of(sheet(5.1 * CELL), sheet(7.1 * CELL)), 0.5)
     at = {int(y): both.node_K3[:, 1] == y for y in (4, 6, 7, 8)}
     normal = {y: round(float(both.normal_K23[rows, HIDDEN][0, 1])) for y, rows in at.items()}
-    # node 6 is 0.9 above the lower sheet and 1.1 below the upper one; node 7 is too near to stop anything
-    assert normal == {4: 1, 6: -1, 7: 0, 8: -1}
+    # node 6 is 0.9 above the lower sheet and 1.1 below the upper one
+    assert normal == {4: 1, 6: -1, 7: 1, 8: -1}
     assert [set(both.obstacle_K2[rows, HIDDEN]) for rows in at.values()] == [{0}, {0}, {1}, {1}]
 
 
