@@ -19,9 +19,11 @@ from hgn.runtime.rollouts import RolloutResult
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, from_mapping
 from tools.measures import neighbours
 from tools.solver_rollouts import solver_trials
+from tools.stability import network_motion
 from tools.stability.network import case_row, case_trials, energy_growth, initial_states, main, share_of_way
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
 from tools.stability.network_motion import (
@@ -32,6 +34,7 @@ from tools.stability.network_motion import (
     flight_frames,
     meeting,
     motion_rows,
+    turned_rows,
 )
 from tools.stability.row import Row
 
@@ -71,7 +74,10 @@ def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.Captu
     flights = ["dropped", *(f"thrown at {speed} a second" for speed in ("0.1", "0.3", "1", "3", "10"))]
     motion = [
         f"{case}, {name}" for name in MATERIAL_NAMES
-        for case in (*flights, *(f"gravity {kind}" for kind in GRAVITIES), "two bodies meet without gravity")
+        for case in (
+            *flights, *(f"gravity {kind}" for kind in GRAVITIES),
+            *(f"to rest in gravity along {way}" for way in ("-x", "-z")), "two bodies meet without gravity",
+        )
     ]  # fmt: skip
     rests = [f"5 frames, {name}" for name in MATERIAL_NAMES]
     singles = [f"single particle, {name}" for name in MATERIAL_NAMES]
@@ -103,16 +109,21 @@ def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.Captu
 
 
 class Repeats(torch.nn.Module):
-    """Accelerates as in the frame before, by a factor; and adds what its velocity is times another."""
+    """Accelerates as in the frame before, by a factor; adds its velocity times another, and a wind along y."""
 
-    def __init__(self, factor: float, drag: float) -> None:
+    def __init__(self, factor: float, drag: float, wind: float = 0.0) -> None:
         super().__init__()
+        self.wind = wind
         self.config, self.weight = network_of().config, torch.nn.Parameter(torch.zeros(1))
         self.factor, self.drag = factor, drag
 
     def forward(self, state: ParticleState) -> torch.Tensor:
         velocity_NM3 = state.velocity_NM3
-        return self.factor * (velocity_NM3[:, 0] - velocity_NM3[:, 1]) - self.drag * velocity_NM3[:, 0]
+        return (
+            self.factor * (velocity_NM3[:, 0] - velocity_NM3[:, 1])
+            - self.drag * velocity_NM3[:, 0]
+            + self.wind * torch.eye(3)[1]
+        )
 
 
 def motion_of(network: torch.nn.Module, cases: tuple[str, ...], solver: MpmConfig | None = None) -> dict[str, Row]:
@@ -148,6 +159,23 @@ def test_flight_ends_before_the_walls() -> None:
                 moved_3 = seconds * scene.velocity_N3[0] + 0.5 * seconds**2 * np.array(gravity)
                 place_N3 = scene.position_N3 + moved_3
                 assert ((place_N3 > 0.07) & (place_N3 < 0.93)).all() == clear or last == 60
+
+
+def test_turned_gravity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What hangs in the air is as far from a fall whichever way gravity points; with a wind along y it is nearer where
+    that is down."""
+    path = 0.5 * np.array(GRAVITY) * (np.arange(20)[:, None, None] / 60) ** 2
+
+    def falls(scenes: list[Scene], *_: object) -> list[RolloutResult]:
+        return [RolloutResult((scene.position_N3 + path).astype(np.float32)) for scene in scenes]
+
+    monkeypatch.setattr(network_motion, "solver_trials", falls)
+    monkeypatch.setattr(network_motion, "TO_REST_FRAMES", 20)
+    for wind, held in ((0.0, True), (-1e-3, False)):
+        simulator = Simulator(Repeats(0.0, 0.0, wind), 60.0, "torch")  # type: ignore[arg-type]
+        rows = list(turned_rows(simulator, SceneConfig(group_size=0.03), "snow", MpmConfig()))
+        assert [row.held for row in rows] == [held] * 2
+        assert not held or rows[0].measured == pytest.approx(1.0, rel=1e-3)
 
 
 def test_collisions_against_the_solver() -> None:

@@ -19,6 +19,7 @@ from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
+from hgn.training.errors import position_mse
 from tools.solver_rollouts import solver_trials
 from tools.stability.row import Row
 
@@ -37,6 +38,8 @@ GRAVITIES = {
     "two, downwards": (0.0, -2 * EARTH, 0.0),
     "two, oblique": (1.2 * EARTH, 0.0, -1.6 * EARTH),
 }  # domain units per second squared, named in the earth's
+TURNS = {"-x": (1, 0, 2), "-z": (0, 2, 1)}  # exchanges of axes that turn upright gravity
+AS_GOOD, TO_REST_FRAMES = 1.25, 90  # position MSE, of the upright rollout's
 KEPT_AT_LEAST, GRAVITY_WITHIN = 0.99, 0.02
 FLIGHT_FRAMES = 60  # at most
 REACH = 2.0  # finest cells of the network from a wall: beyond what a network has of it, and what the solver's walls do
@@ -80,6 +83,8 @@ def motion_rows(
             throws = {"at rest": np.zeros(3), "+x": np.array(DIRECTIONS["+x"]), "up": np.array(DIRECTIONS["up"])}
             other = replace(scene, gravity=gravity)
             yield flight_row(simulator, f"gravity {name}, {material}", other, material, throws, together)
+        if "gravity" in cases and solver is not None and len(set(scene.domain_size)) == 1:
+            yield from turned_rows(simulator, scene, material, solver)
         if "collision" in cases:
             yield meeting_row(simulator, scene, material, together, solver)
 
@@ -165,6 +170,31 @@ def flight(trial: RolloutResult, scene: Scene, frames: int, frame_rate_hz: float
     lost_T = np.linalg.norm(lost_T3, axis=1)
     kept = 1 - float(lost_T.max()) / speed if speed else None
     return Flight(kept, float(error_T.max()), int(lost_T.argmax()), int(error_T.argmax()), frames)
+
+
+def turned_rows(simulator: Simulator, scene: SceneConfig, material: str, solver: MpmConfig) -> Iterator[Row]:
+    """Whether a cube that falls and comes to rest is as near to the solver where the scene and gravity are turned."""
+    upright = cube(scene, material, 0.5 * np.array(scene.domain_size), np.zeros(3))
+    reference: RolloutResult | None = None
+    for name, order in TURNS.items():
+        name = f"to rest in gravity along {name}, {material}"
+        x, y, z = (upright.gravity[axis] for axis in order)
+        turned = replace(upright, position_N3=upright.position_N3[:, order], gravity=(x, y, z))
+        trials = _rollouts(simulator, [upright, turned], TO_REST_FRAMES)
+        if isinstance(trials, str):
+            yield Row(name, AS_GOOD, "refused", False, trials)
+            continue
+        if reference is None:  # seconds on a GPU, a minute on a CPU
+            (reference,) = solver_trials([upright], solver, TO_REST_FRAMES, simulator.frame_rate_hz)
+        causes = [trial.cause for trial in (*trials, reference) if trial.cause is not None]
+        if causes:
+            yield Row(name, AS_GOOD, "diverged", False, causes[0])
+            continue
+        straight, back = trials[0].position_TN3, trials[1].position_TN3[..., order]
+        own, other = (float(position_mse(path, reference.position_TN3).mean()) for path in (straight, back))
+        held = other <= AS_GOOD * own
+        more = {"upright_mse": own, "turned_mse": other}
+        yield Row(name, AS_GOOD, other / own, held, "times the upright rollout's position MSE to the solver", more)
 
 
 def meeting_row(
