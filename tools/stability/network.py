@@ -95,15 +95,13 @@ def main(mapping: dict[str, Any]) -> int:
         if ahead is not None:
             print(ahead.wait(), file=sys.stderr)
     meta["seconds_before_cases"] = time.monotonic() - begun
+    beside = solver_beside(made, solver, simulator.frame_rate_hz) if solver is not None else {}
     late = late_kernels(backend.name)
     with bar("cases", total=len(made), unit="case") as progress:
         for case, states in zip(made, initial, strict=True):
             started, growths, compiled = time.monotonic(), simulator.backend.growths, late()
             trials = case_trials(simulator, case, states)
-            beside = None
-            if solver is not None and case.beside_solver:
-                beside = solver_trials(case.scenes, solver, case.frames, simulator.frame_rate_hz)
-            row = case_row(simulator, case, states, config.energy_bound, *trials, beside)
+            row = case_row(simulator, case, states, config.energy_bound, *trials, beside.get(case.name))
             if config.picture is not None:
                 pictures.append(case_picture(simulator, case, trials[0][0], Path(config.weights).name))
             row.more["growths"], row.more["kernels_compiled"] = simulator.backend.growths - growths, late() - compiled
@@ -117,6 +115,16 @@ def main(mapping: dict[str, Any]) -> int:
     print(table(rows))
     keep(done=True)
     return 0
+
+
+def solver_beside(made: Sequence[Case], config: MpmConfig, frame_rate_hz: float) -> dict[str, list[RolloutResult]]:
+    """The solver's trajectories of the cases that it stands beside, by name: as many at once as have one length."""
+    found: dict[str, list[RolloutResult]] = {}
+    for frames in sorted({case.frames for case in made if case.beside_solver}):
+        some = [case for case in made if case.beside_solver and case.frames == frames]
+        trials = iter(solver_trials([scene for case in some for scene in case.scenes], config, frames, frame_rate_hz))
+        found |= {case.name: [next(trials) for _ in case.scenes] for case in some}
+    return found
 
 
 def late_kernels(backend: str) -> Callable[[], int]:
