@@ -140,7 +140,12 @@ def test_flight_against_its_closed_form() -> None:
     assert exact["thrown at 3 a second, sand"].more["scenes"] == 14
     frames = {name: throw["frames"] for name, throw in exact["thrown at 10 a second, sand"].more["throws"].items()}
     assert set(frames.values()) == {2, 4} and frames["diagonal"] == 4
-    assert exact["gravity none, sand"].more["throws"]["at rest"] == {"kept": None, "error": 0.0, "frames": 60}
+    assert exact["gravity none, sand"].more["throws"]["at rest"] == {
+        "kept": None, "error": 0.0, "across": 0.0, "frames": 60,
+    }  # fmt: skip
+    blown = motion_of(Repeats(1.0, 0.0, 1e-6), ("gravity",))["gravity half, sideways, sand"].more["throws"]["at rest"]
+    # 1e-6 more in each frame: after n frames n (n + 1) / 2 of it, over n frames
+    assert blown["across"] == pytest.approx(0.5e-6 * (blown["frames"] + 1) * 60**2 / 9.8, rel=0.05)
     weak = motion_of(Repeats(0.95, 0.0), ("throw", "gravity"))
     assert not any(row.held for name, row in weak.items() if name != "gravity none, sand")
     drag = motion_of(Repeats(1.0, 0.005), ("throw",))

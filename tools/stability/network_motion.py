@@ -54,10 +54,12 @@ MET_AT_LEAST = 0.1  # of the relative velocity, that must go over; beside the so
 @dataclass(frozen=True)
 class Flight:
     """What one flight shows at its worst: the share of its velocity kept across gravity (none for a drop), the error of
-    its acceleration along gravity in gravities (the earth's where there is none), and the frames of these."""
+    its acceleration along gravity in gravities (the earth's where there is none), the frames of these, and the
+    acceleration across gravity on average, in the earth's: what takes velocity away."""
 
     kept: float | None
     error: float
+    across: float
     kept_frame: int
     error_frame: int
     frames: int
@@ -135,7 +137,7 @@ def flight_row(
         beyond += f"; keeps {kept[at]:.1%} of its velocity in frame {flights[at].kept_frame} {labels[at]}"
         held, more["kept"] = held and kept[at] >= KEPT_AT_LEAST, kept[at]
     more["throws"] = {
-        label: {"kept": one.kept, "error": one.error, "frames": one.frames}
+        label: {"kept": one.kept, "error": one.error, "across": one.across, "frames": one.frames}
         for label, one in zip(labels[: len(throws)], flights, strict=False)
     }
     return Row(name, GRAVITY_WITHIN, error, held, beyond, more)
@@ -169,7 +171,8 @@ def flight(trial: RolloutResult, scene: Scene, frames: int, frame_rate_hz: float
         lost_T3 = lost_T3 - np.outer(lost_T3 @ gravity_3, gravity_3) / size**2
     lost_T = np.linalg.norm(lost_T3, axis=1)
     kept = 1 - float(lost_T.max()) / speed if speed else None
-    return Flight(kept, float(error_T.max()), int(lost_T.argmax()), int(error_T.argmax()), frames)
+    across = float(lost_T[-1]) / frames * frame_rate_hz**2 / EARTH
+    return Flight(kept, float(error_T.max()), across, int(lost_T.argmax()), int(error_T.argmax()), frames)
 
 
 def turned_rows(simulator: Simulator, scene: SceneConfig, material: str, solver: MpmConfig) -> Iterator[Row]:
