@@ -50,9 +50,13 @@ LONGEST_FILES = (  # half a minute and more on one core; begun last, one of them
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first."""
-    place = {Path(__file__).parent / f"{name}.py": number for number, name in enumerate(LONGEST_FILES)}
+    """Long files first; a file's tests in one process, and all of the solver's in one, which compiles kernels once."""
+    tests = Path(__file__).parent
+    place = {tests / f"{name}.py": number for number, name in enumerate(LONGEST_FILES)}
     items.sort(key=lambda item: place.get(item.path, len(place)))
+    for item in items:
+        solver = item.path.parent == tests / "datagen" / "mpm"
+        item.add_marker(pytest.mark.xdist_group("solver" if solver else str(item.path.relative_to(tests))))
 
 
 @pytest.fixture(autouse=True)

@@ -79,9 +79,7 @@ def test_free_fall_with_intervals_that_change() -> None:
     """Free fall stays exact where the speed shortens the intervals on the way: thrown up at 9 m/s, it comes back."""
     scene = block(SNOW, (0.4, 0.3, 0.4), (0.5, 0.4, 0.5), (0, 9, 0), count=100, gravity=(0.0, -60.0, 0.0))
     scene = dataclasses.replace(scene, domain_size=(1.0, 2.0, 1.0))
-    config = dataclasses.replace(ADAPTIVE, transfer_speed_m_s=8.0)
-    outcome = simulate([scene], config, 19, 60.0)[0]
-    assert isinstance(outcome, Simulated), outcome
+    outcome = run(scene, dataclasses.replace(ADAPTIVE, transfer_speed_m_s=8.0), 19)
     centre = outcome.position_TN3.astype(float)[:, :, 1].mean(axis=1)
     time = np.arange(19) / 60
     assert np.abs(centre - centre[0] - 9 * time + 30 * time**2).max() < 2e-4 * 9**2 / 120
@@ -232,7 +230,7 @@ def test_scenes_of_a_batch_equal_scenes_alone() -> None:
     scenes = [
         block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (1, -3, 0)),
         block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet,)),
-        joined(block(SAND, (0.3, 0.2, 0.3), (0.4, 0.3, 0.4)), block(WATER, (0.5, 0.2, 0.3), (0.6, 0.3, 0.4))),
+        joined(block(SAND, (0.3, 0.2, 0.3), (0.4, 0.3, 0.4)), block(WATER, (0.5, 0.2, 0.3), (0.6, 0.3, 0.4)), BESIDE),
     ]
     steps = (0.5, 1.0, 0.25)
     together = simulate(scenes, ADAPTIVE, 7, 60.0, stability_fractions=steps)

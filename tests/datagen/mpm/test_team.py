@@ -43,6 +43,6 @@ def test_teams_agree_with_the_other_launch() -> None:
         assert np.abs(one.position_TN3[1] - other.position_TN3[1]).max() < 1e-6
         assert np.abs(one.position_TN3 - other.position_TN3).max() < 1e-3
         assert one.counters["substeps"] == other.counters["substeps"]
-    alone = simulate(scenes[:1], CONFIG, 11, 60.0, team_threads=1)[0]
+    alone = simulate(scenes[1:2], CONFIG, 11, 60.0, team_threads=1)[0]  # with all that the batch's kernel computes
     assert isinstance(alone, Simulated)
-    assert np.abs(alone.position_TN3 - found[0].position_TN3).max() < 1e-3
+    assert np.abs(alone.position_TN3 - found[1].position_TN3).max() < 1e-3
