@@ -8,7 +8,7 @@ from dataclasses import replace
 from types import FrameType
 from typing import Any
 
-from datagen.pool.pool import LocalCrew, Pool, Stopped, plan_workers, visible_gpus
+from datagen.pool.pool import LocalWorkerFactory, Pool, Stopped, plan_workers, visible_gpus
 from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend
 from datagen.pool.writer import DatasetWriter
@@ -101,7 +101,7 @@ def generate(
                         Pool(config, writer, progress, crew.plan, crew, should_stop).run()
                 else:
                     plan = plan_workers(config, visible_gpus(), available_cpus(), available_memory())
-                    Pool(config, writer, progress, plan, LocalCrew(config, backend, plan), should_stop).run()
+                    Pool(config, writer, progress, plan, LocalWorkerFactory(config, backend, plan), should_stop).run()
             except Stopped:
                 progress.message(
                     f"stopped; {writer.done} of {writer.total} episodes are kept in {writer.folder}: run the same "

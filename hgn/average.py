@@ -52,8 +52,8 @@ def average(config: AverageConfig) -> None:
         for file, coefficient, (_, each) in zip(files, coefficients, loaded, strict=True)
     ]
     updates = max(each.updates for _, each in loaded)
-    made = replace(info, updates=updates, provenance=provenance() | {"average_of": parts})
-    save_weights(Path(config.out), network, made, config.stored_precision)
+    mean_info = replace(info, updates=updates, provenance=provenance() | {"average_of": parts})
+    save_weights(Path(config.out), network, mean_info, config.stored_precision)
 
 
 def _require_same(
@@ -63,10 +63,10 @@ def _require_same(
     i: int,
 ) -> None:
     for field in SHARED:
-        expected, found = getattr(first[1], field), getattr(other[1], field)
-        if expected != found:
+        expected, other_value = getattr(first[1], field), getattr(other[1], field)
+        if expected != other_value:
             raise ConfigError(
-                f"weights[{i}] must have the {field} of weights[0] ({names[0]}), {expected}, got {found} in "
+                f"weights[{i}] must have the {field} of weights[0] ({names[0]}), {expected}, got {other_value} in "
                 f"{names[i]}; average weights of one network and data"
             )
     normalisers = [network.normaliser.state_dict() for network, _ in (first, other)]

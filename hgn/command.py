@@ -101,7 +101,7 @@ def _unread() -> bool:
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
-def section(mapping: Mapping[str, Any], known: Mapping[str, str | None]) -> dict[str, Any]:
+def section(mapping: Mapping[str, Any], names: Mapping[str, str | None]) -> dict[str, Any]:
     """Picks a command's own keys out of a composed config, which experiment files share with other commands.
 
     `known` maps each key that may occur to the dotted name under which it is wanted; None leaves it out. Aliases
@@ -109,10 +109,10 @@ def section(mapping: Mapping[str, Any], known: Mapping[str, str | None]) -> dict
     Raises: ConfigError for a key that is not known.
     """
     for key in mapping:
-        if key not in known:
-            raise ConfigError(f"{key} is not a known key; {known_keys(str(key), known)}")
+        if key not in names:
+            raise ConfigError(f"{key} is not a known key; {known_keys(str(key), names)}")
     picked: dict[str, Any] = {}
-    for key, name in known.items():
+    for key, name in names.items():
         if name is None or key not in mapping:
             continue
         *folders, leaf = name.split(".")

@@ -363,7 +363,7 @@ class NetworkConfig:
 
 # Plane waves of the smooth noise, and the lengths that they are drawn from, in finest cells: short ones stir a body,
 # long ones shift it.
-SMOOTH_WAVES, SMOOTH_CELLS = 16, (4, 64)
+CORRELATED_WAVES, CORRELATED_WAVELENGTHS = 16, (4, 64)
 
 
 @dataclass(frozen=True)

@@ -137,8 +137,8 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
                 first = min(short, key=lambda end: end["frames"])
                 told = f"{first['episode']} at frame {first['frames']}: {first['cause']}"
                 lines.append(f"{'diverged':<20} {len(short)} of {len(row['ends'])} scenes, first {told}")
-            shares = ("penetration", "reference_penetration", "outside_domain")
-            mean = {name: np.mean([end[name] for end in row["ends"]]) for name in shares}
+            fractions = ("penetration", "reference_penetration", "outside_domain")
+            mean = {name: np.mean([end[name] for end in row["ends"]]) for name in fractions}
             worst = max(end["penetration"] - end["reference_penetration"] for end in row["ends"])
             lines.append(
                 f"{'at the end':<20} within obstacles {mean['penetration']:.2%}, the solver's "

@@ -37,14 +37,14 @@ EVERY = 3  # frames of the rollout for one picture of the GIF
 def main(mapping: dict[str, Any]) -> int:
     """Simulates, writes the rollout file and what is drawn of it; returns the exit code."""
     config = from_mapping(RolloutConfig, mapping)
-    path, made = rollout(config)
+    path, result = rollout(config)
     print(path)
     if config.render if config.render is not None else config.out is None:
         still, moving = path.with_suffix(".png"), path.with_suffix(".gif")
-        write_picture(still, compare_picture(made, spread(made.frame_count, PICTURES)), made.source)
+        write_picture(still, compare_picture(result, spread(result.frame_count, PICTURES)), result.source)
         print(still)
-        with bar("drawing", total=len(range(0, made.frame_count, EVERY)), unit="picture") as progress:
-            animate(made, moving, every=EVERY, progress=lambda *_: progress.update())
+        with bar("drawing", total=len(range(0, result.frame_count, EVERY)), unit="picture") as progress:
+            animate(result, moving, every=EVERY, progress=lambda *_: progress.update())
         print(moving)
     return 0
 
@@ -96,7 +96,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
             (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
         except DivergedError as error:
             raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
-    made = Rollout(
+    result = Rollout(
         position_TN3=position_TN3,
         material_N=initial.material_N,
         obstacles=obstacles,
@@ -107,7 +107,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         source=source,
         reference_TN3=reference_TN3,
     )
-    return save_rollout(config.out or f"rollout/{name}.vtkhdf", made, config.surface), made
+    return save_rollout(config.out or f"rollout/{name}.vtkhdf", result, config.surface), result
 
 
 def _fastest(initial: InitialState) -> float:

@@ -102,11 +102,11 @@ def from_stored(cls: type[T], mapping: Mapping[str, Any], section: str) -> T:
     return from_mapping(cls, current_names(mapping, section), section)
 
 
-def known_keys(key: str, known: Iterable[str]) -> str:
+def known_keys(key: str, names: Iterable[str]) -> str:
     """What to say beside a key that is not known: the one that may have been meant, or else all."""
-    known = list(known)
-    close = difflib.get_close_matches(key, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"known keys: {', '.join(known)}"
+    names = list(names)
+    close = difflib.get_close_matches(key, names, n=1)
+    return f"did you mean {close[0]}?" if close else f"known keys: {', '.join(names)}"
 
 
 def to_mapping(value: Any) -> Any:

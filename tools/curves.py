@@ -36,7 +36,7 @@ ROW_KEYS = (
     "gpu_memory_gb",
 )
 ROW_PREFIXES = ("one_step", "baseline", "rollout", "monitor")
-TRIVIAL_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
+BASELINE_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
 LOSS = "MSE of normalised acceleration"
 ONE_STEP = "one-step MSE (sum over axes, frame units)"
 LINES = 200  # of the plain loss that are kept
@@ -198,7 +198,7 @@ def _origin(run: Run) -> str:
 
 
 def _baseline_lines(axes: Any, last: dict[str, float]) -> None:
-    for name, style in TRIVIAL_STYLES.items():
+    for name, style in BASELINE_STYLES.items():
         if f"baseline/validation_{name}" in last:
             label = f"{name.replace('_', ' ')}, validation"
             axes.axhline(last[f"baseline/validation_{name}"], color="0.3", linestyle=style, label=label)

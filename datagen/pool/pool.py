@@ -109,7 +109,7 @@ class WorkerFactory(Protocol):
     def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]: ...
 
 
-class LocalCrew:
+class LocalWorkerFactory:
     """Processes of this machine."""
 
     def __init__(self, config: DatagenConfig, backend: Backend, plan: WorkerPlan) -> None:

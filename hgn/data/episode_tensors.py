@@ -1,4 +1,4 @@
-"""What the fast training path reads: the samples of many updates, and whole episodes instead of windows.
+"""What training with backend triton reads: the samples of many updates, and whole episodes instead of windows.
 
 Shape legend: H velocity history, T frames, N particles, K obstacle cells.
 """

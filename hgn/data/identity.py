@@ -65,12 +65,12 @@ def identity_hash(identity: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def identity_differences(found: Mapping[str, Any], asked: Mapping[str, Any], path: str = "") -> list[str]:
+def identity_differences(stored: Mapping[str, Any], asked: Mapping[str, Any], path: str = "") -> list[str]:
     """One line for each key in which two identities differ: `scene.obstacle_count is 5 there, 3 is asked for`."""
     lines = []
-    for key in sorted(found.keys() | asked.keys()):
+    for key in sorted(stored.keys() | asked.keys()):
         name = f"{path}.{key}" if path else key
-        left, right = found.get(key, "nothing"), asked.get(key, "nothing")
+        left, right = stored.get(key, "nothing"), asked.get(key, "nothing")
         if isinstance(left, Mapping) and isinstance(right, Mapping):
             lines += identity_differences(left, right, name)
         elif left != right:
@@ -78,12 +78,12 @@ def identity_differences(found: Mapping[str, Any], asked: Mapping[str, Any], pat
     return lines
 
 
-def require_same_dataset(found: Mapping[str, Any], config: DatagenConfig, folder: object) -> None:
+def require_same_dataset(stored: Mapping[str, Any], config: DatagenConfig, folder: object) -> None:
     """A folder's data set (its manifest's `config`) is the one that a configuration asks for.
 
     Raises: ConfigError naming the first keys that differ, and the remedy.
     """
-    differences = identity_differences(found, dataset_identity(config))
+    differences = identity_differences(stored, dataset_identity(config))
     if differences:
         shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
         raise ConfigError(

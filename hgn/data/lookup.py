@@ -12,20 +12,20 @@ from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 
 
-def first_indices(store: EpisodeStore, count: int, known: int | None = None) -> list[int]:
+def first_indices(store: EpisodeStore, count: int, published: int | None = None) -> list[int]:
     """Where in the store the episodes of lowest index among the first `known` published (all of them if absent) are."""
-    places = ((entry.index, place) for place, entry in enumerate(islice(store.entries, known)))
+    places = ((entry.index, place) for place, entry in enumerate(islice(store.entries, published)))
     return [place for _, place in nsmallest(count, places)]
 
 
-def first_episodes(store: EpisodeStore, count: int, known: int | None = None) -> list[Episode]:
+def first_episodes(store: EpisodeStore, count: int, published: int | None = None) -> list[Episode]:
     """These episodes.
 
     Raises: ConfigError when there are none.
     """
     if not len(store):
         raise ConfigError(f"data must hold episodes of the split {store.split}, got none in {store.folder}")
-    return [store.episodes[i] for i in first_indices(store, count, known)]
+    return [store.episodes[i] for i in first_indices(store, count, published)]
 
 
 def find_episode(folder: Path | str, key: str) -> Episode:

@@ -152,9 +152,9 @@ def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
     identity = (str(path.resolve()), status.st_size, status.st_mtime_ns, sha256)
     if identity in _verified:
         return
-    found = file_sha256(path)
-    if found != sha256:
-        raise ConfigError(f"{path} must have sha256 {sha256}, got {found}: it was altered; {remedy}")
+    actual = file_sha256(path)
+    if actual != sha256:
+        raise ConfigError(f"{path} must have sha256 {sha256}, got {actual}: it was altered; {remedy}")
     _verified.add(identity)
 
 
@@ -262,14 +262,14 @@ class _Remote:
         try:
             self._patiently(name, PATIENCE_S, put)
             self._files.invalidate_cache()
-            found = self._files.info(f"{self._root}/{name}")["size"]
+            written = self._files.info(f"{self._root}/{name}")["size"]
         except (NotImplementedError, FileNotFoundError) as error:
             raise ConfigError(
                 f"{self._url} must be a place to write to, got {type(error).__name__} for {name}; see that it exists, "
                 "and that its protocol knows writing"
             ) from None
-        if found != expected:
-            raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {found}; copy it again")
+        if written != expected:
+            raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
 
     def _fetch(self, name: str, sha256: str, size: int, path: Path, patience_s: float) -> None:
         self._require_not_away(name, patience_s)
@@ -324,9 +324,9 @@ class _Remote:
         begin, pause, said = time.monotonic(), _FIRST_PAUSE_S, False
         while True:
             try:
-                found = read(f"{self._root}/{name}")
+                result = read(f"{self._root}/{name}")
                 self._away = 0.0, ""
-                return found
+                return result
             except FileNotFoundError:
                 raise
             except Exception as error:

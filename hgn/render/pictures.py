@@ -353,10 +353,10 @@ class _Palette:
         ]
         ramp = np.linspace(0.3, 1.0, 12)[:, None, None] * MATERIAL_COLORS
         flat = to_bytes(np.concatenate((BACKGROUND_COLOR[None], OBSTACLE_COLOR[None], ramp.reshape(-1, 3))))
-        room = 255 - len(flat)
-        chosen = Image.fromarray(np.concatenate(samples)[None], "RGB").quantize(room).getpalette() or []
+        free_colors = 255 - len(flat)
+        chosen = Image.fromarray(np.concatenate(samples)[None], "RGB").quantize(free_colors).getpalette() or []
         exact = np.concatenate((flat, [TEXT_COLOR])).astype(np.uint8)
-        self.colors = np.concatenate((exact, np.reshape(chosen, (-1, 3))[:room].astype(np.uint8)))
+        self.colors = np.concatenate((exact, np.reshape(chosen, (-1, 3))[:free_colors].astype(np.uint8)))
         # nearest colour for the upper six bits of each channel; Pillow's own search is coarser
         center = np.stack(np.meshgrid(*[np.arange(64) * 4 + 1.5] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         self.nearest = KDTree(self.colors.astype(np.float64)).query(center)[1].astype(np.uint8)

@@ -113,8 +113,8 @@ class Stage:
     def draw(self, position_N3: np.ndarray, material_N: np.ndarray) -> Image.Image:
         """One frame as an RGB picture; particles that are not finite or ten domains away are left out."""
         camera = self.camera
-        kept = (np.abs(position_N3) < 10 * max(self.domain_size)).all(axis=1)
-        position_N3, material_N = position_N3[kept].astype(np.float64), material_N[kept]
+        near = (np.abs(position_N3) < 10 * max(self.domain_size)).all(axis=1)
+        position_N3, material_N = position_N3[near].astype(np.float64), material_N[near]
         picture_P3 = self.empty_P3.copy()
         lit_N = self._cast_shadows(picture_P3, position_N3)
         self._draw_particles(picture_P3, position_N3, material_N, lit_N)

@@ -26,7 +26,7 @@ from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.gns_edges import Edges, PlainEdges
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.stepped_rollout import Rollout, SteppedRollout
-from hgn.runtime.triton_host import why_no_triton
+from hgn.runtime.triton_host import host_unsupported_reason
 from hgn.schema import ConfigError, require
 
 TRITON_WIDTHS = (16, 32, 64, 128)
@@ -210,7 +210,7 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
     """What keeps simulations from the backend triton, in words; none if nothing does."""
     if device.type != "cuda":
         return f"it needs a CUDA device, not {device.type}"
-    if reason := why_no_triton():
+    if reason := host_unsupported_reason():
         return reason
     if config.kind != "hgn" and precision != "fp16":
         return f"it computes {config.kind} with precision fp16, not {precision}"

@@ -1,4 +1,4 @@
-"""When a simulation has come apart: one rule for all backends, and for training on the network's own states."""
+"""When a simulation has come apart: one rule for all backends, and for pushforward."""
 
 from __future__ import annotations
 

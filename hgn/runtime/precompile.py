@@ -27,7 +27,7 @@ from hgn.system.machine import available_cpus
 from hgn.system.processes import die_with_parent
 
 MOST_PROCESSES = 12
-CELL_SHARES = (0.1, 0.4, 1.2)  # of the particles
+CELL_FRACTIONS = (0.1, 0.4, 1.2)  # of the particles
 COMMAND = (sys.executable, "-m", "hgn.runtime.precompile_program")
 
 
@@ -44,14 +44,14 @@ class Precompilation:
         self._messages = [self._files.enter_context(tempfile.TemporaryFile()) for _ in range(processes)]  # noqa: SIM115
         self._processes = [
             subprocess.Popen(
-                [*command, str(share), str(processes)],
+                [*command, str(part), str(processes)],
                 stdin=subprocess.PIPE,
                 stdout=message,
                 stderr=message,
                 preexec_fn=partial(die_with_parent, signal.SIGINT),
                 process_group=0,
             )
-            for share, message in enumerate(self._messages)
+            for part, message in enumerate(self._messages)
         ]
         for process in self._processes:
             assert process.stdin is not None
@@ -103,7 +103,7 @@ class Precompilation:
         return next((line.strip() for line in reversed(lines) if line.strip()), "no message")
 
 
-def frames_ahead(
+def precompile_frames(
     networks: Sequence[NetworkConfig], precisions: Sequence[str], device: torch.device, particles: Sequence[int]
 ) -> Precompilation | None:
     """Compiles what simulations of so many particles launch, however far they spread; none where nothing is."""
@@ -125,4 +125,4 @@ def frame_sizes(particles: Sequence[int]) -> tuple[tuple[int, int], ...]:
     """Particles, and cells of the finest level from dense groups to where they lie spread: kernels differ by rows."""
     some = sorted(set(particles))
     some = sorted({some[0], some[len(some) // 2], some[-1]})
-    return tuple((count, max(1, int(share * count))) for count in some for share in CELL_SHARES)
+    return tuple((count, max(1, int(fraction * count))) for count in some for fraction in CELL_FRACTIONS)

@@ -113,19 +113,19 @@ def _nowhere(config: NetworkConfig, particles: int, scenes: int, device: str) ->
 def _rollout_launches(job: PrecompileJob, scenes: int, network: HierarchicalGraphNetwork, device: str) -> None:
     """Those of a frame of hgn.training.graph_pushforward, or of a monitored rollout."""
     config = job.network
-    share = scenes / job.settings.scenes
-    particles = round(share * job.particles)
+    fraction = scenes / job.settings.scenes
+    particles = round(fraction * job.particles)
     obstacles = None
     if config.obstacle_features:
         obstacles = ObstacleTable([None] * scenes, job.settings.obstacle_cell_size, torch.device(device))
-    capacities = first_capacities([round(share * cells) for cells in job.cells], particles)
+    capacities = first_capacities([round(fraction * cells) for cells in job.cells], particles)
     state = _nowhere(config, particles, scenes, device)
     _Unplaced(network, state, job.precision, capacities, obstacles=obstacles).frame_launches()
 
 
-def compile_share(job: PrecompileJob | FrameJob, share: int, shares: int) -> int:
-    """Compiles every `shares`-th kernel from number `share` on; how many those are."""
-    mine = list(launches_of(job).values())[share::shares]
+def compile_part(job: PrecompileJob | FrameJob, part: int, parts: int) -> int:
+    """Compiles every `parts`-th kernel from number `part` on; how many those are."""
+    mine = list(launches_of(job).values())[part::parts]
     for function, data in mine:
         build_launcher(preload(function, data))
     return len(mine)
@@ -150,10 +150,10 @@ def job_of(text: str) -> PrecompileJob | FrameJob:
 
 def main() -> None:
     os.nice(NICENESS)
-    share, shares = map(int, sys.argv[1:])
+    part, parts = map(int, sys.argv[1:])
     job = job_of(sys.stdin.read())
     use_target(job.capability)
-    print(compile_share(job, share, shares))
+    print(compile_part(job, part, parts))
 
 
 if __name__ == "__main__":

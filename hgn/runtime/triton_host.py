@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 
-def why_no_triton() -> str | None:
+def host_unsupported_reason() -> str | None:
     """What keeps this machine from launching Triton's kernels, in words; none if nothing does.
 
     Without a GPU they are interpreted, which needs the package alone.

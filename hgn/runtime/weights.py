@@ -100,12 +100,12 @@ def load_weights(
     info = from_mapping(WeightsInfo, current_names(mapping), "weights")
     network = build_network(info.network)
     expected = {name: tensor.shape for name, tensor in network.state_dict().items()}
-    found = {name: tensor.shape for name, tensor in tensors.items()}
-    for name in sorted(expected.keys() | found.keys()):
-        if expected.get(name) != found.get(name):
+    shapes = {name: tensor.shape for name, tensor in tensors.items()}
+    for name in sorted(expected.keys() | shapes.keys()):
+        if expected.get(name) != shapes.get(name):
             raise ConfigError(
                 f"{field} tensor {name} must have shape {_shape(expected.get(name))} for the declared network, "
-                f"got {_shape(found.get(name))} in {path}; these are the weights of another network"
+                f"got {_shape(shapes.get(name))} in {path}; these are the weights of another network"
             )
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     return network.to(device).eval(), info

@@ -70,11 +70,11 @@ def fill(region: Region, count: int, rng: np.random.Generator) -> np.ndarray:
 
 def points_in_ball(count: int, dimensions: int, rng: np.random.Generator) -> np.ndarray:
     """Uniformly random points of the unit ball, float64 [P, dimensions], by rejection from the cube."""
-    kept = np.zeros((0, dimensions))
-    while len(kept) < count:
+    accepted = np.zeros((0, dimensions))
+    while len(accepted) < count:
         candidate = 2 * rng.random((max(count, 16), dimensions)) - 1
         square = candidate[:, 0] * candidate[:, 0]
         for axis in range(1, dimensions):
             square = square + candidate[:, axis] * candidate[:, axis]
-        kept = np.concatenate([kept, candidate[square <= 1]])
-    return kept[:count]
+        accepted = np.concatenate([accepted, candidate[square <= 1]])
+    return accepted[:count]

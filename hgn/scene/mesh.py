@@ -122,10 +122,10 @@ def _orientation(triangle_F3: np.ndarray) -> np.ndarray | None:
     column = np.concatenate([face_two + np.where(disagree, count, 0), face_two + np.where(disagree, 0, count)])
     graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), shape=(2 * count, 2 * count))
     parts, label = connected_components(graph, directed=False)
-    kept, flipped = label[:count], label[count:]
-    if (kept == flipped).any():
+    upright, flipped = label[:count], label[count:]
+    if (upright == flipped).any():
         return None
     # a component and its mirror image hold the same triangles; the one with more unflipped ones wins
-    votes = np.bincount(kept, minlength=parts)
-    kept_wins = (votes[kept] > votes[flipped]) | ((votes[kept] == votes[flipped]) & (kept < flipped))
+    votes = np.bincount(upright, minlength=parts)
+    kept_wins = (votes[upright] > votes[flipped]) | ((votes[upright] == votes[flipped]) & (upright < flipped))
     return ~kept_wins

@@ -300,6 +300,6 @@ def _read(file: h5py.File) -> Rollout:
     )
 
 
-def _same_materials(found: list[str]) -> None:
-    if tuple(found) != MATERIALS:
-        raise ConfigError(f"materials must be {', '.join(MATERIALS)}, got {', '.join(found)}")
+def _same_materials(names: list[str]) -> None:
+    if tuple(names) != MATERIALS:
+        raise ConfigError(f"materials must be {', '.join(MATERIALS)}, got {', '.join(names)}")

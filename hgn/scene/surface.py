@@ -54,10 +54,10 @@ def sample_surface(
             near = point_tree(points).query(point, distance_upper_bound=spacing)[0]
             free = near >= spacing  # infinite where nothing is nearer
             point, owner = point[free], owner[free]
-        kept = _spread_out(point, spacing)
-        points = np.concatenate([points, point[kept]])
-        owners = np.concatenate([owners, owner[kept]])
-        if round_index + 1 >= MINIMUM_ROUNDS and len(kept) < SETTLED * len(points):
+        selected = _spread_out(point, spacing)
+        points = np.concatenate([points, point[selected]])
+        owners = np.concatenate([owners, owner[selected]])
+        if round_index + 1 >= MINIMUM_ROUNDS and len(selected) < SETTLED * len(points):
             break
     return points, owners
 
@@ -125,15 +125,15 @@ def _spread_out(point: np.ndarray, spacing: float) -> np.ndarray:
     pair = point_tree(point).query_pairs(spacing, output_type="ndarray").astype(np.int64)
     earlier, later = pair.min(axis=1), pair.max(axis=1)
     undecided = np.ones(len(point), bool)
-    kept = np.zeros(len(point), bool)
+    selected = np.zeros(len(point), bool)
     while undecided.any():
         waits = np.zeros(len(point), bool)
         waits[later] = True
         settled = undecided & ~waits
-        kept |= settled
+        selected |= settled
         dropped = later[settled[earlier]]
         undecided &= ~settled
         undecided[dropped] = False
         open_pair = undecided[earlier] & undecided[later]
         earlier, later = earlier[open_pair], later[open_pair]
-    return np.flatnonzero(kept)
+    return np.flatnonzero(selected)

@@ -58,13 +58,13 @@ def scene_symmetries(gravity: Vector, domain_size: Vector, cell_size: float) -> 
     """
     x, y, z = (round(length / cell_size) - 1 for length in domain_size)
     cells = x, y, z
-    found = []
+    symmetries = []
     for s0, s1, s2 in permutations(range(3)):
         for m0, m1, m2 in product((False, True), repeat=3):
             symmetry = Symmetry((s0, s1, s2), (m0, m1, m2), cells, cell_size)
             if symmetry.direction(gravity) == gravity and [domain_size[s] for s in symmetry.source] == [*domain_size]:
-                found.append(symmetry)
-    return tuple(found)
+                symmetries.append(symmetry)
+    return tuple(symmetries)
 
 
 def drawn_symmetry(symmetries: tuple[Symmetry, ...], seed: int) -> Symmetry:

@@ -88,8 +88,8 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     network, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    found, wanted = to_mapping(info.network), to_mapping(config.network)
-    pairs = [(f"network.{key}", found[key], wanted[key]) for key in sorted(found)]
+    stored, wanted = to_mapping(info.network), to_mapping(config.network)
+    pairs = [(f"network.{key}", stored[key], wanted[key]) for key in sorted(stored)]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))

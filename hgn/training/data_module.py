@@ -95,7 +95,7 @@ class EpisodeDataModule(LightningDataModule):
             update_samples = UpdateSamples(samples, state, tuple((episodes[i], frame) for i, frame in drawn[1]))
             return update_samples if self.training.pushforward_fraction else update_samples.batch(self.network)
 
-        yield from self._ahead(draw, read)
+        yield from self._prefetched(draw, read)
 
     def chunks(self) -> Iterator[UpdateChunk]:
         """The same samples, those of many updates at once. A chunk ends wherever something is due between updates."""
@@ -118,7 +118,7 @@ class EpisodeDataModule(LightningDataModule):
             episodes = self._whole(new)
             return UpdateChunk(tuple(self._weighted(update) for update in samples), episodes, state, starts)
 
-        yield from self._ahead(draw, read)
+        yield from self._prefetched(draw, read)
 
     def _update(self) -> int:
         """The number of the next update."""
@@ -173,7 +173,7 @@ class EpisodeDataModule(LightningDataModule):
             self.training.seed, self.training.batch_scenes, self._published, self.sampler_state, rank, world_size
         )
 
-    def _ahead(
+    def _prefetched(
         self, draw: Callable[[], tuple[Any, SamplerState]], read: Callable[[Any, SamplerState], T]
     ) -> Iterator[T]:
         # The order may have to ask other ranks, so it stays in this thread; reading runs ahead in another.

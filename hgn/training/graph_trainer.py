@@ -1,7 +1,7 @@
 """Training by captured updates: what Lightning sees stays true, what runs is hgn.kernels.update.
 
 Parameters and Adam's moments live in the kernels' layout while a chunk of updates runs, and are copied back after it,
-so that checkpoints, monitoring and the other path find them where they belong.
+so that checkpoints, monitoring and backend torch find them where they belong.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class GraphTrainer:
         """`averaged` holds the moving average of the weights.
 
         loss_sum [2] and counters [5] are added to, as hgn.kernels.update.kernel.finish_update says."""
-        self._begun, self._made, self._late = time.monotonic(), 0, JitMisses()
+        self._begun, self._made, self._jit_misses = time.monotonic(), 0, JitMisses()
         self._seconds: dict[str, float] = defaultdict(float)
         self.network, self.optimizer = network, optimizer
         self.device = next(network.parameters()).device
@@ -122,13 +122,13 @@ class GraphTrainer:
         """Where the time of the first updates went: once, when REPORTED_UPDATES are made."""
         if not self._begun or self._made < REPORTED_UPDATES:
             return None
-        total, updates, late = time.monotonic() - self._begun, self.updates, self._late
+        total, updates, misses = time.monotonic() - self._begun, self.updates, self._jit_misses
         self._begun = 0.0
         parts = [f"{seconds:.1f} s {what}" for what, seconds in self._seconds.items()]
         parts.append(f"{updates.capture_seconds:.1f} s capturing {updates.captures} times")
         return (
             f"backend triton: the first {self._made} updates took {total:.1f} s, {', '.join(parts)}; "
-            f"in that {late.seconds:.1f} s for {late.count} kernels that were not compiled ahead"
+            f"in that {misses.seconds:.1f} s for {misses.count} kernels that were not compiled ahead"
         )
 
     def _placed(self, episode: EpisodeTensors) -> DeviceEpisode:

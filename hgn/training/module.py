@@ -57,7 +57,7 @@ class TrainingModule(LightningModule):
         # what GradientGuard counts, see there
         self.gradient_counters: torch.Tensor
         self.register_buffer("gradient_counters", torch.zeros(5), persistent=False)
-        self._fast: Any = None
+        self._graph_trainer: Any = None
         self._pool: PushforwardPool | None = None
         self.backend: Backend | None = None  # of the updates that PyTorch makes, once the device is known
         self._unchecked = True  # whether kernels compute on this machine what they should
@@ -123,7 +123,7 @@ class TrainingModule(LightningModule):
     @property
     def pushforward_figures(self) -> dict[str, float]:
         """What is to be logged of the pushforward pool."""
-        pool = self._pool if self._fast is None else self._fast.pool
+        pool = self._pool if self._graph_trainer is None else self._graph_trainer.pool
         return {} if pool is None else dict(pool.figures)
 
     def on_fit_start(self) -> None:
@@ -146,7 +146,7 @@ class TrainingModule(LightningModule):
 
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Adam)
-            self._fast = GraphTrainer(
+            self._graph_trainer = GraphTrainer(
                 self.network,
                 optimizer,
                 self.training_config,
@@ -185,17 +185,17 @@ class TrainingModule(LightningModule):
 
     def _train_chunk(self, chunk: UpdateChunk) -> None:
         first, count = self.global_step, len(chunk.samples)
-        first_chunk = self._fast.parity is None
+        first_chunk = self._graph_trainer.parity is None
         updates = range(first, first + count)
         average_weights = None
         if self.averaged is not None:
             average_weights = [self._average_weight(update) for update in updates]
-        self._fast.run(chunk, [self._rate(update) for update in updates], average_weights, first)
+        self._graph_trainer.run(chunk, [self._rate(update) for update in updates], average_weights, first)
         if first_chunk and self.trainer.is_global_zero:
-            outputs, gradients = self._fast.parity
+            outputs, gradients = self._graph_trainer.parity
             text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"
             print(f"backend triton: {text if math.isfinite(outputs) else 'batch too large to check'}", file=sys.stderr)
-        report = self._fast.report()
+        report = self._graph_trainer.report()
         if report and self.trainer.is_global_zero:
             print(report, file=sys.stderr)
         self.sampler_state = chunk.sampler_state

@@ -12,7 +12,7 @@ import math
 
 import torch
 
-from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES, TrainingConfig
+from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.system.splitmix import splitmix64
 
@@ -57,11 +57,11 @@ def correlated_walk(
     """Velocity noise [m, N, 3] that neighbours have in common: a sum of plane waves, random Fourier features (Rahimi,
     Recht 2007), whose amplitudes walk as `random_walk` does; over waves its standard deviation is the same everywhere.
     """
-    waves, device = SMOOTH_WAVES, generator.device
+    waves, device = CORRELATED_WAVES, generator.device
     direction_K3 = torch.randn(waves, 3, generator=generator, device=device)
     length_K = torch.rand(waves, generator=generator, device=device)
     phase_K = 2 * math.pi * torch.rand(waves, generator=generator, device=device)
-    shortest, longest = (cells * cell_size for cells in SMOOTH_CELLS)
+    shortest, longest = (cells * cell_size for cells in CORRELATED_WAVELENGTHS)
     number_K = 2 * math.pi / shortest * torch.exp(-math.log(longest / shortest) * length_K)
     wave_K3 = direction_K3 * (number_K / direction_K3.norm(dim=1))[:, None]
     height_NK = torch.cos(position_N3.float() @ wave_K3.T + phase_K)

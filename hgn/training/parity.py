@@ -43,10 +43,10 @@ def require_parity(
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
     fused.backward()
-    found = [torch.zeros_like(parameter) for parameter in parameters]
-    updates.packed.scatter(fused.totals[: updates.packed.size], found)
+    gradients = [torch.zeros_like(parameter) for parameter in parameters]
+    updates.packed.scatter(fused.totals[: updates.packed.size], gradients)
     gradient_error = relative_error(
-        torch.cat([tensor.flatten() for tensor in found]),
+        torch.cat([tensor.flatten() for tensor in gradients]),
         torch.cat(
             [(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, expected, strict=True)]
         ),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from datagen.pool.plan import SceneTask, scene_seed
-from datagen.pool.pool import LocalCrew, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
+from datagen.pool.pool import LocalWorkerFactory, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
 from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend, LocalWorker, MadeScene, Worker
 from datagen.pool.writer import DatasetWriter
@@ -51,7 +51,7 @@ def generate(config: DatagenConfig, backend: Backend, plan: WorkerPlan = ONE, **
     recorder = Recorder()
     try:
         with DatasetWriter(config, recorder.message) as writer:
-            Pool(config, writer, recorder, plan, LocalCrew(config, backend, plan), **options).run()
+            Pool(config, writer, recorder, plan, LocalWorkerFactory(config, backend, plan), **options).run()
     finally:
         assert not multiprocessing.active_children()
     return recorder
@@ -110,7 +110,7 @@ def test_scenes_are_spread_over_solvers(make_config: MakeConfig, backend: Backen
     config = make_config(training_scenes=11, validation_scenes=0, test_scenes=0)
     batches: dict[int, list[int]] = {}
 
-    class WorkerFactory(LocalCrew):
+    class WorkerFactory(LocalWorkerFactory):
         def start_solver(self, number: int) -> Worker:
             worker = super().start_solver(number)
             give = worker.give
@@ -192,7 +192,7 @@ def test_stop_keeps_what_is_staged(make_config: MakeConfig, backend: Backend, co
     config = make_config()
     recorder = Recorder()
     with pytest.raises(Stopped), DatasetWriter(config) as writer:
-        crew = LocalCrew(config, backend, ONE)
+        crew = LocalWorkerFactory(config, backend, ONE)
         Pool(config, writer, recorder, ONE, crew, lambda: len(recorder.episodes) >= 3).run()
     assert not multiprocessing.active_children()
     # the episode in flight may or may not have been staged when its worker ended
@@ -209,7 +209,7 @@ def test_workers_that_die_while_stopping(make_config: MakeConfig, backend: Backe
     (control / f"kill-{scene_seed(0, 'train', 0, 0)}").write_text("1")
     recorder = Recorder()
     with pytest.raises(Stopped), DatasetWriter(config) as writer:
-        crew = LocalCrew(config, backend, ONE)
+        crew = LocalWorkerFactory(config, backend, ONE)
         Pool(config, writer, recorder, ONE, crew, lambda: (control / "simulated.log").exists()).run()
     assert recorder.messages == [] and len(simulated(control)) == 1
 
@@ -235,7 +235,7 @@ def test_full_disk_in_a_worker_reaches_the_parent(make_config: MakeConfig, backe
         staging.rmdir()
         staging.write_text("in the way")
         with pytest.raises(NotADirectoryError):
-            Pool(config, writer, Recorder(), ONE, LocalCrew(config, backend, ONE)).run()
+            Pool(config, writer, Recorder(), ONE, LocalWorkerFactory(config, backend, ONE)).run()
         staging.unlink()
         staging.mkdir()
 

@@ -12,7 +12,7 @@ import torch
 from hgn.config import NetworkConfig
 from hgn.network.build import build_network
 from hgn.runtime.backend import choose
-from hgn.runtime.triton_host import why_no_triton
+from hgn.runtime.triton_host import host_unsupported_reason
 from hgn.schema import ConfigError
 
 
@@ -30,23 +30,23 @@ def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_what_is_missing(host: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Headers, then a compiler; nothing with both, or CC, or where they were used before."""
-    assert f"headers: {host}/include/Python.h, on Debian" in str(why_no_triton())
+    assert f"headers: {host}/include/Python.h, on Debian" in str(host_unsupported_reason())
     (host / "more").mkdir()
     (host / "more" / "Python.h").touch()
     with monkeypatch.context() as patch:
         patch.setenv("CPATH", f"/nowhere:{host}/more")
-        assert why_no_triton() is None
+        assert host_unsupported_reason() is None
     (host / "include").mkdir()
     (host / "include" / "Python.h").touch()
-    assert why_no_triton() is None
+    assert host_unsupported_reason() is None
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert why_no_triton() == "Triton needs a C compiler: gcc, clang or CC=…"
+    assert host_unsupported_reason() == "Triton needs a C compiler: gcc, clang or CC=…"
     monkeypatch.setenv("CC", "/opt/cc")
-    assert why_no_triton() is None
+    assert host_unsupported_reason() is None
     monkeypatch.delenv("CC")
     (host / "cache" / "ABC").mkdir(parents=True)
     (host / "cache" / "ABC" / "cuda_utils.so").touch()
-    assert why_no_triton() is None
+    assert host_unsupported_reason() is None
 
 
 def test_it_is_said(host: Path) -> None:

@@ -31,7 +31,7 @@ from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
 from tools.error_vs_time.comparisons import comparisons
-from tools.error_vs_time.contenders import FastPredictor, TrivialContender
+from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
 from tools.error_vs_time.paired import paired_difference, paired_lines, paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.settings import ErrorVsTimeConfig
@@ -78,13 +78,13 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     out = tmp_path / "results" / "report"
     options = {"data": data, "out": str(out), "weights": weights, "split": "validation", "frame_stride": 2}
     options |= {"mpm_grids": [32, 64], "timed_frames": 5, "rounds": 1, "batch_scenes": 2, "timed_scenes": 1}
-    options |= {"training_hours": [1.5, 2.0], "generation_hours": 0.5, "sinkhorn_points": 8, "device": "cpu"}
+    options |= {"sinkhorn_points": 8, "device": "cpu"}
     assert main(options) == 0
     report = json.loads(Path(f"{out}.json").read_text())
     assert {"device", "versions", "commit", "date", "command", "convention", "reference"} <= report["meta"].keys()
     rows = report["rows"]
     systems = [row["system"] for row in rows]
-    assert systems == ["hgn", "gns", *["trivial"] * 3, *["mpm"] * 4, *["chaos"] * 2]
+    assert systems == ["hgn", "gns", *["baseline"] * 3, *["mpm"] * 4, *["chaos"] * 2]
     keys = {
         "one_step_mse",
         "position_mse",
@@ -107,7 +107,6 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     floor = {row["floor"]: row["position_mse"]["5"] for row in rows if row["system"] == "chaos"}
     assert 1e-13 < floor["perturbed by 1e-06"] < 3e-12
     assert floor["twice the step"] == pytest.approx(mpm[64, 0.5]["position_mse"]["5"])
-    assert rows[0]["training_hours"] == 1.5 and "pay_back_rollouts" in rows[0]
     assert report["meta"]["set"]["drawn"] is None and len(report["meta"]["set"]["not_frozen_before"]) == 2
     assert rows[0]["by_scene"].keys() == {"one-step MSE", "position MSE", "Sinkhorn"} != rows[-1]["by_scene"].keys()
     for row in rows:
@@ -149,11 +148,11 @@ def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.Monkey
     assert [call for call in calls if call[2] == 3] == [(1 / 64, [0.5, 1.0], 3)]  # of one grid side by side
     assert {call[2] for call in calls} == {2, 3, 4} and all(len(call[1]) == 1 for call in calls if call[2] != 3)
     rows = json.loads(Path(f"{out}.json").read_text())["rows"]
-    assert [row["system"] for row in rows] == ["trivial"] * 3 + ["mpm", "mpm", "chaos"]
+    assert [row["system"] for row in rows] == ["baseline"] * 3 + ["mpm", "mpm", "chaos"]
     assert rows[4]["scenes_reached"] == {"5": 0} and rows[4]["failed_scenes"] == 0
     assert main(options | {"seconds": 1e-9}) == 0
     report = json.loads(Path(f"{out}.json").read_text())
-    assert [row["system"] for row in report["rows"]] == ["trivial"] * 3 and len(report["meta"]["not_run"]) == 3
+    assert [row["system"] for row in report["rows"]] == ["baseline"] * 3 and len(report["meta"]["not_run"]) == 3
     assert all(left["cause"] == "the time was over" for left in report["meta"]["not_run"])
 
 
@@ -167,10 +166,10 @@ def test_the_data_can_be_the_reference(data: str, tmp_path: Path) -> None:
     assert rows["ballistic motion"]["one_step_mse"] < 1e-13 < rows["constant velocity"]["one_step_mse"]
 
 
-def test_trivial_errors_are_those_of_training(data: str) -> None:
+def test_baseline_errors_are_those_of_training(data: str) -> None:
     """One-step errors agree with what training measures, at every frame."""
     (episode,) = EpisodeStore(data, "test").episodes
-    gravity = TrivialContender("fall", lambda e: 0.9 * np.asarray(e.gravity) / e.frame_rate_hz**2, CPU)
+    gravity = BaselineContender("fall", lambda e: 0.9 * np.asarray(e.gravity) / e.frame_rate_hz**2, CPU)
     network = network_of(torch.float32, obstacle_features=False)
     batches = frame_batches([episode], network, 1, 100)
     expected = one_step_errors({"fall": lambda b: 0.9 * ballistic(b)}, batches, CPU, network.config.materials)
@@ -189,7 +188,7 @@ def test_the_fast_path_tells_its_own_errors(data: str) -> None:
         material_N=episode.material_N[1:],
     )
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1)
-    predict, made = FastPredictor(network, "fp32"), []
+    predict, made = TritonPredictor(network, "fp32"), []
     with torch.inference_mode():
         for samples in ([(episode, 0), (episode, 2)], [(fewer, 1), (fewer, 3)], [(episode, 3)]):
             batch = make_batch(samples, network.config)
@@ -296,7 +295,7 @@ def test_ghost_acceleration_counts_particles_at_rest(data: str) -> None:
         initial_velocity_N3=np.zeros_like(episode.initial_velocity_N3),
         gravity=(0.0, 0.0, 0.0),
     )
-    step = TrivialContender("push", lambda e: np.array([3e-3, 0.0, 4e-3]), CPU).one_step(still, 1, 1e-4)
+    step = BaselineContender("push", lambda e: np.array([3e-3, 0.0, 4e-3]), CPU).one_step(still, 1, 1e-4)
     assert step.rest_count == 8 * (position_TN3.shape[1] - 1)
     assert score.one_step_figures([step])["ghost"] == pytest.approx(5e-3, rel=1e-5)
 
@@ -375,13 +374,6 @@ def test_other_grids_keep_their_walls() -> None:
     assert cells == [2, 2, 3, 6]
 
 
-def test_pay_back() -> None:
-    """Hours over the time that a rollout saves; none where it saves nothing or hours are not told."""
-    assert score.pay_back({"ms": 1.0}, 4.0, 2.0, 1.0, 300) == pytest.approx(3 * 3.6e6 / 900)
-    assert score.pay_back({"ms": 5.0}, 4.0, 2.0, 1.0, 300) is None
-    assert score.pay_back({"ms": 1.0}, 4.0, None, 1.0, 300) is None
-
-
 def test_scenes_that_failed_leave_the_means(data: str) -> None:
     """Errors at a frame are means over the scenes that reached it, and say over how many."""
     episodes = list(EpisodeStore(data, "validation").episodes)
@@ -400,7 +392,6 @@ def test_scenes_that_failed_leave_the_means(data: str) -> None:
     [
         ({"mpm_steps": [0.0]}, r"mpm_steps\[0\] must be above 0"),
         ({"weights": ["a/x.safetensors", "b/x.safetensors"]}, "weights must be files of different names"),
-        ({"weights": ["a"], "training_hours": [1.0, 2.0]}, "training_hours must be a list of 1"),
         ({"frames": 1}, "frames must be at least 2"),
         ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32, fp16"),
         ({"split": "all"}, "split must be one of train"),
@@ -474,7 +465,7 @@ def test_what_nobody_foresaw_stops_one_contender(
     options = {"data": data, "weights": weights, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
     assert main(options | SHORT) == 1
     report = json.loads((tmp_path / "report.json").read_text())
-    assert [row["system"] for row in report["rows"]] == ["gns", *["trivial"] * 3]
+    assert [row["system"] for row in report["rows"]] == ["gns", *["baseline"] * 3]
     (left,) = report["meta"]["not_run"]
     assert left["cause"] == "RuntimeError: an illegal memory access" and report["rows"][0]["ms"] > 0
     assert "Traceback" in (told := capsys.readouterr().err) and "1 of the measurements failed" in told
@@ -538,7 +529,7 @@ def test_scenes_beside_one_that_diverges_go_their_way(data: str, kind: str) -> N
 
 def report_row(system: str, error: float, ms: float | None, **more: Any) -> dict[str, Any]:
     one_step = None if system in ("mpm", "chaos") else error
-    worst = {"episode": "test-000003", "share": 0.02, "reference": 0.01, "reference_worst": 0.015}
+    worst = {"episode": "test-000003", "fraction": 0.02, "reference": 0.01, "reference_worst": 0.015}
     row = {"system": system, "one_step_mse": one_step, "one_step_quartiles": one_step and [0.5 * error, 2 * error]}
     row |= {"one_step_by_material": one_step and {"water": 2 * error}, "position_mse": {"50": error, "299": 2 * error}}
     row |= {"position_quartiles": {"50": [0.5 * error, 2 * error]}, "scenes_reached": {"50": 2, "299": 1}}
@@ -555,7 +546,7 @@ def report_rows() -> list[dict[str, Any]]:
         report_row("hgn", 1e-7, 2.0, precision="fp32"),
         report_row("gns", 2e-7, 5.0, precision="fp16"),
         report_row("gns_particles", 1e3, 50.0, precision="fp16"),
-        report_row("trivial", 1e-5, None, predictor="ballistic motion"),
+        report_row("baseline", 1e-5, None, predictor="ballistic motion"),
         report_row("mpm", 0.5e-7, 100.0, grid=64, step=0.5, precision="fp32"),
         report_row("mpm", 1e-3, 20.0, grid=32, step=1.0, precision="fp32"),
         report_row("chaos", 1e-9, None, floor="twice the step"),

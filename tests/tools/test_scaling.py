@@ -101,7 +101,7 @@ def alone(tmp_path: Path) -> Iterator[dist.ProcessGroup]:
 
 
 def averaged(
-    group: dist.ProcessGroup, make: type[measure.PlainUpdates | measure.FastUpdates], config: ScalingConfig
+    group: dist.ProcessGroup, make: type[measure.TorchUpdates | measure.TritonUpdates], config: ScalingConfig
 ) -> measure.Contender:
     device = torch.device("cpu")
     updates = make(config, measure._batches(config, 0, 0.1, device), device)
@@ -113,7 +113,7 @@ def averaged(
 def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pytest.MonkeyPatch) -> None:
     """Averages that are wrong, and weights that differ between ranks, are found, and get a reason instead of a time."""
     config = from_mapping(ScalingConfig, SMALL)
-    contender = averaged(alone, measure.PlainUpdates, config)
+    contender = averaged(alone, measure.TorchUpdates, config)
     assert contender.check == "pass" and len(contender.messages) == 1
     right = dist.all_reduce
 
@@ -122,7 +122,7 @@ def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pyt
 
     with monkeypatch.context() as patch:
         patch.setattr(dist, "all_reduce", wrong_sum)
-        wrong = averaged(alone, measure.PlainUpdates, config)
+        wrong = averaged(alone, measure.TorchUpdates, config)
     assert wrong.check.startswith("relative error of averaged gradients 9.1e-02 exceeds 2e-02")
     monkeypatch.setattr(dist, "broadcast", lambda tensor, *_, **__: tensor.add_(1e-3))
     measure._check_weights(contender, {1: alone}, 0)
@@ -135,7 +135,7 @@ def test_the_fast_path_is_timed_alike(alone: dist.ProcessGroup) -> None:
     """Its updates are those of backend torch on the same scenes: weights agree after them; averages are checked."""
     small = {"network": {"width": 16, "levels": 1, "message_passing_steps": 1}, "particles": 6}
     config = from_mapping(ScalingConfig, SMALL | small | {"scenes": 1, "batches": 1})
-    plain, fast = (averaged(alone, make, config) for make in (measure.PlainUpdates, measure.FastUpdates))
+    plain, fast = (averaged(alone, make, config) for make in (measure.TorchUpdates, measure.TritonUpdates))
     assert plain.check == fast.check == "pass"
     assert plain.messages[0] <= fast.messages[0] < 2 * plain.messages[0]  # the kernels' layout has spare places
     assert plain.update is not None and fast.update is not None

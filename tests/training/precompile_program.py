@@ -8,7 +8,7 @@ from no_gpu import use_h100
 
 from hgn.config import NetworkConfig
 from hgn.kernels.update.op import UpdateSettings
-from hgn.runtime.precompile_program import FrameJob, PrecompileJob, compile_share, launches_of
+from hgn.runtime.precompile_program import FrameJob, PrecompileJob, compile_part, launches_of
 
 use_h100()
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
@@ -20,7 +20,7 @@ last = len(expected) - 1
 rolling = replace(job, pushforward_scenes=(3,))
 with_frames = set(launches_of(rolling, "cpu"))
 assert set(launches_of(rolling)) == with_frames > expected, len(with_frames)
-assert compile_share(job, last, len(expected)) == 1
+assert compile_part(job, last, len(expected)) == 1
 # frames: of two precisions each has kernels of its own, and a network with fewer levels only tables of its own
 frames = FrameJob(((network, "fp16"),), ((300, 200), (40_000, 20_000)), 90)
 both = replace(frames, networks=(*frames.networks, (network, "tf32")))

@@ -139,14 +139,14 @@ class Train:
     def check(self, precision: str) -> str:
         """`pass`, or by how much loss or gradients differ from float64, without noise and jitter."""
         plain = replace(self.module.training_config, noise_std=0.0, grid_jitter=False)
-        found = TrainingModule(self.module.network, plain, _data_info())
-        found.backend = self.module.backend
-        found.network.zero_grad()
-        found_loss = found.loss(self.batch)
-        found_loss.backward()
-        gradients = [_gradient(p) for p in found.network.parameters()]
-        expected_loss, expected = reference_gradients(found.network, self.batch)
-        first = verdict("loss", relative_error(found_loss.detach().double(), expected_loss), BOUNDS[precision])
+        module = TrainingModule(self.module.network, plain, _data_info())
+        module.backend = self.module.backend
+        module.network.zero_grad()
+        loss = module.loss(self.batch)
+        loss.backward()
+        gradients = [_gradient(p) for p in module.network.parameters()]
+        expected_loss, expected = reference_gradients(module.network, self.batch)
+        first = verdict("loss", relative_error(loss.detach().double(), expected_loss), BOUNDS[precision])
         if first != PASS:
             return first
         error = relative_error(torch.cat(gradients).double(), expected)

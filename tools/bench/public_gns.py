@@ -56,8 +56,8 @@ def load_public(folder: Path, maximum_neighbours: int | None) -> ModuleType:
     finally:
         sys.path.remove(str(folder.resolve()))
     assert module.__file__ is not None
-    found = Path(module.__file__).resolve()
-    require(found == file.resolve(), "public_gns", "the only package named gns", str(found))
+    imported = Path(module.__file__).resolve()
+    require(imported == file.resolve(), "public_gns", "the only package named gns", str(imported))
     module.radius_graph = functools.partial(_radius_graph, maximum_neighbours)  # type: ignore[attr-defined]
     return module
 

@@ -28,7 +28,7 @@ from tools.bench.timing import Timed, once
 FRAMES_AT_ONCE = 16  # at most, so that a frame's launch hides behind the one before, as in a simulation
 UPDATES_AT_ONCE = 20
 OBSTACLE_CELL_SIZE = 1 / 64
-FIRST_MOMENT_SHARE = 0.1  # of Adam, of the gradient, after the first update
+FIRST_MOMENT_FRACTION = 0.1  # of Adam, of the gradient, after the first update
 
 
 class TritonFrame:
@@ -135,7 +135,7 @@ class TritonTrain:
         first = verdict("loss", relative_error(plain.loss_sum[0].double(), expected_loss), BOUNDS[precision])
         if first != PASS:
             return first
-        found = [torch.zeros_like(parameter) for parameter in self.network.parameters()]
-        plain.packed.scatter(plain.first_moment / FIRST_MOMENT_SHARE, found)
-        gradient = torch.cat([tensor.flatten() for tensor in found]).double()
+        gradients = [torch.zeros_like(parameter) for parameter in self.network.parameters()]
+        plain.packed.scatter(plain.first_moment / FIRST_MOMENT_FRACTION, gradients)
+        gradient = torch.cat([tensor.flatten() for tensor in gradients]).double()
         return verdict("gradient", relative_error(gradient, expected), GRADIENT_BOUNDS[precision])

@@ -37,17 +37,17 @@ from tools.error_vs_time.contenders import (
     COARSE_GRIDS,
     PARTICLES_AT_ONCE,
     SAME_GRID,
+    BaselineContender,
     Contender,
     NetworkContender,
     SolverContender,
-    TrivialContender,
     solver_row,
 )
 from tools.error_vs_time.earlier import Earlier, is_among
 from tools.error_vs_time.paired import paired_lines, paired_rows
 from tools.error_vs_time.plot import CONVENTION
 from tools.error_vs_time.run import Run, draw
-from tools.error_vs_time.score import pay_back, table
+from tools.error_vs_time.score import table
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.solver_launches import Setting, SolverLaunches
 from tools.solver_rollouts import other_grid
@@ -55,7 +55,7 @@ from tools.solver_rollouts import other_grid
 if TYPE_CHECKING:
     from hgn.runtime.precompile import Precompilation
 
-COMPILING_SHARE = 0.4  # of the seconds given, until when kernels that are compiled ahead are waited for
+COMPILING_FRACTION = 0.4  # of the seconds given, until when kernels that are compiled ahead are waited for
 HGN_ORDER, GNS_ORDER = ("tf32", "fp16", "fp32"), ("fp16", "tf32", "fp32")  # what tells most for its time first
 
 
@@ -88,15 +88,15 @@ def main(mapping: dict[str, Any]) -> int:
 
     solvers = solver_contenders(config, mpm, launches, own_grid, known)
     with ExitStack() as stack:
-        ahead = _kernels_ahead(networks, episodes, device)
-        if ahead is not None:
-            stack.enter_context(ahead)
+        precompilation = _precompiled_frames(networks, episodes, device)
+        if precompilation is not None:
+            stack.enter_context(precompilation)
         if config.resimulate:
             references, left_out = resimulated(episodes, launches(own_grid), config.reference_step)
         else:
             references, left_out = [_with_positions(e, np.asarray(e.position_TN3[:frames])) for e in episodes], {}
         require(bool(references), "data", "scenes that the solver gets through", left_out)
-        trivial = [c for c in trivial_contenders(store, device) if not is_among(c.row, known)]
+        baselines = [c for c in baseline_contenders(store, device) if not is_among(c.row, known)]
         meta = provenance(device) | {
             "config": without_folders(to_mapping(config)),
             "data": Path(config.data).name,
@@ -110,13 +110,12 @@ def main(mapping: dict[str, Any]) -> int:
             "convention": CONVENTION,
             "seconds_before_scoring": time.monotonic() - begun,
         }
-        run = Run(config, [*networks, *trivial, *solvers], references, device, meta, begun, known)
-        run.score_beside(lambda: ahead is not None and ahead.running)
-        if ahead is not None:
-            print(ahead.wait(lambda: run.late(COMPILING_SHARE)), file=sys.stderr)
+        run = Run(config, [*networks, *baselines, *solvers], references, device, meta, begun, known)
+        run.score_beside(lambda: precompilation is not None and precompilation.running)
+        if precompilation is not None:
+            print(precompilation.wait(lambda: run.is_past(COMPILING_FRACTION)), file=sys.stderr)
     run.meta["seconds_before_timing"] = time.monotonic() - begun
     run.measure()
-    add_pay_back(run.rows, config, mpm, references[0], frames)
     run.write(drawn=True)
     print(
         table(run.rows),
@@ -195,14 +194,14 @@ def fitting_weights(episodes: Sequence[Episode]) -> list[Path]:
     What does not fit is said.
     """
     seen = any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
-    found = []
+    files = []
     for name, file in shipped_weights().items():
         info = load_weights(file)[1]
         if info.network.sees_obstacles == seen and _why_unfit(info, episodes) is None:
-            found.append(file)
+            files.append(file)
         else:
             print(f"left out: the shipped weights {name}, which are for other data", file=sys.stderr)
-    return found
+    return files
 
 
 def _why_unfit(info: WeightsInfo, episodes: Sequence[Episode]) -> str | None:
@@ -223,23 +222,23 @@ def _why_unfit(info: WeightsInfo, episodes: Sequence[Episode]) -> str | None:
     return None
 
 
-def _kernels_ahead(
+def _precompiled_frames(
     networks: Sequence[NetworkContender], episodes: Sequence[Episode], device: torch.device
 ) -> Precompilation | None:
     """Compiles whole frames of networks: beside the solver, which needs one core."""
-    fast = [contender for contender in networks if not contender.stepped]
-    if not fast:
+    whole = [contender for contender in networks if not contender.stepped]
+    if not whole:
         return None
     # Triton, which backend torch does without, is loaded here.
-    from hgn.runtime.precompile import frames_ahead
+    from hgn.runtime.precompile import precompile_frames
 
     particles = max(len(episode.material_N) for episode in episodes)
     sizes = [particles, 8 * particles, PARTICLES_AT_ONCE]
-    pairs = [(contender.network.config, contender.precision) for contender in fast]
-    return frames_ahead([config for config, _ in pairs], [precision for _, precision in pairs], device, sizes)
+    pairs = [(contender.network.config, contender.precision) for contender in whole]
+    return precompile_frames([config for config, _ in pairs], [precision for _, precision in pairs], device, sizes)
 
 
-def trivial_contenders(store: EpisodeStore, device: torch.device) -> list[Contender]:
+def baseline_contenders(store: EpisodeStore, device: torch.device) -> list[Contender]:
     """What a network must beat to have learned anything."""
     split = "train" if store.manifest.published("train") else store.split  # fresh test sets are tests alone
     mean_3 = np.asarray(store.manifest.statistics(split).acceleration.mean)
@@ -248,7 +247,7 @@ def trivial_contenders(store: EpisodeStore, device: torch.device) -> list[Conten
         "ballistic motion": lambda episode: np.asarray(episode.gravity) / episode.frame_rate_hz**2,
         "mean acceleration": lambda episode: mean_3,
     }
-    return [TrivialContender(name, acceleration, device) for name, acceleration in predictors.items()]
+    return [BaselineContender(name, acceleration, device) for name, acceleration in predictors.items()]
 
 
 def solver_contenders(
@@ -295,25 +294,6 @@ def resimulated(
     pairs = list(zip(episodes, trials, strict=True))
     left_out = {episode.key: trial.cause for episode, trial in pairs if trial.cause is not None}
     return [_with_positions(e, trial.position_TN3) for e, trial in pairs if trial.cause is None], left_out
-
-
-def add_pay_back(
-    rows: Sequence[dict[str, Any]], config: ErrorVsTimeConfig, mpm: MpmConfig, episode: Episode, frames: int
-) -> None:
-    """Adds to networks after how many rollouts they have paid for themselves, against the solver that made the data."""
-    own = round(1 / episode.obstacle_grid.cell_size)
-    solver_ms = next(
-        (r.get("ms") for r in rows if r["system"] == "mpm" and (r["grid"], r["step"]) == (own, mpm.stability_fraction)),
-        None,
-    )
-    hours = dict(
-        zip((find_weights(name).name for name in config.weights or ()), config.training_hours or (), strict=False)
-    )
-    for row in rows:
-        if "weights" in row:
-            row["training_hours"] = hours.get(row["weights"])
-            row["generation_hours"] = config.generation_hours
-            row["pay_back_rollouts"] = pay_back(row, solver_ms, row["training_hours"], config.generation_hours, frames)
 
 
 def _with_positions(episode: Episode, position_TN3: np.ndarray) -> Episode:

@@ -15,25 +15,25 @@ Row = Mapping[str, Any]
 def comparisons(rows: Sequence[Row]) -> list[str]:
     """Lines for people, from the rows of a report."""
     networks = [row for row in rows if row["system"] in NETWORK_KINDS]
-    trivial = [row for row in rows if row["system"] == "trivial" and row["one_step_mse"]]
+    baselines = [row for row in rows if row["system"] == "baseline" and row["one_step_mse"]]
     return [
-        *_one_step(networks, trivial),
+        *_one_step(networks, baselines),
         *_beside_gns(networks),
         *_beside_solver(networks, [row for row in rows if row["system"] == "mpm" and row.get("ms")]),
         *_penetration(networks),
     ]
 
 
-def _one_step(networks: Sequence[Row], trivial: Sequence[Row]) -> list[str]:
+def _one_step(networks: Sequence[Row], baselines: Sequence[Row]) -> list[str]:
     """Of each network at each precision, over all particles and by material."""
-    if not networks or not trivial:
+    if not networks or not baselines:
         return []
-    best = min(trivial, key=lambda row: row["one_step_mse"])
+    best = min(baselines, key=lambda row: row["one_step_mse"])
     lines = ["", f"one-step MSE beside the best baseline ({best['predictor']}, {best['one_step_mse']:.2e})"]
     for row in networks:
         parts = []
         for material, mse in row["one_step_by_material"].items():
-            least = min(other["one_step_by_material"][material] for other in trivial)
+            least = min(other["one_step_by_material"][material] for other in baselines)
             parts.append(f"{material} {mse:.2e}, {_gain(least, mse)}")
         told = f"{row['one_step_mse']:.2e}, {_gain(best['one_step_mse'], row['one_step_mse'])}"
         lines.append(f"  {label(row)}: {told} ({'; '.join(parts)})")
@@ -83,7 +83,7 @@ def _penetration(networks: Sequence[Row]) -> list[str]:
     lines = ["", "particles within obstacles at the end: of all scenes, in the worst one, and the solver's own"]
     for row in networks:
         worst = row["worst_penetration"]
-        there = f"{worst['share']:.3%} in {worst['episode']}, where the solver has {worst['reference']:.3%}"
+        there = f"{worst['fraction']:.3%} in {worst['episode']}, where the solver has {worst['reference']:.3%}"
         own = f"{row['reference_penetration']:.3%}, {worst['reference_worst']:.3%} in its worst scene"
         lines.append(f"  {label(row)}: {row['penetration']:.3%}, {there}; the solver {own}")
     return lines

@@ -101,7 +101,7 @@ class NetworkContender:
             self.importance = HGN_NEXT if not self.stepped else HGN_LAST if hgn else GNS_LAST
         self.all_at_once = hgn and self.stepped and device.type == "cuda"  # which waits for the host then
         self.frames = None if rank == 0 or not self.stepped else repeated_frames
-        self._fast: FastPredictor | None = None
+        self._predictor: TritonPredictor | None = None
         self.row: dict[str, Any] = {
             "system": config.kind,
             "weights": file.name,
@@ -127,8 +127,8 @@ class NetworkContender:
         with self.matmul():
             if not self.stepped:
                 assert isinstance(self.network, HierarchicalGraphNetwork)
-                self._fast = self._fast or FastPredictor(self.network, self.precision)
-                return one_step(self._fast, config, episode, stride, rest_speed, self.device, PARTICLES_AT_ONCE)
+                self._predictor = self._predictor or TritonPredictor(self.network, self.precision)
+                return one_step(self._predictor, config, episode, stride, rest_speed, self.device, PARTICLES_AT_ONCE)
             return one_step(network_predictor(self.simulator.backend), config, episode, stride, rest_speed, self.device)
 
     def trials(
@@ -139,7 +139,7 @@ class NetworkContender:
             return simulate_scenes(self.simulator, [InitialState.of_episode(e) for e in episodes], frames, on_frame)
 
     def release(self) -> None:
-        self._fast = None
+        self._predictor = None
         self.simulator.backend.release()
 
 
@@ -184,13 +184,13 @@ class SolverContender:
         """Nothing is kept on the device."""
 
 
-class TrivialContender:
+class BaselineContender:
     """The same acceleration for every particle, whatever happens: nothing is learned."""
 
     all_at_once, importance = False, SAME_GRID
 
     def __init__(self, name: str, acceleration: Callable[[Episode], np.ndarray], device: torch.device) -> None:
-        self.row: dict[str, Any] = {"system": "trivial", "predictor": name}
+        self.row: dict[str, Any] = {"system": "baseline", "predictor": name}
         self.acceleration, self.device = acceleration, device
 
     def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep:
@@ -218,7 +218,7 @@ class TrivialContender:
         """Nothing is kept on the device."""
 
 
-class FastPredictor:
+class TritonPredictor:
     """Accelerations by backend triton's own launches: a frame simulated from each given state."""
 
     def __init__(self, network: HierarchicalGraphNetwork, precision: str) -> None:

@@ -22,8 +22,8 @@ GRID_COLORS = ("#111111", "#5c5c5c", "#9a9a9a", "#c0c0c0")  # the finest first
 PRECISION_MARKERS = {"fp32": "o", "tf32": "s", "fp16": "D"}
 PRECISION_NAMES = {"fp32": "fp32", "tf32": "TF32", "fp16": "fp16"}
 STEP_MARKERS = ("^", "v", "<", ">")  # the largest step first
-FLOOR_COLOR, TRIVIAL_COLOR = "#2b8a3e", "#868e96"
-FLOOR_LINES, TRIVIAL_LINES = ("-", "--"), (":", "--", "-.")
+FLOOR_COLOR, BASELINE_COLOR = "#2b8a3e", "#868e96"
+FLOOR_LINES, BASELINE_LINES = ("-", "--"), (":", "--", "-.")
 TEXT, SMALL, TINY = 10.5, 9.5, 7.5  # points
 FIGURE_WIDTH, PANEL_HEIGHT = 16.2, 4.9  # inches
 NEAR_FLOOR, FAR_ABOVE = 30, 8  # what is still shown: times below the least error, above the best that learns nothing
@@ -141,13 +141,13 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks:
 def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
     """Of the errors' axis: all points but those far above what learns nothing, and floors that are near."""
     errors = [error for row in rows if (error := _error(row, frame)) is not None and row["system"] not in UNTIMED]
-    trivial = [error for row in rows if row["system"] == "trivial" and (error := _error(row, frame)) is not None]
+    baselines = [error for row in rows if row["system"] == "baseline" and (error := _error(row, frame)) is not None]
     floors = [error for row in rows if row["system"] == "chaos" and (error := _error(row, frame)) is not None]
-    everything = errors + trivial + floors or [1.0]
-    low, high = min(errors or everything), max([*errors, *trivial[:1]] or everything)
+    everything = errors + baselines + floors or [1.0]
+    low, high = min(errors or everything), max([*errors, *baselines[:1]] or everything)
     low = min([low, *(floor for floor in floors if floor > low / NEAR_FLOOR)])
-    if trivial:
-        high = min(max(high, min(trivial)), FAR_ABOVE * min(trivial))
+    if baselines:
+        high = min(max(high, min(baselines)), FAR_ABOVE * min(baselines))
     return low / 2.5, high * (2.5 * high / low) ** 0.12
 
 
@@ -217,7 +217,7 @@ def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
 def _looks(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Colours and markers by name: one of each network, each grid of the solver, and each line across."""
     hgn, gns = iter(HGN_COLORS * len(rows)), iter(GNS_COLORS * len(rows))
-    floors, trivial = iter(FLOOR_LINES * len(rows)), iter(TRIVIAL_LINES * len(rows))
+    floors, baselines = iter(FLOOR_LINES * len(rows)), iter(BASELINE_LINES * len(rows))
     grids = sorted({row["grid"] for row in rows if row["system"] == "mpm"}, reverse=True)
     steps = sorted({row["step"] for row in rows if row["system"] == "mpm"}, reverse=True)
     markers = dict(zip(steps, STEP_MARKERS * len(steps), strict=False))
@@ -232,8 +232,8 @@ def _looks(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
             looks[name] |= {"color": color, "markers": markers}
         elif system == "chaos":
             looks[name] |= {"color": FLOOR_COLOR, "line": next(floors)}
-        elif system == "trivial":
-            looks[name] |= {"color": TRIVIAL_COLOR, "line": next(trivial)}
+        elif system == "baseline":
+            looks[name] |= {"color": BASELINE_COLOR, "line": next(baselines)}
         else:
             looks[name] |= {"color": next(hgn if system == "hgn" else gns)}
     return looks
@@ -243,7 +243,7 @@ def _name(row: Row) -> str:
     match row["system"]:
         case "mpm":
             return f"MPM solver, {row['grid']}³ cells"
-        case "trivial":
+        case "baseline":
             return f"learns nothing: {row['predictor']}"
         case "chaos":
             return f"chaos floor: {row['floor']}"
@@ -283,8 +283,8 @@ def _footer(figure: Any, meta: Mapping[str, Any]) -> float:
 
 def _png(figure: Any, meta: Mapping[str, Any], title: str, below: float) -> bytes:
     """With a title, and so many inches kept free below."""
-    share = below / figure.get_figheight()
-    figure.get_layout_engine().set(rect=(0, share, 1, 1 - share))
+    free = below / figure.get_figheight()
+    figure.get_layout_engine().set(rect=(0, free, 1, 1 - free))
     figure.suptitle(
         f"{title}: {meta['scenes']} {meta['split']} scenes of {meta['data']}, {meta['device']}", fontsize=TEXT + 2
     )

@@ -18,7 +18,7 @@ from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 from hgn.system.files import write_atomically, write_json
 from hgn.system.progress import bar
-from tools.error_vs_time.contenders import GNS_FIRST, Contender, SolverContender, TrivialContender
+from tools.error_vs_time.contenders import GNS_FIRST, BaselineContender, Contender, SolverContender
 from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, report, score
@@ -26,7 +26,7 @@ from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
 from tools.error_vs_time.timing import Stopwatch, Timing
 
 # of the seconds given: until when a contender, and a further round of run times, may be begun
-BEGIN_SHARE, ROUND_SHARE = 0.85, 0.95
+BEGIN_FRACTION, ROUND_FRACTION = 0.85, 0.95
 DRAWN_EVERY_S = 60.0  # which takes some seconds each time
 
 
@@ -59,9 +59,9 @@ class Run:
     def rows(self) -> list[dict[str, Any]]:
         return [*self.earlier, *(self._rows[i] for i in sorted(self._rows))]
 
-    def late(self, share: float) -> bool:
-        """Whether that share of the time given is over."""
-        return self.config.seconds is not None and time.monotonic() - self.begun > share * self.config.seconds
+    def is_past(self, fraction: float) -> bool:
+        """Whether that fraction of the time given is over."""
+        return self.config.seconds is not None and time.monotonic() - self.begun > fraction * self.config.seconds
 
     def score_beside(self, compiling: Callable[[], bool]) -> None:
         """Scores what is simulated already or needs no simulation, then, as long as kernels are being compiled, what
@@ -69,11 +69,11 @@ class Run:
         """
         for i, contender in enumerate(self.contenders):
             known = isinstance(contender, SolverContender) and contender.simulated
-            if known or isinstance(contender, TrivialContender):  # late or not: it takes a second
+            if known or isinstance(contender, BaselineContender):  # past the time or not: it takes a second
                 self._attempt(i, self._score)
         self.write()
         for i, contender in enumerate(self.contenders):
-            if contender.importance == GNS_FIRST and compiling() and not self.late(BEGIN_SHARE):
+            if contender.importance == GNS_FIRST and compiling() and not self.is_past(BEGIN_FRACTION):
                 self._attempt(i, self._score)
                 self.write()
 
@@ -82,7 +82,7 @@ class Run:
         order = sorted(range(len(self.contenders)), key=lambda i: self.contenders[i].importance)
         with bar("contenders", total=len(order), unit="contender") as progress:
             for i in order:
-                if self.late(BEGIN_SHARE):
+                if self.is_past(BEGIN_FRACTION):
                     if i not in self._rows and i not in self._given_up:
                         self._leave_out(i, "the time was over")
                 else:
@@ -91,7 +91,7 @@ class Run:
                 progress.update()
         for _ in range(1, self.config.rounds):
             for i in sorted(self.watches):
-                if not self.late(ROUND_SHARE):
+                if not self.is_past(ROUND_FRACTION):
                     self._attempt(i, self._time)
         self.write()
 

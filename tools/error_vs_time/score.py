@@ -106,20 +106,11 @@ def rollout_figures(
     worst = max(range(len(ends)), key=lambda i: ends[i]["penetration"])
     row["worst_penetration"] = {
         "episode": references[worst].key,
-        "share": ends[worst]["penetration"],
+        "fraction": ends[worst]["penetration"],
         "reference": ends[worst]["reference_penetration"],  # the solver's own, in this scene
         "reference_worst": max(end["reference_penetration"] for end in ends),
     }
     return row
-
-
-def pay_back(
-    row: Mapping[str, Any], solver_ms: float | None, hours: float | None, generation: float | None, frames: int
-) -> float | None:
-    """Rollouts after which training and generation are paid for by the time that each saves; none if never."""
-    if hours is None or generation is None or row["ms"] is None or solver_ms is None or row["ms"] >= solver_ms:
-        return None
-    return (hours + generation) * 3.6e6 / ((solver_ms - row["ms"]) * frames)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -143,7 +134,7 @@ def label(row: Mapping[str, Any]) -> str:
     match row["system"]:
         case "mpm":
             return f"MPM {row['grid']}³, step {row['step']:g}"
-        case "trivial":
+        case "baseline":
             return str(row["predictor"])
         case "chaos":
             return f"chaos floor: {row['floor']}"

@@ -9,7 +9,7 @@ from hgn.config import PRECISIONS
 from hgn.data.manifest import SPLITS
 from hgn.schema import NonNegative, Positive, TwoOrMore, require, require_bounds, require_one_of
 
-UNTIMED = ("trivial", "chaos")  # rows without run times
+UNTIMED = ("baseline", "chaos")  # rows without run times
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class ErrorVsTimeConfig:
     precisions: tuple[str, ...] | None = None
     backend: str = "auto"  # of the networks: torch, triton; auto: triton wherever it runs
     mpm_grids: tuple[int, ...] = (32, 48, 64)  # cells along a length of 1
-    mpm_steps: tuple[float, ...] = (1.0, 0.5)  # shares of the limit of stability
-    reference_step: float = 0.25  # share of the limit of stability of the reference, on the data's own grid
+    mpm_steps: tuple[float, ...] = (1.0, 0.5)  # fractions of the limit of stability
+    reference_step: float = 0.25  # fraction of the limit of stability of the reference, on the data's own grid
     # of rollouts of a network's further precisions on backend torch (GNS in tf32, HGN in fp32), which take
     # minutes
     repeated_frames: TwoOrMore = 51
@@ -56,9 +56,6 @@ class ErrorVsTimeConfig:
     sinkhorn_scenes: NonNegative[int] = 20  # of the test scenes
     sinkhorn_blur: Positive[float] = 0.01  # domain units
     rest_speed: NonNegative[float] = 1e-4  # domain units a frame; what is slower is at rest
-    # of each weights file, for the number of rollouts that pay for it; null: not told
-    training_hours: tuple[float, ...] | None = None
-    generation_hours: float | None = None  # of the data set
     # when they are over, what has not begun is left out, and said; the most important comes first
     seconds: Positive[float] | None = None
     device: str = "auto"
@@ -87,6 +84,3 @@ class ErrorVsTimeConfig:
         require_one_of(self, "backend", ("auto", "torch", "triton"))
         names = [Path(file).name for file in self.weights or ()]
         require(len(set(names)) == len(names), "weights", "files of different names", names)
-        if self.training_hours is not None:
-            told, count = len(self.training_hours), len(self.weights or ())
-            require(told == count, "training_hours", f"a list of {count}, one for each of weights", told)

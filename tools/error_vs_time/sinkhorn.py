@@ -28,7 +28,7 @@ def sinkhorn_divergence(first_N3: torch.Tensor, second_M3: torch.Tensor, blur: f
 
 def sinkhorn_divergences(pairs: Sequence[tuple[torch.Tensor, torch.Tensor]], blur: float) -> list[float]:
     """Those of many pairs of clouds, pairs of equal numbers of particles at once: each as if it were alone."""
-    found = [math.nan] * len(pairs)
+    divergences = [math.nan] * len(pairs)
     of_size: dict[tuple[int, int], list[int]] = {}
     for i, (first_N3, second_M3) in enumerate(pairs):
         of_size.setdefault((len(first_N3), len(second_M3)), []).append(i)
@@ -38,8 +38,8 @@ def sinkhorn_divergences(pairs: Sequence[tuple[torch.Tensor, torch.Tensor]], blu
             some = indices[start : start + together]
             first_BN3, second_BM3 = (torch.stack([pairs[i][side] for i in some]) for side in (0, 1))
             for i, value in zip(some, _divergences(first_BN3, second_BM3, blur).tolist(), strict=True):
-                found[i] = value
-    return found
+                divergences[i] = value
+    return divergences
 
 
 def _divergences(first_BN3: torch.Tensor, second_BM3: torch.Tensor, blur: float) -> torch.Tensor:

@@ -14,7 +14,7 @@ from tools.error_vs_time.contenders import Contender, frame_milliseconds
 from tools.error_vs_time.score import quartiles
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 
-WARM_FRAMES, FAST_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
+WARM_FRAMES, TRITON_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
 SOLVER_WARM_FRAMES = 2  # the initial state and the first, in which the solver compiles
 
 
@@ -45,7 +45,7 @@ class Timing:
         will be timed, as far as something is captured or compiled for it. Tells the most GPU memory that the first
         scene took, of what torch knows.
         """
-        kind, fast = contender.row["system"], not getattr(contender, "stepped", True)
+        kind, graphed = contender.row["system"], not getattr(contender, "stepped", True)
         contender.release()
         before = 0
         if self.device.type == "cuda":
@@ -58,8 +58,8 @@ class Timing:
             for scenes in (*self.singles, self.batch):  # kernels are compiled for the materials that a scene holds
                 frame_milliseconds(contender, scenes, min(SOLVER_WARM_FRAMES, most))
         # what looks at its frames 32 at a time tells nothing of fewer
-        frames = FAST_WARM_FRAMES if fast else WARM_FRAMES
-        captures = fast or kind.startswith("gns")
+        frames = TRITON_WARM_FRAMES if graphed else WARM_FRAMES
+        captures = graphed or kind.startswith("gns")
         if captures:  # which would be taken for the time of a frame
             frame_milliseconds(contender, self.singles[0], min(frames, most))
         taken = frame_milliseconds(contender, self.singles[0], min(frames, most))

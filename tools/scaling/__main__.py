@@ -50,19 +50,19 @@ def main(mapping: dict[str, Any]) -> int:
     device_type, count = devices(config)
     with tempfile.TemporaryDirectory() as folder:
         torch.multiprocessing.spawn(measure, (count, config, device_type, Path(folder)), nprocs=count)
-        found = json.loads((Path(folder) / "rows.json").read_text())
-    rows = with_efficiency([{"case": "weak_scaling"} | row for row in found["updates"]])
-    rows += predicted([{"case": "all_reduce"} | row for row in found["all_reduces"]], config.node_devices)
-    rows += model_rows(rows, found["backward_seconds"], config)
+        report = json.loads((Path(folder) / "rows.json").read_text())
+    rows = with_efficiency([{"case": "weak_scaling"} | row for row in report["updates"]])
+    rows += predicted([{"case": "all_reduce"} | row for row in report["all_reduces"]], config.node_devices)
+    rows += model_rows(rows, report["backward_seconds"], config)
     print(table(rows))
-    _write(config, device_type, {"backward_seconds": found["backward_seconds"], "rows": rows})
+    _write(config, device_type, {"backward_seconds": report["backward_seconds"], "rows": rows})
     return 0 if all(row.get("check", PASS) == PASS for row in rows) else EXIT_RED
 
 
-def _write(config: ScalingConfig, device_type: str, found: dict[str, Any]) -> None:
+def _write(config: ScalingConfig, device_type: str, report: dict[str, Any]) -> None:
     if config.json is not None:
         meta = provenance(device_type) | {"config": without_folders(to_mapping(config))}
-        write_json(config.json, {"meta": meta} | found)
+        write_json(config.json, {"meta": meta} | report)
 
 
 def devices(config: ScalingConfig) -> tuple[str, int]:
@@ -107,15 +107,15 @@ def model_rows(
     rows: list[dict[str, Any]], backward_seconds: dict[str, float], config: ScalingConfig
 ) -> list[dict[str, Any]]:
     """One row for each backend, network and number of GPUs; none without several devices to take the figures from."""
-    found = []
+    predicted_rows = []
     for backend in config.backends:
         trained = [row for row in rows if row["case"] == "weak_scaling" and row["backend"] == backend and row["ms"]]
         alone = next((row for row in trained if row["devices"] == 1 and row["particle_spread"] == 0), None)
         sent = next((row["messages"] for row in trained if row["messages"]), None)
         if alone is not None and sent is not None:
             step = Step(alone["ms"] / 1e3, backward_seconds[backend], tuple(sent), _spread(config))
-            found += _rows_of(step, backend, fitted(rows, config.node_devices), config)
-    return found
+            predicted_rows += _rows_of(step, backend, fitted(rows, config.node_devices), config)
+    return predicted_rows
 
 
 def given_rows(config: ScalingConfig) -> list[dict[str, Any]]:
@@ -136,11 +136,11 @@ def _spread(config: ScalingConfig) -> float:
 
 
 def _rows_of(step: Step, backend: str, node: Cluster, config: ScalingConfig) -> list[dict[str, Any]]:
-    found = []
+    rows = []
     for name, link in NETWORKS.items():
         cluster = replace(node, between=link)
-        found += [_model_row(backend, name, update(step, gpus, cluster), cluster, config) for gpus in SIZES]
-    return found
+        rows += [_model_row(backend, name, update(step, gpus, cluster), cluster, config) for gpus in SIZES]
+    return rows
 
 
 def _model_row(backend: str, network: str, seen: Update, cluster: Cluster, config: ScalingConfig) -> dict[str, Any]:
@@ -172,9 +172,9 @@ def table(rows: list[dict[str, Any]]) -> str:
         if row["case"] == "weak_scaling":
             sent = f"{len(row['messages'])}, up to {max(row['messages']) / 1e6:.1f} MB" if row["averaged"] else "none"
             times = ("-", "-") if row["ms"] is None else (f"{row['ms']:.2f}", _range(row["ms_quartiles"]))
-            share = "-" if row["efficiency"] is None else f"{row['efficiency']:.3f}"
+            efficiency = "-" if row["efficiency"] is None else f"{row['efficiency']:.3f}"
             work = (row[key] for key in ("backend", "precision", "devices", "scenes", "particle_spread"))
-            lines.append(_line((*work, sent, *times, share, row["check"])))
+            lines.append(_line((*work, sent, *times, efficiency, row["check"])))
     if any(row["case"] == "all_reduce" for row in rows):
         lines += ["", "| devices | bytes | all-reduce, ms | quartiles | model, ms |", "| --: | --: | --: | --: | --: |"]
     for row in rows:

@@ -56,13 +56,13 @@ class Contender:
     averaged: bool
     message_mb: float | None  # of backend torch; triton sends all gradients at once
     spread: float  # of the particles of a scene
-    update: PlainUpdates | FastUpdates | None = field(default=None, repr=False)  # none in processes that take no part
+    update: TorchUpdates | TritonUpdates | None = field(default=None, repr=False)  # none in processes that take no part
     check: str = PASS
     messages: list[int] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)  # of one update
 
 
-class PlainUpdates:
+class TorchUpdates:
     """Training updates of one rank on batches that lie on its device, with autograd."""
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
@@ -113,14 +113,14 @@ class PlainUpdates:
 
     def backward_seconds(self) -> float:
         """Seconds of an update's backward pass, the median over the batches."""
-        found = []
+        milliseconds = []
         for batch in self.batches:
             self.optimizer.zero_grad()
-            found.append(once(self.loss(batch).backward, self.device))
-        return float(np.median(found)) / 1e3
+            milliseconds.append(once(self.loss(batch).backward, self.device))
+        return float(np.median(milliseconds)) / 1e3
 
 
-class FastUpdates:
+class TritonUpdates:
     """The same with hgn.kernels.update, on episodes of one window each."""
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
@@ -209,12 +209,12 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
             _check_weights(contender, groups, rank)
         rows = [row for size, group in groups.items() for row in _all_reduces(size, group, rank, device)]
         if rank == 0:
-            found = {
+            report = {
                 "backward_seconds": backward,
                 "updates": [_row(c, config, device) for c in contenders],
                 "all_reduces": rows,
             }
-            (folder / "rows.json").write_text(json.dumps(found))
+            (folder / "rows.json").write_text(json.dumps(report))
         dist.barrier()
     finally:
         dist.destroy_process_group()
@@ -227,18 +227,20 @@ def _torch_precision(config: ScalingConfig, device: torch.device) -> str:
 
 def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -> list[Contender]:
     chosen = averaging_options()["bucket_cap_mb"]
-    found = []
+    contenders = []
     for backend in config.backends:
         if backend == "triton" and triton_unsupported_reason(device, config.network, config.precision):
             continue
         sent = list(dict.fromkeys([chosen, *config.message_mb])) if backend == "torch" else [None]
         for size in sizes:
-            found.append(Contender(backend, size, False, None, 0.0))
+            contenders.append(Contender(backend, size, False, None, 0.0))
             if size > 1:
-                found += [Contender(backend, size, True, message_mb, 0.0) for message_mb in sent]
+                contenders += [Contender(backend, size, True, message_mb, 0.0) for message_mb in sent]
             if config.particle_spread > 0:
-                found.append(Contender(backend, size, size > 1, sent[0] if size > 1 else None, config.particle_spread))
-    return found
+                contenders.append(
+                    Contender(backend, size, size > 1, sent[0] if size > 1 else None, config.particle_spread)
+                )
+    return contenders
 
 
 def _batches(config: ScalingConfig, rank: int, spread: float, device: torch.device) -> list[Batch]:
@@ -262,7 +264,7 @@ def _prepared(
     device: torch.device,
 ) -> Contender:
     if rank < contender.devices:
-        made = PlainUpdates if contender.backend == "torch" else FastUpdates
+        made = TorchUpdates if contender.backend == "torch" else TritonUpdates
         contender.update = made(config, batches[contender.spread], device)
         if contender.averaged:
             _average(contender, groups[contender.devices])

@@ -80,10 +80,10 @@ def main(mapping: dict[str, Any]) -> int:
         ahead = None
         if not backend.stepped:
             # Triton, which backend torch does without, is loaded here.
-            from hgn.runtime.precompile import frames_ahead
+            from hgn.runtime.precompile import precompile_frames
 
             particles = [sum(len(scene.position_N3) for scene in case.scenes) for case in made]
-            ahead = frames_ahead([network.config], [config.precision], device, particles)
+            ahead = precompile_frames([network.config], [config.precision], device, particles)
         if ahead is not None:
             stack.enter_context(ahead)
         for row in motion_rows(

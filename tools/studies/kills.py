@@ -76,7 +76,7 @@ def main(mapping: dict[str, Any]) -> int:
     command = [sys.executable, "-m", "datagen.service", *overrides, f"out={killed}", "port=0", "progress=off"]
     began = time.monotonic()
     kills = generate_with_kills(command, killed, kills_config, out / "service.log")
-    found = differences(peaceful, killed)
+    faults = differences(peaceful, killed)
     equal = equal_shards(peaceful, killed)
     manifest = Manifest.load(killed)
     counts = {target: sum(kill.target == target for kill in kills) for target in TARGETS}
@@ -87,18 +87,20 @@ def main(mapping: dict[str, Any]) -> int:
         "shards": len(manifest.shards),
         "shards_bitwise_equal": equal,
         "kills_that_met_a_temporary_file": sum(kill.temporary_files > 0 for kill in kills),
-        "differences": found,
+        "differences": faults,
     }
     print(f"{len(kills)} kills: " + ", ".join(f"{count} of {target}" for target, count in counts.items()))
     print(
         f"{manifest.published('train')} training episodes; {equal} of {len(manifest.shards)} shards are bitwise equal"
     )
-    print("\n".join(found) or "complete and verified, with the same scenes and first frames; no temporary file is left")
+    print(
+        "\n".join(faults) or "complete and verified, with the same scenes and first frames; no temporary file is left"
+    )
     if kills_config.json is not None:
         meta = provenance() | {"config": without_folders(to_mapping(config) | {"kills": to_mapping(kills_config)})}
         report = {"meta": meta, "summary": summary, "rows": [asdict(kill) for kill in kills]}
         write_json(kills_config.json, report)
-    return EXIT_RED if found else 0
+    return EXIT_RED if faults else 0
 
 
 def generate_with_kills(command: Sequence[str], folder: Path, config: KillsConfig, log: Path) -> list[Kill]:
@@ -154,24 +156,28 @@ def verified_shards(folder: Path, before: Sequence[str]) -> list[str]:
 
 def differences(peaceful: Path, killed: Path) -> list[str]:
     """What a data set lacks, or has too much of, beside one that was made in peace; empty when nothing."""
-    found = []
+    faults = []
     one, other = Manifest.load(peaceful), Manifest.load(killed)
     verified_shards(killed, ())
     if not other.complete:
-        found.append("it is not complete")
+        faults.append("it is not complete")
     if other.quarantined:
-        found.append(f"{len(other.quarantined)} scenes are quarantined, the first because {other.quarantined[0].cause}")
+        faults.append(
+            f"{len(other.quarantined)} scenes are quarantined, the first because {other.quarantined[0].cause}"
+        )
     if sorted(shard.name for shard in one.shards) != sorted(shard.name for shard in other.shards):
-        found.append("its shards have other names")
+        faults.append("its shards have other names")
     for split in SPLITS:
         first, second = (_by_key(EpisodeStore(folder, split)) for folder in (peaceful, killed))
         if first.keys() != second.keys():
-            found.append(f"{split}: other episodes")
-        found += [f"{key}: another scene" for key in first.keys() & second.keys() if not _same(first[key], second[key])]
+            faults.append(f"{split}: other episodes")
+        faults += [
+            f"{key}: another scene" for key in first.keys() & second.keys() if not _same(first[key], second[key])
+        ]
     index = {Path(name).name for name, _ in other.shards.files()}
     expected = {MANIFEST_NAME, INDEX_NAME, LOCK_NAME, *index, *(shard.name for shard in other.shards)}
     left = sorted(path.name for path in killed.rglob("*") if path.name not in expected)
-    return found + [f"{name} was left behind" for name in left]
+    return faults + [f"{name} was left behind" for name in left]
 
 
 def equal_shards(one: Path, other: Path) -> int:
@@ -272,15 +278,15 @@ def _complete(folder: Path) -> bool:
 
 def _spawned(process: int) -> list[int]:
     """The processes that multiprocessing has started from one, without its own helpers."""
-    found = []
+    children = []
     try:
         for path in Path(f"/proc/{process}/task").glob("*/children"):
             for child in path.read_text().split():
                 if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
-                    found.append(int(child))
+                    children.append(int(child))
     except (FileNotFoundError, ProcessLookupError):  # ended meanwhile
         return []
-    return found
+    return children
 
 
 if __name__ == "__main__":

@@ -106,20 +106,20 @@ def _timed(
     )
     row: dict[str, Any] = {"scenes": len(scenes), "particles": sum(scene.particle_count for scene in scenes)}
     failures = [outcome.cause for outcome in outcomes if isinstance(outcome, SceneFailure)]
-    found = [outcome for outcome in outcomes if isinstance(outcome, Simulated)]
-    if not all(np.isfinite(outcome.position_TN3[-1]).all() for outcome in found):
+    simulated = [outcome for outcome in outcomes if isinstance(outcome, Simulated)]
+    if not all(np.isfinite(outcome.position_TN3[-1]).all() for outcome in simulated):
         failures.append("positions are not finite")
     if failures:
         return row | {"substeps": None, "ms": None, "cause": failures[0]}
     steps = sum(
-        outcome.counters["substeps"] * scene.particle_count for outcome, scene in zip(found, scenes, strict=True)
+        outcome.counters["substeps"] * scene.particle_count for outcome, scene in zip(simulated, scenes, strict=True)
     )
     # frames of one launch end together: from the end of the launch that the middle frame is in
     begin = max(t for t in range(frames - 1) if ends[t] <= ends[(frames - 1) // 2] + 1e-3)
     return row | {
         "substeps": steps / row["particles"] / (frames - 1),
         "ms": 1e3 * (ends[-1] - ends[begin]) / (frames - 1 - begin),
-        "projections": sum(outcome.counters["surface_projections"] for outcome in found),
+        "projections": sum(outcome.counters["surface_projections"] for outcome in simulated),
     }
 
 

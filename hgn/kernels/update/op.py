@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import triton
 
-from hgn.config import SMOOTH_CELLS, SMOOTH_WAVES, TrainingConfig
+from hgn.config import CORRELATED_WAVELENGTHS, CORRELATED_WAVES, TrainingConfig
 from hgn.kernels.backward import FusedTrainingNetwork
 from hgn.kernels.capture import captured
 from hgn.kernels.forward import feature_columns
@@ -196,7 +196,7 @@ class Updates:
         self.origin_S3, self.domain_S3 = torch.zeros(scenes, 3, device=device), torch.ones(scenes, 3, device=device)
         self.gravity_S3 = torch.zeros(scenes, 3, device=device)  # zero with absolute inputs
         columns = 4 + 3 * self.config.velocity_history  # a wave's number and phase, its amplitude in each velocity
-        self.waves_SKC = torch.zeros(scenes, SMOOTH_WAVES, columns, device=device)
+        self.waves_SKC = torch.zeros(scenes, CORRELATED_WAVES, columns, device=device)
         sees = self.config.obstacle_features
         self.obstacles = ObstacleTable([None] * scenes, settings.obstacle_cell_size, device) if sees else None
         none_S5 = torch.zeros(scenes, OBSTACLE_COLUMNS, dtype=torch.int64, device=device)
@@ -371,14 +371,14 @@ class Updates:
         """Windows, symmetry, noise and jitter of the update's samples; see hgn.training.noise for the torch backend."""
         settings, config = self.settings, self.config
         correlated, steps = settings.noise_correlated_fraction, config.velocity_history
-        wave_step = settings.noise_std * math.sqrt(2 / SMOOTH_WAVES * correlated / steps)
+        wave_step = settings.noise_std * math.sqrt(2 / CORRELATED_WAVES * correlated / steps)
         own_step = settings.noise_std * math.sqrt((1 - correlated) / steps)
         if wave_step > 0:
-            shortest, longest = (cells * config.cell_size for cells in SMOOTH_CELLS)
+            shortest, longest = (cells * config.cell_size for cells in CORRELATED_WAVELENGTHS)
             kernel.draw_waves[(settings.scenes,)](
                 samples=self._samples, update=self.update, waves=self.waves_SKC, amplitude_step=wave_step,
                 largest_number=2 * math.pi / shortest, log_range=math.log(longest / shortest),
-                scenes=settings.scenes, HISTORY=config.velocity_history, WAVES=SMOOTH_WAVES,
+                scenes=settings.scenes, HISTORY=config.velocity_history, WAVES=CORRELATED_WAVES,
             )  # fmt: skip
         kernel.assemble_batch[(triton.cdiv(self.particles, BLOCK),)](
             samples=self._samples, sample_vectors=self._vectors, update=self.update, position=self.position_N3,
@@ -388,7 +388,7 @@ class Updates:
             mean=self.mean, std=self.std, noise_step=own_step, waves=self.waves_SKC,
             jitter=config.cell_size if settings.grid_jitter else 0.0, scenes=settings.scenes,
             obstacle_cell_size=settings.obstacle_cell_size, HISTORY=config.velocity_history,
-            SYMMETRY=settings.symmetry, NOISE=own_step > 0, WAVES=SMOOTH_WAVES if wave_step > 0 else 0,
+            SYMMETRY=settings.symmetry, NOISE=own_step > 0, WAVES=CORRELATED_WAVES if wave_step > 0 else 0,
             SCENES=triton.next_power_of_2(settings.scenes), BLOCK=BLOCK,
         )  # fmt: skip
 
