@@ -71,12 +71,12 @@ def test_names_in_lists(monkeypatch: pytest.MonkeyPatch) -> None:
         ["hgn.export", "checkpoint="],  # an error, to where nobody reads
     ],
 )
-def test_a_reader_that_leaves(arguments: list[str]) -> None:
+def test_a_reader_that_leaves(warm_python: Path, arguments: list[str]) -> None:
     """As in `… | head`: the command ends with an exit code of its own, and without a traceback."""
     read, write = os.pipe()
     os.close(read)
     error = write if arguments[1] != "--help" else subprocess.PIPE
-    ended = subprocess.run([sys.executable, "-m", *arguments], stdout=write, stderr=error, text=True)
+    ended = subprocess.run([str(warm_python), "-m", *arguments], stdout=write, stderr=error, text=True)
     os.close(write)
     assert ended.returncode == EXIT_UNREAD and not ended.stderr
 
