@@ -153,6 +153,16 @@ def test_flight_against_its_closed_form() -> None:
     assert "of its velocity in frame" in drag["thrown at 1 a second, sand"].beyond
 
 
+def test_relative_inputs_take_any_gravity() -> None:
+    """A network in relative inputs whose own answer is nothing flies exactly: the judges are green where they can."""
+    network = network_of(torch.float32, inputs="relative", width=8, material_embedding=2, levels=2)
+    with torch.no_grad():
+        network.decode.second.weight.zero_()
+        network.decode.second.bias.zero_()
+    rows = motion_of(network, ("gravity",))
+    assert len(rows) == 6 and all(row.held for row in rows.values()), rows
+
+
 def test_flight_ends_before_the_walls() -> None:
     """No particle of the closed form comes within two finest cells of a wall, where it still is on the next frame."""
     for gravity in GRAVITIES.values():
