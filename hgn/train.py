@@ -21,7 +21,15 @@ from hgn.data.storage import is_remote
 from hgn.network.base import ParticleNetwork
 from hgn.schema import from_mapping
 from hgn.system.extras import require_installed
-from hgn.training.checkpoint import check_checkpoint, network_of_weights, read_checkpoint, sampler_state_of_checkpoint
+from hgn.system.files import held
+from hgn.training.checkpoint import (
+    LAST_NAMES,
+    DamagedError,
+    check_checkpoint,
+    network_of_weights,
+    read_checkpoint,
+    sampler_state_of_checkpoint,
+)
 from hgn.training.dataset import PublishedEpisodes, is_complete, wait_for_episodes
 from hgn.training.distributed import default_run, first_rank, layout
 from hgn.training.generator import Generator
@@ -40,11 +48,13 @@ def main(mapping: dict[str, Any]) -> int:
     folder, run = config.dataset.folder, Path(config.run)
     if EpisodeStore.available(folder):
         require_same_dataset(Manifest.load(folder).config, config.datagen, folder)
-    checkpoint = _checkpoint_to_resume(config, run / "checkpoints" / "last.ckpt")
-    initial = _initial_network(config, checkpoint)
     stop = StopRequest()
     stop.listen()
     with ExitStack() as stack:
+        if first_rank():
+            stack.enter_context(held(run / ".lock", "run", "another training is in it; wait for its end, or choose"))
+        checkpoint = _checkpoint_to_resume(config, run / "checkpoints")
+        initial = _initial_network(config, checkpoint)
         generator = None
         # what a URL lacks, its own service makes
         if first_rank() and config.training.generate and not is_remote(folder) and not is_complete(config):
@@ -60,11 +70,23 @@ def main(mapping: dict[str, Any]) -> int:
         return train_network(config, store, checkpoint, initial, stop, published, precompilation)
 
 
-def _checkpoint_to_resume(config: TrainConfig, path: Path) -> tuple[Path, SamplerState] | None:
-    """The run's last checkpoint, checked before anything is started, and where in the data it stood."""
-    if not path.exists():
+def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> tuple[Path, SamplerState] | None:
+    """The run's last whole checkpoint, checked before anything is started, and where in the data it stood.
+
+    Raises: DamagedError when there are some and none is whole.
+    """
+    damaged: DamagedError | None = None
+    for path in (folder / name for name in LAST_NAMES if (folder / name).exists()):
+        try:
+            checkpoint = read_checkpoint(path)
+            break
+        except DamagedError as error:
+            print(f"{error}; trying the one before", file=sys.stderr)
+            damaged = damaged or error
+    else:
+        if damaged is not None:
+            raise damaged
         return None
-    checkpoint = read_checkpoint(path)
     check_checkpoint(checkpoint, config, identity_hash(dataset_identity(config.datagen)), path)
     return path, sampler_state_of_checkpoint(checkpoint)
 

@@ -117,6 +117,10 @@ class EpisodeStore:
                     open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes)
                 self._fetched += 1
 
+    def digest(self, count: int) -> str | None:
+        """Tells the first `count` episodes from any others; none where no shard ends with the last of them."""
+        return self.manifest.shards.digest(self.split, count)
+
     @property
     def revision(self) -> int:
         """The manifest revision last read."""

@@ -24,6 +24,7 @@ class SamplerState:
     epoch: int = 0
     position: int = 0  # samples of this epoch already taken
     episodes: int = 0  # episodes in this epoch; 0: not decided yet
+    digest: str = ""  # of the shards that hold these; none: not known (checkpoints of 0.1.0)
 
 
 class Sample(NamedTuple):  # which Python makes faster than other classes: a thousand in a second are drawn
@@ -47,7 +48,7 @@ class EpisodeSampler:
     `published(epoch)` is asked once when an epoch begins and returns the number of frames of each published
     episode, oldest publication first; it must return the same on every rank, and a list that continues the
     one of the epoch before. After a resume it may return more than the state's epoch knew: the surplus waits
-    for the next epoch.
+    for the next epoch. `digest(count)` tells the first so many from others; see `hgn.data.index`.
     """
 
     def __init__(
@@ -58,15 +59,16 @@ class EpisodeSampler:
         state: SamplerState | None = None,
         rank: int = 0,
         world_size: int = 1,
+        digest: Callable[[int], str | None] = lambda count: "",
     ) -> None:
         assert 0 <= rank < world_size and batch_scenes >= 1
         self.seed, self.batch_scenes, self.rank, self.world_size = seed, batch_scenes, rank, world_size
         self.state = state or SamplerState()
-        self._published = published
+        self._published, self._digest = published, digest
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
         self._first_seed = 0  # of an epoch's samples, which have one after the other
-        self._begin_epoch(self.state.epoch, self.state.position, self.state.episodes)
+        self._begin_epoch(self.state.epoch, self.state.position, self.state.episodes, self.state.digest)
 
     def next_batch(self) -> list[Sample]:
         """This rank's `batch_scenes` samples of the next global batch; advances the state."""
@@ -75,14 +77,14 @@ class EpisodeSampler:
         taken = 0  # of the global batch, which may run over the end of an epoch
         while taken < total:
             if self.state.position == len(self._order):
-                self._begin_epoch(self.state.epoch + 1, 0, 0)
+                self._begin_epoch(self.state.epoch + 1, 0, 0, "")
             rest = self._order[self.state.position :][: total - taken]
             samples += self._samples(rest[max(mine - taken, 0) : max(mine + self.batch_scenes - taken, 0)])
             self.state = replace(self.state, position=self.state.position + len(rest))
             taken += len(rest)
         return samples
 
-    def _begin_epoch(self, epoch: int, position: int, episodes: int) -> None:
+    def _begin_epoch(self, epoch: int, position: int, episodes: int, digest: str) -> None:
         frame_counts = list(self._published(epoch))
         if episodes > len(frame_counts):
             raise ConfigError(
@@ -92,10 +94,16 @@ class EpisodeSampler:
         frame_counts = frame_counts[: episodes or len(frame_counts)]
         if not frame_counts:
             raise ConfigError("data set must hold at least one training episode, got none; generate some first")
+        found = self._digest(len(frame_counts)) or ""
+        if digest not in ("", found):
+            raise ConfigError(
+                f"data set must still hold the shards that epoch {epoch} began with, in the order they were published "
+                "in, got others or another order; restore them, or start another run"
+            )
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_permutation(self.seed, epoch, int(self._first_sample[-1]))
         self._first_seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0])
-        self.state = SamplerState(epoch, position, len(frame_counts))
+        self.state = SamplerState(epoch, position, len(frame_counts), found)
 
     def _samples(self, index_K: np.ndarray) -> list[Sample]:
         episode_K = self._first_sample.searchsorted(index_K, side="right") - 1

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import os
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
+
+from hgn.schema import ConfigError
 
 TEMPORARY_SUFFIX = ".partial"
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems that know none
@@ -63,6 +66,27 @@ def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps(value, indent=1, allow_nan=allow_nan).encode() + b"\n")
+
+
+@contextlib.contextmanager
+def held(path: Path, field: str, refusal: str) -> Iterator[None]:
+    """A lock file that one process at a time has; the kernel frees it when that ends, however it ends.
+
+    Raises: ConfigError `<field> must be ...`, with `refusal`, when another one has it. A file system without locks lets
+    everybody in.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"{field} must be a folder of its own, got {path.parent}: {refusal} another {field}=..."
+            ) from None
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+        yield
 
 
 def sync_file(file: BinaryIO) -> None:

@@ -31,6 +31,7 @@ from hgn.schema import ConfigError, to_mapping
 from hgn.system.files import TEMPORARY_SUFFIX
 from hgn.system.progress import bar
 from hgn.training import lightning_compat
+from hgn.training.checkpoint import LAST_NAMES
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.data_module import EpisodeDataModule, agreed_count
 from hgn.training.errors import (
@@ -44,7 +45,7 @@ from hgn.training.errors import (
 )
 from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
-from hgn.training.stop import StopRequest
+from hgn.training.stop import BY_WEIGHT, StopRequest
 from hgn.training.tensorboard import show_rollout
 
 
@@ -100,7 +101,7 @@ class Checkpoints(Callback):
     def save_last(self, trainer: Trainer) -> None:
         """All ranks call this; rank 0 writes, see CheckpointWriter."""
         if self._saved_update != trainer.global_step:
-            trainer.save_checkpoint(self.folder / "last.ckpt")
+            trainer.save_checkpoint(self.folder / LAST_NAMES[0])
             self._saved_update = trainer.global_step
 
     def offer(self, trainer: Trainer, error: float) -> None:
@@ -303,9 +304,9 @@ class Stopper(Callback):
         if trainer.strategy.reduce_boolean_decision(self.stop.requested, all=False):
             trainer.should_stop = True
             # A signal may have reached one rank alone; all end with its exit code.
-            signal = torch.tensor(self.stop.signal or 0, device=pl_module.device)
-            reduced = trainer.strategy.reduce(signal, reduce_op="max")
-            self.stop.signal = int(reduced) or None
+            mine = 0 if self.stop.signal is None else 1 + BY_WEIGHT.index(self.stop.signal)
+            heaviest = int(trainer.strategy.reduce(torch.tensor(mine, device=pl_module.device), reduce_op="max"))
+            self.stop.signal = int(BY_WEIGHT[heaviest - 1]) if heaviest else None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.checkpoints.finish(trainer)

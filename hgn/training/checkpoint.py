@@ -6,6 +6,8 @@ Nothing here needs Lightning: export and resume checks read plain containers and
 from __future__ import annotations
 
 import pickle
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,13 @@ from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import ConfigError, from_stored, to_mapping
 
 SECTION = "hgn"  # the checkpoint's key for what is ours
+LAST_NAMES = ("last.ckpt", "last-1.ckpt", "last-2.ckpt")  # newest first
+_ZIP_FAULTS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 NETWORK, AVERAGED = "network.", "averaged."  # prefixes of the tensors: as trained, and their moving average
+
+
+class DamagedError(ConfigError):
+    """A checkpoint's bytes are not those that were written."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +46,19 @@ class DataInfo:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """A checkpoint's content; only plain containers and tensors are ever loaded.
 
-    Raises: ConfigError when the file is missing, damaged, or no checkpoint of this project.
+    Raises: DamagedError when it is cut or any bit of it changed, which torch would not notice; ConfigError when the
+    file is missing, or no checkpoint of this project.
     """
     try:
+        with zipfile.ZipFile(path) as records:
+            if (damaged := records.testzip()) is not None:
+                raise zlib.error(f"{damaged} has another CRC")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise ConfigError(f"checkpoint must be an existing file, got {path}; hgn.train writes one") from None
-    except (RuntimeError, EOFError, ValueError, KeyError, OSError, pickle.UnpicklingError) as error:
+    except (RuntimeError, EOFError, ValueError, KeyError, OSError, pickle.UnpicklingError, *_ZIP_FAULTS) as error:
         reason = str(error).strip().split("\n")[0]
-        raise ConfigError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from None
+        raise DamagedError(f"checkpoint must be a whole checkpoint file, got {path}: {reason}") from None
     if not isinstance(checkpoint, dict) or SECTION not in checkpoint:
         raise ConfigError(f"checkpoint must be one of python -m hgn.train, got {path}")
     return checkpoint

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import shutil
 import sys
 from collections.abc import Iterator
 from concurrent import futures
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning_utilities.core.apply_func import apply_to_collection
 
-from hgn.system.files import write_atomically
+from hgn.system.files import temporary_file, write_atomically
+from hgn.training.checkpoint import LAST_NAMES
 
 TURN_S = 1e-4  # for which a checkpoint's writing keeps Python's lock from the training; Python's own are 5e-3
 
@@ -71,11 +74,25 @@ def snapshot(checkpoint: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
+def _keep_earlier(folder: Path) -> None:
+    """The names of earlier checkpoints move on by one; the last keeps its own until it is replaced."""
+    for earlier, later in pairwise(reversed(LAST_NAMES)):
+        if (folder / later).exists():
+            with temporary_file(folder / earlier) as temporary:
+                try:
+                    temporary.hardlink_to(folder / later)
+                except OSError:  # a file system without hard links
+                    shutil.copyfile(folder / later, temporary)
+                temporary.replace(folder / earlier)
+
+
 def _write(checkpoint: dict[str, Any], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     content = io.BytesIO()
     with _short_turns():
         torch.save(checkpoint, content)
+    if path.name == LAST_NAMES[0]:
+        _keep_earlier(path.parent)
     write_atomically(path, content.getvalue())
 
 

@@ -170,7 +170,13 @@ class EpisodeDataModule(LightningDataModule):
     def _order(self) -> EpisodeSampler:
         rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         return EpisodeSampler(
-            self.training.seed, self.training.batch_scenes, self._published, self.sampler_state, rank, world_size
+            self.training.seed,
+            self.training.batch_scenes,
+            self._published,
+            self.sampler_state,
+            rank,
+            world_size,
+            self.store.digest,
         )
 
     def _prefetched(
@@ -229,11 +235,11 @@ def agreed_count(store: EpisodeStore, trainer: Trainer) -> int:
     """How many episodes rank 0 knows; the other ranks wait until they see as many. All ranks call this.
 
     Episodes come in publication order, so that the first `count` are then the same everywhere.
-    Raises: ConfigError when a node does not see them for SHARED_FOLDER_PATIENCE_S.
+    Raises: ConfigError when a node does not see them for SHARED_FOLDER_PATIENCE_S; on every rank when one sees others.
     """
     if trainer.world_size == 1:
         return len(store)
-    count = int(trainer.strategy.broadcast(len(store)))
+    count, digest = trainer.strategy.broadcast((len(store), store.digest(len(store))))
     deadline = time.monotonic() + SHARED_FOLDER_PATIENCE_S
     while len(store) < count:
         if time.monotonic() > deadline:
@@ -243,6 +249,13 @@ def agreed_count(store: EpisodeStore, trainer: Trainer) -> int:
             )
         time.sleep(1)
         store.refresh()
+    same = store.digest(count) == digest
+    if not trainer.strategy.reduce_boolean_decision(same, all=True):
+        raise ConfigError(
+            f"{store.folder} must show the same {count} episodes on every node, got others, or another order, on "
+            + ("another rank" if same else f"rank {trainer.global_rank}")
+            + "; is it a shared folder?"
+        )
     return count
 
 

@@ -10,6 +10,10 @@ import signal
 import time
 from types import FrameType
 
+# what a process that got several of them ends with: a scheduler that sent SIGUSR1 queues the job again, and sends
+# SIGTERM too when it is in a hurry
+BY_WEIGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+
 
 class StopRequest:
     """Whether, and why, this process should stop training."""
@@ -20,7 +24,7 @@ class StopRequest:
 
     def listen(self) -> None:
         """Takes over SIGINT, SIGTERM and SIGUSR1; only the main thread may call this."""
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
+        for number in BY_WEIGHT:
             signal.signal(number, self._on_signal)
 
     def restart_clock(self, maximum_minutes: float | None) -> None:
@@ -43,4 +47,4 @@ class StopRequest:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.signal is not None and number == signal.SIGINT:
             raise KeyboardInterrupt
-        self.signal = number
+        self.signal = max(self.signal or number, number, key=BY_WEIGHT.index)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -72,6 +74,17 @@ def test_lost_or_missing_episodes_are_refused():
         EpisodeSampler(0, 1, lambda _: [5, 5], SamplerState(0, 2, 3))
     with pytest.raises(ConfigError, match="at least one training episode"):
         EpisodeSampler(0, 1, lambda _: [])
+
+
+def test_other_shards_are_refused():
+    """An epoch goes on only with the shards that it began with, in their order; later ones may be there."""
+    order = EpisodeSampler(0, 1, lambda _: [5, 5], digest=lambda count: f"digest {count}")
+    assert order.state.digest == "digest 2"
+    EpisodeSampler(0, 1, lambda _: [5, 5, 5], order.state, digest=lambda count: f"digest {count}")
+    EpisodeSampler(0, 1, lambda _: [5, 5], replace(order.state, digest=""), digest=lambda count: f"digest {count}")
+    for found in ("other", None):
+        with pytest.raises(ConfigError, match="must still hold the shards that epoch 0 began with"):
+            EpisodeSampler(0, 1, lambda _: [5, 5], order.state, digest=lambda count, found=found: found)
 
 
 def test_order_is_the_same_everywhere():

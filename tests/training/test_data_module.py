@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import fsspec
 import pytest
@@ -17,7 +18,8 @@ from hgn.data.batch import Batch
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import CACHE_VARIABLE
-from hgn.training.data_module import EpisodeDataModule
+from hgn.schema import ConfigError
+from hgn.training.data_module import EpisodeDataModule, agreed_count
 
 UPDATES = 40  # of 2 samples, where an epoch has 25
 SETTINGS = (NetworkConfig(**NETWORK), TrainingConfig(**TRAINING))
@@ -76,3 +78,34 @@ def test_feeding_from_a_url_equals_feeding_from_a_folder(
     for here, there in zip(streamed(folder), streamed("memory://feeding"), strict=True):
         assert torch.equal(here.window_WN3, there.window_WN3)
         assert (here.seeds_S, here.sampler_state) == (there.seeds_S, there.sampler_state)
+
+
+def test_shard_made_again_is_not_mixed_up(
+    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path], folder: Path
+) -> None:
+    """A damaged shard that was deleted and made again is published last: an epoch that began before does not go on,
+    for some samples would come twice."""
+    feed = EpisodeDataModule(EpisodeStore(folder, "train"), *SETTINGS)
+    *_, last = islice(feed.batches(), 3)
+    (folder / "train-000001-000002.tar").unlink()
+    make_dataset(make_config())
+    again = EpisodeDataModule(EpisodeStore(folder, "train"), *SETTINGS)
+    again.sampler_state = last.sampler_state
+    with pytest.raises(ConfigError, match="must still hold the shards that epoch 0 began with, in the order"):
+        next(again.batches())
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_ranks_with_other_data_are_refused(folder: Path, here: bool) -> None:
+    """Ranks whose data were published in another order end together, wherever the difference is seen."""
+
+    class Strategy:
+        def broadcast(self, mine: tuple[int, str]) -> tuple[int, str]:
+            return (mine[0], "another order" if here else mine[1])
+
+        def reduce_boolean_decision(self, same: bool, all: bool) -> bool:
+            return same and here
+
+    trainer = SimpleNamespace(world_size=2, global_rank=1, strategy=Strategy())
+    with pytest.raises(ConfigError, match=r"must show the same 5 episodes on every node, got others.* rank"):
+        agreed_count(EpisodeStore(folder, "train"), trainer)  # type: ignore[arg-type]

@@ -146,8 +146,11 @@ class Shared:
     def __init__(self, rank: int, world_size: int) -> None:
         self.global_rank, self.world_size, self.strategy, self.global_step = rank, world_size, self, 0
 
-    def broadcast(self, count: int) -> int:
-        return count
+    def broadcast(self, mine: Any) -> Any:
+        return mine
+
+    def reduce_boolean_decision(self, decision: bool, all: bool) -> bool:
+        return decision
 
 
 def test_feeds_of_all_ranks_resume_anywhere(data: DatagenConfig) -> None:
@@ -236,7 +239,8 @@ def test_resume_equals_no_interruption(data: DatagenConfig, stop_at: Callable[[i
 
     with tempfile.TemporaryDirectory() as folder:
         whole = trained(Path(folder) / "whole", [])
-    assert dataclasses.asdict(SamplerState(1, 7, 5)) == whole["hgn"]["sampler_state"]
+    digest = EpisodeStore(data.dataset.folder, "train").digest(5)
+    assert dataclasses.asdict(SamplerState(1, 7, 5, digest)) == whole["hgn"]["sampler_state"]
 
     @settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
     @given(st.lists(st.integers(1, UPDATES - 1), min_size=1, max_size=2, unique=True).map(sorted))

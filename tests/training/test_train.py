@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import os
 import signal
+import zipfile
 from collections.abc import Callable, Collection
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +23,12 @@ from hgn.config import DatagenConfig, TrainConfig
 from hgn.data.manifest import Manifest
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
+from hgn.system.files import held
 from hgn.training import callbacks
-from hgn.training.checkpoint import read_checkpoint
+from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
 from hgn.training.dataset import PublishedEpisodes
 from hgn.training.module import TrainingModule
+from hgn.training.stop import StopRequest
 
 MakeConfig = Callable[..., DatagenConfig]
 MakeDataset = Callable[[DatagenConfig], Path]
@@ -205,7 +209,7 @@ def test_a_finished_run_stays_finished(data, tmp_path):
     before = weights(run / "checkpoints" / "last.ckpt")
     (run / "checkpoints" / ".last.ckpt.1.partial").write_bytes(b"half")
     assert train.main(train_mapping(data, run)) == 0
-    assert {path.name for path in (run / "checkpoints").iterdir()} == {"last.ckpt", "best.ckpt"}
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {*LAST_NAMES, "best.ckpt"}
     after = read_checkpoint(run / "checkpoints" / "last.ckpt")
     assert after["hgn"]["updates"] == 12
     assert all(torch.equal(before[name], tensor) for name, tensor in after["state_dict"].items())
@@ -256,16 +260,48 @@ def test_another_data_set_is_refused(data, make_config, tmp_path):
         train.main(train_mapping(make_config(frames=7), run))
 
 
-def test_damaged_checkpoints_are_refused(data, tmp_path):
-    """A cut checkpoint ends in a message, not in a traceback, and stays."""
+def test_damaged_checkpoints_are_refused(data, tmp_path, capsys):
+    """Of the last three checkpoints the newest whole one is gone on with: one that was cut, or of which a bit changed,
+    is named and stays. Where none is whole the training ends with a message."""
     run = tmp_path / "run"
-    train.main(train_mapping(data, run, maximum_updates=2))
-    path = run / "checkpoints" / "last.ckpt"
-    cut = path.read_bytes()[: path.stat().st_size // 2]
-    path.write_bytes(cut)
-    with pytest.raises(ConfigError, match="must be a whole checkpoint file"):
+    train.main(train_mapping(data, run))
+    paths = [run / "checkpoints" / name for name in LAST_NAMES]
+    assert [read_checkpoint(path)["hgn"]["updates"] for path in paths] == [12, 10, 5]
+    contents = [path.read_bytes() for path in paths]
+    with zipfile.ZipFile(paths[0]) as records:
+        largest = max((i for i in records.infolist() if "/data/" in i.filename), key=lambda info: info.file_size)
+    flipped = bytearray(contents[0])
+    flipped[largest.header_offset + 200] ^= 1
+    paths[0].write_bytes(flipped)
+    paths[1].write_bytes(contents[1][:1000])
+    torch.load(paths[0], weights_only=True)  # which does not see it
+    mapping = train_mapping(data, run)
+    config = from_mapping(TrainConfig, {name: value for name, value in mapping.items() if name != "name"})
+    path, state = train._checkpoint_to_resume(config, paths[0].parent)
+    errors = capsys.readouterr().err
+    assert path == paths[2] and state.position == 10 and errors.count("must be a whole checkpoint file") == 2
+    assert "has another CRC; trying the one before" in errors
+    paths[2].write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"last\.ckpt: .* has another CRC"):
+        train.main(mapping)
+    assert paths[0].read_bytes() == flipped
+
+
+def test_two_trainings_in_one_folder(data, tmp_path):
+    """A run that another training is in is refused, and can be gone on with when that has ended."""
+    run = tmp_path / "run"
+    with held(run / ".lock", "run", ""), pytest.raises(ConfigError, match="run must be a folder of its own, got"):
         train.main(train_mapping(data, run))
-    assert path.read_bytes() == cut
+    assert train.main(train_mapping(data, run, maximum_updates=1)) == 0
+
+
+@pytest.mark.parametrize("order", list(permutations((signal.SIGTERM, signal.SIGUSR1))))
+def test_signals_of_a_scheduler(order):
+    """SIGUSR1, by which a job is queued again, counts, whatever comes before or after it."""
+    stop = StopRequest()
+    for number in order:
+        stop._on_signal(number, None)
+    assert stop.exit_code == 138
 
 
 def test_missing_data_without_generator(make_config, tmp_path):
