@@ -15,16 +15,13 @@ class ScalingConfig:
     devices: OneOrMore | None = None  # at most; none: all GPUs, or two processes on a CPU
     scenes: OneOrMore = 8  # on each device
     particles: OneOrMore = 4_296  # of a scene
-    # of a scene's particles, standard deviation as a share of the mean; the paper's random scenes: 0.17
+    # of a scene's particles, standard deviation as a fraction of the mean; the paper's random scenes: 0.17
     particle_spread: NonNegative[float] = 0.17
     batches: OneOrMore = 8  # of each device; one sample is an update on each of them
     backends: tuple[str, ...] = ("torch", "triton")  # of training; triton where there are GPUs
     precision: str = "tf32"  # as for training; or fp32, fp16 (where backend torch takes tf32)
     message_mb: tuple[Positive[float], ...] = (25.0,)  # message sizes that are timed beside backend torch's own
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    node_devices: OneOrMore = 8  # of the clusters that the model tells of
-    update_ms: Positive[float] | None = None  # of one device alone: prints the model of such an update alone
-    backward_ms: NonNegative[float] = 0.0  # of these; 0: all gradients leave at the end, as on backend triton
     rounds: Positive[int] = 20  # samples of each contender
     seconds: Positive[float] = 30.0  # at most for all contenders, once three rounds are done
     device: str = "auto"  # or cpu, cuda
@@ -33,8 +30,6 @@ class ScalingConfig:
     def __post_init__(self) -> None:
         require_bounds(self)
         require_one_of(self, "precision", PRECISIONS)
-        if self.update_ms is not None:
-            require(self.backward_ms <= self.update_ms, "backward_ms", "at most update_ms", self.backward_ms)
         for i, backend in enumerate(self.backends):
             require(backend in ("torch", "triton"), f"backends[{i}]", "torch or triton", backend)
         require(self.device in ("auto", "cpu", "cuda"), "device", "auto, cpu or cuda", self.device)

@@ -34,14 +34,11 @@ from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
 from tools.bench.contenders import FRAME_RATE_HZ, PASS, bench_network
 from tools.bench.states import Workload, batch_of_scenes
-from tools.bench.timing import once
 from tools.scaling.config import ScalingConfig
 
 # Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
 # order each time, which turns the activations that lie next to their kink, and TF32 makes more of it.
 GRADIENT_BOUND = 2e-2
-ALL_REDUCE_BYTES = (4, 65_536, 1_048_576, 4_194_304, 16_777_216)
-ALL_REDUCE_CALLS, ALL_REDUCE_SAMPLES = 10, 5
 WARM_UPDATES = 3
 MINIMUM_ROUNDS = 3
 PATIENCE = datetime.timedelta(minutes=2)
@@ -111,14 +108,6 @@ class TorchUpdates:
     def weights(self) -> torch.Tensor:
         return torch.cat([p.detach().flatten() for p in self.parameters])
 
-    def backward_seconds(self) -> float:
-        """Seconds of an update's backward pass, the median over the batches."""
-        milliseconds = []
-        for batch in self.batches:
-            self.optimizer.zero_grad()
-            milliseconds.append(once(self.loss(batch).backward, self.device))
-        return float(np.median(milliseconds)) / 1e3
-
 
 class TritonUpdates:
     """The same with hgn.kernels.update, on episodes of one window each."""
@@ -168,10 +157,6 @@ class TritonUpdates:
     def weights(self) -> torch.Tensor:
         return self.ours.values
 
-    def backward_seconds(self) -> float:
-        """None of it hides a message: they leave when all gradients are there."""
-        return 0.0
-
 
 class _Loss(nn.Module):
     """The loss as a forward pass, which is where DistributedDataParallel begins."""
@@ -202,19 +187,11 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
         batches = {spread: _batches(config, rank, spread, device) for spread in {0.0, config.particle_spread}}
         contenders = [_prepared(c, config, rank, groups, batches, device) for c in _contenders(config, sizes, device)]
-        alone = {c.backend: c.update for c in contenders if c.devices == 1 and c.spread == 0}
-        backward = {name: update.backward_seconds() for name, update in alone.items() if update is not None}
         _alternate(contenders, config, rank)
         for contender in contenders:
             _check_weights(contender, groups, rank)
-        rows = [row for size, group in groups.items() for row in _all_reduces(size, group, rank, device)]
         if rank == 0:
-            report = {
-                "backward_seconds": backward,
-                "updates": [_row(c, config, device) for c in contenders],
-                "all_reduces": rows,
-            }
-            (folder / "rows.json").write_text(json.dumps(report))
+            (folder / "rows.json").write_text(json.dumps([_row(c, config, device) for c in contenders]))
         dist.barrier()
     finally:
         dist.destroy_process_group()
@@ -340,28 +317,10 @@ def _seconds(contender: Contender, rank: int) -> float:
     return float(taken)
 
 
-def _all_reduces(size: int, group: dist.ProcessGroup, rank: int, device: torch.device) -> list[dict[str, Any]]:
-    rows = []
-    for byte_count in ALL_REDUCE_BYTES:
-        dist.barrier()
-        if rank < size:
-            values = torch.zeros(byte_count // 4, device=device)
-            calls = partial(_all_reduce_often, values, group)
-            once(calls, device)
-            samples = [once(calls, device) / ALL_REDUCE_CALLS for _ in range(ALL_REDUCE_SAMPLES)]
-            low, middle, high = np.percentile(samples, (25, 50, 75)).tolist()
-            rows.append({"devices": size, "bytes": byte_count, "ms": middle, "ms_quartiles": [low, high]})
-    return rows
-
-
-def _all_reduce_often(values: torch.Tensor, group: dist.ProcessGroup) -> None:
-    for _ in range(ALL_REDUCE_CALLS):
-        dist.all_reduce(values, group=group)
-
-
 def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> dict[str, Any]:
     plain = contender.backend == "torch"
     row: dict[str, Any] = {
+        "case": "weak_scaling",
         "backend": contender.backend,
         "precision": _torch_precision(config, device) if plain else config.precision,
         "devices": contender.devices,
