@@ -1,11 +1,12 @@
-"""precompile_keys.py launch|behind [gns]: the keys in Triton's cache on disk of a small update's kernels, one a line.
+"""precompile_keys.py ORDER…: the keys in Triton's cache on disk of a small update's kernels, one a line.
 
-They are asked for in the order of the launches, as a training does, or from behind, as a process might that compiles a
-share of them.
+They are asked for in a process for each order: `launch`, as a training does, `behind`, as a process might that
+compiles a share of them; `gns` are another network's.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
 from typing import Any
@@ -31,13 +32,26 @@ def not_compiled(
     print(key_of(self, signature, constants, attributes, options))
 
 
+def tell(order: str) -> None:
+    """Prints a blank line, and then the keys."""
+    settings = UpdateSettings(2, 1e-3, True, 1 / 64, True, 0.5)
+    network, sizes = NetworkConfig(width=16, levels=2, message_passing_steps=2), (200, 60)
+    if order == "gns":
+        settings = replace(settings, optimizer="muon")
+        network, sizes = NetworkConfig(kind="gns", width=16, levels=1, message_passing_steps=2), (9000,)
+    found = list(launches_of(PrecompileJob(network, settings, "fp16", True, True, 300, sizes, 90)).values())
+    JITFunction._do_compile = not_compiled
+    print()
+    for function, data in reversed(found) if order == "behind" else found:
+        preload(function, data)
+    sys.stdout.flush()
+
+
 use_h100()
-settings = UpdateSettings(2, 1e-3, True, 1 / 64, True, 0.5)
-network, sizes = NetworkConfig(width=16, levels=2, message_passing_steps=2), (200, 60)
-if "gns" in sys.argv:
-    settings = replace(settings, optimizer="muon")
-    network, sizes = NetworkConfig(kind="gns", width=16, levels=1, message_passing_steps=2), (9000,)
-found = list(launches_of(PrecompileJob(network, settings, "fp16", True, True, 300, sizes, 90)).values())
-JITFunction._do_compile = not_compiled
-for function, data in found if sys.argv[1] == "launch" else reversed(found):
-    preload(function, data)
+for order in sys.argv[1:]:
+    child = os.fork()  # what a process has seen of kernels, the next has not
+    if child == 0:
+        tell(order)
+        os._exit(0)
+    if os.waitpid(child, 0)[1]:
+        sys.exit(f"{order} failed")
