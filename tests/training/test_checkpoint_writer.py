@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +21,6 @@ from hgn.training.checkpoint import read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.module import TrainingModule
 
-ROOT = Path(__file__).resolve().parents[2]
 KILLED = """
 import sys, time
 from pathlib import Path
@@ -132,10 +130,11 @@ def test_a_failed_write_is_raised(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["folder.ckpt"]
 
 
-def test_killed_while_writing(tmp_path):
+def test_killed_while_writing(warm_python, tmp_path):
     """`kill -9` in the middle of a write leaves the file before it, whole."""
     path = tmp_path / "last.ckpt"
-    process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    (program := tmp_path / "killed.py").write_text(KILLED)
+    process = subprocess.Popen([warm_python, program, path], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None and process.stdout.readline() == "writing\n"
     process.kill()
     process.communicate()
