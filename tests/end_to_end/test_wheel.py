@@ -83,6 +83,14 @@ def test_commands_compose_their_config(python: Path, tmp_path: Path, module: str
     assert composed["name"] == "small" and key in composed
 
 
+def test_shipped_weights_simulate(python: Path, tmp_path: Path) -> None:
+    """A random scene with shipped weights, from an empty folder."""
+    (here := tmp_path / "here").mkdir()
+    out = tmp_path / "rollout.vtkhdf"
+    run(python, here, "-m", "hgn.rollout", "weights=obstacles", "frames=2", "device=cpu", "render=false", f"out={out}")
+    assert out.stat().st_size > 10_000
+
+
 def test_command_helps(python: Path, tmp_path: Path) -> None:
     """`--help` says what a command does and shows its keys with their comments, from an empty folder."""
     text = run(python, tmp_path, "-m", "hgn.rollout", "--help")
