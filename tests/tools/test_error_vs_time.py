@@ -30,7 +30,6 @@ from hgn.schema import ConfigError, from_mapping
 from hgn.training.errors import ballistic, frame_batches, one_step_errors
 from tools.error_vs_time import score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
-from tools.error_vs_time.comparisons import comparisons
 from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
 from tools.error_vs_time.paired import paired_difference, paired_lines, paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
@@ -551,20 +550,6 @@ def report_rows() -> list[dict[str, Any]]:
         report_row("mpm", 1e-3, 20.0, grid=32, step=1.0, precision="fp32"),
         report_row("chaos", 1e-9, None, floor="twice the step"),
     ]
-
-
-def test_comparisons_in_words() -> None:
-    """Each network beside the best baseline, by material too; HGN beside GNS and the solver, each at its
-    fastest; penetration in the worst scene beside the solver's own."""
-    told = "\n".join(comparisons(report_rows()))
-    hgn = "HGN L = 3, M = 4, triton fp16 (hgn.safetensors)"
-    assert f"{hgn}: 1.00e-07, 100.00 times below (water 2.00e-07, 100.00 times below)" in told
-    assert f"beside GNS M = 4, triton fp16 (gns.safetensors)\n  {hgn}: one-step MSE 2.00 times below" in told
-    assert "after 299 frames 2.00 times below, 10.0 times as fast" in told
-    assert f"{hgn}: 40.0 times as fast as MPM 32³, step 1" in told
-    assert "for the error after 50 frames 200.0 times as fast as MPM 64³, step 0.5" in told
-    assert "2.000% in test-000003, where the solver has 1.000%; the solver 0.500%, 1.500% in its worst scene" in told
-    assert comparisons([]) == []
 
 
 def test_paired_differences() -> None:

@@ -30,7 +30,6 @@ from tools.bench.triton_contenders import TritonFrame, TritonTrain
 
 GPU_PARTICLES, GPU_SCENES = (TILE_PARTICLES, 40_000, 400_000), (1, 8, 32)
 CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
-PHASE_ROUNDS = 11
 OUT_OF_MEMORY = "out of memory"
 EXIT_RED = 1
 FRAME_CASES = ("frame", "torch_frame", "gns_frame", "public_gns_frame", "mpm_frame")
@@ -75,6 +74,8 @@ def workloads(config: BenchConfig, device: torch.device) -> list[Workload]:
     gpu = device.type == "cuda"
     particles = config.particles or (GPU_PARTICLES if gpu else CPU_PARTICLES)
     scenes = config.scenes or (GPU_SCENES if gpu else CPU_SCENES)
+    if config.random_scenes:  # which have particles of their own
+        particles = particles[:1]
     single = [Workload(count, 1) for count in particles] if 1 in scenes else []
     return single + [Workload(min(particles), count) for count in scenes if count != 1]
 
@@ -110,9 +111,6 @@ def table(rows: list[dict[str, Any]]) -> str:
             f"{row['case']:<16} {row['particles']:>9} {row['scenes']:>6} {row['precision']:>9} {ms:>10} {spread:>19} "
             f"{memory:>7}  {row['check']}"
         )
-        if row.get("phases"):
-            parts = ", ".join(f"{name} {value:.3f}" for name, value in row["phases"].items())
-            lines.append(f"{'':<16} parts without graphs, ms: {parts}")
     ours: dict[tuple[Any, ...], float] = {}
     for row in rows:
         if row["case"] in ("frame", "train") and row["ms"]:
@@ -130,8 +128,8 @@ def _prepare(config: BenchConfig, device: torch.device, precision: str, case: st
     network = config.gns if "gns" in case else config.network
     try:
         if case == "mpm_frame":
-            mpm = MpmFrame(work, config.network.cell_size, config.mpm_frames, device)
-            return Entry(row | {"check": PASS}, mpm.timed(), mpm)
+            mpm = MpmFrame(work, config, device)
+            return Entry(row | {"particles": mpm.particles, "check": PASS}, mpm.timed(), mpm)
         make, backend = _maker(config, device, precision, case)
         row |= {} if backend is None else {"backend": backend}
         checked = checked_workload(work, "frame" if case.endswith("frame") else "train")
@@ -144,8 +142,6 @@ def _prepare(config: BenchConfig, device: torch.device, precision: str, case: st
         contender.run()
         if start is not None:
             row["memory_gb"] = (torch.cuda.max_memory_allocated(device) - start) / 1e9
-        if isinstance(contender, Frame | PublicFrame) and work.scenes == 1:
-            row["phases"] = contender.phases(PHASE_ROUNDS)
         return Entry(row, contender.timed(), contender)
     except torch.OutOfMemoryError:
         return Entry(row | {"check": OUT_OF_MEMORY})
@@ -192,6 +188,8 @@ def _finish(entry: Entry) -> None:
     if entry.timed is not None and entry.row["check"] == PASS:
         low, middle, high = entry.timed.quartiles()
         entry.row |= {"ms": middle, "ms_quartiles": [low, high], "samples": len(entry.timed.milliseconds)}
+        if isinstance(entry.contender, MpmFrame):
+            entry.row["substeps"] = entry.contender.substeps
     entry.timed = entry.contender = None
 
 

@@ -8,25 +8,24 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from hgn.config import MpmConfig, NetworkConfig, TrainingConfig
+from hgn.config import MpmConfig, NetworkConfig, SceneConfig, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.grid import GridHierarchy, build_hierarchy
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import build, fastest_stepped, with_gradients
 from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
+from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
+from tools.bench.config import BenchConfig
 from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_of, state_of
 from tools.bench.timing import Timed, once
 
@@ -86,36 +85,6 @@ class Frame:
             expected_N3 = reference_acceleration(self.network, self.state)
         return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
 
-    def phases(self, rounds: int) -> dict[str, float]:
-        """Medians of the parts by backend torch, ms."""
-        with torch.inference_mode():
-            return {
-                name: float(np.median([once(part, self.device) for _ in range(rounds)][1:]))
-                for name, part in self._parts().items()
-            }
-
-    def _parts(self) -> dict[str, Callable[[], object]]:
-        network, state = self.network, self.state
-        if isinstance(network, GraphNetworkSimulator):
-            neighbours = network.neighbours(state)
-            return {
-                "neighbours": lambda: network.neighbours(state),
-                "network": lambda: network.propagate(state, neighbours),
-            }
-        assert isinstance(network, HierarchicalGraphNetwork)
-        config, origin_S3 = network.config, torch.zeros_like(state.domain_S3)
-
-        def grid() -> GridHierarchy:
-            return build_hierarchy(state.position_N3, state.scene_N, origin_S3, config.cell_size, config.levels)
-
-        built = grid()
-        latent_NW = network.encode_particles(state, built)
-        return {
-            "features": lambda: network.encode_particles(state, built),
-            "grid": grid,
-            "network": lambda: network.propagate(latent_NW, built),
-        }
-
 
 class Train:
     """One training step on data that is on the device: noise, jitter, forward, backward, Adam."""
@@ -154,14 +123,22 @@ class Train:
 
 
 class MpmFrame:
-    """One frame of the solver that makes the data, at its converged step, on the same particles at rest."""
+    """One frame of the solver that makes the data, at its converged step: of the same particles at rest, or of random
+    scenes with obstacles, of which the second half of the frames counts, when most particles have landed.
+    """
 
-    def __init__(self, work: Workload, cell_size: float, frames: int, device: torch.device) -> None:
-        self.scenes = [scene_of(work, seed, cell_size) for seed in range(work.scenes)]
+    def __init__(self, work: Workload, config: BenchConfig, device: torch.device) -> None:
+        self.random = config.random_scenes
+        if self.random:
+            self.scenes = [generate_scene(SceneConfig(), REPORT_SEED + i) for i in range(work.scenes)]
+        else:
+            self.scenes = [scene_of(work, seed, config.network.cell_size) for seed in range(work.scenes)]
         self.config = MpmConfig(device="gpu" if device.type == "cuda" else "cpu", scenes_per_launch=work.scenes)
-        self.frames = frames
+        self.frames = config.mpm_frames
+        self.particles = sum(scene.particle_count for scene in self.scenes) // work.scenes
         self.failure: str | None = None
         self.warm = False
+        self.substeps = 0.0  # of a frame, mean over particles
 
     def sample(self) -> list[float]:
         """Milliseconds a frame of a short simulation: frames may come several at once."""
@@ -174,15 +151,23 @@ class MpmFrame:
         results = simulate(
             self.scenes, self.config, self.frames, FRAME_RATE_HZ, lambda _: ends.append(time.perf_counter())
         )
-        for result in results:
+        steps = 0
+        for scene, result in zip(self.scenes, results, strict=True):
             if isinstance(result, SceneFailure):
                 self.failure = result.cause
             elif not np.isfinite(result.position_TN3[-1]).all():
                 self.failure = "positions are not finite"
-        return [(ends[-1] - ends[0]) * 1e3 / (self.frames - 1)]
+            else:
+                steps += result.counters["substeps"] * scene.particle_count
+        particles = sum(scene.particle_count for scene in self.scenes)
+        self.substeps = steps / particles / (self.frames - 1)
+        first = 0
+        if self.random:  # frames of one launch end together: from the end of the launch that the middle frame is in
+            first = max(t for t in range(self.frames - 1) if ends[t] <= ends[(self.frames - 1) // 2] + 1e-3)
+        return [(ends[-1] - ends[first]) * 1e3 / (self.frames - 1 - first)]
 
     def timed(self) -> Timed:
-        return Timed(self.sample, MPM_ROUNDS)
+        return Timed(self.sample, 1 if self.random else MPM_ROUNDS)
 
 
 def _data_info() -> DataInfo:

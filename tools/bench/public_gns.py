@@ -166,16 +166,6 @@ class PublicFrame(PublicGns):
         found_N3, _ = self.output(self.batch.window_WN3)
         return verdict("acceleration", relative_error(found_N3.double(), self.expected()), BOUNDS[precision])
 
-    def phases(self, rounds: int) -> dict[str, float]:
-        """Medians of the neighbour search, which is ours, and of the rest, ms."""
-        state = self.batch.state()
-        with torch.no_grad():
-            neighbours = float(
-                np.median([once(lambda: self.network.neighbours(state), self.device) for _ in range(rounds)][1:])
-            )
-            frame = float(np.median([once(self.run, self.device) for _ in range(rounds)][1:]))
-        return {"neighbours": neighbours, "without them": frame - neighbours}
-
 
 class PublicTrain(PublicGns):
     """One of their training steps: noise, forward, backward, Adam."""

@@ -32,7 +32,6 @@ from hgn.system.device import choose_device
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
-from tools.error_vs_time.comparisons import comparisons
 from tools.error_vs_time.contenders import (
     COARSE_GRIDS,
     PARTICLES_AT_ONCE,
@@ -119,7 +118,6 @@ def main(mapping: dict[str, Any]) -> int:
     run.write(drawn=True)
     print(
         table(run.rows),
-        *comparisons(run.rows),
         *paired_lines(paired_rows(run.rows)),
         f"{run.out}.png {run.file}",
         sep="\n",
@@ -138,7 +136,7 @@ def _draw_again(config: ErrorVsTimeConfig, earlier: Sequence[Earlier]) -> int:
     Path(config.out).parent.mkdir(parents=True, exist_ok=True)
     files, paired = draw(config.out, rows, first), paired_rows(rows)
     write_json(config.json or f"{config.out}.json", {"meta": first, "rows": rows, "paired": paired}, allow_nan=False)
-    print(table(rows), *comparisons(rows), *paired_lines(paired), " ".join(files), sep="\n")
+    print(table(rows), *paired_lines(paired), " ".join(files), sep="\n")
     return 0
 
 
