@@ -36,6 +36,7 @@ SLOPE_DEG = 35.0
 FLIGHT_ERROR = 0.02  # of the way of free flight, at most
 FRICTION_ERRORS = {SAND: 0.05, SNOW: 0.10}
 FLYING_CELLS, SLIDING_CELLS, FALLING_CELLS = (3.0, 2.0, 3.0), (5.0, 2.0, 5.0), (7.0, 3.0, 7.0)  # of blocks
+SLIDING_CELL_M = 1 / 16  # they slide 0.9 m
 START_CELLS = -9.0  # up the slope from the middle, where sliding blocks begin
 SETTLING_S, SLIDING_S = 0.3, 0.2  # until a block that came to lie on a surface slides steadily; then
 # at first down the slope: friction opposes each particle's own motion, and what spreads across the slope is not braked
@@ -209,7 +210,7 @@ def contacts(config: MpmConfig, cell_size: float) -> list[Row]:
     for closed, surface in ((False, "a sheet"), (True, "a body")):
         for friction in FRICTIONS:
             places = [(setting, material) for setting in settings for material in FRICTION_ERRORS]
-            cases = [(setting, closed, material) for setting, material in places]
+            cases = [(dataclasses.replace(setting, cell_size=SLIDING_CELL_M), closed, kind) for setting, kind in places]
             for (turn, kind), acting in _grouped(places, acting_frictions(cases, friction, config)).items():
                 worst = max(acting, key=lambda value: abs(value - friction))
                 held = abs(worst / friction - 1) <= FRICTION_ERRORS[kind]
