@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from datagen.mpm.sweep import Sweep, build_sweep, near_pairs, near_slabs
+from datagen.mpm.sweep import ON_TRIANGLE, Sweep, build_sweep, near_pairs, near_slabs
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
@@ -41,6 +41,7 @@ GAP_CELLS = 0.75  # from a surface, where material is that nodes begin to stop
 STENCIL_CELLS = 1.501  # from a particle to its nodes, along each axis, with rounding
 ON_EDGE = 1e-6  # of a triangle's edge: as near to it a place lies on it
 WIDENED = 1 + 1e-3  # triangles, since kernels look a ten-thousandth beyond their edges
+REACH_CELLS = WIDENED * STENCIL_CELLS * np.sqrt(3.0)  # of a particle, in any direction
 # squared area over fourth power of the longest edge, below which a triangle has no direction
 FLAT_TRIANGLE = 1e-20
 # of nodes, flat index [P]: signed distance from the surface in cells [P], free direction [P, 3], least mass [P]
@@ -220,7 +221,7 @@ def _points(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, shape: tuple[int, ...]) -> tuple[Contacts, Contacts]:
     """Nodes near a sheet: what is free for particles on their own side of it, and on the other."""
-    node, distance, foot, owner = _rasterise(triangle_F33, WIDENED * STENCIL_CELLS * np.sqrt(3.0), shape)
+    node, distance, foot, owner = _rasterise(triangle_F33, REACH_CELLS, shape)
     face = _face_normals(triangle_F33)[owner]
     offset = _points(node, shape) - foot
     height = (offset * face).sum(axis=1)
@@ -228,7 +229,7 @@ def _sheet_contacts(triangle_F33: np.ndarray, rim_F6: np.ndarray, shape: tuple[i
     # around the rim the way to the foot leads along the sheet, not through it
     on_rim = _on_rim(foot, triangle_F33[owner], rim_F6[owner])
     across = (distance < ON_SURFACE_CELLS) | on_rim
-    away[across] = face[across] * np.where(height[across] < 0, -1.0, 1.0)[:, None]
+    away[across] = face[across] * np.where(height[across] < -ON_TRIANGLE, -1.0, 1.0)[:, None]
     depth = np.where(across, np.abs(height), distance)
     own = (distance <= BEARING_CELLS) & ~on_rim
     return (node[own], distance[own], away[own], reached(distance[own])), (node, -distance, -away, reached(-depth))
@@ -251,9 +252,8 @@ def _on_rim(foot_P3: np.ndarray, triangle_P33: np.ndarray, rim_P6: np.ndarray) -
 def _closed_contacts(
     obstacle: Obstacle, triangle_F33: np.ndarray, band: float, shape: tuple[int, ...], cell_size: float
 ) -> Contacts:
-    # one cell at least: a line of nodes that crosses the surface then meets a node of the band
-    band = max(band, 1.0)
-    node, distance, foot, owner = _rasterise(triangle_F33, band, shape)
+    # of all nodes that a particle outside may reach the way out is exact
+    node, distance, foot, owner = _rasterise(triangle_F33, max(band, REACH_CELLS), shape)
     within = contains(_points(node, shape) * cell_size, obstacle)
     inside = np.zeros(shape, bool)
     inside.ravel()[node[within]] = True
@@ -275,7 +275,8 @@ def _closed_contacts(
     # thin: a cell further on, past the surface, lies outside again
     height = sign * distance
     thin = np.zeros(len(node), bool)
-    outside = np.flatnonzero(height > -BEARING_CELLS)
+    # one cell at least: a line of nodes that crosses the surface then meets a node of the band
+    outside = np.flatnonzero((height > -BEARING_CELLS) & (height <= max(band, 1.0)))
     thin[outside] = ~contains((foot[outside] - normal[outside]) * cell_size, obstacle)
     chosen = (height <= BEARING_CELLS) | thin
     node, height, normal, least = (

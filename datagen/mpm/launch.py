@@ -236,6 +236,7 @@ class Launch(ABC):
         for index, scene in enumerate(self.scenes):
             own = slice(self.particle_begin[index], self.particle_begin[index + 1])
             value[index, VALUE.gravity : VALUE.gravity + 3] = scene.gravity
+            value[index, VALUE.wall_friction : VALUE.wall_friction + 3] = scene.wall_friction
             # what is heavier beside it would pass for water that is pressed together
             alike = (laws[row[own], CONSTANT.mass] == 1).all()
             value[index, VALUE.water_density] = (scene.particles_per_cell or 0.0) if alike else 0.0
@@ -275,7 +276,6 @@ class Launch(ABC):
         setting[SETTING.leapfrog] = config.time_integration == "leapfrog"
         if config.water_density_relaxation_s is not None:
             setting[SETTING.density_relaxation] = 1 / config.water_density_relaxation_s
-        setting[SETTING.friction] = config.collider_friction
         setting[SETTING.low : SETTING.low + 3] = low
         setting[SETTING.high : SETTING.high + 3] = high
         setting[SETTING.size : SETTING.size + 3] = self.scenes[0].domain_size
@@ -292,10 +292,20 @@ class Launch(ABC):
         order = np.argsort(~np.concatenate([collider.doubled_K for collider in self.colliders]), kind="stable")
         vector = np.zeros((len(order), NODE_VECTORS, 3), np.float32)
         vector[:, :2] = np.concatenate([collider.normal_K23 for collider in self.colliders])[order]
-        vector[:, 2, :2] = self.config.collider_friction
+        vector[:, 2, :2] = np.concatenate(
+            [friction[own.obstacle_K2] for friction, own in zip(self._frictions(), self.colliders, strict=True)]
+        )[order]
         least = [cell_mass(scene) * own.least_K2 for scene, own in zip(self.scenes, self.colliders, strict=True)]
         vector[:, 3, :2] = np.concatenate(least)[order]
         return places[order], np.arange(len(order), dtype=np.int32), vector.reshape(-1, 3)
+
+    def _frictions(self) -> list[np.ndarray]:
+        """Of each scene the Coulomb coefficients of its obstacles, one entry at least."""
+        own = self.config.collider_friction
+        return [
+            np.array([own if o.friction is None else o.friction for o in scene.obstacles] or [own], np.float32)
+            for scene in self.scenes
+        ]
 
     def _places(self, node_K3: np.ndarray) -> np.ndarray:
         """Where nodes lie within a scene's arrays of nodes, int32 [K]."""
@@ -336,7 +346,9 @@ class Launch(ABC):
             end += LIST_HEAD * len(count) + len(sweep.triangle_L)
         vector = np.zeros((sum(len(sweep.triangle_F43) for sweep in sweeps), TRIANGLE_VECTORS, 3), np.float32)
         vector[:, :4] = np.concatenate([sweep.triangle_F43 for sweep in sweeps])
-        vector[:, 4, 0] = self.config.collider_friction
+        vector[:, 4, 0] = np.concatenate(
+            [friction[sweep.obstacle_F] for friction, sweep in zip(self._frictions(), sweeps, strict=True)]
+        )
         return places, values, vector.reshape(-1, 3), end
 
     @abstractmethod

@@ -76,7 +76,8 @@ class SceneValue(NamedTuple):
     stability_fraction: int = 13  # of the limit of stability: the longest step of stress
     gravity_time: int = 14  # for which gravity acts in the present substep, s: see mls_mpm
     water_density: int = 15  # at rest, in masses of a particle a cell; 0 where it is not known
-    length: int = 16
+    wall_friction: int = 16  # 16, 17, 18: of the domain's walls across x, y, z
+    length: int = 19
 
 
 class Status(NamedTuple):
@@ -94,14 +95,13 @@ class Setting(NamedTuple):
     fixed_time_step: int = 2  # s; 0 for the adaptive rule
     fixed_substeps: int = 3  # a frame, where the time step is fixed
     speed_fraction: int = 4
-    friction: int = 5  # of the domain's walls
+    density_relaxation: int = 5  # in a second, of water's J to its density
     low: int = 6  # 6, 7, 8: smallest coordinates of a particle
     high: int = 9  # 9, 10, 11: largest
     size: int = 12  # 12, 13, 14: of the domain
     transfer_interval: int = 15  # s; 0 where every substep is a transfer
     leapfrog: int = 16  # 1 where velocities belong to the middle of an interval, 0 to its end
-    density_relaxation: int = 17  # in a second, of water's J to its density
-    length: int = 18
+    length: int = 17
 
 
 class Shape(NamedTuple):

@@ -364,12 +364,16 @@ def node_velocity(
         wall_cells = shape[SHAPE.wall_cells]
         stuck = 0
         for axis in ti.static(range(3)):
+            outward = 0.0
             if index[axis] < wall_cells:
-                v[axis] = ti.max(v[axis], 0.0)
-                stuck = 1
+                outward = -1.0
             if index[axis] >= shape[SHAPE.nodes + axis] - wall_cells:
-                v[axis] = ti.min(v[axis], 0.0)
+                outward = 1.0
+            if outward != 0.0:
                 stuck = 1
+                normal = ti.Vector([0.0, 0.0, 0.0])
+                normal[axis] = -outward
+                v = meet(v, normal, scene_value[scene, VALUE.wall_friction + axis])
         if stuck and shape[SHAPE.sticky_walls]:
             v = ti.Vector([0.0, 0.0, 0.0])
     return v

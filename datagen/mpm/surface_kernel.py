@@ -3,6 +3,7 @@
 import taichi as ti
 
 from datagen.mpm.layout import COUNT, SETTING
+from datagen.mpm.sweep import ON_TRIANGLE
 
 CLEARANCE = 1e-3  # cells from a triangle, nearer than which a particle may not come; rounding is 1e-5
 STOP = 1.5 * CLEARANCE  # where it is put, so that rounding does not bring it nearer
@@ -46,13 +47,13 @@ def hidden_nodes(scaled, list_at: ti.i32, contact: ti.template(), contact_normal
         height_base = height + normal.dot(to_base)
         lowest = height_base + 2.0 * ti.min(normal, 0.0).sum()
         highest = height_base + 2.0 * ti.max(normal, 0.0).sum()
-        if (height >= 0.0 and lowest < 0.0) or (height < 0.0 and highest >= 0.0):
+        if (height >= 0.0 and lowest < 0.0) or (height < 0.0 and highest >= -ON_TRIANGLE):
             along_1 = across_1.dot(offset)
             along_2 = across_2.dot(offset)
             for n in range(STENCIL):
                 way = to_base + ti.cast(ti.Vector([n // 9, n // 3 % 3, n % 3]), ti.f32)
                 height_node = height + normal.dot(way)
-                if (height_node < 0.0) != (height < 0.0):
+                if (height_node < -ON_TRIANGLE) != (height < 0.0):
                     fraction = height / (height - height_node)
                     place_1 = along_1 + fraction * across_1.dot(way)
                     place_2 = along_2 + fraction * across_2.dot(way)

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# cells: a node so near to a triangle is on the side that its normal points to, whatever the rounding
+ON_TRIANGLE = 1e-4
 PAIRS_PER_CHUNK = 1_000_000  # (cell, triangle) pairs held at once
 
 

@@ -6,6 +6,7 @@ Shape legend: N particles, V vertices, F triangles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,6 +27,7 @@ class Obstacle:
     vertex_V3: np.ndarray  # float64, domain units
     triangle_F3: np.ndarray  # int32, indices into vertex_V3
     closed: bool
+    friction: float | None = None  # Coulomb coefficient; None: mpm.collider_friction
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,8 @@ class Scene:
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
     # of material at rest, where its filling is known: the solver then holds water to it
     particles_per_cell: float | None = None
+    # Coulomb coefficients of the domain's walls across x, y (floor and ceiling) and z
+    wall_friction: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         count = len(self.position_N3)
@@ -64,6 +68,10 @@ class Scene:
             bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(axis=1))
             if len(bad):
                 raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
+        frictions = {f"obstacles[{i}].friction": o.friction for i, o in enumerate(self.obstacles)}
+        frictions |= {f"wall_friction[{i}]": friction for i, friction in enumerate(self.wall_friction)}
+        for name, friction in frictions.items():
+            require(friction is None or 0 <= friction < math.inf, name, "finite and >= 0", friction)
         for name, value in self.material_parameters.items():
             if name not in MATERIAL_PARAMETERS:
                 raise ConfigError(f"material_parameters must be among {', '.join(MATERIAL_PARAMETERS)}, got {name!r}")

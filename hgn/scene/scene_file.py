@@ -5,6 +5,7 @@ See conf/example/ for examples. Lengths are in domain units, angles in degrees, 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
-from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require, require_bounds, to_mapping
 
 GROUP_SHAPES = ("cube", "sphere", "box")
 MAXIMUM_PARTICLES = 50_000_000
@@ -39,6 +40,7 @@ class ObstacleEntry:
     size: Positive[float] | None = None  # side, diameter, or base width and height
     position: Vector | None = None  # moves a mesh (origin if absent); the centre of a shape
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
+    friction: NonNegative[float] | None = None  # Coulomb coefficient; null: mpm.collider_friction
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -110,6 +112,8 @@ class SceneFile:
     cell_size: Positive[float] = 1 / 64  # of the solver's grid and of the obstacle cells
     gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
     particles_per_cell: Positive[float] = 8.0
+    floor_friction: NonNegative[float] = 0.0  # Coulomb coefficient of the domain's floor, and of its ceiling
+    wall_friction: NonNegative[float] = 0.0  # of its walls
     seed: int = 0  # of the particles and of the obstacle samples
 
     def __post_init__(self) -> None:
@@ -202,6 +206,7 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         gravity=file.gravity,
         seed=file.seed,
         particles_per_cell=file.particles_per_cell,
+        wall_friction=(file.wall_friction, file.floor_friction, file.wall_friction),
         material_parameters=_material_parameters(file.groups, counts),
         specification={"kind": "file", **to_mapping(file), "particle_counts": counts},
     )
@@ -220,17 +225,19 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:
     if entry.mesh is None:
         assert entry.shape is not None and entry.size is not None and entry.position is not None
         name = f"obstacle_{index}_{entry.shape}"
-        return shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name)
-    # trimesh takes a second to load
-    from hgn.scene.mesh import load_mesh
+        obstacle = shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name)
+    else:
+        # trimesh takes a second to load
+        from hgn.scene.mesh import load_mesh
 
-    return load_mesh(
-        folder / entry.mesh,
-        f"obstacles[{index}].mesh",
-        scale=1.0 if entry.scale is None else entry.scale,
-        translation=entry.position or (0.0, 0.0, 0.0),
-        rotation=entry.rotation,
-    )
+        obstacle = load_mesh(
+            folder / entry.mesh,
+            f"obstacles[{index}].mesh",
+            scale=1.0 if entry.scale is None else entry.scale,
+            translation=entry.position or (0.0, 0.0, 0.0),
+            rotation=entry.rotation,
+        )
+    return dataclasses.replace(obstacle, friction=entry.friction)
 
 
 def _require_inside_walls(name: str, region: Region, position_N3: np.ndarray, file: SceneFile) -> None:

@@ -70,6 +70,18 @@ def test_groups_become_particles(tmp_path):
     assert (np.abs(parts[2] - [1.0, 0.8, 0.5]).max(axis=0) <= np.array([0.25, 0.0625, 0.125]) + 1e-6).all()
 
 
+def test_friction_of_each_surface(tmp_path):
+    """Walls, floor and each obstacle have their own friction, kept in the specification; none is the solver's."""
+    mapping = {
+        "groups": [CUBE], "floor_friction": 0.5, "wall_friction": 0.1, "obstacles": [CONE, {**CONE, "friction": 0.3}],
+    }  # fmt: skip
+    scene = load_scene(write(tmp_path, mapping))
+    assert scene.wall_friction == (0.1, 0.5, 0.1)
+    assert [obstacle.friction for obstacle in scene.obstacles] == [None, 0.3]
+    assert scene.specification["floor_friction"] == 0.5
+    assert scene.specification["obstacles"][1]["friction"] == 0.3
+
+
 def test_editing_one_group_leaves_the_others(tmp_path):
     """Each group has a random stream of its own."""
     other = {**CUBE, "position": [0.2, 0.5, 0.5]}
@@ -136,6 +148,9 @@ def obstacle_with(**changes: object) -> dict[str, object]:
         (scene_with(domain_size=[1, 1]), "domain_size must be a list of 3 values"),
         (scene_with(domain_size=[0.05, 1, 1]), r"groups\[0\] \(cube of water\) must lie between the walls"),
         (scene_with(gravity=[0, float("inf"), 0]), "gravity must be three finite numbers"),
+        (scene_with(floor_friction=-0.1), "floor_friction must be a finite number >= 0, got -0.1"),
+        (scene_with(wall_friction=float("nan")), "wall_friction must be a finite number >= 0, got nan"),
+        (obstacle_with(friction=-1), r"obstacles\[0\]\.friction must be a finite number >= 0, got -1"),
         (scene_with(seed=-1), "seed must be a whole number >= 0"),
         (scene_with(seed=0.5), "seed must be a whole number"),
         (group_with(material="lava"), r"groups\[0\]\.material must be one of water, sand, snow, got 'lava'"),

@@ -22,7 +22,6 @@ from tools.stability.row import Row, table
 from tools.stability.solver_contact import contacts
 from tools.stability.solver_leak import OFFSETS, leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
-from tools.stability.solver_scenes import CELL
 from tools.stability.solver_steps import Point, draw, largest_steps
 from tools.stability.solver_validation import grids, validation
 
@@ -66,7 +65,7 @@ def main(mapping: dict[str, Any]) -> int:
         "stiffness": lambda: stiffnesses(mpm),
         "impact": lambda: impacts(mpm),
         "convergence": lambda: convergence(mpm),
-        "contact": lambda: contacts(mpm, CELL),
+        "contact": lambda: contacts(mpm),
         "leak": lambda: leaks(
             _leak_settings(mpm, config), config.leak_seconds, config.leak_block_cells, config.leak_offsets
         ),

@@ -1,8 +1,9 @@
 """Against published experiments: a dam that breaks, columns of sand that collapse, and the angle at which sand rests.
 
 Walls stand at the last node that stops motion, number 2 (and three from the other end): material fills its basin to
-there, as what is left open is filled by creeping. Floors of sand are sheets at a layer of nodes that bear Coulomb
-friction there alone (a band of half a cell); with the usual band the lowest cell and a half would hardly flow.
+there, as what is left open is filled by creeping. Floors of sand are sheets. Those of columns bear by friction what the
+sand itself bears in simple shear, for a rougher floor shears the sand above it: with more the grid's lowest cell,
+which moves as one, would be braked by more than sand can be.
 Shape legend: T frames, N particles.
 """
 
@@ -14,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from datagen.mpm.layout import sand_alpha, sand_sine
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import SAND, WATER
@@ -163,7 +165,9 @@ def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cell
     """How far a column of so many cells in radius runs out, and how high it stays at its axis, in initial radii."""
     scene = column(aspect, cells)
     duration = TIMES * math.sqrt(aspect * COLUMN_RADIUS / GRAVITY)
-    path = _path(scene, _sand(base, law, angle_deg), 41, 40 / duration)
+    config = _sand(base, law, angle_deg)
+    config = dataclasses.replace(config, collider_friction=shear_strength(config))
+    path = _path(scene, config, 41, 40 / duration)
     place = _above_floor(path[-1], scene.cell_size)
     distance = np.hypot(place[:, 0], place[:, 2])
     many = np.bincount(np.floor(distance).astype(int))
@@ -311,9 +315,13 @@ def _above_floor(position_N3: np.ndarray, cell: float) -> np.ndarray:
 
 
 def _sand(base: MpmConfig, law: str, angle_deg: float) -> MpmConfig:
-    return dataclasses.replace(
-        base, sand_friction_law=law, sand_friction_angle_deg=angle_deg, collider_friction=1.0, collider_band_cells=0.5
-    )
+    return dataclasses.replace(base, sand_friction_law=law, sand_friction_angle_deg=angle_deg, collider_friction=1.0)
+
+
+def shear_strength(config: MpmConfig) -> float:
+    """The shear that sand bears in simple shear, over the pressure: its yield where the middle stress is the mean."""
+    sine = sand_sine(config)
+    return 2 * sine / math.sqrt(3 + sine**2) if sine else 3 * sand_alpha(config) / math.sqrt(2)
 
 
 def _path(scene: Scene, config: MpmConfig, frames: int, rate_hz: float = DAM_RATE_HZ) -> np.ndarray:
