@@ -40,12 +40,13 @@ from datagen.pool.worker import Backend
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 
-LONGEST_FILES = (  # half a minute and more on one core; begun last, one of them would run alone
-    *("jobs/test_jobs", "training/test_ddp", "datagen/mpm/test_solver", "datagen/test_pool", "kernels/test_update"),
-    *("kernels/test_rollout", "network/test_network", "training/test_resume", "training/test_precompile"),
-    *("training/test_live_service", "training/test_train", "datagen/mpm/test_collider", "datagen/test_kills"),
-    *("tools/test_error_vs_time", "tools/test_scaling", "tools/test_stability_solver", "datagen/test_command"),
-    *("datagen/test_service", "kernels/test_pushforward", "end_to_end/test_bad_input", "docs/test_tutorials"),
+LONGEST_FILES = (  # ten seconds and more of one core; begun last, one of them would run alone
+    *("datagen/mpm/test_solver", "jobs/test_jobs", "docs/test_tutorials", "kernels/test_triton_compat"),
+    *("tools/test_error_vs_time", "tools/test_scaling", "training/test_ddp", "kernels/test_kernels_alone"),
+    *("datagen/test_pool", "datagen/test_service", "datagen/test_command", "training/test_precompile"),
+    *("end_to_end/test_datagen", "end_to_end/test_bad_input", "kernels/test_rollout", "kernels/test_update"),
+    *("network/test_network", "kernels/test_network", "training/test_train", "training/test_resume"),
+    *("tools/test_bench", "scene/test_random_scene", "training/test_live_service", "end_to_end/test_wheel"),
 )
 
 
