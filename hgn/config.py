@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
-from hgn.scene.material import MATERIALS, material_index
+from hgn.scene.material import MATERIALS
 from hgn.schema import (
     BelowOne,
     ConfigError,
@@ -18,9 +19,9 @@ from hgn.schema import (
     OneOrMore,
     Positive,
     TwoOrMore,
+    one_of,
     require,
     require_bounds,
-    require_one_of,
 )
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
@@ -32,7 +33,20 @@ NETWORK_INPUTS = ("absolute", "relative")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 TRAINING_BACKENDS = ("auto", "torch", "triton")
 PRECISIONS = ("fp32", "tf32", "fp16")
-STORED_PRECISIONS = ("fp32", "fp16")
+Material = Annotated[str, one_of(*MATERIALS)]
+Processor = Annotated[str, one_of("auto", "cpu", "gpu")]
+BackendName = Annotated[str, one_of(*BACKENDS)]
+Precision = Annotated[str, one_of(*PRECISIONS)]
+SandFrictionLaw = Annotated[str, one_of("matsuoka_nakai", "compression", "plane_strain")]
+SandVolumeCorrection = Annotated[str, one_of("tampubolon", "taichi_elements")]
+WaterEquation = Annotated[str, one_of("linear", "stiffening")]
+WaterVolumeUpdate = Annotated[str, one_of("trace", "taichi_elements")]
+TimeIntegration = Annotated[str, one_of("leapfrog", "symplectic_euler")]
+NetworkKind = Annotated[str, one_of(*NETWORK_KINDS)]
+SymmetryName = Annotated[str, one_of(*SYMMETRIES)]
+TrainingBackendName = Annotated[str, one_of(*TRAINING_BACKENDS)]
+StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
+Split = Annotated[str, one_of("train", "validation", "test")]
 
 
 def config_directory() -> Path:
@@ -66,9 +80,9 @@ class SceneConfig:
     obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, scaled so that the longest side is the size
     obstacle_size: tuple[float, float] = (0.1, 0.5)
     group_count: NonNegative[int] = 4
-    group_shapes: tuple[str, ...] = GROUP_SHAPES
+    group_shapes: tuple[Annotated[str, one_of(*GROUP_SHAPES)], ...] = GROUP_SHAPES
     group_size: Positive[float] = 0.08  # side or diameter
-    materials: tuple[str, ...] = MATERIALS
+    materials: tuple[Material, ...] = MATERIALS
     particles_per_cell: Positive[float] = 8.0
     clearance_cells: NonNegative[float] = 2.0  # between obstacles, groups and walls, in solver cells
     maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; each group draws one velocity
@@ -96,13 +110,9 @@ class SceneConfig:
             require(moving, "maximum_initial_speed", f"above 0 where {name} is", self.maximum_initial_speed)
         low, high = self.obstacle_size
         require(0 < low <= high < math.inf, "obstacle_size", "0 < smallest <= largest", list(self.obstacle_size))
-        for i, name in enumerate(self.materials):
-            material_index(name, f"materials[{i}]")
         for i, name in enumerate(self.obstacle_shapes):
             rule = f"one of {', '.join(OBSTACLE_SHAPES)}, or a mesh file ({', '.join(MESH_SUFFIXES)})"
             require(name in OBSTACLE_SHAPES or is_mesh_file(name), f"obstacle_shapes[{i}]", rule, name)
-        for i, name in enumerate(self.group_shapes):
-            require(name in GROUP_SHAPES, f"group_shapes[{i}]", f"one of {', '.join(GROUP_SHAPES)}", name)
         require(len(self.materials) > 0, "materials", "a list with at least one material", list(self.materials))
         require(len(self.group_shapes) > 0, "group_shapes", "a list with at least one shape", [])
         require(
@@ -123,22 +133,26 @@ class MpmConfig:
     sand_friction_angle_deg: NonNegative[float] = 31.0
     # matsuoka_nakai: 31 degrees in triaxial compression and extension, 34.8 in plane strain, as sand has; or a cone
     # (Drucker-Prager) that has the angle in triaxial compression alone (Taichi Elements, with 45) or in plane_strain
-    sand_friction_law: str = "matsuoka_nakai"  # or compression, plane_strain
-    sand_volume_correction: str = "tampubolon"  # or taichi_elements
+    sand_friction_law: SandFrictionLaw = "matsuoka_nakai"  # or compression, plane_strain
+    sand_volume_correction: SandVolumeCorrection = "tampubolon"  # or taichi_elements
     snow_hardening: NonNegative[float] = 10.0
     snow_critical_compression: NonNegative[float] = 0.025
     snow_critical_stretch: NonNegative[float] = 0.0045
     snow_maximum_hardening: Positive[float] = 20.0  # bound on exp(hardening * (1 - Jp)), counted; beyond 5 m/s raise it
-    water_equation: str = "linear"  # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
-    water_volume_update: str = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
+    water_equation: WaterEquation = (
+        "linear"  # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
+    )
+    water_volume_update: WaterVolumeUpdate = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
     water_tension: NonNegative[float] = 1.0  # fraction of its tension that stretched water bears; 1: Taichi Elements'
     water_viscosity_pa_s: NonNegative[float] = 0.0  # beside that of the grid, which is larger than real water's
     # to be as its particles lie, below a free surface: else water at rest sinks in a random filling; null: never
     water_density_relaxation_s: float | None = 1.0
     water_minimum_volume_ratio: Positive[float] = 0.1  # floor on J; hits are counted
     minimum_singular_value: Positive[float] = 0.05  # floor on the singular values of F; hits are counted
-    time_integration: str = "leapfrog"  # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
-    time_step: str = "adaptive"  # or fixed
+    time_integration: TimeIntegration = (
+        "leapfrog"  # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
+    )
+    time_step: Annotated[str, one_of("adaptive", "fixed")] = "adaptive"  # or fixed
     fixed_time_step_s: Positive[float] = 0.02 / 64
     stability_fraction: Positive[float] = 0.5  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
     speed_fraction: Positive[float] = 0.3  # of a cell that the fastest particle may cross between two transfers
@@ -147,11 +161,11 @@ class MpmConfig:
     # transfers smooth less.
     transfer_speed_m_s: float | None = 30.0
     wall_cells: int = 3  # grid nodes at each face of the domain that stop outgoing motion
-    wall_contact: str = "slip"  # or stick
+    wall_contact: Annotated[str, one_of("slip", "stick")] = "slip"  # or stick
     collider_band_cells: NonNegative[float] = 0.5  # from a sheet, where nodes stop motion; more keeps it further off
     collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
-    device: str = "auto"  # or cpu, gpu
+    device: Processor = "auto"  # or cpu, gpu
     scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 832 on a GPU
     maximum_substeps_per_frame: Positive[int] = 20_000  # beyond it a scene is stopped and reported
 
@@ -170,17 +184,9 @@ class MpmConfig:
         require(compression < 1, "snow_critical_compression", "< 1", compression)
         require(self.sand_friction_angle_deg < 90, "sand_friction_angle_deg", "< 90", self.sand_friction_angle_deg)
         require(self.wall_cells >= 2, "wall_cells", "at least 2, the reach of a particle", self.wall_cells)
-        require_one_of(self, "sand_friction_law", ("matsuoka_nakai", "compression", "plane_strain"))
-        require_one_of(self, "sand_volume_correction", ("tampubolon", "taichi_elements"))
         if self.sand_volume_correction == "taichi_elements":  # whose strains have no deviator to speak of
             rule = "compression or plane_strain with sand_volume_correction=taichi_elements"
             require(self.sand_friction_law != "matsuoka_nakai", "sand_friction_law", rule, self.sand_friction_law)
-        require_one_of(self, "water_equation", ("linear", "stiffening"))
-        require_one_of(self, "water_volume_update", ("trace", "taichi_elements"))
-        require_one_of(self, "time_integration", ("leapfrog", "symplectic_euler"))
-        require_one_of(self, "time_step", ("adaptive", "fixed"))
-        require_one_of(self, "wall_contact", ("slip", "stick"))
-        require_one_of(self, "device", ("auto", "cpu", "gpu"))
 
 
 def _spread(number: int, fraction: float) -> bool:
@@ -207,7 +213,7 @@ class DatasetConfig:
     workers: OneOrMore | None = None  # null: one for each GPU, or for two cores of a CPU; 1 leaves other GPUs alone
     maximum_attempts: Positive[int] = 3  # per scene before it is quarantined and replaced
     worker_silence_s: Positive[float] = 600.0  # after which a process of this machine that has work is replaced
-    pool: str = "local"  # processes of this machine; or ray: of a Ray cluster
+    pool: Annotated[str, one_of("local", "ray")] = "local"  # processes of this machine; or ray: of a Ray cluster
     # of the cluster, as in 10.0.0.1:6379; null: $RAY_ADDRESS, else the cluster that this machine is in
     ray_address: str | None = None
     # 0 to array_tasks - 1: of so many generators on one folder, each makes its own shards alone
@@ -217,7 +223,6 @@ class DatasetConfig:
     def __post_init__(self) -> None:
         require_bounds(self)
         require(self.folder != "", "folder", "a folder name", self.folder)
-        require_one_of(self, "pool", ("local", "ray"))
         require(self.ray_address is None or self.pool == "ray", "ray_address", "left out without pool=ray", self.pool)
         task, tasks = self.array_task, self.array_tasks
         require((task is None) == (tasks is None), "array_task", "given together with array_tasks", [task, tasks])
@@ -297,7 +302,7 @@ class UploadConfig:
 class NetworkConfig:
     """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
 
-    kind: str = "hgn"  # or gns; or gns_particles, which sees obstacles as static particles
+    kind: NetworkKind = "hgn"  # or gns; or gns_particles, which sees obstacles as static particles
     cell_size: Positive[float] = 0.035  # R: the finest level; the connectivity radius of GNS
     levels: Positive[int] = 4  # L; GNS has one, the particles
     message_passing_steps: Positive[int] = 4  # M, in each of the 2 L - 1 blocks
@@ -308,19 +313,15 @@ class NetworkConfig:
     obstacle_features: bool = True
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
     # gravity are exact
-    inputs: str = "absolute"
+    inputs: Annotated[str, one_of(*NETWORK_INPUTS)] = "absolute"
     contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
-    materials: tuple[str, ...] = MATERIALS
+    materials: tuple[Material, ...] = MATERIALS
     maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
     # of gns_particles: how far apart static particles are, at least, in obstacle cells
     static_spacing_cells: Positive[float] = 0.25
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require_one_of(self, "kind", NETWORK_KINDS)
-        require_one_of(self, "inputs", NETWORK_INPUTS)
-        for i, name in enumerate(self.materials):
-            material_index(name, f"materials[{i}]")
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
         if self.relative:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
@@ -374,7 +375,7 @@ class TrainingConfig:
     maximum_minutes: Positive[float] | None = None  # wall time of this start; null: no limit
     batch_scenes: Positive[int] = 1  # frames of random scenes in one update, on each device
     # or muon (Jordan 2024): hidden matrices step along their orthogonalised momentum, everything else as in Adam
-    optimizer: str = "adam"
+    optimizer: Annotated[str, one_of("adam", "muon")] = "adam"
     learning_rate: Positive[float] = 1e-4
     final_learning_rate: Positive[float] = 1e-6  # reached at maximum_updates, exponentially
     warmup_updates: NonNegative[int] = 0  # first updates, over which the rate grows linearly to what it is without
@@ -393,7 +394,9 @@ class TrainingConfig:
     # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
     # all frames alike
     frame_importance: BelowOne[float] = 0.0
-    symmetry: str = "none"  # gravity: a sample is turned and mirrored at random, by what keeps gravity and domain
+    symmetry: SymmetryName = (
+        "none"  # gravity: samples are turned and mirrored at random, by what keeps gravity and domain
+    )
     # of the scenes of an update, taken from the network's own simulations, for example 0.25; 0: none are made
     pushforward_fraction: BelowOne[float] = 0.0
     pushforward_every: Positive[int] = 500  # updates between such simulations
@@ -401,11 +404,11 @@ class TrainingConfig:
     pushforward_frames: Positive[int] = 16  # … for so many frames, each of which can be trained on
     pushforward_pull: Fraction[float] = 0.1  # fraction of the distance from the truth to be taken back in a frame
     seed: NonNegative[int] = 0
-    accelerator: str = "auto"  # or cpu, gpu
+    accelerator: Processor = "auto"  # or cpu, gpu
     devices: OneOrMore | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
     nodes: OneOrMore | None = None  # machines; null: as launched, without a launcher one
-    precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
-    backend: str = "auto"  # torch, triton (kernels in CUDA graphs); auto: triton where it runs
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+    backend: TrainingBackendName = "auto"  # torch, triton (kernels in CUDA graphs); auto: triton where it runs
     minimum_episodes: Positive[int] = 1  # training starts once that many training episodes are published
     generate: bool = True  # start the generator where the data set is missing or incomplete
     maximum_skipped_updates: Positive[int] = 100  # in a row, for gradients that are not finite; then training ends
@@ -420,11 +423,6 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         require_bounds(self)
         require(0 < self.noise_min_scale <= 1, "noise_min_scale", "above 0 and at most 1", self.noise_min_scale)
-        require_one_of(self, "symmetry", SYMMETRIES)
-        require_one_of(self, "optimizer", ("adam", "muon"))
-        require_one_of(self, "accelerator", ("auto", "cpu", "gpu"))
-        require_one_of(self, "precision", PRECISIONS)
-        require_one_of(self, "backend", TRAINING_BACKENDS)
         require(
             self.final_learning_rate <= self.learning_rate,
             "final_learning_rate",
@@ -477,10 +475,10 @@ class ExportConfig:
 
     checkpoint: str
     out: str
-    stored_precision: str = "fp32"  # of the learned tensors; fp16: files half as large
+    stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
 
     def __post_init__(self) -> None:
-        require_one_of(self, "stored_precision", STORED_PRECISIONS)
+        require_bounds(self)
 
 
 @dataclass(frozen=True)
@@ -491,10 +489,10 @@ class AverageConfig:
     weights: tuple[str, ...]
     out: str
     coefficients: tuple[float, ...] | None = None  # of each, together 1, as in [0.7,0.3]; null: equal ones
-    stored_precision: str = "fp32"  # of the learned tensors; fp16: files half as large
+    stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
 
     def __post_init__(self) -> None:
-        require_one_of(self, "stored_precision", STORED_PRECISIONS)
+        require_bounds(self)
         require(len(self.weights) >= 2, "weights", "at least two files", len(self.weights))
         if self.coefficients is not None:
             count = f"one for each of the {len(self.weights)} files"
@@ -518,13 +516,11 @@ class RolloutConfig:
     episode: str | None = None  # … and an episode of it, for example validation-000000
     frames: TwoOrMore = 300
     device: str = "auto"  # or cpu, cuda, cuda:1, …
-    backend: str = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest that runs
-    precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+    backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require_one_of(self, "backend", BACKENDS)
-        require_one_of(self, "precision", PRECISIONS)
         require(
             (self.data is None) == (self.episode is None),
             "data",
@@ -542,18 +538,15 @@ class EvaluateConfig:
 
     weights: str  # a file of python -m hgn.export, or the name of shipped weights
     data: str
-    split: str = "validation"  # or train, test
+    split: Split = "validation"  # or train, test
     scenes: Positive[int] = 5
     frame_stride: Positive[int] = 1
     rollout_frames: NonNegative[int] = 300  # 0: none
     particles_per_batch: Positive[int] = 32_768
     device: str = "auto"  # or cpu, cuda, cuda:1
-    backend: str = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
-    precision: str = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
+    backend: BackendName = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
     json: str | None = None  # also write the figures to this file
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require_one_of(self, "split", ("train", "validation", "test"))
-        require_one_of(self, "backend", BACKENDS)
-        require_one_of(self, "precision", PRECISIONS)

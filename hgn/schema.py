@@ -15,7 +15,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, TypeVar
 
 from hgn.renamed import KEYS, current_names, key_remedy, value_remedy
@@ -28,10 +28,15 @@ _Path = (
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """A rule for a number, beside its type: in words, and as what holds (of NaN none does); see `require_bounds`."""
+    """A rule for a value, beside its type: in words, and as what holds (of NaN none does); see `require_bounds`."""
 
     rule: str
-    holds: Callable[[float], bool]
+    holds: Callable[[Any], bool]
+
+
+def one_of(*choices: str) -> Bound:
+    """The rule of a name among choices."""
+    return Bound(f"one of {', '.join(choices)}", choices.__contains__)
 
 
 N = TypeVar("N", int, float)
@@ -183,12 +188,6 @@ def _require_bound(hint: Any, value: Any, name: str) -> None:
             _require_bound(options[0], item, f"{name}[{i}]")
     elif options and value is not None:  # of an optional one
         _require_bound(options[0], value, name)
-
-
-def require_one_of(owner: object, name: str, choices: Sequence[object]) -> None:
-    """The named field of `owner` is one of `choices`."""
-    value = getattr(owner, name)
-    require(value in choices, name, f"one of {', '.join(map(str, choices))}", value)
 
 
 def _text(path: _Path) -> str:

@@ -8,7 +8,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from hgn.schema import ConfigError, require, require_one_of
+from hgn.schema import ConfigError, require
 from hgn.system.machine import available_cpus, writable_folder
 
 # Taichi aborts the process where HOME is not set, as in a system's service; a user without a name has none
@@ -43,7 +43,7 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
     device or number of threads (Taichi has one runtime a process).
     """
     global _started
-    require_one_of(_Request(device), "device", ("auto", "cpu", "gpu"))
+    require(device in ("auto", "cpu", "gpu"), "device", "one of auto, cpu, gpu", device)
     if cpu_threads is not None:
         require(cpu_threads >= 1, "cpu_threads", "at least 1", cpu_threads)
     if _started is not None:
@@ -79,8 +79,3 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
         )
     _started = Device("gpu", 1) if has_gpu else Device("cpu", threads)
     return _started
-
-
-@dataclass(frozen=True)
-class _Request:
-    device: str

@@ -25,9 +25,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
+from hgn.config import Split
 from hgn.data.statistics import Moments, Statistics
 from hgn.data.storage import open_storage
-from hgn.schema import ConfigError, NonNegative, from_mapping, require, require_bounds, require_one_of, to_mapping
+from hgn.schema import ConfigError, NonNegative, from_mapping, require, require_bounds, to_mapping
 from hgn.system.files import sync_file, sync_folder
 
 SPLITS = ("train", "validation", "test")
@@ -60,7 +61,7 @@ class ShardEntry:
     """One published tar file: episodes [first, stop) of a split."""
 
     name: str
-    split: str
+    split: Split
     first: int
     stop: int
     sha256: str
@@ -73,7 +74,6 @@ class ShardEntry:
         # both become file names, and an index may come from anywhere
         require(_FILE_NAME.fullmatch(self.name) is not None, "name", "a plain file name", self.name)
         require(_SHA256.fullmatch(self.sha256) is not None, "sha256", "64 hexadecimal digits", self.sha256)
-        require_one_of(self, "split", SPLITS)
         numbers = [episode.index for episode in self.episodes]
         if numbers != list(range(self.first, self.stop)):
             raise ConfigError(f"episodes must be numbers {self.first} to {self.stop - 1}, got {numbers}; {_REMEDY}")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from hgn.config import PRECISIONS
-from hgn.data.manifest import SPLITS
-from hgn.schema import NonNegative, Positive, TwoOrMore, require, require_bounds, require_one_of
+from hgn.config import Precision, Split
+from hgn.schema import NonNegative, Positive, TwoOrMore, one_of, require, require_bounds
 
 UNTIMED = ("baseline", "chaos")  # rows without run times
 
@@ -28,14 +28,16 @@ class ErrorVsTimeConfig:
     # files of python -m hgn.export or names of shipped weights, of this data; null: all shipped that fit the
     # data
     weights: tuple[str, ...] | None = None
-    split: str = "test"
+    split: Split = "test"
     scenes: Positive[int] = 20
     frames: TwoOrMore = 300
     frame_stride: Positive[int] = 10  # every tenth frame for the one-step error
     # fp32, tf32, fp16 where a network's backend knows it; null: all on a GPU (tf32 and fp16 of GNS), fp32 on a
     # CPU
-    precisions: tuple[str, ...] | None = None
-    backend: str = "auto"  # of the networks: torch, triton; auto: triton wherever it runs
+    precisions: tuple[Precision, ...] | None = None
+    backend: Annotated[str, one_of("auto", "torch", "triton")] = (
+        "auto"  # of the networks: torch, triton; auto: triton wherever it runs
+    )
     mpm_grids: tuple[int, ...] = (32, 48, 64)  # cells along a length of 1
     mpm_steps: tuple[float, ...] = (1.0, 0.5)  # fractions of the limit of stability
     reference_step: float = 0.25  # fraction of the limit of stability of the reference, on the data's own grid
@@ -71,7 +73,6 @@ class ErrorVsTimeConfig:
             self.data,
             "make one with python -m datagen, or give earlier=[report.json] to draw a report again",
         )
-        require_one_of(self, "split", SPLITS)
         for name in ("timed_frames", "mpm_timed_frames"):
             require(getattr(self, name) >= 4, name, "at least 4", getattr(self, name))
         require(0 < self.reference_step <= 1, "reference_step", "above 0 and at most 1", self.reference_step)
@@ -79,8 +80,5 @@ class ErrorVsTimeConfig:
             require(0 < step <= 1, f"mpm_steps[{i}]", "above 0 and at most 1", step)
         for i, grid in enumerate(self.mpm_grids):
             require(grid >= 8, f"mpm_grids[{i}]", "at least 8", grid)
-        for i, name in enumerate(self.precisions or ()):
-            require(name in PRECISIONS, f"precisions[{i}]", f"one of {', '.join(PRECISIONS)}", name)
-        require_one_of(self, "backend", ("auto", "torch", "triton"))
         names = [Path(file).name for file in self.weights or ()]
         require(len(set(names)) == len(names), "weights", "files of different names", names)

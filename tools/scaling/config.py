@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hgn.config import PRECISIONS, NetworkConfig
-from hgn.schema import NonNegative, OneOrMore, Positive, require, require_bounds, require_one_of
+from hgn.config import NetworkConfig, Precision
+from hgn.schema import NonNegative, OneOrMore, Positive, require, require_bounds
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class ScalingConfig:
     particle_spread: NonNegative[float] = 0.17
     batches: OneOrMore = 8  # of each device; one sample is an update on each of them
     backends: tuple[str, ...] = ("torch", "triton")  # of training; triton where there are GPUs
-    precision: str = "tf32"  # as for training; or fp32, fp16 (where backend torch takes tf32)
+    precision: Precision = "tf32"  # as for training; or fp32, fp16 (where backend torch takes tf32)
     message_mb: tuple[Positive[float], ...] = (25.0,)  # message sizes that are timed beside backend torch's own
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rounds: Positive[int] = 20  # samples of each contender
@@ -29,7 +29,6 @@ class ScalingConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require_one_of(self, "precision", PRECISIONS)
         for i, backend in enumerate(self.backends):
             require(backend in ("torch", "triton"), f"backends[{i}]", "torch or triton", backend)
         require(self.device in ("auto", "cpu", "cuda"), "device", "auto, cpu or cuda", self.device)

@@ -8,16 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
-from hgn.config import BACKENDS, PRECISIONS, NetworkConfig, SceneConfig
+from hgn.config import BackendName, NetworkConfig, Precision, Processor, SceneConfig
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
-from hgn.schema import ConfigError, Positive, require, require_bounds, require_one_of
+from hgn.schema import ConfigError, Positive, one_of, require, require_bounds
 
 MOTION = ("throw", "gravity", "collision")  # tools/stability/network_motion.py
 CASES = (*MOTION, "rest", "particles", "domain", "speed", "single", "slope", "far", "guard")
@@ -34,13 +35,13 @@ class StabilityNetworkConfig:
 
     weights: str  # a file of python -m hgn.export, or the name of shipped weights
     # of throw, gravity, collision, rest, particles, domain, speed, single, slope, far, guard; null: all
-    cases: tuple[str, ...] | None = None
+    cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     frames: int = 300
     long_frames: int = 3000  # of the case rest
     scenes_at_once: Positive[int] = 1  # in each rollout of throw, gravity and collision, at least
     # also ask the solver, which needs Taichi: for slope, collision and rest; without it rest is left out
     solver: bool = True
-    solver_device: str = "auto"  # or cpu, gpu
+    solver_device: Processor = "auto"  # or cpu, gpu
     particle_factor: Positive[float] = 10.0
     # times the floor area, with as many more obstacles and groups; squares
     domain_factors: tuple[int, ...] = (4, 9, 16)
@@ -50,21 +51,16 @@ class StabilityNetworkConfig:
     energy_bound: Positive[float] = 0.02  # how much energy may come from nowhere, of a fall through the domain
     # the scenes as they are in training; obstacles only where the network sees them
     scene: SceneConfig = field(default_factory=SceneConfig)
-    backend: str = "auto"  # torch, triton, cpu; auto: the fastest that runs
-    precision: str = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+    backend: BackendName = "auto"  # torch, triton, cpu; auto: the fastest that runs
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
     device: str = "auto"
     picture: str | None = None  # also draw the first scene of each case, as far as it came, into this PNG
     json: str | None = None  # also write the rows to this file; --json FILE does the same
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require_one_of(self, "solver_device", ("auto", "cpu", "gpu"))
-        require_one_of(self, "backend", BACKENDS)
-        require_one_of(self, "precision", PRECISIONS)
         for name in ("frames", "long_frames"):
             require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
-        for i, case in enumerate(self.cases or ()):
-            require(case in CASES, f"cases[{i}]", f"one of {', '.join(CASES)}", case)
         for i, factor in enumerate(self.domain_factors):
             rule = "a square of a whole number above 1"
             require(factor > 1 and math.isqrt(factor) ** 2 == factor, f"domain_factors[{i}]", rule, factor)

@@ -11,10 +11,10 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from hgn.config import MpmConfig
-from hgn.schema import Positive, from_mapping, require, require_bounds, require_one_of, to_mapping
+from hgn.config import MpmConfig, Processor
+from hgn.schema import Positive, from_mapping, one_of, require, require_bounds, to_mapping
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
@@ -34,8 +34,8 @@ class StabilitySolverConfig:
     """`python -m tools.stability solver`: what is tried."""
 
     # steps, stiffness, impact, convergence, contact, leak, long, validation, grid; null: all
-    cases: tuple[str, ...] | None = None
-    device: str = "auto"  # or cpu, gpu
+    cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
+    device: Processor = "auto"  # or cpu, gpu
     leak_seconds: Positive[float] = 5.0  # simulated, for each row of the table of leaks
     leak_block_cells: Positive[float] = 4.0  # side of the blocks that hit the obstacles, eight particles a cell
     leak_offsets: int = len(OFFSETS)  # of an obstacle within a cell, at most 8; 54 scenes each
@@ -48,9 +48,6 @@ class StabilitySolverConfig:
         require(1 <= self.leak_offsets <= len(OFFSETS), "leak_offsets", f"1 to {len(OFFSETS)}", self.leak_offsets)
         band = self.leak_band_cells
         require(band is None or band > 0, "leak_band_cells", "> 0", band)
-        require_one_of(self, "device", ("auto", "cpu", "gpu"))
-        for i, name in enumerate(self.cases or ()):
-            require(name in CASES, f"cases[{i}]", f"one of {', '.join(CASES)}", name)
         drawn = self.picture is None or self.cases is None or "steps" in self.cases
         require(drawn, "picture", "left out without the case steps", self.picture)
 
