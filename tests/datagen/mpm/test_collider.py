@@ -133,7 +133,7 @@ def test_sheet_nodes_of_a_crumpled_mesh() -> None:
     normal = collider.normal_K23[:, HIDDEN]
     # those of a rim lie across the nearest triangle instead
     toward = (foot - node * CELL)[index]
-    assert ((toward * normal).sum(axis=1) >= -1e-6 * CELL).all()
+    assert ((toward * normal).sum(axis=1) >= -1.01e-4 * CELL).all()  # nodes nearer than 1e-4 are on one side
 
 
 def test_closest_obstacle_wins() -> None:
