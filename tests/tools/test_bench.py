@@ -68,7 +68,7 @@ def test_rows_of_every_case(
         cases = sorted(row["case"] for row in rows if row["scenes"] == scenes)
         assert cases == ["frame", "gns_frame", "gns_train", "mpm_frame", "torch_frame", "train"]
     printed = capsys.readouterr().out
-    assert all(case in printed for case in ("gns_train takes", "mpm_frame takes"))
+    assert all(row["case"] in printed for row in rows)
 
 
 def test_random_scenes_of_the_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +107,7 @@ def test_no_time_where_a_check_is_red(
     assert "relative error of acceleration" in rows["frame"]["check"]
     assert "relative error of gradient" in rows["gns_train"]["check"]
     assert rows["mpm_frame"]["check"] == "left the domain"
-    assert "takes" not in capsys.readouterr().out
+    assert " … " not in capsys.readouterr().out  # no quartiles
 
 
 def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -99,7 +99,7 @@ def group_rows(
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The figures for people, and how many times slower the others are than ours on the same work."""
+    """The figures for people."""
     lines = [
         f"{'case':<16} {'particles':>9} {'scenes':>6} {'precision':>9} {'ms':>10} {'quartiles':>19} {'GB':>7}  check"
     ]
@@ -111,14 +111,6 @@ def table(rows: list[dict[str, Any]]) -> str:
             f"{row['case']:<16} {row['particles']:>9} {row['scenes']:>6} {row['precision']:>9} {ms:>10} {spread:>19} "
             f"{memory:>7}  {row['check']}"
         )
-    ours: dict[tuple[Any, ...], float] = {}
-    for row in rows:
-        if row["case"] in ("frame", "train") and row["ms"]:
-            ours.setdefault(_work(row), row["ms"])  # at the first precision
-    for row in rows:
-        key = _work(row)
-        if row["case"] not in ("frame", "train") and row["ms"] and key in ours:
-            lines.append(f"{row['case']} takes {row['ms'] / ours[key]:.2f} times as long as ours at {_text(row)}")
     return "\n".join(lines)
 
 
@@ -205,14 +197,6 @@ def _clean(device: torch.device) -> int | None:
 
 def _meant(cases: tuple[str, ...], work: Workload) -> bool:
     return cases is not TRAIN_CASES or work.particles <= TILE_PARTICLES  # the paper's scenes; others are simulated only
-
-
-def _work(row: dict[str, Any]) -> tuple[Any, ...]:
-    return row["particles"], row["scenes"], row["case"].endswith("frame")
-
-
-def _text(row: dict[str, Any]) -> str:
-    return f"{row['particles']} particles, {row['scenes']} scene{'s' if row['scenes'] > 1 else ''}"
 
 
 if __name__ == "__main__":

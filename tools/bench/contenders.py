@@ -55,7 +55,19 @@ def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwor
     return network.to(device).eval()
 
 
-class Frame:
+class TimedRun:
+    """What is timed run by run."""
+
+    device: torch.device
+
+    def run(self) -> object:
+        raise NotImplementedError
+
+    def timed(self) -> Timed:
+        return Timed(lambda: [once(self.run, self.device)])
+
+
+class Frame(TimedRun):
     """One frame of a simulation: features, grid or neighbours, network, integration."""
 
     def __init__(
@@ -75,9 +87,6 @@ class Frame:
     def run(self) -> ParticleState:
         return self.simulator.step(self.state)
 
-    def timed(self) -> Timed:
-        return Timed(lambda: [once(self.run, self.device)])
-
     def check(self, precision: str) -> str:
         """`pass`, or by how much the accelerations differ from float64."""
         found_N3 = self.run().velocity_NM3[:, 0].double() - self.state.velocity_NM3[:, 0].double()
@@ -86,7 +95,7 @@ class Frame:
         return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
 
 
-class Train:
+class Train(TimedRun):
     """One training step on data that is on the device: noise, jitter, forward, backward, Adam."""
 
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
@@ -101,9 +110,6 @@ class Train:
         self.optimizer.zero_grad()
         self.module.loss(self.batch).backward()
         self.optimizer.step()
-
-    def timed(self) -> Timed:
-        return Timed(lambda: [once(self.run, self.device)])
 
     def check(self, precision: str) -> str:
         """`pass`, or by how much loss or gradients differ from float64, without noise and jitter."""

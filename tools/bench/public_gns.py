@@ -31,9 +31,8 @@ from hgn.network.neighbours import neighbour_list
 from hgn.runtime.parity import relative_error
 from hgn.schema import ConfigError, require
 from hgn.training.noise import perturbed_window
-from tools.bench.contenders import BOUNDS, bench_network, reference_output, verdict
+from tools.bench.contenders import BOUNDS, TimedRun, bench_network, reference_output, verdict
 from tools.bench.states import Workload, batch_of
-from tools.bench.timing import Timed, once
 
 MODULE = "gns.learned_simulator"
 
@@ -118,7 +117,7 @@ def copy_weights(simulator: nn.Module, network: GraphNetworkSimulator) -> None:
     _copy([theirs._decoder.node_fn], network.decode)
 
 
-class PublicGns:
+class PublicGns(TimedRun):
     """Their simulator on the bench's states, and ours with the same weights to check it against."""
 
     def __init__(self, folder: Path, config: NetworkConfig, work: Workload, device: torch.device) -> None:
@@ -157,9 +156,6 @@ class PublicFrame(PublicGns):
             next_N3 = self.simulator.predict_positions(sequence_NH3, self.batch.particles_S, self.batch.material_N)
         return torch.cat([sequence_NH3[:, 1:], next_N3[:, None]], dim=1)
 
-    def timed(self) -> Timed:
-        return Timed(lambda: [once(self.run, self.device)])
-
     @torch.no_grad()
     def check(self, precision: str) -> str:
         """`pass`, or by how much their accelerations differ from ours."""
@@ -186,9 +182,6 @@ class PublicTrain(PublicGns):
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
-
-    def timed(self) -> Timed:
-        return Timed(lambda: [once(self.run, self.device)])
 
     @torch.no_grad()
     def check(self, precision: str) -> str:

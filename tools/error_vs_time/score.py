@@ -23,7 +23,7 @@ from hgn.training.errors import REPORTED_FRAMES, mean_so_far, position_mse
 from tools.error_vs_time.contenders import Contender, OneStep
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
-from tools.measures import energies, energy_scale, momentum_error, outside_domain
+from tools.measures import momentum_error, outside_domain
 
 
 def score(
@@ -72,7 +72,7 @@ def rollout_figures(
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         for mse_T, found_T in zip(mse_ST, threads.map(_position_mse, trials, references), strict=True):
             mse_T[: len(found_T)] = found_T
-        motions = list(threads.map(_motion, trials, references))
+        momenta = list(threads.map(_momentum_error, trials, references))
         ends = list(threads.map(_end, trials, references))
     reached_T = np.isfinite(mse_ST).sum(0)
     curve_T = mean_so_far(mse_ST)
@@ -98,18 +98,10 @@ def rollout_figures(
         "first_failure": failures[0].cause if failures else None,
         "seeds": [reference.seed for reference in references],
     }
-    for name in ("momentum_error", "energy_drift", "energy_growth"):
-        row[name] = float(np.mean([motion[name] for motion in motions]))
+    row["momentum_error"] = float(np.mean(momenta))
     for name in ("penetration", "reference_penetration", "outside_domain"):
         row[name] = float(np.mean([end[name] for end in ends]))
     row["most_penetration"] = max(end["penetration"] - end["reference_penetration"] for end in ends)
-    worst = max(range(len(ends)), key=lambda i: ends[i]["penetration"])
-    row["worst_penetration"] = {
-        "episode": references[worst].key,
-        "fraction": ends[worst]["penetration"],
-        "reference": ends[worst]["reference_penetration"],  # the solver's own, in this scene
-        "reference_worst": max(end["reference_penetration"] for end in ends),
-    }
     return row
 
 
@@ -170,16 +162,8 @@ def _by_material(
     return {name: {frame: float(np.mean(v)) for frame, v in values.items()} for name, values in found.items()}
 
 
-def _motion(trial: RolloutResult, reference: Episode) -> dict[str, float]:
-    result = {"momentum_error": momentum_error(trial.position_TN3, reference.position_TN3)}
-    if trial.frame_count < 2:
-        return result | {"energy_drift": 0.0, "energy_growth": 0.0}
-    gravity_3 = _gravity(reference)
-    energy_T, reference_T = energies(trial.position_TN3, gravity_3), _reference_energies(reference)
-    scale = energy_scale(gravity_3, reference.domain_size)
-    drift = np.abs(energy_T - reference_T[: len(energy_T)]).mean() / scale
-    growth = (energy_T - reference_T[0]).max() / scale
-    return result | {"energy_drift": float(drift), "energy_growth": float(max(growth, 0.0))}
+def _momentum_error(trial: RolloutResult, reference: Episode) -> float:
+    return momentum_error(trial.position_TN3, reference.position_TN3)
 
 
 def _end(trial: RolloutResult, reference: Episode) -> dict[str, float]:
@@ -191,16 +175,7 @@ def _end(trial: RolloutResult, reference: Episode) -> dict[str, float]:
     }
 
 
-def _gravity(reference: Episode) -> np.ndarray:
-    return np.asarray(reference.gravity, np.float64) / reference.frame_rate_hz**2
-
-
 # The same for every contender.
-@functools.lru_cache(maxsize=256)
-def _reference_energies(reference: Episode) -> np.ndarray:
-    return energies(np.asarray(reference.position_TN3), _gravity(reference))
-
-
 @functools.lru_cache(maxsize=1024)
 def _reference_penetration(reference: Episode, frame: int) -> float:
     return share_inside(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
