@@ -22,6 +22,7 @@ from hgn.system.files import NO_LOCKS
 
 LOCK_NAME = ".lock"
 _MANIFEST_BYTE, _GENERATORS_BYTE, _FIRST_EPISODE_BYTE = 0, 1, 2
+_REMEDY = "mount it with them (NFS with its lock service, Lustre with -o flock) or choose another out=..."
 _EPISODES_OF_A_SPLIT = 1 << 40  # bytes from one split to the next; a lock needs no byte to be there
 
 
@@ -29,14 +30,29 @@ class ShardLocks:
     """One generator's locks on a folder; a context manager."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises: ConfigError where the file system knows no locks."""
+        """Raises: ConfigError where the file system knows no locks, or grants them to everybody."""
         self._path = folder / LOCK_NAME
         self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             self._lock(fcntl.F_RDLCK, _GENERATORS_BYTE, wait=True)
+            self._require_exclusion()
         except BaseException:
             os.close(self._file)
             raise
+
+    def _require_exclusion(self) -> None:
+        """Raises ConfigError where locks are granted to everybody: generators would write over each other."""
+        if not hasattr(fcntl, "F_OFD_SETLK"):
+            return  # locks of a process, which do not exclude itself
+        other = os.open(self._path, os.O_RDWR | os.O_CLOEXEC)
+        try:
+            if self._lock(fcntl.F_WRLCK, _GENERATORS_BYTE, file=other):
+                raise ConfigError(
+                    f"{self._path} must lie on a file system whose locks exclude others, got one that grants them to "
+                    f"everybody; {_REMEDY}"
+                )
+        finally:
+            os.close(other)
 
     def close(self) -> None:
         """Frees every lock."""
@@ -69,22 +85,22 @@ class ShardLocks:
             if alone:
                 self._lock(fcntl.F_RDLCK, _GENERATORS_BYTE)
 
-    def _lock(self, kind: int, start: int, length: int = 1, wait: bool = False) -> bool:
+    def _lock(self, kind: int, start: int, length: int = 1, wait: bool = False, file: int | None = None) -> bool:
+        file = self._file if file is None else file
         try:
             if hasattr(fcntl, "F_OFD_SETLK"):
                 # a lock of the open file, not of the process: two generators in one process exclude each other too
                 request = struct.pack("hhqqi4x", kind, os.SEEK_SET, start, length, 0)
-                fcntl.fcntl(self._file, fcntl.F_OFD_SETLKW if wait else fcntl.F_OFD_SETLK, request)
+                fcntl.fcntl(file, fcntl.F_OFD_SETLKW if wait else fcntl.F_OFD_SETLK, request)
             else:
                 flags = {fcntl.F_RDLCK: fcntl.LOCK_SH, fcntl.F_WRLCK: fcntl.LOCK_EX, fcntl.F_UNLCK: fcntl.LOCK_UN}
-                fcntl.lockf(self._file, flags[kind] | (0 if wait else fcntl.LOCK_NB), length, start)
+                fcntl.lockf(file, flags[kind] | (0 if wait else fcntl.LOCK_NB), length, start)
         except OSError as error:
             if error.errno in (errno.EAGAIN, errno.EACCES) and not wait:
                 return False
             if error.errno in NO_LOCKS:
                 raise ConfigError(
-                    f"{self._path} must lie on a file system with file locks, got {error.strerror}; mount it with them "
-                    "(NFS with its lock service, Lustre with -o flock) or choose another out=..."
+                    f"{self._path} must lie on a file system with file locks, got {error.strerror}; {_REMEDY}"
                 ) from None
             raise
         return True

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import tarfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from hgn.data.statistics import episode_statistics, merge_statistics
 from hgn.data.storage import file_sha256
 from hgn.scene.episode import Episode, encode_episode
 from hgn.schema import ConfigError
-from hgn.system.files import temporary_file
+from hgn.system.files import sync_file, temporary_file
 
 STAGING_NAME = ".staging"
 _COPY_BYTES = 1 << 22
@@ -44,19 +46,36 @@ def pack_episode(episode: Episode) -> bytes:
 
 
 def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
-    """Writes the parts of an episode's tar file, whole or not at all, if the machine does not lose its power: what
-    waits here is read back before it is used, and soon stands in a shard, so it need not reach the disk.
+    """Writes the parts of an episode's tar file, whole or not at all, and behind its end their sha256.
 
     Raises: OSError (a full disk).
     """
-    target = folder / STAGING_NAME / f"{key}.tar"
+    target, digest = folder / STAGING_NAME / f"{key}.tar", hashlib.sha256()
     with temporary_file(target) as temporary:
         with temporary.open("wb", buffering=0) as file:
-            for part in parts:
-                rest = memoryview(part)
+            for part in (*parts, None):
+                data = _seal(digest) if part is None else part
+                digest.update(data)
+                rest = memoryview(data)
                 while rest:  # a write takes 2 GB at most
                     rest = rest[file.write(rest) :]
+            sync_file(file)
         temporary.replace(target)
+
+
+def require_sealed(path: Path) -> None:
+    """Raises ConfigError where a staged file is not what was written: a disk failed, or the machine lost its power."""
+    digest, seal = hashlib.sha256(), len(_seal(hashlib.sha256()))
+    with path.open("rb") as file:
+        size = max(os.fstat(file.fileno()).st_size - seal, 0)
+        for start in range(0, size, _COPY_BYTES):
+            digest.update(file.read(min(_COPY_BYTES, size - start)))
+        if file.read() != _seal(digest):
+            raise ConfigError(f"{path} must end with the sha256 of what it holds, got another; delete it and run again")
+
+
+def _seal(digest: Any) -> bytes:
+    return f"sha256 {digest.hexdigest()}\n".encode()
 
 
 def _tar_of(episode: Episode) -> Iterator[bytes]:
@@ -78,9 +97,10 @@ def _tar_end(written: int) -> bytes:
 
 
 def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
-    """Writes the members of several tars as one."""
+    """Writes the members of several staged tars as one. Raises: ConfigError where one is not what was staged."""
     written = 0
     for source in sources:
+        require_sealed(source)
         members = (place for named in locate_members(source).values() for place in named.values())
         length = max((offset + size for offset, size in members), default=0)
         length += -length % tarfile.BLOCKSIZE

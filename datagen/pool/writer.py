@@ -29,7 +29,7 @@ from datagen.pool.plan import (
     scene_seed,
     work_order,
 )
-from datagen.pool.shard import STAGING_NAME, inspect_shard, join_tars, staged_path
+from datagen.pool.shard import STAGING_NAME, inspect_shard, join_tars, require_sealed, staged_path
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash, require_same_dataset
 from hgn.data.index import ListedIndex
@@ -315,6 +315,7 @@ class DatasetWriter:
             if not path.exists():
                 continue
             try:
+                require_sealed(path)
                 inspect_shard(path, ShardRange(shard.split, index, index + 1), self.config)
             except ConfigError as error:
                 self._report(f"{error}; the episode is made again")

@@ -36,8 +36,7 @@ _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "a
 
 T = TypeVar("T")
 _without_patience = threading.Event()
-# (path, size, modification time, sha256) of the files that this process has verified
-_verified: set[tuple[str, int, int, str]] = set()
+_verified: set[tuple[str | int, ...]] = set()  # the files that this process has verified
 
 
 class UnreachableError(OSError):
@@ -149,13 +148,20 @@ def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
     status = path.stat()
     if status.st_size != size:
         raise ConfigError(f"{path} must have {size} bytes, got {status.st_size}; {remedy}")
-    identity = (str(path.resolve()), status.st_size, status.st_mtime_ns, sha256)
+    identity = _identity(path, sha256)
     if identity in _verified:
         return
     actual = file_sha256(path)
     if actual != sha256:
         raise ConfigError(f"{path} must have sha256 {sha256}, got {actual}: it was altered; {remedy}")
     _verified.add(identity)
+
+
+def _identity(path: Path, sha256: str) -> tuple[str | int, ...]:
+    """Another one as soon as the file may have changed: a modification time can be set back, a change's cannot."""
+    status = path.stat()
+    times = status.st_mtime_ns, status.st_ctime_ns
+    return str(path.resolve()), status.st_dev, status.st_ino, status.st_size, *times, sha256
 
 
 class _Folder:
@@ -290,8 +296,7 @@ class _Remote:
             os.fsync(file.fileno())
             Path(file.name).replace(path)
         sync_folder(path.parent)
-        status = path.stat()
-        _verified.add((str(path.resolve()), status.st_size, status.st_mtime_ns, sha256))
+        _verified.add(_identity(path, sha256))
 
     def _fill(self, file: io.BufferedRandom, name: str, size: int, patience_s: float) -> str:
         """Appends what is missing and returns the sha256 of the whole."""
@@ -386,7 +391,13 @@ def _owned(path: Path, url: str, patience_s: float) -> Iterator[io.BufferedRando
     """
     partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
     while True:
-        with partial.open("a+b") as file:
+        try:
+            opened = open(partial, "a+b", opener=_open_file)  # noqa: SIM115 - a path's takes no opener
+        except OSError as error:
+            if error.errno != errno.ELOOP:
+                raise
+            raise ConfigError(f"{partial} must be a file, got a symbolic link to another; delete it") from None
+        with opened as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | (0 if patience_s else fcntl.LOCK_NB))
             except BlockingIOError:
@@ -415,6 +426,10 @@ def _owned(path: Path, url: str, patience_s: float) -> Iterator[io.BufferedRando
                     partial.unlink(missing_ok=True)
                 raise
             return
+
+
+def _open_file(name: str, flags: int) -> int:
+    return os.open(name, flags | os.O_NOFOLLOW, 0o644)
 
 
 def _is_same(file: io.BufferedRandom, path: Path) -> bool:

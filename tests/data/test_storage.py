@@ -30,7 +30,16 @@ from hgn.command import run_command
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.storage import CACHE_VARIABLE, TOKEN_VARIABLE, UnreachableError, cache_folder, is_remote, open_storage
+from hgn.data.storage import (
+    CACHE_VARIABLE,
+    TOKEN_VARIABLE,
+    UnreachableError,
+    cache_folder,
+    file_sha256,
+    is_remote,
+    open_storage,
+    verify_file,
+)
 from hgn.schema import ConfigError
 
 MakeConfig = Callable[..., DatagenConfig]
@@ -220,6 +229,31 @@ def test_altered_or_cut_shards_are_refused(folder: Path, cache: Path) -> None:
     with pytest.raises(ConfigError, match="is listed in the manifest but missing"):
         store.episodes[1]
     assert list(cache.iterdir()) == []
+
+
+def test_times_that_were_set_back(folder: Path) -> None:
+    """A file whose bytes changed while its size and modification time stayed is hashed again."""
+    path = folder / "train-000000-000001.tar"
+    status, sha256 = path.stat(), file_sha256(path)
+    verify_file(path, sha256, status.st_size, "")
+    content = bytearray(path.read_bytes())
+    content[700] ^= 1
+    path.write_bytes(content)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    with pytest.raises(ConfigError, match="it was altered"):
+        verify_file(path, sha256, status.st_size, "")
+
+
+def test_link_in_the_cache(folder: Path, cache: Path, tmp_path: Path) -> None:
+    """A partial file that is a link to another file is refused; that file stays as it is."""
+    url = in_memory(folder, "linked")
+    entry = Manifest.load(url).shards[0]
+    cache.mkdir(parents=True)
+    (tmp_path / "precious").write_text("mine")
+    (cache / f".{entry.sha256}.tar.partial").symlink_to(tmp_path / "precious")
+    with pytest.raises(ConfigError, match="must be a file, got a symbolic link"):
+        open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
+    assert (tmp_path / "precious").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from written_files import MakeConfig, MakeDataset, Stage, claim_all, hashes, sna
 import datagen.pool.shard
 import datagen.pool.writer
 from datagen.pool.plan import scene_seed
+from datagen.pool.shard import locate_members
 from datagen.pool.writer import MAXIMUM_REPLACEMENTS, DatasetWriter
 from hgn.config import DatagenConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
@@ -260,17 +261,66 @@ def test_no_clock_is_asked(
     assert not list(writer.folder.rglob("*.partial"))
 
 
-def test_broken_staged_file_is_made_again(make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage) -> None:
-    """A staged file that does not read back is dropped and its episode made again."""
+@pytest.mark.parametrize("damage", ["cut", "zeroed", "a bit", "no seal"])
+def test_broken_staged_file_is_made_again(
+    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, damage: str, tmp_path: Path
+) -> None:
+    """A staged file that is not what was written (positions that are zeros read like any others) is dropped and its
+    episode made again; so the shards are those of a run in peace."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 1)
     staged = writer.folder / ".staging" / "train-000001.tar"
-    staged.write_bytes(staged.read_bytes()[:2000])
+    content = bytearray(staged.read_bytes())
+    place, size = locate_members(staged)["train-000001"]["position.npy"]
+    if damage == "zeroed":
+        content[place + 128 : place + size] = bytes(size - 128)
+    content[place + 200] ^= damage == "a bit"
+    staged.write_bytes({"cut": content[:2000], "no seal": content[:-72]}.get(damage, content))
     messages: list[str] = []
     with DatasetWriter(make_config(), messages.append) as writer:
         assert ("train", 1) in claim_all(writer)
-    assert "the episode is made again" in messages[0]
-    make_dataset(make_config())
+    assert "must end with the sha256 of what it holds" in messages[0] and "is made again" in messages[0]
+    assert hashes(make_dataset(make_config())) == hashes(make_dataset(make_config(folder=str(tmp_path / "peace"))))
+
+
+def test_staged_file_that_changes_later_is_not_published(make_config: MakeConfig, stage: Stage) -> None:
+    """What was checked when it was claimed is checked again as it is packed."""
+    with DatasetWriter(make_config()) as writer:
+        stage(writer, "train", 0)
+        staged = writer.folder / ".staging" / "train-000000.tar"
+        content = bytearray(staged.read_bytes())
+        content[1000] ^= 1
+        staged.write_bytes(content)
+        with pytest.raises(ConfigError, match=r"train-000000\.tar must end with the sha256"):
+            writer.publish_next()
+    assert not list(writer.folder.glob("*.tar"))
+
+
+def test_what_is_staged_is_on_the_disk(make_config: MakeConfig, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No file of the folder gets its name before its bytes are on the disk."""
+    synced: set[int] = set()
+    real_sync, real_replace = os.fsync, Path.replace
+
+    def sync(descriptor: int) -> None:
+        synced.add(os.fstat(descriptor).st_ino)
+        real_sync(descriptor)
+
+    def replace(path: Path, target: Path) -> Path:
+        assert path.stat().st_ino in synced, target
+        return real_replace(path, target)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    monkeypatch.setattr(Path, "replace", replace)
+    with DatasetWriter(make_config()) as writer:
+        stage(writer, "train", 0)
+        assert writer.publish_next()
+
+
+def test_locks_that_exclude_nobody(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file system that grants every lock to everybody is refused: generators would sweep each other's files."""
+    monkeypatch.setattr("datagen.pool.locks.fcntl.fcntl", lambda *arguments: 0)
+    with pytest.raises(ConfigError, match=r"must lie on a file system whose locks exclude others.*-o flock"):
+        DatasetWriter(make_config()).__enter__()
 
 
 def test_quarantined_seed_is_replaced(make_config: MakeConfig, stage: Stage) -> None:
