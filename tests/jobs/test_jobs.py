@@ -36,6 +36,7 @@ SHORT = {"maximum_updates": 4, "batch_scenes": 1, "log_every": 2, "monitor_every
 # starts one process for each task of one node, as srun does, and returns the highest exit code
 SRUN = """#!/usr/bin/env bash
 while [[ $1 == --* ]]; do shift; done
+[[ $SRUN_CPUS_PER_TASK == "$SLURM_CPUS_PER_TASK" ]] || exit 99 # srun does not take it from sbatch
 pids=()
 for ((task = 0; task < SLURM_NTASKS; task++)); do
     SLURM_PROCID=$task SLURM_LOCALID=$task SLURM_NODEID=0 "$@" &
@@ -101,6 +102,7 @@ def slurm(tmp_path: Path) -> dict[str, str]:
         "SLURM_FAKE": str(tmp_path),
         "SLURM_NNODES": "1",
         "SLURM_JOB_NUM_NODES": "1",
+        "SLURM_CPUS_PER_TASK": "2",
         "SLURM_NTASKS": "2",
         "SLURM_NTASKS_PER_NODE": "2",
         "SLURM_NODELIST": "localhost",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ import yaml
 from kubeflow_trainer_api.models import TrainerV1alpha1TrainJob
 
 from datagen.generate import KEYS, datagen_config
+from datagen.service.server import _GRACE_S
+from datagen.service.supervisor import _STOP_PATIENCE_S
 from hgn.command import _compose
 from hgn.config import ServiceConfig, TrainConfig
 from hgn.data.storage import TOKEN_VARIABLE
@@ -186,7 +189,8 @@ def test_files_fit_each_other() -> None:
     text = "\n".join(path.read_text() for path in K8S.glob("*.yaml"))
     claims = set(re.findall(r"claimName: (\S+)", text))
     assert claims == {documents("volume.yaml")[0]["metadata"]["name"]}
-    deployment, service = documents("service.yaml")
+    deployment, service, policy = documents("service.yaml")
+    assert policy["spec"]["podSelector"]["matchLabels"] == service["spec"]["selector"]
     pod = deployment["spec"]["template"]
     assert service["spec"]["selector"] == pod["metadata"]["labels"] == deployment["spec"]["selector"]["matchLabels"]
     address = f"http://{service['metadata']['name']}:{service['spec']['ports'][0]['port']}"
@@ -199,3 +203,21 @@ def test_files_fit_each_other() -> None:
     }
     assert secrets == {("hgn-dataset", "token")}
     assert "kubectl create secret generic hgn-dataset --from-literal=token=" in text
+
+
+def test_pods_are_bounded_and_not_root() -> None:
+    """No tag that changes, a limit of memory, no root, no privileges: what the policy "restricted" lets in; probes that
+    wait longer than a second; and as much time to end as the service takes."""
+    image = (K8S / "Dockerfile").read_text()
+    assert re.search(r"USER (\d+)", image)[1] == "1000" and " wget " in image  # KubeRay's probes call it
+    for container in containers():
+        assert not container["image"].endswith(":latest")
+        assert (container.get("resources") or container["resourcesPerNode"])["limits"]["memory"]
+    text = "\n".join(path.read_text() for path in K8S.glob("*.yaml"))
+    pods = text.count(" containers:\n")
+    assert pods == text.count("runAsNonRoot: true") == text.count("drop: [ALL]") == text.count("fsGroup: 1000") == 4
+    pod = documents("service.yaml")[0]["spec"]["template"]["spec"]
+    assert pod["terminationGracePeriodSeconds"] >= _STOP_PATIENCE_S + _GRACE_S
+    assert all(pod["containers"][0][f"{kind}Probe"]["timeoutSeconds"] >= 5 for kind in ("readiness", "liveness"))
+    extras = tomllib.loads((K8S.parents[1] / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert extras["ray"][0].startswith("ray[default]")  # without its dashboard a RayJob is refused
