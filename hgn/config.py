@@ -14,11 +14,13 @@ from hgn.scene.material import MATERIALS
 from hgn.schema import (
     BelowOne,
     ConfigError,
+    FewLayers,
     Fraction,
+    FrameCount,
+    LayerSize,
     NonNegative,
     OneOrMore,
     Positive,
-    TwoOrMore,
     one_of,
     require,
     require_bounds,
@@ -202,9 +204,9 @@ class DatasetConfig:
     training_scenes: NonNegative[int] = 800
     validation_scenes: NonNegative[int] = 5
     test_scenes: NonNegative[int] = 20
-    frames: TwoOrMore = 300  # frame 0 is the initial state
+    frames: FrameCount = 300  # frame 0 is the initial state
     long_fraction: Fraction[float] = 0.0  # of the episodes of each split, evenly spread, that have long_frames
-    long_frames: TwoOrMore = 300
+    long_frames: FrameCount = 300
     frame_rate_hz: Positive[float] = 60.0
     seed: NonNegative[int] = 0
     # true: a GPU begins with few scenes, which takes longer in all; training and the service set it
@@ -276,7 +278,7 @@ class SolveConfig:
 
     scene: str  # a scene file, or the name of one in conf/example, for example funnel
     out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
-    frames: TwoOrMore = 300
+    frames: FrameCount = 300
     frame_rate_hz: Positive[float] = 60.0
     mpm: MpmConfig = field(default_factory=MpmConfig)
 
@@ -304,11 +306,11 @@ class NetworkConfig:
 
     kind: NetworkKind = "hgn"  # or gns; or gns_particles, which sees obstacles as static particles
     cell_size: Positive[float] = 0.035  # R: the finest level; the connectivity radius of GNS
-    levels: Positive[int] = 4  # L; GNS has one, the particles
-    message_passing_steps: Positive[int] = 4  # M, in each of the 2 L - 1 blocks
-    width: Positive[int] = 128  # latent and hidden
-    velocity_history: Positive[int] = 5  # m
-    material_embedding: Positive[int] = 16  # E
+    levels: FewLayers = 4  # L; GNS has one, the particles
+    message_passing_steps: FewLayers = 4  # M, in each of the 2 L - 1 blocks
+    width: LayerSize = 128  # latent and hidden
+    velocity_history: FewLayers = 5  # m
+    material_embedding: LayerSize = 16  # E
     wall_distance_cells: Positive[float] = 8.0  # d_max / R
     obstacle_features: bool = True
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
@@ -522,7 +524,7 @@ class RolloutConfig:
     seed: NonNegative[int] = 0  # … drawn with this number, as the training's scenes are
     data: str | None = None  # or a data set …
     episode: str | None = None  # … and an episode of it, for example validation-000000
-    frames: TwoOrMore = 300
+    frames: FrameCount = 300
     device: str = "auto"  # or cpu, cuda, cuda:1, …
     backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
     precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)

@@ -45,7 +45,13 @@ NonNegative = Annotated[N, Bound("a finite number >= 0", lambda value: 0 <= valu
 Fraction = Annotated[N, Bound("from 0 to 1", lambda value: 0 <= value <= 1)]
 BelowOne = Annotated[N, Bound("0 or more and below 1", lambda value: 0 <= value < 1)]
 OneOrMore = Annotated[int, Bound("at least 1", lambda value: value >= 1)]
-TwoOrMore = Annotated[int, Bound("at least 2", lambda value: value >= 2)]
+FrameCount = Annotated[
+    int,
+    Bound("at least 2", lambda value: value >= 2),
+    Bound("at most 1,000,000", lambda value: value <= 1_000_000),
+]
+LayerSize = Annotated[Positive[int], Bound("at most 65,536", lambda value: value <= 65_536)]
+FewLayers = Annotated[Positive[int], Bound("at most 1,000", lambda value: value <= 1_000)]
 
 
 class ConfigError(ValueError):
@@ -200,8 +206,10 @@ def _text(path: _Path) -> str:
 
 
 def _convert(hint: Any, value: Any, path: _Path) -> Any:
-    if hint is type(value) and hint in (int, float, str, bool):
+    if hint is type(value) and hint in (float, str, bool):
         return value
+    if type(value) is int and not -(2**63) <= value < 2**63:
+        raise ConfigError(f"{_text(path)} must be a number of at most 63 bits, got one of {value.bit_length()}")
     origin, arguments, is_dataclass = _shape(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:

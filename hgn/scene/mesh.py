@@ -20,7 +20,20 @@ from hgn.scene.surface import area_vectors
 from hgn.schema import ConfigError, require
 
 # what trimesh raises for damaged files of these formats
-_READ_ERRORS = (ValueError, LookupError, TypeError, AttributeError, EOFError, struct.error)
+_READ_ERRORS = (
+    *(ValueError, LookupError, TypeError, AttributeError, EOFError, struct.error, ImportError),
+    *(ArithmeticError, MemoryError, RecursionError, OSError),
+)
+
+
+class _Beside(trimesh.resolvers.FilePathResolver):
+    """What a mesh file may name: plain files in its own folder or below, no pipes, devices or files elsewhere."""
+
+    def get(self, name: str) -> bytes:
+        path = (Path(self.parent) / name).resolve()
+        if not (path.is_file() and path.is_relative_to(Path(self.parent).resolve())):
+            raise FileNotFoundError(f"it names {name!r}, which is no file beside it")
+        return path.read_bytes()
 
 
 def load_mesh(
@@ -75,7 +88,8 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
         raise ConfigError(f"{field} must be an existing file, got {path}; in a scene file paths are relative to it")
     try:
         # process=False: trimesh would silently remove non-finite vertices
-        mesh = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
+        beside = _Beside(str(path))
+        mesh = trimesh.load_scene(path, process=False, skip_materials=True, resolver=beside).to_mesh()
         vertex = np.array(mesh.vertices, np.float64).reshape(-1, 3)
         triangle = np.array(mesh.faces, np.int64).reshape(-1, 3)
     except _READ_ERRORS as error:
@@ -84,6 +98,11 @@ def _read(path: Path, field: str) -> tuple[np.ndarray, np.ndarray]:
         ) from error
     if len(triangle) == 0:
         raise ConfigError(f"{field} must contain triangles, got none in {path}; export the surface, not points")
+    if triangle.min() < 0 or triangle.max() >= len(vertex):
+        raise ConfigError(
+            f"{field} must have triangles of its {len(vertex)} vertices, got vertices {triangle.min()} to "
+            f"{triangle.max()} in {path}; export the mesh again"
+        )
     return vertex, triangle
 
 

@@ -178,6 +178,11 @@ def write_rollout(path: str | Path, rollout: Rollout) -> None:
     sync_folder(path.parent)
 
 
+_DEPTH = 8  # of groups
+# what h5py raises for damaged files
+_DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, ArithmeticError, MemoryError)
+
+
 def read_rollout(path: str | Path) -> Rollout:
     """Reads what `write_rollout` wrote.
 
@@ -193,11 +198,12 @@ def read_rollout(path: str | Path) -> Rollout:
     with file:
         _check_format(file, path)
         try:
+            _require_own_data(file)
             return _read(file)
-        except (KeyError, OSError) as error:
-            raise ConfigError(f"rollout must be complete, got {path}: {error}; write it again") from error
         except ConfigError as error:
             raise ConfigError(f"rollout must be consistent, got {path}: {error}; write it again") from error
+        except _DAMAGE as error:
+            raise ConfigError(f"rollout must be complete, got {path}: {error}; write it again") from error
 
 
 def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
@@ -251,6 +257,18 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
         entry["triangles"] = obstacle.triangle_F3.astype(np.int32, copy=False)
     if rollout.reference_TN3 is not None:
         group["reference"] = rollout.reference_TN3.astype(np.float32, copy=False)
+
+
+def _require_own_data(group: h5py.Group, depth: int = 0) -> None:
+    """Raises ConfigError where a file names others, which HDF5 would read with this one's reader's rights."""
+    for name in group:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink) or depth > _DEPTH:
+            raise ConfigError(f"{group.name} must hold its data itself, got a link in {name}")
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            _require_own_data(item, depth + 1)
+        elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
+            raise ConfigError(f"{item.name} must lie in the file itself, got data of another file")
 
 
 def _check_format(file: h5py.File, path: Path) -> None:

@@ -26,6 +26,7 @@ from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require
 
 GROUP_SHAPES = ("cube", "sphere", "box")
 MAXIMUM_PARTICLES = 50_000_000
+MAXIMUM_NODES = 100_000  # of a scene file
 
 Vector = tuple[float, float, float]
 
@@ -126,7 +127,27 @@ class SceneFile:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads 1e5 as a number, as YAML 1.2 and the commands do; PyYAML wants it as 1.0e+5."""
+    """Reads 1e5 as a number, as YAML 1.2 and the commands do; PyYAML wants it as 1.0e+5.
+
+    Raises: yaml.YAMLError, too, where aliases stand for more than MAXIMUM_NODES values, or one for itself.
+    """
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if _node_count(node, {}) > MAXIMUM_NODES:
+            raise yaml.YAMLError(f"its aliases stand for more than {MAXIMUM_NODES} values")
+        return node
+
+
+def _node_count(node: Any, counts: dict[int, float]) -> float:
+    """Values that a node stands for, aliases resolved; infinitely many of one that contains itself."""
+    if not isinstance(node, yaml.CollectionNode):
+        return 1
+    if id(node) not in counts:
+        counts[id(node)] = math.inf
+        items = node.value if isinstance(node, yaml.SequenceNode) else [part for pair in node.value for part in pair]
+        counts[id(node)] = 1 + sum(_node_count(item, counts) for item in items)
+    return counts[id(node)]
 
 
 _Loader.add_implicit_resolver(
@@ -153,7 +174,7 @@ def load_scene(path: str | Path) -> Scene:
         raise ConfigError(f"scene must be an existing YAML file, got {path}")
     try:
         mapping = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a number of thousands of digits, nesting
         raise ConfigError(f"{path} must be a YAML file: {error}") from error
     try:
         require(isinstance(mapping, dict), "the file", "a mapping of keys to values, such as groups", mapping)

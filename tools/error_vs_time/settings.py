@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from hgn.config import Precision, Split
-from hgn.schema import NonNegative, Positive, TwoOrMore, one_of, require, require_bounds
+from hgn.schema import FrameCount, NonNegative, Positive, one_of, require, require_bounds
 
 UNTIMED = ("baseline", "chaos")  # rows without run times
 
@@ -30,7 +30,7 @@ class ErrorVsTimeConfig:
     weights: tuple[str, ...] | None = None
     split: Split = "test"
     scenes: Positive[int] = 20
-    frames: TwoOrMore = 300
+    frames: FrameCount = 300
     frame_stride: Positive[int] = 10  # every tenth frame for the one-step error
     # fp32, tf32, fp16 where a network's backend knows it; null: all on a GPU (tf32 and fp16 of GNS), fp32 on a
     # CPU
@@ -43,8 +43,8 @@ class ErrorVsTimeConfig:
     reference_step: float = 0.25  # fraction of the limit of stability of the reference, on the data's own grid
     # of rollouts of a network's further precisions on backend torch (GNS in tf32, HGN in fp32), which take
     # minutes
-    repeated_frames: TwoOrMore = 51
-    mpm_frames: TwoOrMore = 300  # of the solver's rollouts, which take most of the time
+    repeated_frames: FrameCount = 51
+    mpm_frames: FrameCount = 300  # of the solver's rollouts, which take most of the time
     mpm_timed_frames: int = 12  # of the solver, where networks are timed over timed_frames
     resimulate: bool = True  # false: the data itself is the reference; with mpm_grids=[] perturbation=0 no solver runs
     # domain units, at most, of each coordinate: how far the solver departs from itself; 0: not asked

@@ -1,0 +1,166 @@
+"""Files from anywhere: what is wrong with them ends in one line, never in a traceback, a hang or foreign data."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scene.test_rollout_file import make_rollout
+
+from datagen.pool.shard import locate_members
+from hgn.config import NetworkConfig, SolveConfig
+from hgn.data.index import parse_json
+from hgn.scene.mesh import load_mesh
+from hgn.scene.rollout_file import read_rollout, write_rollout
+from hgn.scene.scene_file import load_scene
+from hgn.schema import ConfigError, from_mapping
+from hgn.training.checkpoint import read_checkpoint
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join(9 * [f'*{before}'])}]\n"
+    for before, name in zip("abcdefghi", "bcdefghij", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (BOMB, "its aliases stand for more than 100000 values"),
+        ("groups: &a [*a]", "its aliases stand for more than 100000 values"),
+        ("groups: " + 1000 * "[", "must be a YAML file"),
+        ("cell_size: " + 5000 * "9", "must be a YAML file: Exceeds the limit"),
+        ("cell_size: " + 400 * "9", "cell_size must be a number of at most 63 bits, got one of 1329"),
+        ("groups: []\ncell_size: .nan", "cell_size must be"),
+    ],
+    ids=["bomb", "cycle", "nesting", "5000 digits", "400 digits", "nan"],
+)
+def test_scene_files(tmp_path: Path, text: str, message: str) -> None:
+    """Aliases that stand for billions of values, deep nesting and endless numbers."""
+    (tmp_path / "scene.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_scene(tmp_path / "scene.yaml")
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("cls", "mapping", "message"),
+    [
+        (SolveConfig, {"scene": "s", "frames": 10**12}, "frames must be at most 1,000,000, got 1000000000000"),
+        (NetworkConfig, {"levels": 10**5}, "levels must be at most 1,000, got 100000"),
+        (NetworkConfig, {"width": 10**9}, "width must be at most 65,536"),
+        (NetworkConfig, {"levels": 10**400}, "levels must be a number of at most 63 bits"),
+        (NetworkConfig, {"cell_size": 10**400}, "cell_size must be a number of at most 63 bits"),
+    ],
+)
+def test_sizes_that_no_machine_has(cls: type, mapping: dict[str, Any], message: str) -> None:
+    """Numbers that would end in MemoryError, or in hours of building a network, are refused by name."""
+    with pytest.raises(ConfigError, match=message):
+        from_mapping(cls, mapping)
+
+
+@pytest.mark.parametrize("uri", ["pipe", "../outside.bin", "/etc/hostname"])
+def test_mesh_that_names_other_files(tmp_path: Path, uri: str) -> None:
+    """A GLB's buffers are plain files beside it: no pipe, on which reading would wait for ever, and none elsewhere."""
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    os.mkfifo(folder / "pipe")
+    (tmp_path / "outside.bin").write_bytes(bytes(1000))
+    content = trimesh.creation.box().export(file_type="glb")
+    length = struct.unpack("<I", content[12:16])[0]
+    header = json.loads(content[20 : 20 + length])
+    header["buffers"][0]["uri"] = uri
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunk = struct.pack("<4sI", b"glTF", 2) + struct.pack("<II4s", 20 + len(text), len(text), b"JSON") + text
+    (folder / "mesh.glb").write_bytes(chunk)
+    with pytest.raises(ConfigError, match="mesh must be a readable GLB file"):
+        load_mesh(folder / "mesh.glb")
+
+
+def test_rollout_with_data_of_other_files(tmp_path: Path) -> None:
+    """HDF5 can take data from any file that its reader may read: such a file is refused."""
+    path, foreign = tmp_path / "rollout.vtkhdf", tmp_path / "foreign"
+    foreign.write_bytes(bytes(10_000))
+
+    def external(file: h5py.File) -> None:
+        points = file["VTKHDF/Points"]
+        shape, dtype = points.shape, points.dtype
+        del file["VTKHDF/Points"]
+        file["VTKHDF"].create_dataset("Points", shape, dtype, external=[(str(foreign), 0, h5py.h5f.UNLIMITED)])
+
+    def link(file: h5py.File) -> None:
+        file["VTKHDF/other"] = h5py.ExternalLink(str(foreign), "/")
+
+    for change, message in ((external, "must lie in the file itself"), (link, "got a link in other")):
+        write_rollout(path, make_rollout())
+        with h5py.File(path, "r+") as file:
+            change(file)
+        with pytest.raises(ConfigError, match=message):
+            read_rollout(path)
+
+
+def mesh(suffix: str) -> tuple[str, bytes, Callable[[Path], object]]:
+    content = trimesh.creation.box().export(file_type=suffix)
+    return f"box.{suffix}", content.encode() if isinstance(content, str) else content, load_mesh
+
+
+def checkpoint() -> tuple[str, bytes, Callable[[Path], object]]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "last.ckpt"
+        torch.save({"hgn": {"network": {"width": 8}}, "state_dict": {"weight": torch.arange(100.0)}}, path)
+        assert not zipfile.ZipFile(path).testzip()
+        return "last.ckpt", path.read_bytes(), read_checkpoint
+
+
+def tar() -> tuple[str, bytes, Callable[[Path], object]]:
+    name = (
+        b"train-000000.json".ljust(100, b"\0") + b"0000644\0" + b"0000000\0" * 2 + b"00000000003\0" + b"0" * 11 + b"\0"
+    )
+    header = name + b" " * 8 + b"0" + bytes(355)
+    header = header[:148] + f"{sum(header):06o}\0 ".encode() + header[156:]
+    return "shard.tar", header + b"abc".ljust(512, b"\0") + bytes(1024), locate_members
+
+
+FILES = {
+    **{suffix: mesh(suffix) for suffix in ("stl", "ply", "glb", "obj")},
+    "checkpoint": checkpoint(),
+    "tar": tar(),
+    "yaml": ("s.yaml", b"groups:\n- {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: sand}\n", load_scene),
+    "json": ("i.jsonl", b'{"bytes": 12, "totals": {"train": 7}}', lambda path: parse_json(path.read_bytes(), "i")),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_decoders_bear_any_bytes(kind: str) -> None:
+    """A file with some bytes changed, cut or repeated is read, or refused with a message: nothing else comes out."""
+    name, content, decode = FILES[kind]
+    places = st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=4)
+
+    @settings(max_examples=25, deadline=None, derandomize=True)
+    @given(places, st.integers(0, len(content)), st.integers(0, 3))
+    def damaged(changes: list[tuple[int, int]], cut: int, kind_of_cut: int) -> None:
+        data = bytearray(content)
+        for place, value in changes:
+            data[place] = value
+        data = {1: data[:cut], 2: data[cut:], 3: data[:cut] + data}.get(kind_of_cut, data)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            path.write_bytes(data)
+            try:
+                decode(path)
+            except ConfigError as error:
+                assert str(error)
+
+    damaged()
