@@ -51,12 +51,12 @@ LONGEST_FILES = (  # ten seconds and more of one core; begun last, one of them w
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first; a file's tests in one process, and all of the solver's in one, which compiles kernels once."""
+    """Long files first; a file's tests in one process, and all that simulate in one, which compiles kernels once."""
     tests = Path(__file__).parent
     place = {tests / f"{name}.py": number for number, name in enumerate(LONGEST_FILES)}
     items.sort(key=lambda item: place.get(item.path, len(place)))
     for item in items:
-        solver = item.path.parent == tests / "datagen" / "mpm"
+        solver = item.path.parent == tests / "datagen" / "mpm" or item.path.stem.startswith("test_stability")
         item.add_marker(pytest.mark.xdist_group("solver" if solver else str(item.path.relative_to(tests))))
 
 
