@@ -39,7 +39,7 @@ ROW_PREFIXES = ("one_step", "baseline", "rollout", "monitor")
 BASELINE_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
 LOSS = "MSE of normalised acceleration"
 ONE_STEP = "one-step MSE (sum over axes, frame units)"
-LINES = 200  # of the plain loss that are kept
+LINES = 200  # of the loss that are kept
 BREAKS = 10  # times the usual time between two records: there the training was stopped
 
 
@@ -122,7 +122,7 @@ def _add_minutes(records: list[dict[str, float]]) -> None:
 
 
 def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
-    """Records with errors in full, and at most LINES of the plain loss lines."""
+    """Records with errors in full, and at most LINES of the loss lines."""
     losses = [record for record in records if "loss" in record]
     step = -(-len(losses) // LINES)
     kept = {id(record) for record in losses[:: max(1, step)]} | {id(r) for r in records if "loss" not in r}

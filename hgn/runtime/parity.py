@@ -1,4 +1,4 @@
-"""How far apart two computations of the same thing are, and how far backend triton may be from the plain one."""
+"""How far apart two computations of the same thing are, and how far backend triton may be from PyTorch."""
 
 from __future__ import annotations
 

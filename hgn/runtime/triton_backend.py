@@ -99,8 +99,8 @@ class TritonGnsBackend(GnsBackend):
             error = relative_error(a, b)
             if not error <= bound:  # NaN fails
                 raise ConfigError(
-                    f"{field} must be tf32 on this machine, got fp16: its {name} differ by {error:.1e} from the plain "
-                    f"network's (at most {bound}); set {field}=tf32, and report device and versions"
+                    f"{field} must be tf32 on this machine, got fp16: its {name} differ by {error:.1e} from "
+                    f"PyTorch's (at most {bound}); set {field}=tf32, and report device and versions"
                 )
 
     def _output_and_gradients(self, state: ParticleState, edges: Edges | None, gradients: bool) -> list[torch.Tensor]:

@@ -38,7 +38,7 @@ TIGHT_START, TIGHT_GROWTH = 1.25, 1.5
 HEADROOM = 8.0  # times the cells of a scene's start: groups that fall and lie spread need up to six times as many,
 SPREAD_CELLS = (0.6, 0.1, 0.035, 0.02)  # so many a particle at most, on each level; coarser ones as the last
 ROOMY_CELLS = 65_536  # of the finest level, up to which there is such headroom: beyond, memory counts
-CHECKED_PARTICLES = 50_000  # at most; the plain network needs memory
+CHECKED_PARTICLES = 50_000  # at most; PyTorch needs memory
 INTEGRATE_BLOCK = 64  # particles
 
 
@@ -198,7 +198,7 @@ class TritonRollout:
         self.grid.status.zero_()
 
     def require_parity(self, network: HierarchicalGraphNetwork, state: ParticleState, field: str = "backend") -> None:
-        """Compares the first output with the plain network's, as all kernels still stand at the start: `state` is that
+        """Compares the first output with PyTorch's, as all kernels still stand at the start: `state` is that
         of the start, or its first scenes.
 
         Both round; kernels that are wrong differ by far more. Raises: ConfigError.
@@ -211,7 +211,7 @@ class TritonRollout:
         if not error <= OUTPUT_BOUND:  # NaN fails
             raise ConfigError(
                 f"{field} must be torch on this machine, got triton: its output differs by {error:.1e} "
-                f"from the plain network's (at most {OUTPUT_BOUND}); set {field}=torch, and report device and versions"
+                f"from PyTorch's (at most {OUTPUT_BOUND}); set {field}=torch, and report device and versions"
             )
 
     def frame_launches(self) -> None:

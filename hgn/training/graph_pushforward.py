@@ -151,7 +151,7 @@ class GraphPushforwardPool:
         return rollout
 
     def _first_scenes(self, episodes: Sequence[DeviceEpisode], state: ParticleState) -> ParticleState | None:
-        """As many of the first scenes as the plain network can check, with their obstacles; none if one is too many."""
+        """As many of the first scenes as PyTorch can check, with their obstacles; none if one is too many."""
         scenes, count = 0, 0
         while scenes < len(episodes) and count + episodes[scenes].particles <= CHECKED_PARTICLES:
             count += episodes[scenes].particles

@@ -66,7 +66,7 @@ class GraphTrainer:
             simulated = averaged or network
             assert isinstance(simulated, HierarchicalGraphNetwork)
             self.pool = GraphPushforwardPool(simulated, training, obstacle_cell_size, rank)
-        self.parity: tuple[float, float] | None = None  # with the plain network, see hgn.training.parity
+        self.parity: tuple[float, float] | None = None  # with PyTorch, see hgn.training.parity
 
     def run(
         self,

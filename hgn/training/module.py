@@ -193,7 +193,7 @@ class TrainingModule(LightningModule):
         self._graph_trainer.run(chunk, [self._rate(update) for update in updates], average_weights, first)
         if first_chunk and self.trainer.is_global_zero:
             outputs, gradients = self._graph_trainer.parity
-            text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of the plain ones"
+            text = f"outputs within {outputs:.0e}, gradients within {gradients:.0e} of PyTorch's"
             print(f"backend triton: {text if math.isfinite(outputs) else 'batch too large to check'}", file=sys.stderr)
         report = self._graph_trainer.report()
         if report and self.trainer.is_global_zero:

@@ -1,4 +1,4 @@
-"""Whether the Triton kernels, as compiled for this machine, compute what the plain network computes.
+"""Whether the Triton kernels, as compiled for this machine, compute what PyTorch computes.
 
 Compared on the first update's own batch, before anything is trained: outputs, and the gradients of a random weighting
 of them. Both paths round, and rounding turns the activations next to their kink, so the bounds are wide; kernels that
@@ -54,7 +54,7 @@ def require_parity(
     if not (output_error <= OUTPUT_BOUND and gradient_error <= GRADIENT_BOUND):  # NaN fails
         raise ConfigError(
             f"training.backend must be torch on this machine, got triton: its outputs differ by {output_error:.1e} "
-            f"from the plain network's (at most {OUTPUT_BOUND}), its gradients by {gradient_error:.1e} (at most "
+            f"from PyTorch's (at most {OUTPUT_BOUND}), its gradients by {gradient_error:.1e} (at most "
             f"{GRADIENT_BOUND}); set training.backend=torch, and report device and versions"
         )
     if updates.device.type == "cuda":
@@ -66,7 +66,7 @@ def require_parity(
 def _state(
     updates: Updates, episodes: Sequence[EpisodeTensors], symmetries: Sequence[Symmetry] | None, count: int
 ) -> tuple[ParticleState, torch.Tensor]:
-    """The batch as the plain network reads it, noise and jitter included."""
+    """The batch as PyTorch reads it, noise and jitter included."""
     config = updates.config
     keys, normals = [], []
     for scene, episode in enumerate(episodes):

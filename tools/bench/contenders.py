@@ -1,6 +1,6 @@
 """What is timed, and how each is checked before: a frame, a training step, the solver's frame.
 
-A check compares with the plain network in float64 on the same input. Work that is too large for float64 is checked
+A check compares with PyTorch in float64 on the same input. Work that is too large for float64 is checked
 on one scene of a tile, by the same code.
 """
 

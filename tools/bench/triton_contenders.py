@@ -1,4 +1,4 @@
-"""Backend triton on the bench: frames and training updates in CUDA graphs, checked like the plain ones.
+"""Backend triton on the bench: frames and training updates in CUDA graphs, checked like PyTorch's.
 
 Shape legend: N particles of all scenes, S scenes.
 """
