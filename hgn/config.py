@@ -463,14 +463,6 @@ class TrainConfig:
             f"at most dataset.frames - 2 = {frames - 2} where pushforward_fraction > 0",
             training.pushforward_frames,
         )
-        drawn = self.scene.zero_gravity_fraction + self.scene.tilted_gravity_fraction > 0
-        require(
-            self.network.relative or not drawn,
-            "network.inputs",
-            "relative for scenes whose gravity differs",
-            self.network.inputs,
-            "or set scene.zero_gravity_fraction=0 scene.tilted_gravity_fraction=0",
-        )
         unknown = [name for name in self.scene.materials if name not in self.network.materials]
         require(not unknown, "network.materials", "all of scene.materials", list(self.network.materials))
 
