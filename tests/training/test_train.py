@@ -321,7 +321,6 @@ def test_missing_data_without_generator(make_config, tmp_path):
         ("network", {"materials": ["lava"]}, "network.materials"),
         ("scene", {"materials": ["lava"]}, "scene.materials"),
         ("network", {"obstacle_features": False}, "obstacle_features must be true"),
-        ("scene", {"tilted_gravity_fraction": 0.1}, "network.inputs must be relative where scene"),
     ],
 )
 def test_bad_configuration(make_config, tmp_path, section, change, message):
