@@ -36,6 +36,23 @@ def _base(position, origin, scene, row, live, axis: tl.constexpr, cell_size):
 
 
 @triton.jit
+def _base_cell(position, origin, scene, row, live, low, geometry, cell_size):
+    """Of each particle the lowest of its 8 cells, counted from the window's first, its fractions, and whether the
+    window holds all 8; else cell 0."""
+    x, fx = _base(position, origin, scene, row, live, 0, cell_size)
+    y, fy = _base(position, origin, scene, row, live, 1, cell_size)
+    z, fz = _base(position, origin, scene, row, live, 2, cell_size)
+    # in floats first: a wild position has no integer
+    x, y, z = x - tl.load(low), y - tl.load(low + 1), z - tl.load(low + 2)
+    nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
+    inside = live & (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
+    x = tl.where(inside, x, 0.0).to(tl.int32)
+    y = tl.where(inside, y, 0.0).to(tl.int32)
+    z = tl.where(inside, z, 0.0).to(tl.int32)
+    return x, y, z, fx, fy, fz, inside
+
+
+@triton.jit
 def _slots_of(geometry, level: tl.constexpr):
     """Of a level what `_slot` needs: the compiler would read it again for each slot."""
     line = geometry + level * GEOMETRY_COLUMNS
@@ -63,20 +80,10 @@ def mark_cells(
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
     scene = tl.load(scene_of + row, mask=live, other=0)
-    bx, fx = _base(position, origin, scene, row, live, 0, cell_size)
-    by, fy = _base(position, origin, scene, row, live, 1, cell_size)
-    bz, fz = _base(position, origin, scene, row, live, 2, cell_size)
-    # in floats first: a wild position has no integer
-    x, y, z = bx - tl.load(low), by - tl.load(low + 1), bz - tl.load(low + 2)
-    nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
-    inside = (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
+    x, y, z, fx, fy, fz, inside = _base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     lost = tl.sum((live & (inside == 0)).to(tl.int32), 0)
     if lost > 0:
         tl.atomic_or(status, OUT_OF_WINDOW)
-    inside = inside & live
-    x = tl.where(inside, x, 0.0).to(tl.int32)
-    y = tl.where(inside, y, 0.0).to(tl.int32)
-    z = tl.where(inside, z, 0.0).to(tl.int32)
     upper_x, upper_y, upper_z = x + (fx > 0).to(tl.int32), y + (fy > 0).to(tl.int32), z + (fz > 0).to(tl.int32)
     levels = ()
     for level in tl.static_range(LEVELS):
@@ -298,15 +305,7 @@ def prepare_particles(
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
     scene = tl.load(scene_of + row, mask=live, other=0)
-    bx, fx = _base(position, origin, scene, row, live, 0, cell_size)
-    by, fy = _base(position, origin, scene, row, live, 1, cell_size)
-    bz, fz = _base(position, origin, scene, row, live, 2, cell_size)
-    x, y, z = bx - tl.load(low), by - tl.load(low + 1), bz - tl.load(low + 2)
-    nx, ny, nz = tl.load(geometry + 7) - 3, tl.load(geometry + 2) - 3, tl.load(geometry + 3) - 3
-    inside = live & (x >= 0) & (y >= 0) & (z >= 0) & (x < nx) & (y < ny) & (z < nz)
-    x = tl.where(inside, x, 0.0).to(tl.int32)
-    y = tl.where(inside, y, 0.0).to(tl.int32)
-    z = tl.where(inside, z, 0.0).to(tl.int32)
+    x, y, z, fx, fy, fz, inside = _base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     slots = _slots_of(geometry, 0)
     # all corners at once, [BLOCK, 8]: what a thread stores lies side by side
     corner = tl.arange(0, 8)[None, :]
