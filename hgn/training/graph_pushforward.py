@@ -173,6 +173,7 @@ class GraphPushforwardPool:
             material_N=state.material_N[:count].long(),
             scene_N=state.scene_N[:count],
             domain_S3=state.domain_S3[:scenes],
+            gravity_S3=state.gravity_S3[:scenes],
             obstacles=obstacles,
         )
 
