@@ -36,8 +36,7 @@ def normalised_acceleration(
 ) -> torch.Tensor:
     """What the network's own function of that name gives, without gradients."""
     with torch.no_grad():
-        grid = network.grid(state, origin_S3)
-        return propagate(network, network.encode_particles(state, grid), grid)
+        return network.accelerate(state, network.grid(state, origin_S3), partial(propagate, network))
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:

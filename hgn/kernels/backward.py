@@ -223,6 +223,8 @@ class FusedTrainingNetwork(FusedNetwork):
         self._clear(self.product_gradient)
         self.counts[: grid.levels].copy_(grid.counts_L)
         self.counts[grid.levels :].copy_(self.particle_count)
+        if self.config.relative:
+            grid.disturb_backward(self.output_gradient, self.particle_count)
         self._mlp_backward(
             packed.decode, self.output_gradient, self.particle_count, self.decode_hidden, g.decode.hidden,
             g.decode.output, into=(self.latent_gradient, 1), norm=False,

@@ -147,6 +147,8 @@ class FusedNetwork(Buffers):
             packed.cell_to_particle, self.by_particle_up, coarse.product, self.pairs_up, self.decoder_input, False
         )
         self._mlp(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
+        if self.config.relative:
+            grid.disturb(self.output, self.particle_count)
 
     def _operands(self) -> dict[str, Any]:
         """What every kernel with products takes."""

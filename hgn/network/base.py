@@ -58,6 +58,15 @@ class ParticleNetwork(nn.Module, ABC):
         `origin_S3` moves the grid, where the network has one.
         """
 
+    def relative_features(self, state: ParticleState, grid: GridHierarchy) -> torch.Tensor:
+        """All columns but the material's, [N, F]."""
+        return relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
+
+    def encode_features(self, feature_NF: torch.Tensor, material_N: torch.Tensor) -> torch.Tensor:
+        """Relative features to latent vectors [N, W]."""
+        material_MH = self.encode.project(1, self.embedding.weight) + self.encode.first.bias
+        return self.encode.finish(self.encode.add_projection(material_MH.index_select(0, material_N), 0, feature_NF))
+
     def encode_particles(self, state: ParticleState, grid: GridHierarchy | None = None) -> torch.Tensor:
         """Particle features to latent vectors [N, W] (sec. 3.2, step 0). Zero normals are not multiplied.
 
@@ -65,11 +74,7 @@ class ParticleNetwork(nn.Module, ABC):
         """
         if self.config.relative:
             assert grid is not None
-            material_MH = self.encode.project(1, self.embedding.weight) + self.encode.first.bias
-            feature_NF = relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
-            return self.encode.finish(
-                self.encode.add_projection(material_MH.index_select(0, state.material_N), 0, feature_NF)
-            )
+            return self.encode_features(self.relative_features(state, grid), state.material_N)
         velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
         maximum = self.config.wall_distance_cells * self.config.cell_size
         wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)

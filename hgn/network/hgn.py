@@ -8,6 +8,8 @@ Shape legend: N particles, C cells, E directed edges, W width, S scenes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import nn
 
@@ -16,6 +18,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 from hgn.network.mlp import MLP
+from hgn.network.relative import disturbance
 
 
 class MessagePassing(nn.Module):
@@ -76,8 +79,20 @@ class HierarchicalGraphNetwork(ParticleNetwork):
 
         The finest grid's origin in each scene is 0 unless given.
         """
-        grid = self.grid(state, origin_S3)
-        return self.propagate(self.encode_particles(state, grid), grid)
+        return self.accelerate(state, self.grid(state, origin_S3), self.propagate)
+
+    def accelerate(
+        self,
+        state: ParticleState,
+        grid: GridHierarchy,
+        propagate: Callable[[torch.Tensor, GridHierarchy], torch.Tensor],
+    ) -> torch.Tensor:
+        """The same on a grid, with `propagate` for steps 1 to 12."""
+        if not self.config.relative:
+            return propagate(self.encode_particles(state, grid), grid)
+        feature_NF = self.relative_features(state, grid)
+        output_N3 = propagate(self.encode_features(feature_NF, state.material_N), grid)
+        return output_N3 * disturbance(feature_NF, grid, self.config)[:, None]
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

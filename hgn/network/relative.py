@@ -13,6 +13,8 @@ ask:
 | 6 | walls within reach, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals, at the particle and where it is flying to; only with obstacle_features |
 
+The output is multiplied by `disturbance`, which is 0 where nothing moves against anything: what flies freely in one
+piece has exactly the acceleration g, whatever the weights.
 Shape legend: N particles, H velocities, L levels, C cells of a level, S scenes.
 """
 
@@ -27,6 +29,7 @@ from hgn.network.obstacles import ObstacleCells
 
 WALL_LIMIT = 2.0  # of wall_nearness: beyond the plane by the reach
 STEPS_AHEAD = 4  # places looked at on the way of one frame
+QUIET = 0.01  # s_a: changes and differences of velocity below it count by their square; rounding leaves 1e-5 to 1e-4
 SMALLEST_MASS = 1e-30  # a cell that rounding gave no weight has no velocity either
 
 
@@ -108,3 +111,25 @@ def contact_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch
     """G [N]: exactly 0 where no surface is within reach, 1 where a normal is, rising to 1 half way to a wall."""
     gate_N = (2 * wall_N6.amax(-1)).clamp(max=1)
     return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
+
+
+def disturbance(feature_NF: torch.Tensor, grid: GridHierarchy, config: NetworkConfig) -> torch.Tensor:
+    """How far what is around a particle is from free flight in one piece, [N]: 0 (to rounding) to 1.
+
+    A particle is disturbed by a surface within reach, or if a column of history or surroundings is not small against
+    QUIET. A coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces:
+    within a frame an impact is felt through a body. A particle takes the mean of its cells'.
+    """
+    motion = 3 * (config.velocity_history - 1 + config.levels)
+    wall_N6, normal_NK = feature_NF[:, motion + 3 : motion + 9], feature_NF[:, motion + 9 :]
+    touch_N = contact_gate(wall_N6, normal_NK if config.obstacle_features else None)
+    own_N = (touch_N + (feature_NF[:, :motion] / QUIET).square().sum(-1)).clamp(max=1)
+    cell_N8 = grid.cell_N8
+    for level in grid.levels[:-1]:
+        assert level.parent_C is not None
+        cell_N8 = level.parent_C[cell_N8]
+    coarsest = grid.levels[-1]
+    own_C = own_N.new_zeros(coarsest.cell_count)
+    own_C.scatter_reduce_(0, cell_N8.flatten(), torch.where(grid.weight_N8 > 0, own_N[:, None], 0).flatten(), "amax")
+    around_C = own_C.scatter_reduce(0, coarsest.receiver_E, own_C[coarsest.sender_E], "amax")
+    return (grid.weight_N8 * around_C[cell_N8]).sum(1)

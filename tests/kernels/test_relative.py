@@ -12,7 +12,7 @@ from network.states import network_of
 
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.network.relative import relative_features
+from hgn.network.relative import disturbance, relative_features
 from hgn.runtime.parity import relative_error
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
@@ -80,6 +80,27 @@ def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool) -> None
     network, state = relative_network(levels=2), moving_state(counts, obstacles)
     output, together, each = compare(network, state, "fp32", 1.0, 256)
     assert max(output, together, *each) < 2e-5
+
+
+def test_what_flies_in_one_piece() -> None:
+    """How disturbed each particle is: not at all in free flight, in part where a neighbour hardly moves, whole in other
+    scenes; and outputs and gradients with it."""
+    network, state = relative_network(levels=2), moving_state((30, 30, 30), obstacles=False, spread=0.15)
+    velocity_NH3, gravity_N3 = state.velocity_NM3.clone(), state.gravity_S3[state.scene_N]
+    age_1H1 = torch.arange(velocity_NH3.shape[1], dtype=torch.float64)[None, :, None]
+    quiet_N = state.scene_N < 2
+    velocity_NH3[quiet_N] = (torch.tensor([1e-2, 2e-2, 0.0]) - age_1H1 * gravity_N3[:, None])[quiet_N]
+    velocity_NH3[35, 0] += 2e-3 * float(network.normaliser.acceleration_std[0])
+    state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=velocity_NH3)
+    origin_S3, _ = drawn(network, state)
+    grid = network.grid(state, origin_S3)
+    expected = disturbance(network.relative_features(state, grid), grid, network.config)
+    assert expected[state.scene_N == 0].max() < 1e-3 < expected[state.scene_N == 1].max() < 0.5 < expected[-1]
+    engine = engine_of(network, state)
+    run_forward(engine, network, state, origin_S3)
+    torch.testing.assert_close(engine.grid.gate_N[: len(expected)].cpu().double(), expected, rtol=0, atol=1e-3)
+    output, together, each = compare(network, state, "fp32", 1.0, 256)
+    assert max(output, together, *each) < 2e-4
 
 
 @pytest.mark.parametrize("precision", list(PRECISIONS))

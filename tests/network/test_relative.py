@@ -14,7 +14,7 @@ from hgn.config import NetworkConfig
 from hgn.network.features import Normaliser, ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.relative import contact_gate, obstacle_normals, relative_features, wall_nearness
+from hgn.network.relative import QUIET, contact_gate, disturbance, obstacle_normals, relative_features, wall_nearness
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import Symmetry, scene_symmetries
 from hgn.schema import ConfigError
@@ -78,6 +78,40 @@ def test_free_flight_knows_no_gravity(gravity: tuple[float, float, float]) -> No
     assert float(found[:, SURROUNDINGS].abs().max()) < 1e-12
     resting = in_flight(state, (0.0, 0.0, 0.0), torch.zeros(3, dtype=torch.float64))
     torch.testing.assert_close(network(flying) - gravity_3, network(resting), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.0), (1.7e-1, 0.0, 0.0), (-1e-3, 5e-2, 2e-2)])
+def test_free_flight_in_one_piece_is_exact(velocity: tuple[float, float, float]) -> None:
+    """With any weights, velocity up to 10 m/s and gravity, what flies freely as one has the acceleration g to rounding;
+    and so has a single particle, however it got there."""
+    network, gravity_3 = network_of(inputs="relative"), torch.tensor([2e-3, -5e-3, 1e-3], dtype=torch.float64)
+    state = in_flight(airborne(), velocity, gravity_3)
+    torch.testing.assert_close(network(state), gravity_3.expand_as(state.position_N3), rtol=0, atol=1e-15)
+
+
+def test_what_is_disturbed_disturbs_its_body() -> None:
+    """One particle that is slower than its neighbours frees the output of all within a coarsest cell, and of nothing
+    in another scene."""
+    network, zero_3 = network_of(inputs="relative"), torch.zeros(3, dtype=torch.float64)
+    config = network.config
+    state = in_flight(airborne((40, 17)), (1e-2, 0.0, 0.0), zero_3)
+    reach = config.cell_size * 2 ** (config.levels - 1)
+    near_N = (state.position_N3 - state.position_N3[3]).abs().amax(-1) < reach
+
+    def gates(velocity_NH3: torch.Tensor) -> torch.Tensor:
+        changed = replace(state, velocity_NM3=velocity_NH3)
+        grid = network.grid(changed)
+        return disturbance(network.relative_features(changed, grid), grid, config)
+
+    scale = float(network.normaliser.acceleration_std[0])
+    for slower, full in ((3 * scale, True), (QUIET * scale / 4, False)):
+        velocity_NH3 = state.velocity_NM3.clone()
+        velocity_NH3[3, :, 0] -= slower
+        gate_N = gates(velocity_NH3)
+        assert gate_N[40:].max() < 1e-15
+        assert gate_N[3] == pytest.approx(1) if full else 1e-3 < gate_N[3] < 1
+        assert (gate_N[:40][near_N[:40]] > 0).all()
+    assert gates(state.velocity_NM3).abs().max() < 1e-15
 
 
 def test_each_scene_has_its_gravity() -> None:

@@ -19,6 +19,7 @@ from hgn.scene.symmetry import CELL_BITS
 
 GEOMETRY_COLUMNS = tl.constexpr(8)
 OBSTACLE_COLUMNS = tl.constexpr(5)
+FULLY = tl.constexpr(1 << 24)  # disturbed: what counts as 1
 OVERFLOW = tl.constexpr(1)  # more active cells than capacity
 OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
 CODE_BITS = tl.constexpr(3 + CELL_BITS)  # of an axis in a symmetry's code: where it comes from, whether mirrored, cells
@@ -418,14 +419,15 @@ def _asinh(x):
 @triton.jit
 def prepare_relative_features(
     position, velocity, scene_of, material_of, domain, gravity, particle_count, scale, obstacle_table,
-    obstacle_cell_size, cell_of, weight_of, motion, parent, geometry, features, reach,
+    obstacle_cell_size, cell_of, weight_of, motion, parent, geometry, features, disturbed, reach, quiet,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr,
     SYMMETRY: tl.constexpr, FEATURES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
     velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
     near a surface velocity, walls, and the normals here and ahead if NORMALS; one-hot material. Differences of
-    velocity are in units of `scale`, and their asinh. OBSTACLES and SYMMETRY as in prepare_features.
+    velocity are in units of `scale`, and their asinh. `disturbed` of the coarsest cells is raised to that of their
+    particles, over FULLY. OBSTACLES and SYMMETRY as in prepare_features.
 
     Reference: hgn.network.features; test: tests/kernels/test_relative.py.
     """
@@ -494,9 +496,59 @@ def prepare_relative_features(
             value = _with_column(value, WALLS + 9 + i, there)
         gate = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, gate)
     value = tl.where(is_contact, value * gate[:, None], value)
+    moved = tl.where((column < CONTACT)[None, :], value / quiet, 0.0)
+    own = (tl.minimum(gate + tl.sum(moved * moved, 1), 1.0) * FULLY).to(tl.int32)[:, None]
+    # most are told by another already
+    raised = corners & (weight > 0) & (tl.load(disturbed + cell, mask=corners, other=0) < own)
+    tl.atomic_max(disturbed + cell, own + 0 * cell, mask=raised, sem="relaxed")
     material = tl.load(material_of + row, mask=live, other=0)
     value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
     tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
+
+
+@triton.jit
+def disturb(
+    output, gate_of, cell_of, weight_of, parent, neighbour, disturbed, geometry, particle_count, capacity,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """gate_of [N]: how disturbed the coarsest cells around each particle are, 0 to 1; multiplies output [N, OUT] by it.
+
+    Reference: hgn.network.relative.disturbance; test: tests/kernels/test_relative.py.
+    """
+    count = tl.load(particle_count)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    corner = tl.arange(0, 8)[None, :]
+    here = (row < count)[:, None] & (corner >= 0)
+    cell = tl.load(cell_of + row[:, None] * 8 + corner, mask=here, other=0)
+    for level in tl.static_range(LEVELS - 1):
+        first = tl.load(geometry + level * GEOMETRY_COLUMNS + 6)
+        cell = tl.maximum(tl.load(parent + first + cell, mask=here, other=0), 0)
+    most = tl.load(disturbed + cell, mask=here, other=0)
+    for slot in tl.static_range(6):
+        other = tl.load(neighbour + slot * capacity + cell, mask=here, other=-1)
+        most = tl.maximum(most, tl.load(disturbed + other, mask=here & (other >= 0), other=0))
+    weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=here, other=0.0)
+    gate = tl.sum(weight * (most.to(tl.float32) / FULLY), 1)
+    tl.store(gate_of + row, gate, mask=row < count)
+    column = tl.arange(0, OUT)[None, :]
+    at, live = output + row[:, None] * OUT + column, (row < count)[:, None] & (column < 3)
+    tl.store(at, tl.load(at, mask=live, other=0.0) * gate[:, None], mask=live)
+
+
+@triton.jit
+def disturb_backward(gradient, gate_of, particle_count, OUT: tl.constexpr, BLOCK: tl.constexpr):
+    """The gradient [N, OUT] of what `disturb` multiplied, in place of that of its product.
+
+    Reference: hgn.network.relative.disturbance; test: tests/kernels/test_relative.py.
+    """
+    count = tl.load(particle_count)
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = tl.arange(0, OUT)[None, :]
+    at, live = gradient + row[:, None] * OUT + column, (row < count)[:, None] & (column < 3)
+    gate = tl.load(gate_of + row, mask=row < count, other=0.0)
+    tl.store(at, tl.load(at, mask=live, other=0.0) * gate[:, None], mask=live)
 
 
 settle_keys(globals())

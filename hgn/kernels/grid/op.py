@@ -18,6 +18,7 @@ from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES, SCENE_LIMIT, pack, unpack
 from hgn.network.obstacles import ObstacleCells
+from hgn.network.relative import QUIET
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
@@ -117,7 +118,8 @@ class DeviceGrid:
 
     Buffers (int32): counts_L (after clipping), needed_L (before), status (sticky flags); neighbour, parent, octant and
     children of level l as views; per particle cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF.
-    For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other.
+    For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other; then
+    disturbed_C of the coarsest cells, in units of FULLY, and gate_N of the particles.
     """
 
     def __init__(
@@ -157,7 +159,11 @@ class DeviceGrid:
         self.weight_N8 = torch.zeros(particles, 8, device=device)
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
         self.feature_NF = torch.zeros(particles, features, device=device)
-        self.motion_C4 = torch.zeros(at if relative else 1, 4, device=device)
+        # one piece, cleared at once
+        self._moved = torch.zeros(4 * at + self.capacities[-1] if relative else 5, device=device)
+        self.motion_C4 = self._moved[: 4 * at if relative else 4].view(-1, 4)
+        self.disturbed_C = self._moved[4 * at if relative else 4 :].view(torch.int32)
+        self.gate_N = torch.ones(particles if relative else 1, device=device)
         self._at = [row[6] for row in rows]
 
     def neighbour(self, level: int) -> torch.Tensor:
@@ -221,7 +227,7 @@ class DeviceGrid:
         """
         blocks = (triton.cdiv(self.particles, PARTICLE_BLOCK),)
         if config.relative:
-            self.motion_C4.zero_()
+            self._moved.zero_()
         kernel.prepare_particles[blocks](
             position=position, velocity=velocity, scene_of=scene_N, origin=origin_S3, particle_count=count,
             low=self.low, geometry=self.geometry, occupied=self.occupied, prefix_sum=self.prefix_sum,
@@ -244,8 +250,24 @@ class DeviceGrid:
         kernel.prepare_relative_features[blocks](
             **arguments, gravity=gravity_S3, scale=std_3, cell_of=self.cell_N8, weight_of=self.weight_N8,
             motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
-            reach=config.contact_reach_cells * config.cell_size, LEVELS=self.levels,
+            reach=config.contact_reach_cells * config.cell_size, disturbed=self.disturbed_C, quiet=QUIET,
+            LEVELS=self.levels,
         )  # fmt: skip
+
+    def disturb(self, output: torch.Tensor, count: torch.Tensor) -> None:
+        """Multiplies output [N, OUT] by how disturbed each particle is, for relative inputs."""
+        kernel.disturb[(triton.cdiv(self.particles, PARTICLE_BLOCK),)](
+            output=output, gate_of=self.gate_N, cell_of=self.cell_N8, weight_of=self.weight_N8, parent=self._parent,
+            neighbour=self.neighbour(self.levels - 1), disturbed=self.disturbed_C, geometry=self.geometry,
+            particle_count=count, capacity=self.capacities[-1], LEVELS=self.levels, OUT=output.shape[1],
+            BLOCK=PARTICLE_BLOCK,
+        )  # fmt: skip
+
+    def disturb_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
+        """From the gradient of what `disturb` leaves to that of what it was given, in place."""
+        kernel.disturb_backward[(triton.cdiv(self.particles, PARTICLE_BLOCK),)](
+            gradient=gradient, gate_of=self.gate_N, particle_count=count, OUT=gradient.shape[1], BLOCK=PARTICLE_BLOCK
+        )
 
 
 def feature_arguments(
