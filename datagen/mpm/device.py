@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import io
 import os
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ class Device:
 
     kind: str  # cpu or gpu
     threads: int  # of the CPU; 1 on a GPU
+    processors: int = 1  # of the GPU: thread blocks at work at once
 
 
 _started: Device | None = None
@@ -74,8 +76,19 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             default_fp=ti.f32,
             default_ip=ti.i32,
             fast_math=False,  # it reorders sums by what stands beside them, and drops tests for NaN
+            gpu_max_reg=128,  # 512 threads of the largest kernels run on a processor then
             cfg_optimization=False,  # three quarters of the time to compile, and LLVM does the same again
             log_level=ti.ERROR,
         )
-    _started = Device("gpu", 1) if has_gpu else Device("cpu", threads)
+    _started = Device("gpu", 1, _processors()) if has_gpu else Device("cpu", threads)
     return _started
+
+
+def _processors() -> int:
+    """How many multiprocessors the GPU has that Taichi started."""
+    count = ctypes.c_int()
+    multiprocessors, device = 16, 0
+    status = ctypes.CDLL("libcuda.so.1").cuDeviceGetAttribute(ctypes.byref(count), multiprocessors, device)
+    if status != 0:
+        raise ConfigError(f"device must be one that CUDA tells about, got error {status}; choose cpu")
+    return count.value

@@ -15,6 +15,7 @@ from datagen.mpm.mls_mpm import (
     Scalars,
     Vectors,
     choose_time_step,
+    falls,
     find_hidden,
     ghost_place,
     initial_stiffness,
@@ -28,6 +29,7 @@ from datagen.mpm.mls_mpm import (
     raise_maximum,
     respond,
     settle,
+    settles,
     weights,
 )
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
@@ -82,11 +84,11 @@ def _particle_to_grid(
     if begins == 0.0:
         stretch = affine[p]  # which holds it until the interval ends
         v_now, C_now = interpolate(
-            position[p], scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, node, inverse_dx, shape, 1
+            position[p], scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, node, inverse_dx, shape
         )
         if ti.static(bool(variant & VARIANT.sheets)):
             v_now, C_now = interpolate_hidden(
-                position[p], v_now, C_now, hidden_here, scene, 0, node, inverse_dx, shape, contact, 1
+                position[p], v_now, C_now, hidden_here, scene, node, inverse_dx, shape, contact
             )
         C = C_now
         raise_maximum(counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
@@ -134,6 +136,20 @@ def _particle_to_grid(
 
 
 @ti.func
+def _mass_around(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template()) -> ti.f32:
+    """The masses of the nodes around x, interpolated."""
+    scaled = x * inverse_dx
+    base = ti.floor(scaled - 0.5, ti.i32)
+    w0, w1, w2 = weights(scaled - ti.cast(base, ti.f32))
+    w = ti.static((w0, w1, w2))
+    index_x, index_y, index_z = node_places(base, first_node, shape, 1)
+    mass = 0.0
+    for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
+        mass += w[i][0] * w[j][1] * w[k][2] * node[index_x[i] + index_y[j] + index_z[k]][3]
+    return mass
+
+
+@ti.func
 def _grid_to_particle(
     p: ti.i32,
     scene: ti.i32,
@@ -155,18 +171,17 @@ def _grid_to_particle(
     """New velocity and its gradient, then advection."""
     x = position[p]
     first_node = scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
-    v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape, 1)
+    v, C = interpolate(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
     if ti.static(bool(variant & VARIANT.sheets)):
-        v, C = interpolate_hidden(
-            x, v, C, hidden[p], scene, 0, node, setting[SETTING.inverse_cell_size], shape, contact, 1
-        )
+        v, C = interpolate_hidden(x, v, C, hidden[p], scene, node, setting[SETTING.inverse_cell_size], shape, contact)
     moved, speed, speed_square = move(
         x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
     )
     raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
     if ti.static(bool(variant & VARIANT.water)):
-        if is_water:
-            volume[p] = settle(x, volume[p], first_node, scene, node, 3, scene_value, setting, shape, 1)
+        if is_water and settles(scene, scene_value, setting):
+            mass = _mass_around(x, first_node, node, setting[SETTING.inverse_cell_size], shape)
+            volume[p] = settle(x, volume[p], mass, scene, scene_value, setting, shape)
     position[p] = moved
     velocity[p] = speed
     affine[p] = C
@@ -270,8 +285,8 @@ def substep(
                 mass = before[3] + total[3]
                 v = node_velocity(
                     ti.Vector([before[0], before[1], before[2]]), ti.Vector([total[0], total[1], total[2]]), mass,
-                    n & 63, 2 * entry + field, scene, block[2 * shape[SHAPE.all_blocks] + (n >> 6)], scene_value,
-                    setting, shape, contact_normal, variant,
+                    n & 63, 2 * entry + field, block[2 * shape[SHAPE.all_blocks] + (n >> 6)],
+                    falls(scene, scene_value), scene, scene_value, shape, contact_normal, variant,
                 )  # fmt: skip
                 node[own] = ti.Vector([v[0], v[1], v[2], mass])
 

@@ -143,10 +143,11 @@ class Field(NamedTuple):
     velocity: int = 3
     affine: int = 6
     volume: int = 15
-    fluid: int = 16  # fields of particles without a deformation gradient
-    deformation: int = 16
-    stretch: int = 25  # xx, yy, zz, xy, xz, yz: see mls_mpm.respond
-    solid: int = 31  # fields of particles with a deformation gradient
+    mass: int = 16  # of the nodes around, interpolated, at the end of an interval
+    fluid: int = 17  # fields of particles without a deformation gradient
+    deformation: int = 17
+    stretch: int = 26  # xx, yy, zz, xy, xz, yz: see mls_mpm.respond
+    solid: int = 32  # fields of particles with a deformation gradient
 
 
 class Tag(NamedTuple):
@@ -161,13 +162,11 @@ class Tag(NamedTuple):
 class Live(NamedTuple):
     """Positions in the int32 state of a scene that its team shares."""
 
-    cells: int = 0  # occupied, in this step
-    blocks: int = 1  # touched, in this step
-    cursor: int = 2  # particles that have a place in the order
-    copy: int = 3  # which of the two copies of the particles is the present one
-    ordered: int = 4  # 1 once there is an order to copy by
-    frames: int = 5  # completed
-    length: int = 6
+    blocks: int = 0  # touched, in this interval
+    cursor: int = 1  # particles that have a place in the order
+    copy: int = 2  # which of the two copies of the particles is the present one
+    frames: int = 3  # completed
+    length: int = 4
 
 
 CONSTANT, COUNT, VALUE, STATUS = Constant(), Count(), SceneValue(), Status()

@@ -205,37 +205,41 @@ def mark(
     base = base_node(x, inverse_dx)
     first = base >> 2
     last = (base + 2) >> 2
-    for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
-        corner = ti.Vector([last[0] if i else first[0], last[1] if j else first[1], last[2] if k else first[2]])
-        fresh = 1
-        for axis, high in ti.static(((0, i), (1, j), (2, k))):
-            if ti.static(high):
-                if first[axis] == last[axis]:
-                    fresh = 0
+    corner = ti.Matrix([[last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)] for n in range(8)])
+    index = ti.Vector(
+        [
+            scene * shape[SHAPE.scene_blocks]
+            + (corner[n, 0] * shape[SHAPE.blocks + 1] + corner[n, 1]) * shape[SHAPE.blocks + 2]
+            + corner[n, 2]
+            for n in range(8)
+        ]
+    )
+    flag = ti.Vector([block[index[n]] for n in range(8)])  # all at once: each is a way to memory
+    for n in ti.static(range(8)):
+        fresh = flag[n] == 0
+        for axis in ti.static(range(3)):
+            if ti.static(bool(n >> (2 - axis) & 1)):
+                fresh = fresh and first[axis] != last[axis]
         if fresh:
-            index = scene * shape[SHAPE.scene_blocks]
-            index += (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
-            if block[index] == 0:
-                if ti.atomic_max(block[index], 1) == 0:
-                    entry = list_begin + ti.atomic_add(length[length_at], 1)
-                    block[entry] = index
-                    block[entry + shape[SHAPE.all_blocks]] = (corner[0] << 20) | (corner[1] << 10) | corner[2]
+            if ti.atomic_max(block[index[n]], 1) == 0:
+                entry = list_begin + ti.atomic_add(length[length_at], 1)
+                block[entry] = index[n]
+                block[entry + shape[SHAPE.all_blocks]] = (corner[n, 0] << 20) | (corner[n, 1] << 10) | corner[n, 2]
 
 
 @ti.func
-def node_places(base, first_node: ti.i32, shape: ti.template(), components: ti.template()):
-    """Shares of x, y, z in the place of nodes base .. base + 2; the place is the sum of one of each.
-
-    With several components it is that of the first in an array [block, component, node in block].
+def node_places(base, first_entry: ti.i32, shape: ti.template(), entries: ti.template()):
+    """Shares of x, y, z in the place of nodes base .. base + 2, in an array that holds so many entries for each node;
+    the place is the sum of one of each.
     """
-    stride_z = BLOCK_NODES * components
+    stride_z = BLOCK_NODES * entries
     stride_y = shape[SHAPE.blocks + 2] * stride_z
     stride_x = shape[SHAPE.blocks + 1] * stride_y
     offset = ti.Vector([0, 1, 2])
     return (
-        first_node + _node_of_axis(base[0] + offset, stride_x, BLOCK * BLOCK),
-        _node_of_axis(base[1] + offset, stride_y, BLOCK),
-        _node_of_axis(base[2] + offset, stride_z, 1),
+        first_entry + _node_of_axis(base[0] + offset, stride_x, BLOCK * BLOCK * entries),
+        _node_of_axis(base[1] + offset, stride_y, BLOCK * entries),
+        _node_of_axis(base[2] + offset, stride_z, entries),
     )
 
 
@@ -318,16 +322,23 @@ def respond(
 
 
 @ti.func
+def falls(scene: ti.i32, scene_value: ti.template()):
+    """What gravity adds to velocities in the present substep."""
+    gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
+    return scene_value[scene, VALUE.gravity_time] * gravity
+
+
+@ti.func
 def node_velocity(
     before,
     momentum,
     mass: ti.f32,
     local: ti.i32,
     facing: ti.i32,
-    scene: ti.i32,
     corner: ti.i32,
+    fall,
+    scene: ti.i32,
     scene_value: ti.template(),
-    setting: ti.template(),
     shape: ti.template(),
     contact_normal: ti.template(),
     variant: ti.template(),
@@ -336,12 +347,11 @@ def node_velocity(
     too.
 
     The node is the `local` one of a block whose place along x, y, z is `corner`, in ten bits each; `facing` is that of
-    the field's contact, or less than 0.
+    the field's contact, or less than 0; `fall` is what gravity adds.
     """
     v = ti.Vector([0.0, 0.0, 0.0])
     if mass > SMALLEST_MASS:
-        gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
-        v = before + momentum / mass + scene_value[scene, VALUE.gravity_time] * gravity
+        v = before + momentum / mass + fall
         if ti.static(bool(variant & VARIANT.contact)):
             if facing >= 0:
                 entry = facing // 2
@@ -380,19 +390,14 @@ def node_velocity(
 
 
 @ti.func
-def interpolate(
-    x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template(), components: ti.template()
-):
-    """Velocity and its gradient at x, from the nodes around.
-
-    Nodes are vectors with components=1, or scalars with several (see node_places).
-    """
+def interpolate(x, first_node: ti.i32, node: ti.template(), inverse_dx: ti.f32, shape: ti.template()):
+    """Velocity and its gradient at x, from the nodes around."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     fx = scaled - ti.cast(base, ti.f32)
     w0, w1, w2 = weights(fx)
     w = ti.static((w0, w1, w2))
-    index_x, index_y, index_z = node_places(base, first_node, shape, components)
+    index_x, index_y, index_z = node_places(base, first_node, shape, 1)
     v = ti.Vector([0.0, 0.0, 0.0])
     gradient_x = ti.Vector([0.0, 0.0, 0.0])
     gradient_y = ti.Vector([0.0, 0.0, 0.0])
@@ -405,14 +410,8 @@ def interpolate(
             line = ti.Vector([0.0, 0.0, 0.0])
             line_z = ti.Vector([0.0, 0.0, 0.0])
             for k in ti.static(range(3)):
-                place = index_x[i] + index_y[j] + index_z[k]
-                value = ti.Vector([0.0, 0.0, 0.0])
-                if ti.static(components == 1):
-                    whole = node[place]
-                    value = ti.Vector([whole[0], whole[1], whole[2]])
-                else:
-                    value = ti.Vector([node[place + a * BLOCK_NODES] for a in range(3)])
-                share = w[k][2] * value
+                whole = node[index_x[i] + index_y[j] + index_z[k]]
+                share = w[k][2] * ti.Vector([whole[0], whole[1], whole[2]])
                 line += share
                 line_z += (k - fx[2]) * share
             plane += w[j][1] * line
@@ -448,43 +447,29 @@ def _room(fx, base: ti.i32, axis: ti.template(), shape: ti.template()) -> ti.f32
 
 
 @ti.func
+def settles(scene: ti.i32, scene_value: ti.template(), setting: ti.template()) -> ti.i32:
+    """Whether the water of a scene follows its density."""
+    return scene_value[scene, VALUE.water_density] > 0.0 and setting[SETTING.density_relaxation] > 0.0
+
+
+@ti.func
 def settle(
     x,
     volume: ti.f32,
-    first_node: ti.i32,
+    mass: ti.f32,
     scene: ti.i32,
-    node: ti.template(),
-    mass_at: ti.template(),
     scene_value: ti.template(),
     setting: ti.template(),
     shape: ti.template(),
-    components: ti.template(),
 ) -> ti.f32:
-    """J of a particle of water after an interval, nearer to what the masses of the nodes around tell.
-
-    Masses are the fourth of a node's vector with components=1, or lie at `mass_at` (see node_places).
-    """
-    out = volume
-    rest = scene_value[scene, VALUE.water_density]
-    if rest > 0.0 and setting[SETTING.density_relaxation] > 0.0:
-        scaled = x * setting[SETTING.inverse_cell_size]
-        base = ti.floor(scaled - 0.5, ti.i32)
-        fx = scaled - ti.cast(base, ti.f32)
-        w0, w1, w2 = weights(fx)
-        w = ti.static((w0, w1, w2))
-        index_x, index_y, index_z = node_places(base, first_node, shape, components)
-        mass = 0.0
-        for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
-            place = index_x[i] + index_y[j] + index_z[k]
-            weight = w[i][0] * w[j][1] * w[k][2]
-            if ti.static(components == 1):
-                mass += weight * node[place][3]
-            else:
-                mass += weight * node[place + mass_at * BLOCK_NODES]
-        room = _room(fx[0], base[0], 0, shape) * _room(fx[1], base[1], 1, shape) * _room(fx[2], base[2], 2, shape)
-        share = scene_value[scene, VALUE.interval_elapsed] * setting[SETTING.density_relaxation]
-        out = settled(volume, mass / (rest * ti.max(room, 0.1)), ti.min(share, 1.0))
-    return out
+    """J of a particle of water after an interval, nearer to what the masses of the nodes around, interpolated, tell."""
+    scaled = x * setting[SETTING.inverse_cell_size]
+    base = ti.floor(scaled - 0.5, ti.i32)
+    fx = scaled - ti.cast(base, ti.f32)
+    room = _room(fx[0], base[0], 0, shape) * _room(fx[1], base[1], 1, shape) * _room(fx[2], base[2], 2, shape)
+    share = scene_value[scene, VALUE.interval_elapsed] * setting[SETTING.density_relaxation]
+    density = mass / (scene_value[scene, VALUE.water_density] * ti.max(room, 0.1))
+    return settled(volume, density, ti.min(share, 1.0))
 
 
 @ti.func
@@ -536,17 +521,12 @@ def interpolate_hidden(
     C,
     hidden: ti.i32,
     scene: ti.i32,
-    component: ti.template(),
     node: ti.template(),
     inverse_dx: ti.f32,
     shape: ti.template(),
     contact: ti.template(),
-    components: ti.template(),
 ):
-    """What `interpolate` gave, with the second fields of hidden nodes in place of their first.
-
-    `component` is where a node's velocity begins among its components, times the nodes of a block.
-    """
+    """What `interpolate` gave, with the second fields of hidden nodes in place of their first."""
     scaled = x * inverse_dx
     base = ti.floor(scaled - 0.5, ti.i32)
     new_v = v
@@ -558,27 +538,14 @@ def interpolate_hidden(
             index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
             offset = ti.cast(index, ti.f32) - scaled
             place = node_place(index, scene, shape)
-            ghost = shape[SHAPE.ghost_begin] + contact[place]
-            change = ti.Vector([0.0, 0.0, 0.0])
-            if ti.static(components == 1):
-                difference = node[ghost] - node[place]
-                change = ti.Vector([difference[0], difference[1], difference[2]])
-            else:
-                first = planar(place, components) + component
-                second = planar(ghost, components) + component
-                change = ti.Vector([node[second + a * BLOCK_NODES] - node[first + a * BLOCK_NODES] for a in range(3)])
+            difference = node[shape[SHAPE.ghost_begin] + contact[place]] - node[place]
+            change = ti.Vector([difference[0], difference[1], difference[2]])
             change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
             new_v += change
             new_C += (4.0 * inverse_dx) * change.outer_product(offset)
         bits >>= 1
         n += 1
     return new_v, new_C
-
-
-@ti.func
-def planar(place: ti.i32, components: ti.template()) -> ti.i32:
-    """Where the first component of a node lies in an array [block, component, node in block]."""
-    return (place >> 6) * (BLOCK_NODES * components) + (place & (BLOCK_NODES - 1))
 
 
 @ti.func

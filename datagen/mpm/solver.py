@@ -24,10 +24,13 @@ from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
-# a scene of more fills a GPU better by itself
-TEAM_PARTICLES = 50_000
-TEAM_THREADS = 256  # two teams fit on a processor then, with 128 registers a thread
-TEAM_SCENES = 16  # fewer are done sooner where each has the whole GPU, a launch a substep
+# thread blocks of a GPU for each scene: 512 threads run on a processor at once, whatever they do (see device)
+TEAM_THREADS = 256  # of a scene's only block
+SHARED_THREADS, SHARED_BLOCKS = 128, 2  # of each of several, and how many of them a processor has
+SHARED_PARTICLES = 8  # at least, of each of several
+LARGE_THREADS = 512  # where a scene has more particles for each processor than
+LARGE_PARTICLES = 4096
+WARM_SCENES = 16
 CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
 
 __all__ = ["SceneFailure", "Simulated", "fixed_substeps", "initialise", "particle_bounds", "simulate", "warm_up"]
@@ -43,6 +46,7 @@ def simulate(
     colliders: Sequence[Collider] | None = None,
     team_threads: int | None = None,
     stability_fractions: Sequence[float] | None = None,
+    team_blocks: int = 1,
 ) -> list[Simulated | SceneFailure]:
     """Simulates `scenes` side by side and returns `frames` frames of each, the initial state among them.
 
@@ -53,9 +57,10 @@ def simulate(
     taken ceil(frame / step) times a frame in full, as Taichi Elements does: 54 times at 60 Hz and 3.125e-4 s,
     which is 1.25 % more than the frame. `on_frame(t)` is called when frame t of all scenes is complete, from 0.
     `cpu_threads` counts from the process's first simulation; see `initialise`. `colliders` are the scenes' own from
-    `build_collider`, where they were built before. `team_threads` chooses how scenes run: so many threads of a GPU
-    for each (a multiple of 32; 1 works on a CPU too), or 0 for one launch a substep; none takes what suits the
-    device and the scenes. `stability_fractions` are the scenes' own where they differ from the config's.
+    `build_collider`, where they were built before. `team_threads` chooses how scenes run: so many threads a block
+    of a GPU (a multiple of 32; 1 works on a CPU too), with `team_blocks` blocks for each scene, or 0 for one launch a
+    substep; none takes what suits the device and the scenes. `stability_fractions` are the scenes' own where they
+    differ from the config's.
 
     On a CPU the result of a scene is the same, bitwise, whatever its batch mates do, and depends on
     `cpu_threads` only through the number of parts that particles are summed in, min(cpu_threads, 4). On a GPU
@@ -94,10 +99,10 @@ def simulate(
             [scenes[i] for i in occupied], [colliders[i] for i in occupied], config, node_counts, frame_rate_hz,
             own_fractions,
         )  # fmt: skip
-        threads = _team_threads(device, batch[0]) if team_threads is None else team_threads
+        threads, blocks = _team(device, batch[0]) if team_threads is None else (team_threads, team_blocks)
         with _arrays_freed_here():
             outcomes = _launched(
-                TeamLaunch(threads, *batch) if threads else GridLaunch(device, *batch), frames, on_frame
+                TeamLaunch(threads, blocks, *batch) if threads else GridLaunch(device, *batch), frames, on_frame
             )
         for index, outcome in zip(occupied, outcomes, strict=True):
             results[index] = outcome
@@ -145,14 +150,22 @@ def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
         np.array([material_index(name) for name in scene.materials], np.uint8),
         obstacles, scene.domain_size, scene.cell_size, scene.gravity,
     )  # fmt: skip
-    simulate([one] * min(scenes, TEAM_SCENES), config, 2, 60.0)
+    simulate([one] * min(scenes, WARM_SCENES), config, 2, 60.0)
 
 
-def _team_threads(device: Device, scenes: Sequence[Scene]) -> int:
+def _team(device: Device, scenes: Sequence[Scene]) -> tuple[int, int]:
+    """Threads of a block, and blocks of a scene: 0 threads for a launch a substep.
+
+    The blocks of a scene wait for each other, so all of them have to be at work at once.
+    """
+    if device.kind == "cpu":
+        return 0, 0
     most = max(scene.particle_count for scene in scenes)
-    if device.kind == "cpu" or len(scenes) < TEAM_SCENES or most > TEAM_PARTICLES:
-        return 0
-    return TEAM_THREADS
+    share = device.processors // len(scenes)
+    if share > 1 and most > LARGE_PARTICLES * share:
+        return LARGE_THREADS, share
+    blocks = min(SHARED_BLOCKS * device.processors // len(scenes), -(-most // SHARED_PARTICLES))
+    return (SHARED_THREADS, blocks) if blocks > 1 else (TEAM_THREADS, 1)
 
 
 def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, int]:

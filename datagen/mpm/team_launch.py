@@ -1,4 +1,4 @@
-"""Whole frames of all scenes a launch, a team of GPU threads for each scene: the way for many scenes at once."""
+"""Whole frames of all scenes a launch, a team of GPU threads for each scene."""
 
 from __future__ import annotations
 
@@ -18,39 +18,57 @@ from datagen.mpm import team_kernel  # isort: skip
 
 LAUNCH_SECONDS = 3.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
 MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
+RUN = 8  # particles in the order of their cells, that a thread adds up before it adds to nodes
 PAUSE = 0.8  # of the time that a launch is expected to take
+SHORT_SECONDS = 0.1  # of a launch that nobody sleeps for
 
 
 class TeamLaunch(Launch):
     """Particles in one array, field by field, in two copies."""
 
-    entries_a_node = team_kernel.COMPONENTS
+    entries_a_node = 2 * team_kernel.LANES
 
-    def __init__(self, threads: int, *batch: Any) -> None:
+    def __init__(self, threads: int, blocks: int, *batch: Any) -> None:
         super().__init__(*batch)
-        self.threads = threads
+        self.threads, self.blocks_a_team = threads, blocks
+        # in a block with few particles a thread each is sooner done
+        few = max(np.diff(self.particle_begin)) <= threads * blocks
+        self.run_length = 1 if few else RUN
         fields = FIELD.solid if has_solid(self.variant) else FIELD.fluid
         self.state = ti.ndarray(ti.f32, 2 * fields * self.particles)
         tag = np.zeros((2, TAG.length, self.particles), np.int32)
-        tag[0, TAG.origin] = np.concatenate([np.arange(scene.particle_count) for scene in self.scenes])
+        order = self._order()
+        tag[0, TAG.origin] = order - np.repeat(self.particle_begin[:-1], np.diff(self.particle_begin))
         self.tag = device_array(tag.ravel())
-        self.rank, self.order, self.cell_list = (ti.ndarray(ti.i32, self.particles) for _ in range(3))
-        self.cell_begin = ti.ndarray(ti.i32, 2 * self.particles)
+        self.rank, self.cell_list = (ti.ndarray(ti.i32, self.particles) for _ in range(2))
         self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
-        for array in (self.cell_count, self.block, self.node):
-            array.fill(0)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
+        self.meeting = ti.ndarray(ti.i32, len(self.scenes) * team_kernel.MEETING)
+        self.cells = ti.ndarray(ti.i32, 2 * len(self.scenes) * blocks)
+        for array in (self.cell_count, self.block, self.cells, self.node):
+            array.fill(0)
         self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))
         team_kernel.start_team(
             self.state, self.tag, *(
                 device_array(np.concatenate([getattr(scene, name) for scene in self.scenes]).astype(np.float32).ravel())
                 for name in ("position_N3", "velocity_N3")
-            ), self.label, self.law_row, self.counter, self.law, fields,
+            ), self.label, self.law_row, device_array(order), self.counter, self.law, fields,
         )  # fmt: skip
 
+    def _order(self) -> np.ndarray:
+        """Particles in the order of their cells, int32 [P]: neighbours in space are neighbours in memory then."""
+        cell = np.concatenate(
+            [
+                self._places(np.floor(scene.position_N3 / scene.cell_size - 0.5).astype(np.int32))
+                + np.int64(index * self.scene_nodes)
+                for index, scene in enumerate(self.scenes)
+            ]
+        )
+        return np.argsort(cell, kind="stable").astype(np.int32)
+
     def _node_array(self, nodes: int) -> ti.ScalarNdarray:
-        return ti.ndarray(ti.f32, team_kernel.COMPONENTS * nodes)
+        return ti.ndarray(ti.f32, self.entries_a_node * nodes)
 
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         most = max(1, MAXIMUM_OUTPUT_BYTES // (12 * self.particles))
@@ -61,13 +79,18 @@ class TeamLaunch(Launch):
         while size:
             # Taichi holds the interpreter's lock while it waits for the device: other threads run before that
             pause = PAUSE * min(expected * size, LAUNCH_SECONDS)
-            time.sleep(max(0.0, begin + pause - time.perf_counter()))
+            if pause > SHORT_SECONDS:
+                time.sleep(max(0.0, begin + pause - time.perf_counter()))
+            woken = time.perf_counter()
             position = output.to_numpy().reshape(size, self.particles, 3)
+            taken = time.perf_counter() - begin
+            if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # it was done before, nobody knows when
+                taken *= 0.5
             total = self.counter.to_numpy()[:, COUNT.substeps]
             completed = self.live.to_numpy().reshape(-1, LIVE.length)[:, LIVE.frames].astype(np.int64)
             work, substeps = (total - substeps) * np.diff(self.particle_begin), total
             done += size
-            expected = (time.perf_counter() - begin) / size
+            expected = taken / size
             size = min(max(1, min(2 * size, int(LAUNCH_SECONDS / expected))), most, frames - done)
             del output  # before the device is at work: memory may only come free when it rests
             gc.collect(0)  # its cycle, see solver: none is collected by itself
@@ -81,10 +104,11 @@ class TeamLaunch(Launch):
         """
         output = ti.ndarray(ti.f32, 3 * max(frames, 1) * self.particles)
         self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
+        self.meeting.fill(0)
         team_kernel.advance(
-            frames, self.frame_s, self.state, self.tag, self.rank, self.order, self.hidden, self.cell_count,
-            self.cell_list, self.cell_begin, self.block, self.live, self.node, self.turn, self.scene_value,
-            self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal, output, self.variant,
-            self.threads,
+            frames, self.blocks_a_team, self.frame_s, self.state, self.tag, self.rank, self.hidden, self.cell_count,
+            self.cell_list, self.block, self.live, self.cells, self.meeting, self.node,
+            self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact,
+            self.contact_normal, output, self.variant, self.threads, self.blocks_a_team > 1, self.run_length,
         )  # fmt: skip
         return output

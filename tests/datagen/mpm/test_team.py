@@ -1,6 +1,6 @@
 """Whole frames in one launch, a team for each scene: the same physics as one launch a substep.
 
-A GPU runs it with hundreds of threads a team; here a team has one.
+A GPU runs it with hundreds of threads a block; here a block has one, and two blocks run on the two threads.
 """
 
 import numpy as np
@@ -43,6 +43,17 @@ def test_teams_agree_with_the_other_launch() -> None:
         assert np.abs(one.position_TN3[1] - other.position_TN3[1]).max() < 1e-6
         assert np.abs(one.position_TN3 - other.position_TN3).max() < 1e-3
         assert one.counters["substeps"] == other.counters["substeps"]
-    alone = simulate(scenes[1:2], CONFIG, 11, 60.0, team_threads=1)[0]  # with all that the batch's kernel computes
+    # with all that the batch's kernel computes
+    alone = simulate(scenes[1:2], CONFIG, 11, 60.0, team_threads=1)[0]
     assert isinstance(alone, Simulated)
     assert np.abs(alone.position_TN3 - found[1].position_TN3).max() < 1e-3
+
+
+def test_blocks_that_wait_for_each_other_agree_with_one() -> None:
+    """A scene of two blocks ends where that of one does, also where another scene of the launch fails."""
+    scenes = [mixed(120, 0, (0, -3, 0)), mixed(40, 3, (0, 1e6, 0))]
+    one, other = (simulate(scenes, CONFIG, 4, 60.0, team_threads=1, team_blocks=blocks) for blocks in (1, 2))
+    assert isinstance(one[0], Simulated) and isinstance(other[0], Simulated)
+    assert isinstance(one[1], SceneFailure) and one[1] == other[1]
+    assert np.abs(one[0].position_TN3 - other[0].position_TN3).max() < 1e-5
+    assert one[0].counters["substeps"] == other[0].counters["substeps"]

@@ -1,0 +1,42 @@
+"""python -m tools.studies.solver_targets: a row for each case; no time for what fails or differs."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hgn.config import MpmConfig
+from hgn.schema import ConfigError
+from tools.bench.states import Workload, scene_of
+from tools.studies import solver_targets
+from tools.studies.solver_targets import main, table, timed
+
+
+def test_rows_and_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows name case, milliseconds and check, the plain prototype's too; what fell elsewhere than ours is red."""
+    monkeypatch.setattr(solver_targets, "CUBE_SIZE", 0.03)
+    file = tmp_path / "made" / "times.json"
+    given = {"cases": ["one_scene_te_step", "plain_one_scene_te_step"], "frames": 6, "device": "cpu"}
+    assert main({**given, "json": str(file)}) == 0
+    rows = json.loads(file.read_text())["rows"]
+    assert [row["case"] for row in rows] == given["cases"]
+    assert all(row["ms"] > 0 and row["check"] == "green" and row["substeps"] == 55 for row in rows)
+    assert "| one_scene_te_step | " in table(rows)
+    monkeypatch.setattr(solver_targets, "FALL", 0.0)
+    assert main({**given, "cases": ["plain_one_scene_te_step"]}) == 1
+
+
+def test_no_time_for_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes that fail, and paths that lead elsewhere than the other launch, have a cause in place of a time."""
+    scene = [scene_of(Workload(40, 1), 0, 0.035)]
+    row = timed(scene, MpmConfig(device="cpu", maximum_substeps_per_frame=1), 4)
+    assert row["ms"] is None
+    assert "maximum_substeps_per_frame = 1" in table([{"case": "one_scene", "target": None} | row])
+    monkeypatch.setattr(solver_targets, "LATER_FRAMES", -1.0)
+    assert timed(scene, MpmConfig(device="cpu"), 4)["ms"] is None
+
+
+def test_bad_input() -> None:
+    """Cases that there are not are refused by name."""
+    with pytest.raises(ConfigError, match=r"cases must be some of one_scene_te_step, .*'two_scenes'"):
+        main({"cases": ["two_scenes"]})

@@ -1,0 +1,213 @@
+"""python -m tools.studies.solver_targets [--json FILE]: the solver's frames and data set beside what is asked of them.
+
+First a path's result is compared: the first frames with one launch a substep, the plain prototype's fall with ours, a
+data set's shards with their checksums. A path whose check is red gets no time. Timed is the second half of the frames,
+when most particles have landed.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datagen.mpm.collider import Collider, build_collider
+from hgn.command import run_command
+from hgn.config import MpmConfig, Processor, SceneConfig
+from hgn.data.manifest import MANIFEST_NAME, Manifest
+from hgn.data.storage import verify_file
+from hgn.scene.random_scene import REPORT_SEED, generate_scene
+from hgn.scene.scene import Scene
+from hgn.schema import Positive, from_mapping, require, require_bounds, to_mapping
+from hgn.system.files import write_json
+from hgn.system.progress import bar
+from hgn.system.provenance import provenance, without_folders
+from tools.bench.states import Workload, scene_of
+
+FRAME_RATE_HZ = 60.0
+STEP_S, SUBSTEPS = 1 / 60 / 54, 55  # Taichi Elements' step at 64 cells a side, and how many it takes a frame
+CUBES = ((0.3, 0.3, 0.3), (0.3, 0.3, 0.7), (0.7, 0.3, 0.3), (0.7, 0.3, 0.7))
+CUBE_KINDS, CUBE_SIZE = (0, 1, 2, 0), 0.08
+SIDE_BY_SIDE = 256
+# asked for: ms a frame and scene on one H100, seconds of a data set
+TARGETS = {
+    "one_scene_te_step": 2.0, "one_scene": 5.0, "one_random_scene": 8.0, "scenes_256_te_step": 0.2,
+    "scenes_256_random": None, "particles_1m": 110.0, "plain_one_scene_te_step": None, "plain_256_te_step": None,
+    "dataset_800": 150.0,
+}  # fmt: skip
+COMPARED_FRAMES = 4
+FIRST_FRAME, LATER_FRAMES, FALL = 1e-6, 1e-4, 0.01  # bounds: domain units
+EXIT_RED = 1
+
+
+@dataclass(frozen=True)
+class SolverTargetsConfig:
+    """`python -m tools.studies.solver_targets`: what is timed."""
+
+    cases: tuple[str, ...] = tuple(TARGETS)
+    frames: int = 60  # the second half is timed; of a million particles a tenth
+    scenes: Positive[int] = 800  # of the data set
+    device: Processor = "auto"  # or cpu, gpu
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        unknown = sorted(set(self.cases) - set(TARGETS))
+        require(not unknown, "cases", f"some of {', '.join(TARGETS)}", unknown)
+        require(self.frames >= COMPARED_FRAMES, "frames", f"at least {COMPARED_FRAMES}", self.frames)
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Prints a table, and writes JSON where asked to; the exit code is 1 where a check is red."""
+    from datagen.mpm.device import initialise
+
+    config = from_mapping(SolverTargetsConfig, mapping)
+    device = initialise(config.device)
+    meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": without_folders(to_mapping(config))}
+    rows: list[dict[str, Any]] = []
+    with bar("cases", len(config.cases), unit="case") as progress:
+        for case in config.cases:
+            rows.append({"case": case, "target": TARGETS[case]} | _row(case, config, device.kind))
+            progress.update()
+            if config.json is not None:  # after each: what a later case does takes nothing away
+                write_json(config.json, {"meta": meta, "rows": rows})
+    print(table(rows))
+    return 0 if all(row["check"] == "green" for row in rows) else EXIT_RED
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The figures for people, as Markdown."""
+    lines = [
+        "| case | ms a frame and scene, or s | asked for | steps a frame | check |",
+        "| :-- | --: | --: | --: | :-- |",
+    ]
+    for row in rows:
+        found = row.get("seconds", row.get("ms"))
+        figures = [f"{value:.4g}" if value is not None else "" for value in (found, row["target"], row.get("substeps"))]
+        lines.append(f"| {row['case']} | " + " | ".join(figures) + f" | {row['check']} |")
+    return "\n".join(lines)
+
+
+def _row(case: str, config: SolverTargetsConfig, kind: str) -> dict[str, Any]:
+    plain, mpm, rate, frames = MpmConfig(device=kind), _at_their_step(kind), 1 / (SUBSTEPS * STEP_S), config.frames
+    many = [_cubes()] * SIDE_BY_SIDE
+    if case == "dataset_800":
+        return _dataset(config.scenes)
+    if case.startswith("plain"):
+        return _plain(len(many) if "256" in case else 1, mpm, rate, frames)
+    if case == "one_scene":
+        return timed([_cubes()], plain, frames)
+    if case in ("one_random_scene", "scenes_256_random"):
+        scenes, colliders = _random_scenes(1 if case == "one_random_scene" else SIDE_BY_SIDE)
+        return timed(scenes, plain, frames, colliders=colliders)
+    if case == "particles_1m":
+        return timed([scene_of(Workload(1_000_000, 1), 0, 0.035)], plain, max(COMPARED_FRAMES, frames // 10))
+    return timed(many if case == "scenes_256_te_step" else many[:1], mpm, frames, rate)
+
+
+def timed(
+    scenes: Sequence[Scene],
+    mpm: MpmConfig,
+    frames: int,
+    rate: float = FRAME_RATE_HZ,
+    colliders: Sequence[Collider] | None = None,
+) -> dict[str, Any]:
+    """Milliseconds a frame and scene, after a comparison of the first scene that compiles."""
+    from datagen.mpm.solver import SceneFailure, Simulated, simulate
+
+    colliders = colliders or [build_collider(scenes[0], mpm.collider_band_cells)] * len(scenes)
+    expected = simulate(scenes[:1], mpm, COMPARED_FRAMES, rate, colliders=colliders[:1], team_threads=0)[0]
+    simulate(scenes, mpm, 2, rate, colliders=colliders)
+    ends: list[float] = []
+    outcomes = simulate(scenes, mpm, frames, rate, lambda _: ends.append(time.perf_counter()), colliders=colliders)
+    row: dict[str, Any] = {"scenes": len(scenes), "particles": sum(scene.particle_count for scene in scenes)}
+    for outcome in (expected, *outcomes):
+        if isinstance(outcome, SceneFailure):
+            return row | {"ms": None, "check": outcome.cause}
+    paths = [outcome.position_TN3 for outcome in (expected, *outcomes) if isinstance(outcome, Simulated)]
+    if not all(np.isfinite(path_TN3[-1]).all() for path_TN3 in paths):
+        return row | {"ms": None, "check": "positions are not finite"}
+    away_T = np.abs(paths[1][:COMPARED_FRAMES] - paths[0]).max(axis=(1, 2))
+    if away_T[1] > FIRST_FRAME or away_T.max() > LATER_FRAMES:
+        return row | {"ms": None, "check": f"{away_T[1]:.1e} after a frame, {away_T.max():.1e} after some"}
+    # frames of one launch end together: from the end of the launch that the middle frame is in
+    begin = max(t for t in range(frames - 1) if ends[t] <= ends[(frames - 1) // 2] + 1e-3)
+    steps = [outcome.counters["substeps"] for outcome in outcomes if isinstance(outcome, Simulated)]
+    return row | {
+        "ms": 1e3 * (ends[-1] - ends[begin]) / (frames - 1 - begin) / len(scenes),
+        "substeps": float(np.mean(steps)) / (frames - 1),
+        "check": "green",
+    }
+
+
+def _plain(copies: int, mpm: MpmConfig, rate: float, frames: int) -> dict[str, Any]:
+    from datagen.mpm.solver import Simulated, simulate
+    from tools.studies.plain_mpm import plain_milliseconds
+
+    scene = _cubes()
+    taken, position_N3 = plain_milliseconds(scene, copies, SUBSTEPS, STEP_S, frames)
+    (ours,) = simulate([scene], mpm, frames + 1, rate)
+    assert isinstance(ours, Simulated)
+    away = float(np.linalg.norm(position_N3.mean(axis=0) - ours.position_TN3[-1].mean(axis=0)))
+    row = {"scenes": copies, "particles": copies * scene.particle_count, "substeps": SUBSTEPS}
+    if not away < FALL:
+        return row | {"ms": None, "check": f"its centre of mass is {away:.1e} from ours"}
+    return row | {"ms": taken / copies, "check": "green"}
+
+
+def _dataset(scenes: int) -> dict[str, Any]:
+    """Seconds from the start of the command to its end, shards verified after."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "datagen", "+experiment=obstacles", f"scenes={scenes}", f"out={folder}/data"]
+        begin = time.perf_counter()
+        ended = subprocess.run([*command, "progress=off"], check=False).returncode
+        seconds = time.perf_counter() - begin
+        if ended:
+            return {"scenes": scenes, "seconds": None, "check": f"ended with {ended}"}
+        data = Path(folder) / "data"
+        shards = Manifest.parse((data / MANIFEST_NAME).read_bytes(), data).shards.since(0)
+        for shard in shards:
+            verify_file(data / shard.name, shard.sha256, shard.bytes, "generate it again")
+    return {"scenes": scenes, "seconds": seconds, "check": "green" if shards else "no shards"}
+
+
+def _at_their_step(kind: str) -> MpmConfig:
+    """As conf/mpm/taichi_elements.yaml, at the step that Taichi Elements takes."""
+    return MpmConfig(
+        device=kind, time_step="fixed", fixed_time_step_s=STEP_S, sand_volume_correction="taichi_elements",
+        sand_friction_law="compression", sand_friction_angle_deg=45.0, time_integration="symplectic_euler",
+        water_volume_update="taichi_elements", water_density_relaxation_s=None, snow_maximum_hardening=100.0,
+    )  # fmt: skip
+
+
+def _cubes() -> Scene:
+    count = int(8 * (64 * CUBE_SIZE) ** 3 + 1)
+    draw = np.random.default_rng(0).uniform
+    position = np.concatenate([draw(-CUBE_SIZE / 2, CUBE_SIZE / 2, (count, 3)) + centre for centre in CUBES])
+    kinds = np.repeat(np.array(CUBE_KINDS, np.uint8), count)
+    return Scene(position.astype(np.float32), np.zeros(position.shape, np.float32), kinds)
+
+
+def _random_scenes(count: int) -> tuple[list[Scene], list[Collider]]:
+    """Scenes of the data set with obstacles; a case's own, so that no case waits for another's."""
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+        made = list(pool.map(_scene, range(REPORT_SEED, REPORT_SEED + count), chunksize=4))
+    return [scene for scene, _ in made], [collider for _, collider in made]
+
+
+def _scene(seed: int) -> tuple[Scene, Collider]:
+    scene = generate_scene(SceneConfig(), seed)
+    return scene, build_collider(scene, MpmConfig().collider_band_cells)
+
+
+if __name__ == "__main__":
+    run_command(main, "solver_targets")
