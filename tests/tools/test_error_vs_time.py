@@ -76,7 +76,14 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
     out = tmp_path / "results" / "report"
     options = {"data": data, "out": str(out), "weights": weights, "split": "validation", "frame_stride": 2}
-    options |= {"mpm_grids": [32, 64], "timed_frames": 5, "rounds": 1, "batch_scenes": 2, "timed_scenes": 1}
+    options |= {
+        "mpm_grids": [32, 64],
+        "timed_frames": 5,
+        "rounds": 1,
+        "batch_scenes": 2,
+        "timed_batches": [2],
+        "timed_scenes": 1,
+    }
     options |= {"sinkhorn_points": 8, "device": "cpu"}
     assert main(options) == 0
     report = json.loads(Path(f"{out}.json").read_text())
@@ -139,6 +146,7 @@ def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.Monkey
         "mpm_frames": 3,
         "timed_frames": 5,
         "mpm_timed_frames": 4,
+        "timed_batches": [2],
         "rounds": 1,
         "perturbation": 0.0,
     }
@@ -227,7 +235,14 @@ def test_what_counts_most_comes_first(
 
     monkeypatch.setattr("tools.error_vs_time.run.score", noted)
     options = {"data": data, "out": str(tmp_path / "report"), "split": "validation", "weights": files, "device": "cpu"}
-    options |= {"frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1, "sinkhorn_scenes": 0}
+    options |= {
+        "frame_stride": 5,
+        "timed_frames": 4,
+        "rounds": 1,
+        "timed_scenes": 1,
+        "timed_batches": [2],
+        "sinkhorn_scenes": 0,
+    }
     options |= {"mpm_grids": [48, 64], "mpm_steps": [0.5], "precisions": ["tf32", "fp32"], "repeated_frames": 3}
     assert main(options) == 0
     assert [name.split(" (")[0] for name in order] == [
@@ -402,7 +417,7 @@ def test_bad_options(change: dict[str, Any], message: str) -> None:
 
 
 SHORT = {"split": "validation", "device": "cpu", "frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1}
-SHORT |= {"sinkhorn_points": 8, "batch_scenes": 2, "mpm_timed_frames": 4, "perturbation": 0.0}
+SHORT |= {"sinkhorn_points": 8, "batch_scenes": 2, "timed_batches": [2], "mpm_timed_frames": 4, "perturbation": 0.0}
 
 
 def test_a_report_goes_on_where_it_was_cut_off(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

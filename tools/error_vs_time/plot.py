@@ -48,7 +48,7 @@ def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = Fa
     size = (FIGURE_WIDTH, PANEL_HEIGHT + below + 0.9)
     figure, grid = new_figure(1, len(shown), size)
     scenes = max((row.get("batch_scenes") or 1 for row in rows), default=1)
-    how = f"{scenes} scenes side by side" if batched else "one scene"
+    how = f"up to {scenes} scenes side by side, as each has it best" if batched else "one scene"
     for panel, frame in zip(grid[0], shown, strict=True):
         _pareto(panel, rows, frame, "ms_batched" if batched else "ms", looks)
         panel.set_xlabel(f"milliseconds a frame{' and scene' if batched else ''} ({how})", fontsize=TEXT)

@@ -45,11 +45,12 @@ class ErrorVsTimeConfig:
     # minutes
     repeated_frames: FrameCount = 51
     mpm_frames: FrameCount = 300  # of the solver's rollouts, which take most of the time
-    mpm_timed_frames: int = 12  # of the solver, where networks are timed over timed_frames
+    mpm_timed_frames: int = 300  # of the solver, whose frames take longest when material has landed
     resimulate: bool = True  # false: the data itself is the reference; with mpm_grids=[] perturbation=0 no solver runs
     # domain units, at most, of each coordinate: how far the solver departs from itself; 0: not asked
     perturbation: NonNegative[float] = 1e-6
-    batch_scenes: Positive[int] = 8  # simulated side by side for the second run time
+    batch_scenes: Positive[int] = 8  # of a network's rollouts, side by side
+    timed_batches: tuple[Positive[int], ...] = (8, 64, 256)  # scenes side by side: each has its best
     timed_scenes: Positive[int] = 3
     timed_frames: int = 100  # at most
     timed_seconds: Positive[float] = 0.5  # of each timed rollout, about: the slow take fewer frames, at least six
@@ -76,6 +77,7 @@ class ErrorVsTimeConfig:
         for name in ("timed_frames", "mpm_timed_frames"):
             require(getattr(self, name) >= 4, name, "at least 4", getattr(self, name))
         require(0 < self.reference_step <= 1, "reference_step", "above 0 and at most 1", self.reference_step)
+        require(len(self.timed_batches) > 0, "timed_batches", "one number of scenes or more", self.timed_batches)
         for i, step in enumerate(self.mpm_steps):
             require(0 < step <= 1, f"mpm_steps[{i}]", "above 0 and at most 1", step)
         for i, grid in enumerate(self.mpm_grids):

@@ -16,6 +16,7 @@ from tools.error_vs_time.settings import ErrorVsTimeConfig
 
 WARM_FRAMES, TRITON_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
 SOLVER_WARM_FRAMES = 2  # the initial state and the first, in which the solver compiles
+GAIN = 0.95  # of a scene's time, that a larger batch must come below
 
 
 @dataclass(eq=False)
@@ -23,6 +24,7 @@ class Stopwatch:
     """The run times of a contender: how many frames it is timed over, and what was measured."""
 
     contender: Contender
+    batch: list[Episode]
     single_frames: int
     batch_frames: int
     memory_gb: float | None
@@ -37,13 +39,16 @@ class Timing:
         # The largest first: what is captured for it has room for the others.
         some = sorted(references[: config.timed_scenes], key=lambda episode: -len(episode.material_N))
         self.singles = [[episode] for episode in some]
-        self.batch = list(references[: config.batch_scenes])
+        # the scenes again and again where a batch holds more
+        self.batches = [
+            [references[i % len(references)] for i in range(count)] for count in sorted(config.timed_batches)
+        ]
         self.config, self.device = config, device
 
     def begun(self, contender: Contender) -> Stopwatch:
-        """Simulates one scene and the batch for some frames, which say how many take `timed_seconds`; then all that
-        will be timed, as far as something is captured or compiled for it. Tells the most GPU memory that the first
-        scene took, of what torch knows.
+        """Simulates one scene and batches for some frames, which say how many take `timed_seconds`, and which batch
+        is done soonest; then all that will be timed, as far as something is captured or compiled for it. Tells the
+        most GPU memory that the first scene took, of what torch knows. The solver is timed over whole rollouts.
         """
         kind, graphed = contender.row["system"], not getattr(contender, "stepped", True)
         contender.release()
@@ -52,10 +57,10 @@ class Timing:
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(self.device)
             before = torch.cuda.memory_allocated(self.device)
-        most = min(self.config.timed_frames, len(self.batch[0].position_TN3))
+        most = min(self.config.timed_frames, len(self.singles[0][0].position_TN3))
         if kind == "mpm":
             most = min(most, self.config.mpm_timed_frames)
-            for scenes in (*self.singles, self.batch):  # kernels are compiled for the materials that a scene holds
+            for scenes in self.singles:  # kernels are compiled for the materials that a scene holds
                 frame_milliseconds(contender, scenes, min(SOLVER_WARM_FRAMES, most))
         # what looks at its frames 32 at a time tells nothing of fewer
         frames = TRITON_WARM_FRAMES if graphed else WARM_FRAMES
@@ -64,29 +69,47 @@ class Timing:
             frame_milliseconds(contender, self.singles[0], min(frames, most))
         taken = frame_milliseconds(contender, self.singles[0], min(frames, most))
         peak = torch.cuda.max_memory_allocated(self.device) - before if self.device.type == "cuda" else 0
-        if captures:
-            frame_milliseconds(contender, self.batch, min(frames, most))
-        together = frame_milliseconds(contender, self.batch, min(frames, most))
+        batch, together = self._best_batch(contender, min(frames, most), kind == "mpm" or captures)
 
         def affordable(milliseconds: float | None) -> int:
-            if milliseconds is None:
+            if milliseconds is None or kind == "mpm":
                 return most
             return min(most, max(frames, int(1e3 * self.config.timed_seconds / milliseconds)))
 
         memory = peak / 1e9 if kind != "mpm" and self.device.type == "cuda" else None
-        watch = Stopwatch(contender, affordable(taken), affordable(together), memory)
+        watch = Stopwatch(contender, batch, affordable(taken), affordable(together), memory)
         if captures:
             for single in self.singles:
                 frame_milliseconds(contender, single, watch.single_frames)
-            frame_milliseconds(contender, self.batch, watch.batch_frames)
+            frame_milliseconds(contender, batch, watch.batch_frames)
         return watch
+
+    def _best_batch(self, contender: Contender, frames: int, compiles: bool) -> tuple[list[Episode], float | None]:
+        """The batch whose scenes are done soonest, and the milliseconds of its frames: larger ones are tried as long as
+        they gain and there is memory.
+        """
+        best, least = self.batches[0], None
+        for batch in self.batches:
+            try:
+                if compiles:
+                    frame_milliseconds(contender, batch, frames)
+                taken = frame_milliseconds(contender, batch, frames)
+            except torch.OutOfMemoryError:
+                contender.release()
+                break
+            if taken is None or (least is not None and taken / len(batch) > GAIN * least / len(best)):
+                break
+            best, least = batch, taken
+        return best, least
 
     def round(self, watch: Stopwatch) -> dict[str, Any]:
         """Simulates each of the scenes once more; what the report tells of all times so far. `ms` is a frame of one
         scene, `ms_batched` a frame of each of the scenes side by side.
         """
-        for scenes in (*self.singles, self.batch):
-            together = scenes is self.batch
+        for scenes in (*self.singles, watch.batch):
+            together = scenes is watch.batch
+            if together and watch.batched and watch.contender.row["system"] == "mpm":
+                continue  # a whole rollout of many scenes, once
             frames = watch.batch_frames if together else watch.single_frames
             taken = frame_milliseconds(watch.contender, scenes, frames)
             if taken is not None:
@@ -95,7 +118,7 @@ class Timing:
             "ms": float(np.median(watch.single)) if watch.single else None,
             "ms_quartiles": quartiles(watch.single),
             "ms_batched": float(np.median(watch.batched)) if watch.batched else None,
-            "batch_scenes": len(self.batch),
+            "batch_scenes": len(watch.batch),
             "timed_frames": watch.single_frames,
             "memory_gb": watch.memory_gb,
         }
