@@ -6,6 +6,7 @@ next update, after a checkpoint.
 
 from __future__ import annotations
 
+import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,6 +23,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.schema import from_mapping
 from hgn.system.extras import require_installed
 from hgn.system.files import held
+from hgn.system.processes import die_with_parent
 from hgn.training.checkpoint import (
     LAST_NAMES,
     DamagedError,
@@ -31,7 +33,7 @@ from hgn.training.checkpoint import (
     sampler_state_of_checkpoint,
 )
 from hgn.training.dataset import PublishedEpisodes, is_complete, wait_for_episodes
-from hgn.training.distributed import default_run, first_rank, layout
+from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
 from hgn.training.generator import Generator
 from hgn.training.session import precompile_kernels, train_network
 from hgn.training.stop import StopRequest
@@ -44,6 +46,9 @@ def main(mapping: dict[str, Any]) -> int:
     if mapping.get("run") is None:
         mapping["run"] = str(default_run(name))
     config = from_mapping(TrainConfig, mapping)
+    if not first_on_machine():
+        # whoever started this rank has ended, by an error of its own say: no time-out is waited for
+        die_with_parent(signal.SIGKILL)
     layout(config.training)
     folder, run = config.dataset.folder, Path(config.run)
     if EpisodeStore.available(folder):

@@ -203,10 +203,21 @@ class _Remote:
         if self._http:
             import aiohttp
 
+            from hgn.data.bounded_http import BoundedResponse
+
             token = dataset_token()
             timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_S, sock_read=_SILENCE_S)
-            headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-            options = {"client_kwargs": {"headers": headers, "timeout": timeout}, "use_listings_cache": False}
+            # packed, a small answer could become a large one
+            headers = {"Accept-Encoding": "identity"}
+            if token is not None:
+                headers["Authorization"] = f"Bearer {token}"
+            client = {
+                "headers": headers,
+                "timeout": timeout,
+                "auto_decompress": False,
+                "response_class": BoundedResponse,
+            }
+            options = {"client_kwargs": client, "use_listings_cache": False}
         try:
             self._files, self._root = fsspec.core.url_to_fs(url, **options)
         except (ValueError, ImportError) as error:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import fcntl
 import functools
+import gzip
 import http.server
 import json
 import multiprocessing
@@ -242,6 +244,41 @@ def test_times_that_were_set_back(folder: Path) -> None:
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
     with pytest.raises(ConfigError, match="it was altered"):
         verify_file(path, sha256, status.st_size, "")
+
+
+@pytest.mark.parametrize("attack", ["gzip bomb", "endless", "long range"])
+def test_answers_are_bounded(monkeypatch: pytest.MonkeyPatch, attack: str) -> None:
+    """A server cannot fill the memory: a packed answer stays packed, and one that is longer than was asked for, or
+    than any, is cut."""
+    monkeypatch.setattr("hgn.data.bounded_http.LARGEST_BYTES", 100_000)
+
+    class Attack(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(206 if attack == "long range" else 200)
+            if attack == "gzip bomb":
+                self.send_header("Content-Encoding", "gzip")
+            self.end_headers()
+            with contextlib.suppress(ConnectionError):
+                if attack == "gzip bomb":
+                    self.wfile.write(gzip.compress(bytes(10**7)))
+                for _ in range(0 if attack == "gzip bomb" else 1000):
+                    self.wfile.write(bytes(10_000))
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Attack) as server:
+        threading.Thread(target=server.serve_forever).start()
+        storage = open_storage(f"http://127.0.0.1:{server.server_port}")
+        try:
+            if attack == "gzip bomb":
+                assert len(storage.manifest("manifest.json")) < 20_000
+            else:
+                limit = 50 if attack == "long range" else 100_000
+                with pytest.raises(ConfigError, match=f"must answer with at most {limit} bytes, got more"):
+                    storage.read("s", 0, 50) if attack == "long range" else storage.manifest("manifest.json")
+        finally:
+            server.shutdown()
 
 
 def test_link_in_the_cache(folder: Path, cache: Path, tmp_path: Path) -> None:

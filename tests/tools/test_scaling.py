@@ -21,7 +21,6 @@ SMALL: dict[str, Any] = {
     "scenes": 2,
     "batches": 2,
     "rounds": 3,
-    "message_mb": [],
     "network": {"width": 16, "levels": 2, "message_passing_steps": 1},
     "device": "cpu",
 }
@@ -57,7 +56,7 @@ def averaged(
 ) -> measure.Contender:
     device = torch.device("cpu")
     updates = make(config, measure._batches(config, 0, 0.1, device), device)
-    found = measure.Contender("any", 1, True, 4, 0.1, updates)
+    found = measure.Contender("any", 1, True, 0.1, updates)
     measure._average(found, group)
     return found
 
@@ -103,7 +102,6 @@ def test_triton_is_timed_alike(alone: dist.ProcessGroup) -> None:
         ({"device": "cuda:1"}, "device must be auto, cpu or cuda"),
         ({"batches": 0}, "batches must be at least 1"),
         ({"backends": ["slow"]}, r"backends\[0\] must be torch or triton"),
-        ({"message_mb": [0]}, r"message_mb\[0\] must be a finite number > 0"),
         ({"particle_spread": -1}, "particle_spread must be"),
         ({"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),
     ],

@@ -346,3 +346,28 @@ def test_devices_that_are_not_there(no_launcher: pytest.MonkeyPatch) -> None:
     no_launcher.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match=r"training\.accelerator must be auto or cpu without a GPU, got 'gpu'"):
         layout(TrainingConfig(accelerator="gpu"))
+
+
+@pytest.mark.parametrize(("local_rank", "expected"), [("0", []), ("1", [signal.SIGKILL])])
+def test_ranks_end_with_the_one_that_started_them(
+    monkeypatch: pytest.MonkeyPatch,
+    make_config: Callable[..., DatagenConfig],
+    tmp_path: Path,
+    local_rank: str,
+    expected: Any,
+) -> None:
+    """Lightning's launcher leaves the other ranks waiting when the first one fails: the kernel ends them. The first
+    one of a machine outlives its shell, as any command."""
+    for name in LAUNCHER_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("LOCAL_RANK", local_rank)
+    asked: list[int] = []
+    monkeypatch.setattr(train, "die_with_parent", asked.append)
+
+    def far_enough(training: TrainingConfig) -> None:
+        raise ConfigError("far enough")
+
+    monkeypatch.setattr(train, "layout", far_enough)
+    with pytest.raises(ConfigError, match="far enough"):
+        train.main(train_mapping(make_config(), tmp_path / "run"))
+    assert asked == expected

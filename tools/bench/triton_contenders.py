@@ -6,10 +6,12 @@ Shape legend: N particles of all scenes, S scenes.
 from __future__ import annotations
 
 import copy
+from typing import TYPE_CHECKING
 
 import torch
 
 from hgn.config import NetworkConfig, TrainingConfig
+from hgn.data.batch import Batch
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import kernel_precision
 from hgn.runtime.parity import relative_error
@@ -24,6 +26,9 @@ from tools.bench.contenders import (
 )
 from tools.bench.states import Workload, batch_of, state_of
 from tools.bench.timing import Timed, once
+
+if TYPE_CHECKING:
+    from hgn.kernels.update.op import DeviceEpisode
 
 FRAMES_AT_ONCE = 16  # at most, so that a frame's launch hides behind the one before, as in a simulation
 UPDATES_AT_ONCE = 20
@@ -83,28 +88,24 @@ class TritonFrame:
         return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
 
 
+def device_samples(batch: Batch) -> list[tuple[DeviceEpisode, int, int]]:
+    """The scenes of a batch as Triton's updates take them: episodes of one window, frame 0 and the seed."""
+    from hgn.kernels.update.op import DeviceEpisode  # loads Triton
+
+    windows = batch.window_WN3.split(batch.particles_S, dim=1)
+    materials = batch.material_N.int().split(batch.particles_S)
+    rows = zip(windows, materials, batch.domain_S3.tolist(), batch.gravity_S3.tolist(), batch.seeds_S, strict=True)
+    return [(DeviceEpisode(w.contiguous(), m.clone(), None, tuple(d), tuple(g)), 0, s) for w, m, d, g, s in rows]
+
+
 class TritonTrain:
     """One training update: batch, noise, jitter, grid or neighbours, forward, backward, Adam."""
 
     def __init__(self, precision: str, config: NetworkConfig, work: Workload, device: torch.device) -> None:
-        from hgn.kernels.update.op import DeviceEpisode  # loads Triton
-
         self.device, self.precision = device, precision
         self.batch = batch_of(work, config, device)
         self.network = bench_network(config, device)
-        counts = list(self.batch.particles_S)
-        parts = zip(
-            self.batch.window_WN3.split(counts, dim=1),
-            self.batch.material_N.split(counts),
-            self.batch.gravity_S3.tolist(),
-            self.batch.seeds_S,
-            strict=True,
-        )
-        size = (work.domain_size,) * 3
-        self.samples = [
-            (DeviceEpisode(window_WN3.contiguous(), material_N.int(), None, size, tuple(gravity)), 0, seed)
-            for window_WN3, material_N, gravity, seed in parts
-        ]
+        self.samples = device_samples(self.batch)
         training = TrainingConfig()
         self.updates = self._updates(training.noise_std, training.grid_jitter)
         self.rates = [training.learning_rate] * UPDATES_AT_ONCE

@@ -20,7 +20,6 @@ class ScalingConfig:
     batches: OneOrMore = 8  # of each device; one sample is an update on each of them
     backends: tuple[str, ...] = ("torch", "triton")  # of training; triton where there are GPUs
     precision: Precision = "tf32"  # as for training; or fp32, fp16 (where backend torch takes tf32)
-    message_mb: tuple[Positive[float], ...] = (25.0,)  # message sizes that are timed beside backend torch's own
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rounds: Positive[int] = 20  # samples of each contender
     seconds: Positive[float] = 30.0  # at most for all contenders, once three rounds are done

@@ -34,6 +34,7 @@ from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
 from tools.bench.contenders import FRAME_RATE_HZ, PASS, bench_network
 from tools.bench.states import Workload, batch_of_scenes
+from tools.bench.triton_contenders import device_samples
 from tools.scaling.config import ScalingConfig
 
 # Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
@@ -51,7 +52,6 @@ class Contender:
     backend: str  # torch or triton
     devices: int
     averaged: bool
-    message_mb: float | None  # of backend torch; triton sends all gradients at once
     spread: float  # of the particles of a scene
     update: TorchUpdates | TritonUpdates | None = field(default=None, repr=False)  # none in processes that take no part
     check: str = PASS
@@ -72,9 +72,8 @@ class TorchUpdates:
         self.loss: nn.Module = _Loss(module)
         self.parameters = list(network.parameters())
 
-    def average(self, group: dist.ProcessGroup, message_mb: float | None) -> list[int]:
+    def average(self, group: dist.ProcessGroup) -> list[int]:
         """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
-        assert message_mb is not None
         messages: list[int] = []
 
         # torch reads annotations, and takes none for right but not those that are strings
@@ -82,13 +81,13 @@ class TorchUpdates:
             messages.append(bucket.buffer().nbytes)
             return allreduce_hook(group, bucket)
 
-        probe = _averaged(copy.deepcopy(self.loss), group, message_mb, self.device)
+        probe = _averaged(copy.deepcopy(self.loss), group, self.device)
         probe.register_comm_hook(None, hook)
         for _ in range(2):  # after the first pass the messages follow the order in which gradients came
             messages.clear()
             probe.zero_grad()
             probe(self.batches[0]).backward()
-        self.loss = _averaged(self.loss, group, message_mb, self.device)
+        self.loss = _averaged(self.loss, group, self.device)
         return messages
 
     def run(self) -> None:
@@ -114,7 +113,7 @@ class TritonUpdates:
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
         # Triton, which backend torch does without, is loaded here.
-        from hgn.kernels.update.op import DeviceEpisode, Updates, UpdateSettings
+        from hgn.kernels.update.op import Updates, UpdateSettings
 
         training = TrainingConfig(batch_scenes=config.scenes)
         network = bench_network(config.network, device)
@@ -124,15 +123,10 @@ class TritonUpdates:
         counters = torch.zeros(2, device=device), torch.zeros(5, device=device)
         self.make = partial(Updates, network, settings, precision, *counters)
         self.ours = self.make()
-        self.chunk = []
-        for batch in batches:
-            windows = batch.window_WN3.split(batch.particles_S, dim=1)
-            materials = batch.material_N.int().split(batch.particles_S)
-            rows = zip(windows, materials, batch.domain_S3.tolist(), batch.seeds_S, strict=True)
-            self.chunk.append([(DeviceEpisode(w.contiguous(), m.clone(), None, tuple(d)), 0, s) for w, m, d, s in rows])
+        self.chunk = [device_samples(batch) for batch in batches]
         self.rates = [training.learning_rate] * len(self.chunk)
 
-    def average(self, group: dist.ProcessGroup, message_mb: float | None) -> list[int]:
+    def average(self, group: dist.ProcessGroup) -> list[int]:
         """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
         messages: list[int] = []
 
@@ -203,20 +197,16 @@ def _torch_precision(config: ScalingConfig, device: torch.device) -> str:
 
 
 def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -> list[Contender]:
-    chosen = averaging_options()["bucket_cap_mb"]
     contenders = []
     for backend in config.backends:
         if backend == "triton" and triton_unsupported_reason(device, config.network, config.precision):
             continue
-        sent = list(dict.fromkeys([chosen, *config.message_mb])) if backend == "torch" else [None]
         for size in sizes:
-            contenders.append(Contender(backend, size, False, None, 0.0))
+            contenders.append(Contender(backend, size, False, 0.0))
             if size > 1:
-                contenders += [Contender(backend, size, True, message_mb, 0.0) for message_mb in sent]
+                contenders.append(Contender(backend, size, True, 0.0))
             if config.particle_spread > 0:
-                contenders.append(
-                    Contender(backend, size, size > 1, sent[0] if size > 1 else None, config.particle_spread)
-                )
+                contenders.append(Contender(backend, size, size > 1, config.particle_spread))
     return contenders
 
 
@@ -249,12 +239,9 @@ def _prepared(
     return contender
 
 
-def _averaged(
-    loss: nn.Module, group: dist.ProcessGroup, message_mb: float, device: torch.device
-) -> DistributedDataParallel:
-    options: dict[str, Any] = averaging_options() | {"bucket_cap_mb": message_mb}
+def _averaged(loss: nn.Module, group: dist.ProcessGroup, device: torch.device) -> DistributedDataParallel:
     here = [device] if device.type == "cuda" else None
-    return DistributedDataParallel(loss, device_ids=here, process_group=group, **options)
+    return DistributedDataParallel(loss, device_ids=here, process_group=group, **averaging_options())
 
 
 def _average(contender: Contender, group: dist.ProcessGroup) -> None:
@@ -263,7 +250,7 @@ def _average(contender: Contender, group: dist.ProcessGroup) -> None:
     expected = contender.update.gradients().clone()
     dist.all_reduce(expected, group=group)
     expected /= dist.get_world_size(group)
-    contender.messages = contender.update.average(group, contender.message_mb)
+    contender.messages = contender.update.average(group)
     error = relative_error(contender.update.gradients(), expected)
     if not error <= GRADIENT_BOUND:
         contender.check = f"relative error of averaged gradients {error:.1e} exceeds {GRADIENT_BOUND:.0e}"
@@ -328,7 +315,6 @@ def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> d
         "particles": config.particles,
         "particle_spread": contender.spread,
         "averaged": contender.averaged,
-        "message_mb": contender.message_mb,
         "messages": contender.messages,
         "check": contender.check,
         "ms": None,
