@@ -20,7 +20,7 @@ import numpy as np
 
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
 from hgn.data.statistics import Statistics
-from hgn.data.storage import UnreachableError, is_remote, open_storage
+from hgn.data.storage import UnreachableError, holders, is_remote, open_storage
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, require
 
@@ -114,7 +114,7 @@ class EpisodeStore:
         with contextlib.suppress(ConfigError, OSError):
             for shard in manifest.shards.since(self._fetched):
                 if shard.split == self.split:
-                    open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes)
+                    open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, make_room=False)
                 self._fetched += 1
 
     def digest(self, count: int) -> str | None:
@@ -171,32 +171,40 @@ class EpisodeStore:
         self._measured = 0  # how many shards these are
         self._fetched = 0  # of the data set's shards, how many were brought here one after the other
         self._lock = threading.Lock()
+        holders.add(self)
 
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)
 
     def _open(self, index: int) -> Episode:
         shard, entry = self._locate(index)
-        path = None
-        if shard.name not in self._open_shards:  # outside of the lock: this may wait for a server
-            path = open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes)
-        with self._lock:
+        while True:
             opened = self._open_shards.get(shard.name)
-            if opened is None:
-                assert path
-                opened = self._open_shards[shard.name] = _OpenShard(path)
+            if opened is None:  # outside of the lock: this may wait for a server
+                opened = _OpenShard(open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes))
+            with self._lock:
+                opened = self._open_shards.setdefault(shard.name, opened)
+                self._open_shards.move_to_end(shard.name)
                 # each map holds a file descriptor; episodes that are in use keep theirs
                 if len(self._open_shards) > MAPPED_SHARDS:
                     self._open_shards.popitem(last=False)
-            self._open_shards.move_to_end(shard.name)
-            size = opened.path.stat().st_size
-            if size < shard.bytes:  # to read what is mapped there would end the process
-                raise ConfigError(
-                    f"{opened.path} must have {shard.bytes} bytes, got {size}: it was cut while it was open"
-                )
-            if entry.key not in opened.episodes:
-                opened.episodes[entry.key] = self._read(opened.content, shard, entry)
-            return opened.episodes[entry.key]
+                size = opened.size()
+                if size is None and is_remote(self.folder):  # it left a full cache, and comes again
+                    del self._open_shards[shard.name]
+                    continue
+                if size is not None and size < shard.bytes:  # to read what is mapped there would end the process
+                    raise ConfigError(
+                        f"{opened.path} must have {shard.bytes} bytes, got {size}: it was cut while it was open"
+                    )
+                if entry.key not in opened.episodes:
+                    opened.episodes[entry.key] = self._read(opened.content, shard, entry)
+                return opened.episodes[entry.key]
+
+    def release(self, path: Path) -> None:
+        """Closes a shard; episodes of it that are in use stay readable."""
+        with self._lock:
+            for name in [name for name, opened in self._open_shards.items() if opened.path == path]:
+                del self._open_shards[name]
 
     def _read(self, content: np.ndarray, shard: ShardEntry, entry: EpisodeEntry) -> Episode:
         episode = read_episode(content, shard.name, entry.key, entry.members)
@@ -214,6 +222,13 @@ class EpisodeStore:
 
 class _OpenShard:
     """One map a shard, not one an episode."""
+
+    def size(self) -> int | None:
+        """Of the file now; none where it is gone."""
+        try:
+            return self.path.stat().st_size
+        except FileNotFoundError:
+            return None
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -2,7 +2,8 @@
 
 Shards of a URL are kept in a cache on this machine, under their sha256, so that no two data sets collide there; one
 process of the machine brings a shard, the others wait for it. `HGN_CACHE` names the cache's folder (default
-`~/.cache/hgn`), `HGN_DATASET_TOKEN` the token that a dataset service asks for.
+`~/.cache/hgn`), `HGN_CACHE_GB` how much may be in it (default: all that fits on its disk; the shard that was brought
+first makes room), `HGN_DATASET_TOKEN` the token that a dataset service asks for.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ import fcntl
 import functools
 import hashlib
 import io
+import math
 import os
 import random
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -27,6 +30,7 @@ from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 CACHE_VARIABLE = "HGN_CACHE"
+LIMIT_VARIABLE = "HGN_CACHE_GB"
 PATIENCE_S = 300.0  # with a server that does not answer: time enough to start a service again
 _CHUNK_BYTES = 16 * 2**20  # of a shard at a time: what is lost when a connection is
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 10.0
@@ -47,6 +51,17 @@ class UnreachableError(OSError):
         super().__init__(errno.ETIMEDOUT, f"no answer for {patience_s:.0f} s (at last: {cause})", url)
 
 
+class Holder(Protocol):
+    """Who has files of the cache open, which take their room until they are closed."""
+
+    def release(self, path: Path) -> None:
+        """Closes a file that is about to go."""
+        ...
+
+
+holders: weakref.WeakSet[Holder] = weakref.WeakSet()
+
+
 class Storage(Protocol):
     """A data set's files, wherever they are."""
 
@@ -58,8 +73,11 @@ class Storage(Protocol):
         """Some bytes of a file. Raises: FileNotFoundError; UnreachableError; ConfigError (no access, too short)."""
         ...
 
-    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
-        """The path of a shard on this machine, verified. Raises: ConfigError; UnreachableError; OSError."""
+    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, make_room: bool = True) -> Path:
+        """The path of a shard on this machine, verified; others leave a full cache for it, if it may `make_room`.
+
+        Raises: ConfigError; UnreachableError; OSError (a full disk, or cache).
+        """
         ...
 
 
@@ -178,7 +196,7 @@ class _Folder:
             file.seek(start)
             return _whole(file.read(stop - start), f"{self._folder}/{name}", start, stop)
 
-    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
+    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, make_room: bool = True) -> Path:
         path = self._folder / name
         try:
             verify_file(path, sha256, size, "delete it and run the generator again")
@@ -246,13 +264,13 @@ class _Remote:
             data = data[start:stop]
         return _whole(data, f"{self._url}/{name}", start, stop)
 
-    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S) -> Path:
+    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, make_room: bool = True) -> Path:
         path = cache_folder() / f"{sha256}.tar"
         remedy = "it is fetched again"
         for again in (True, False):
             if not path.exists():
                 try:
-                    self._fetch(name, sha256, size, path, patience_s)
+                    self._fetch_into_room(name, sha256, size, path, patience_s, make_room)
                 except FileNotFoundError:
                     raise ConfigError(
                         f"{self._url}/{name} is listed in the manifest but missing; run the generator again"
@@ -287,6 +305,21 @@ class _Remote:
             ) from None
         if written != expected:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
+
+    def _fetch_into_room(
+        self, name: str, sha256: str, size: int, path: Path, patience_s: float, make_room: bool
+    ) -> None:
+        while True:
+            try:
+                over = _bytes_over(path.parent, size)
+                if over > 0:
+                    raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
+                return self._fetch(name, sha256, size, path, patience_s)
+            except OSError as error:
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not make_room:
+                    raise
+                if not _make_room(path.parent, max(over, size)):
+                    raise
 
     def _fetch(self, name: str, sha256: str, size: int, path: Path, patience_s: float) -> None:
         self._require_not_away(name, patience_s)
@@ -365,6 +398,42 @@ def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:
     if len(data) != stop - start:
         raise ConfigError(f"{path} must have {stop} bytes, got {start + len(data)}; it was cut: generate it again")
     return data
+
+
+def _cached(folder: Path) -> list[tuple[int, int, Path]]:
+    """Of each shard in the cache when it was brought, its bytes and path; others may take them away meanwhile."""
+    found = []
+    for path in folder.glob("*.tar"):
+        with contextlib.suppress(FileNotFoundError):
+            status = path.stat()
+            found.append((status.st_mtime_ns, status.st_size, path))
+    return sorted(found)
+
+
+def _bytes_over(folder: Path, size: int) -> float:
+    """By how much the cache would be over its limit with one more file. Raises: ConfigError."""
+    limit = os.environ.get(LIMIT_VARIABLE)
+    if not limit:
+        return 0
+    try:
+        allowed = float(limit) * 1e9
+    except ValueError:
+        allowed = 0.0
+    require(0 < allowed < math.inf, LIMIT_VARIABLE, "a number of gigabytes > 0", limit)
+    return sum(cached for _, cached, _ in _cached(folder)) + size - allowed
+
+
+def _make_room(folder: Path, size: float) -> bool:
+    """Removes the shards that were brought first; whether there was any."""
+    freed = 0
+    for _, cached, path in _cached(folder):
+        if freed >= size:
+            break
+        for holder in list(holders):
+            holder.release(path)
+        path.unlink(missing_ok=True)
+        freed += cached
+    return freed > 0
 
 
 def _read_range(files: Any, start: int, stop: int) -> Callable[[str], bytes]:

@@ -18,6 +18,7 @@ import threading
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import numpy as np
@@ -34,6 +35,7 @@ from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import (
     CACHE_VARIABLE,
+    LIMIT_VARIABLE,
     TOKEN_VARIABLE,
     UnreachableError,
     cache_folder,
@@ -279,6 +281,44 @@ def test_answers_are_bounded(monkeypatch: pytest.MonkeyPatch, attack: str) -> No
                     storage.read("s", 0, 50) if attack == "long range" else storage.manifest("manifest.json")
         finally:
             server.shutdown()
+
+
+@pytest.mark.parametrize("full", ["limit", "disk"])
+def test_full_cache(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
+    """A data set that is larger than the cache's limit, or its disk, is read all the same, again and again: shards that
+    were brought first make room, and what had them open lets them go. Nothing is thrown out for what is only fetched
+    ahead."""
+    room = 30_000  # of 51,200 bytes in four shards
+    if full == "limit":
+        monkeypatch.setenv(LIMIT_VARIABLE, str(room / 1e9))
+    else:
+        real = hgn.data.storage._Remote._fill
+
+        def fill(self: Any, file: Any, name: str, size: int, patience_s: float) -> str:
+            if sum(path.stat().st_size for path in cache.glob("*.tar")) + size > room:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return real(self, file, name, size, patience_s)
+
+        monkeypatch.setattr(hgn.data.storage._Remote, "_fill", fill)
+    url = in_memory(folder, f"large-{full}")
+    store, expected = EpisodeStore(url, "train"), EpisodeStore(folder, "train")
+    store.fetch_ahead()
+    assert store._fetcher
+    store._fetcher.join()
+    kept = sorted(cache.glob("*.tar"))
+    assert 0 < store._fetched < len(store.manifest.shards) and len(kept) == 2
+    for _ in range(2):
+        for mine, other in zip(store.episodes, expected.episodes, strict=True):
+            assert np.array_equal(mine.position_TN3, other.position_TN3)
+            assert sum(path.stat().st_size for path in cache.glob("*.tar")) <= room
+        assert len(store._open_shards) <= 2
+    assert sorted(cache.glob("*.tar")) != kept
+    monkeypatch.setenv(LIMIT_VARIABLE, "1e-9")
+    store.release(store._open_shards.popitem()[1].path)
+    for path in cache.glob("*.tar"):
+        path.unlink()
+    with pytest.raises(OSError, match="the cache is full"):
+        store.episodes[0]
 
 
 def test_link_in_the_cache(folder: Path, cache: Path, tmp_path: Path) -> None:
