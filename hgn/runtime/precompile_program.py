@@ -13,7 +13,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 
@@ -26,7 +26,7 @@ from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.triton_backend import updates_of
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
-from hgn.schema import from_mapping
+from hgn.schema import from_mapping, to_mapping
 
 NICENESS = 10
 
@@ -132,20 +132,12 @@ def compile_part(job: PrecompileJob | FrameJob, part: int, parts: int) -> int:
 
 
 def job_text(job: PrecompileJob | FrameJob) -> str:
-    return json.dumps(asdict(job))
+    return json.dumps(to_mapping(job))
 
 
 def job_of(text: str) -> PrecompileJob | FrameJob:
     mapping = json.loads(text)
-    if "networks" in mapping:
-        networks = tuple(
-            (from_mapping(NetworkConfig, network), precision) for network, precision in mapping["networks"]
-        )
-        return FrameJob(networks, tuple((n, cells) for n, cells in mapping["sizes"]), mapping["capability"])
-    network = from_mapping(NetworkConfig, mapping.pop("network"))
-    settings = UpdateSettings(**mapping.pop("settings"))
-    tuples = {name: tuple(mapping[name]) for name in ("cells", "pushforward_scenes")}
-    return PrecompileJob(network, settings, **{**mapping, **tuples})
+    return from_mapping(FrameJob, mapping) if "networks" in mapping else from_mapping(PrecompileJob, mapping)
 
 
 def main() -> None:

@@ -71,24 +71,27 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     """
     remedy = "set it so, or choose another run=FOLDER"
     # Through the dataclass: a key that is younger than the checkpoint has its default in it.
-    stored = to_mapping(from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network"))
-    wanted = to_mapping(config.network)
-    for key in sorted(stored.keys() | wanted.keys()):
-        if stored.get(key) != wanted.get(key):
-            raise ConfigError(
-                f"network.{key} must be {stored.get(key)!r} to go on with {path}, got {wanted.get(key)!r}; {remedy}"
-            )
-    if checkpoint[SECTION]["data"]["config_hash"] != config_hash:
+    stored, section = from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network"), checkpoint[SECTION]
+    pairs = _network_pairs(stored, config)
+    pairs.append(("training.noise_std", section["noise_std"], config.training.noise_std))  # is in the normaliser
+    _require_equal(pairs, f" to go on with {path}", remedy)
+    if section["data"]["config_hash"] != config_hash:
         raise ConfigError(
             f"dataset.folder must hold the data set that {path} was trained on, got another one (config hash "
-            f"{config_hash[:12]} instead of {checkpoint[SECTION]['data']['config_hash'][:12]}); {remedy}"
+            f"{config_hash[:12]} instead of {section['data']['config_hash'][:12]}); {remedy}"
         )
-    if checkpoint[SECTION]["noise_std"] != config.training.noise_std:
-        # The normaliser was made with this noise.
-        raise ConfigError(
-            f"training.noise_std must be {checkpoint['hgn']['noise_std']} to go on with {path}, "
-            f"got {config.training.noise_std}; {remedy}"
-        )
+
+
+def _network_pairs(network: NetworkConfig, config: TrainConfig) -> list[tuple[str, Any, Any]]:
+    """Each key of the networks' settings: its name, the value there, and the one that is asked for."""
+    stored, wanted = to_mapping(network), to_mapping(config.network)
+    return [(f"network.{key}", stored[key], wanted[key]) for key in sorted(stored)]
+
+
+def _require_equal(pairs: list[tuple[str, Any, Any]], why: str, remedy: str) -> None:
+    for name, theirs, ours in pairs:
+        if theirs != ours:
+            raise ConfigError(f"{name} must be {theirs!r}{why}, got {ours!r}; {remedy}")
 
 
 def network_of_weights(config: TrainConfig) -> ParticleNetwork:
@@ -100,14 +103,11 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     network, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    stored, wanted = to_mapping(info.network), to_mapping(config.network)
-    pairs = [(f"network.{key}", stored[key], wanted[key]) for key in sorted(stored)]
+    pairs = _network_pairs(info.network, config)
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:
         pairs.append(("scene.cell_size", info.obstacle_cell_size, config.scene.cell_size))
-    for name, theirs, ours in pairs:
-        if theirs != ours:
-            raise ConfigError(f"{name} must be {theirs!r}, as in training.init_weights {path}, got {ours!r}; {remedy}")
+    _require_equal(pairs, f", as in training.init_weights {path}", remedy)
     return network
 
 
