@@ -607,7 +607,7 @@ def test_the_figures_show_what_diverged(tmp_path: Path) -> None:
     meta |= {"scenes": 2, "split": "test", "data": "d", "device": "a GPU", "reference": "the solver"}
     rows = report_rows()
     rows[2] |= {"position_mse": {"50": 1e-6}, "scenes_reached": {"50": 2, "299": 0}, "failed_scenes": 2}
-    for some in (rows, rows[:1], []):
+    for some in (rows, []):
         for picture in (draw_pareto(some, meta), draw_pareto(some, meta, batched=True), draw_frames(some, meta)):
             with Image.open(io.BytesIO(picture)) as image:
                 assert image.width > 500
