@@ -78,7 +78,7 @@ def main(mapping: dict[str, Any]) -> int:
         order = sorted(range(len(made)), key=lambda i: -sum(len(scene.obstacles) for scene in made[i].scenes))
         starts = {i: threads.submit(initial_states, made[i]) for i in order}
         ahead = None
-        if not backend.stepped:
+        if made and not backend.stepped:
             # Triton, which backend torch does without, is loaded here.
             from hgn.runtime.precompile import precompile_frames
 
