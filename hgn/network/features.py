@@ -67,6 +67,11 @@ class Normaliser(nn.Module):
             scale = acceleration_std_3.double().square().mean().sqrt().expand(3)
             self.set(quantity, torch.zeros(3), scale, noise_std)
 
+    def feature_scale(self, relative: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and standard deviation [3] of what features show of velocities: relative ones are of accelerations."""
+        quantity = "acceleration" if relative else "velocity"
+        return getattr(self, f"{quantity}_mean"), getattr(self, f"{quantity}_std")
+
     def normalise_velocity(self, velocity: torch.Tensor) -> torch.Tensor:
         return (velocity - self.velocity_mean) / self.velocity_std
 

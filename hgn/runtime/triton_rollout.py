@@ -114,7 +114,7 @@ class TritonRollout:
         self.path_TN3 = torch.zeros(2 * self.look_frames, self.particles, 3, device=self.device)
         self.overlap = self.device.type == "cuda"  # frames are started before those before them are taken away
         normaliser = network.normaliser
-        self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
+        self.velocity_mean, self.velocity_std = (x.float() for x in normaliser.feature_scale(self.config.relative))
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.frames_done = 0
         self.growths = 0

@@ -98,8 +98,7 @@ def prepare(
         domain,
         state.gravity_S3.float().to(where),
         engine.particle_count,
-        normaliser.velocity_mean.float().to(where),
-        normaliser.velocity_std.float().to(where),
+        *(x.float().to(where) for x in normaliser.feature_scale(config.relative)),
         obstacles,
     )
 

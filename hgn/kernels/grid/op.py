@@ -222,8 +222,8 @@ class DeviceGrid:
     ) -> None:
         """Cells and features of every particle; without `obstacles` normals are zero, and nothing is looked up.
 
-        Velocities have `mean_3` and `std_3`; gravity counts for relative inputs alone. With `symmetry` the obstacles
-        are seen under the symmetries in their rows.
+        `mean_3` and `std_3` are those of Normaliser.feature_scale; gravity counts for relative inputs alone. With
+        `symmetry` the obstacles are seen under the symmetries in their rows.
         """
         blocks = (triton.cdiv(self.particles, PARTICLE_BLOCK),)
         if config.relative:

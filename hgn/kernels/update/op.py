@@ -201,7 +201,7 @@ class Updates:
         self.obstacles = ObstacleTable([None] * scenes, settings.obstacle_cell_size, device) if sees else None
         none_S5 = torch.zeros(scenes, OBSTACLE_COLUMNS, dtype=torch.int64, device=device)
         self._obstacle_row = self.obstacles.row_S5 if self.obstacles else none_S5
-        self.velocity_mean, self.velocity_std = normaliser.velocity_mean.float(), normaliser.velocity_std.float()
+        self.velocity_mean, self.velocity_std = (x.float() for x in normaliser.feature_scale(self.config.relative))
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.capacities = capacities
         self.particles = 0
