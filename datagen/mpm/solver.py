@@ -17,23 +17,33 @@ from datagen.mpm.collider import Collider, build_collider
 from datagen.mpm.device import Device, initialise
 from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.launch import Launch, SceneFailure, Simulated, fixed_substeps, no_counters, particle_bounds
-from datagen.mpm.team_launch import TeamLaunch
+from datagen.mpm.team_launch import Team, TeamLaunch
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.material import material_index
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
-# thread blocks of a GPU for each scene: 512 threads run on a processor at once, whatever they do (see device)
+GPU_THREADS = 512  # that run on a processor at once, whatever they do (see device)
 TEAM_THREADS = 256  # of a scene's only block
 SHARED_THREADS, SHARED_BLOCKS = 128, 2  # of each of several, and how many of them a processor has
 SHARED_PARTICLES = 8  # at least, of each of several
 LARGE_THREADS = 512  # where a scene has more particles for each processor than
 LARGE_PARTICLES = 4096
 WARM_SCENES = 16
+USUAL_PARTICLES = 4_000  # of a random scene
 CELL_TOLERANCE = 1e-3  # of a cell that a domain may be longer or shorter than whole cells
 
-__all__ = ["SceneFailure", "Simulated", "fixed_substeps", "initialise", "particle_bounds", "simulate", "warm_up"]
+__all__ = [
+    "SceneFailure",
+    "Simulated",
+    "Team",
+    "fixed_substeps",
+    "initialise",
+    "particle_bounds",
+    "simulate",
+    "warm_up",
+]
 
 
 def simulate(
@@ -44,9 +54,8 @@ def simulate(
     on_frame: Callable[[int], None] | None = None,
     cpu_threads: int | None = None,
     colliders: Sequence[Collider] | None = None,
-    team_threads: int | None = None,
+    team: Team | None = None,
     stability_fractions: Sequence[float] | None = None,
-    team_blocks: int = 1,
 ) -> list[Simulated | SceneFailure]:
     """Simulates `scenes` side by side and returns `frames` frames of each, the initial state among them.
 
@@ -57,10 +66,8 @@ def simulate(
     taken ceil(frame / step) times a frame in full, as Taichi Elements does: 54 times at 60 Hz and 3.125e-4 s,
     which is 1.25 % more than the frame. `on_frame(t)` is called when frame t of all scenes is complete, from 0.
     `cpu_threads` counts from the process's first simulation; see `initialise`. `colliders` are the scenes' own from
-    `build_collider`, where they were built before. `team_threads` chooses how scenes run: so many threads a block
-    of a GPU (a multiple of 32; 1 works on a CPU too), with `team_blocks` blocks for each scene, or 0 for one launch a
-    substep; none takes what suits the device and the scenes. `stability_fractions` are the scenes' own where they
-    differ from the config's.
+    `build_collider`, where they were built before. `team` says who runs a scene; none takes what suits the device and
+    the scenes. `stability_fractions` are the scenes' own where they differ from the config's.
 
     On a CPU the result of a scene is the same, bitwise, whatever its batch mates do, and depends on
     `cpu_threads` only through the number of parts that particles are summed in, min(cpu_threads, 4). On a GPU
@@ -99,10 +106,12 @@ def simulate(
             [scenes[i] for i in occupied], [colliders[i] for i in occupied], config, node_counts, frame_rate_hz,
             own_fractions,
         )  # fmt: skip
-        threads, blocks = _team(device, batch[0]) if team_threads is None else (team_threads, team_blocks)
+        if team is None:
+            team = _team(device, len(occupied), max(scene.particle_count for scene in batch[0]))
+        _require_at_once(device, team, len(occupied))
         with _arrays_freed_here():
             outcomes = _launched(
-                TeamLaunch(threads, blocks, *batch) if threads else GridLaunch(device, *batch), frames, on_frame
+                TeamLaunch(team, *batch) if team.threads else GridLaunch(device, *batch), frames, on_frame
             )
         for index, outcome in zip(occupied, outcomes, strict=True):
             results[index] = outcome
@@ -136,7 +145,8 @@ def _arrays_freed_here() -> Iterator[None]:
 
 def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
     """Starts a GPU and compiles what a launch of so many random scenes of `scene` needs; nothing on a CPU."""
-    if initialise(config.device).kind == "cpu":
+    device = initialise(config.device)
+    if device.kind == "cpu":
         return
     x, y, z = scene.domain_size
     middle = (0.5 * x, 0.5 * y, 0.5 * z)
@@ -150,22 +160,29 @@ def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
         np.array([material_index(name) for name in scene.materials], np.uint8),
         obstacles, scene.domain_size, scene.cell_size, scene.gravity,
     )  # fmt: skip
-    simulate([one] * min(scenes, WARM_SCENES), config, 2, 60.0)
+    simulate([one] * min(scenes, WARM_SCENES), config, 2, 60.0, team=_team(device, scenes, USUAL_PARTICLES))
 
 
-def _team(device: Device, scenes: Sequence[Scene]) -> tuple[int, int]:
-    """Threads of a block, and blocks of a scene: 0 threads for a launch a substep.
-
-    The blocks of a scene wait for each other, so all of them have to be at work at once.
-    """
+def _team(device: Device, scenes: int, most: int) -> Team:
+    """Who runs so many scenes soonest, the largest of so many particles."""
     if device.kind == "cpu":
-        return 0, 0
-    most = max(scene.particle_count for scene in scenes)
-    share = device.processors // len(scenes)
+        return Team(0)
+    share = device.processors // scenes
     if share > 1 and most > LARGE_PARTICLES * share:
-        return LARGE_THREADS, share
-    blocks = min(SHARED_BLOCKS * device.processors // len(scenes), -(-most // SHARED_PARTICLES))
-    return (SHARED_THREADS, blocks) if blocks > 1 else (TEAM_THREADS, 1)
+        return Team(LARGE_THREADS, share)
+    blocks = min(SHARED_BLOCKS * device.processors // scenes, -(-most // SHARED_PARTICLES))
+    if blocks <= 1:
+        return Team(TEAM_THREADS)
+    # where each thread has a particle at most, it is done sooner alone
+    return Team(SHARED_THREADS, blocks, 1) if most <= SHARED_THREADS * blocks else Team(SHARED_THREADS, blocks)
+
+
+def _require_at_once(device: Device, team: Team, scenes: int) -> None:
+    """The blocks of a scene wait for each other."""
+    if team.blocks > 1:
+        # a CPU runs one scene after the other
+        room = device.threads if device.kind == "cpu" else device.processors * (GPU_THREADS // team.threads) // scenes
+        require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
 
 
 def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,16 @@ from datagen.mpm import team_kernel  # isort: skip
 
 LAUNCH_SECONDS = 3.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
 MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
-RUN = 8  # particles in the order of their cells, that a thread adds up before it adds to nodes
 PAUSE = 0.8  # of the time that a launch is expected to take
 SHORT_SECONDS = 0.1  # of a launch that nobody sleeps for
+
+
+class Team(NamedTuple):
+    """Who runs a scene: so many thread blocks, which wait for each other, so all of them have to be at work at once."""
+
+    threads: int  # of a block: of a GPU a multiple of 32, of a CPU 1; 0: nobody, but one launch a substep
+    blocks: int = 1
+    run: int = 8  # particles in the order of their cells, that a thread adds up before it adds to nodes
 
 
 class TeamLaunch(Launch):
@@ -28,12 +35,9 @@ class TeamLaunch(Launch):
 
     entries_a_node = 2 * team_kernel.LANES
 
-    def __init__(self, threads: int, blocks: int, *batch: Any) -> None:
+    def __init__(self, team: Team, *batch: Any) -> None:
         super().__init__(*batch)
-        self.threads, self.blocks_a_team = threads, blocks
-        # in a block with few particles a thread each is sooner done
-        few = max(np.diff(self.particle_begin)) <= threads * blocks
-        self.run_length = 1 if few else RUN
+        self.team = team
         fields = FIELD.solid if has_solid(self.variant) else FIELD.fluid
         self.state = ti.ndarray(ti.f32, 2 * fields * self.particles)
         tag = np.zeros((2, TAG.length, self.particles), np.int32)
@@ -45,7 +49,7 @@ class TeamLaunch(Launch):
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.meeting = ti.ndarray(ti.i32, len(self.scenes) * team_kernel.MEETING)
-        self.cells = ti.ndarray(ti.i32, 2 * len(self.scenes) * blocks)
+        self.cells = ti.ndarray(ti.i32, 2 * len(self.scenes) * team.blocks)
         for array in (self.cell_count, self.block, self.cells, self.node):
             array.fill(0)
         self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))
@@ -106,9 +110,9 @@ class TeamLaunch(Launch):
         self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
         self.meeting.fill(0)
         team_kernel.advance(
-            frames, self.blocks_a_team, self.frame_s, self.state, self.tag, self.rank, self.hidden, self.cell_count,
+            frames, self.team.blocks, self.frame_s, self.state, self.tag, self.rank, self.hidden, self.cell_count,
             self.cell_list, self.block, self.live, self.cells, self.meeting, self.node,
             self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact,
-            self.contact_normal, output, self.variant, self.threads, self.blocks_a_team > 1, self.run_length,
+            self.contact_normal, output, self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
         )  # fmt: skip
         return output

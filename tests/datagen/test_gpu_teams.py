@@ -15,17 +15,17 @@ SHEET = Obstacle(
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize(("threads", "blocks"), [(256, 1), (128, 2), (128, 40), (512, 20)])
-def test_teams_agree_with_one_launch_a_substep(threads: int, blocks: int) -> None:
+@pytest.mark.parametrize(("threads", "blocks", "run"), [(256, 1, 8), (128, 2, 8), (128, 40, 1), (512, 20, 8)])
+def test_teams_agree_with_one_launch_a_substep(threads: int, blocks: int, run: int) -> None:
     """Three materials on a sheet: one frame agrees to 1e-6, twelve to 1e-4 of the domain; as many substeps."""
-    from datagen.mpm.solver import Simulated, simulate
+    from datagen.mpm.solver import Simulated, Team, simulate
 
     position = np.random.default_rng(0).uniform((0.3, 0.35, 0.3), (0.5, 0.55, 0.5), (3000, 3)).astype(np.float32)
     kinds = (np.arange(3000) % 3).astype(np.uint8)
     scene = Scene(position, np.tile(np.float32((0, -2, 0)), (3000, 1)), kinds, (SHEET,), cell_size=1 / 32)
     config = MpmConfig(device="gpu")
-    (expected,) = simulate([scene], config, 13, 60.0, team_threads=0)
-    found = simulate([scene] * 3, config, 13, 60.0, team_threads=threads, team_blocks=blocks)
+    (expected,) = simulate([scene], config, 13, 60.0, team=Team(0))
+    found = simulate([scene] * 3, config, 13, 60.0, team=Team(threads, blocks, run))
     assert isinstance(expected, Simulated)
     for one in found:
         assert isinstance(one, Simulated)

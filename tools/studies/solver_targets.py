@@ -122,10 +122,10 @@ def timed(
     colliders: Sequence[Collider] | None = None,
 ) -> dict[str, Any]:
     """Milliseconds a frame and scene, after a comparison of the first scene that compiles."""
-    from datagen.mpm.solver import SceneFailure, Simulated, simulate
+    from datagen.mpm.solver import SceneFailure, Simulated, Team, simulate
 
     colliders = colliders or [build_collider(scenes[0], mpm.collider_band_cells)] * len(scenes)
-    expected = simulate(scenes[:1], mpm, COMPARED_FRAMES, rate, colliders=colliders[:1], team_threads=0)[0]
+    expected = simulate(scenes[:1], mpm, COMPARED_FRAMES, rate, colliders=colliders[:1], team=Team(0))[0]
     simulate(scenes, mpm, 2, rate, colliders=colliders)
     ends: list[float] = []
     outcomes = simulate(scenes, mpm, frames, rate, lambda _: ends.append(time.perf_counter()), colliders=colliders)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds, simulate
+from datagen.mpm.solver import SceneFailure, Simulated, Team, particle_bounds, simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import SAND, SNOW, WATER
 from hgn.scene.scene import Scene
@@ -25,7 +25,7 @@ def test_a_hundred_thousand_substeps() -> None:
     place = np.array([[3.2, 3.5, 2.7], [4.1, 2.8, 3.3], [2.6, 2.9, 4.4]]) * CELL
     scene = scene_of(place, (0, 0, 0), np.arange(3), domain_size=(8 * CELL,) * 3)
     config = MpmConfig(device="cpu", time_step="fixed", fixed_time_step_s=5e-4)
-    (outcome,) = simulate([scene], config, 12, 1 / 4.55, team_threads=1)
+    (outcome,) = simulate([scene], config, 12, 1 / 4.55, team=Team(1))
     assert isinstance(outcome, Simulated), outcome
     assert outcome.counters["substeps"] == 11 * 9100 > 100_000
     low, high = particle_bounds(scene, config)

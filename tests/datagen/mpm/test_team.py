@@ -4,10 +4,13 @@ A GPU runs it with hundreds of threads a block; here a block has one, and two bl
 """
 
 import numpy as np
+import pytest
 
-from datagen.mpm.solver import SceneFailure, Simulated, simulate
+from datagen.mpm.device import Device
+from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, simulate
 from hgn.config import MpmConfig
 from hgn.scene.scene import Obstacle, Scene
+from hgn.schema import ConfigError
 
 CELL = 1 / 16
 CONFIG = MpmConfig(device="cpu")
@@ -33,7 +36,7 @@ def test_teams_agree_with_the_other_launch() -> None:
     scenes = [mixed(120, 0, (0, -3, 0)), mixed(90, 1, (1, -1, 0), material_parameters=heavy), mixed(1, 2, (0, 0, 0))]
     frames: list[int] = []
     expected = simulate(scenes, CONFIG, 11, 60.0)
-    found = simulate([*scenes, mixed(40, 3, (0, 1e6, 0))], CONFIG, 11, 60.0, frames.append, team_threads=1)
+    found = simulate([*scenes, mixed(40, 3, (0, 1e6, 0))], CONFIG, 11, 60.0, frames.append, team=Team(1))
     assert frames == list(range(11))
     failed = found.pop()
     assert isinstance(failed, SceneFailure) and failed.cause.startswith("frame 1: ")
@@ -44,16 +47,34 @@ def test_teams_agree_with_the_other_launch() -> None:
         assert np.abs(one.position_TN3 - other.position_TN3).max() < 1e-3
         assert one.counters["substeps"] == other.counters["substeps"]
     # with all that the batch's kernel computes
-    alone = simulate(scenes[1:2], CONFIG, 11, 60.0, team_threads=1)[0]
+    alone = simulate(scenes[1:2], CONFIG, 11, 60.0, team=Team(1))[0]
     assert isinstance(alone, Simulated)
     assert np.abs(alone.position_TN3 - found[1].position_TN3).max() < 1e-3
 
 
 def test_blocks_that_wait_for_each_other_agree_with_one() -> None:
-    """A scene of two blocks ends where that of one does, also where another scene of the launch fails."""
+    """A scene of two blocks ends where that of one does, particles added up one by one or in runs, beside one that
+    fails.
+    """
     scenes = [mixed(120, 0, (0, -3, 0)), mixed(40, 3, (0, 1e6, 0))]
-    one, other = (simulate(scenes, CONFIG, 4, 60.0, team_threads=1, team_blocks=blocks) for blocks in (1, 2))
+    one, other = (simulate(scenes, CONFIG, 4, 60.0, team=team) for team in (Team(1), Team(1, 2, 1)))
     assert isinstance(one[0], Simulated) and isinstance(other[0], Simulated)
     assert isinstance(one[1], SceneFailure) and one[1] == other[1]
     assert np.abs(one[0].position_TN3 - other[0].position_TN3).max() < 1e-5
     assert one[0].counters["substeps"] == other[0].counters["substeps"]
+
+
+@pytest.mark.parametrize("scenes", [1, 2, 7, 32, 132, 133, 264, 800])
+@pytest.mark.parametrize("most", [1, 50, 4_000, 40_000, 1_000_000])
+def test_blocks_that_wait_for_each_other_all_run_at_once(scenes: int, most: int) -> None:
+    """The blocks of a scene, where there are several, find room on a GPU's processors with those of all scenes."""
+    team = _team(Device("gpu", 1, 132), scenes, most)
+    assert team.threads % 32 == 0
+    assert team.blocks == 1 or scenes * team.blocks <= 132 * (512 // team.threads)
+    assert _team(Device("cpu", 2), scenes, most) == Team(0)
+
+
+def test_more_blocks_than_run_at_once() -> None:
+    """Blocks that would wait for ever are refused."""
+    with pytest.raises(ConfigError, match=r"team.blocks must be at most 2, .*, got 3"):
+        simulate([mixed(1, 0, (0, 0, 0))], CONFIG, 2, 60.0, team=Team(1, 3))
