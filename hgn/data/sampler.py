@@ -25,6 +25,7 @@ class SamplerState:
     position: int = 0  # samples of this epoch already taken
     episodes: int = 0  # episodes in this epoch; 0: not decided yet
     digest: str = ""  # of the shards that hold these; none: not known (checkpoints of 0.1.0)
+    window: int = 0  # episodes whose samples are shuffled together; 0: all
 
 
 class Sample(NamedTuple):  # which Python makes faster than other classes: a thousand in a second are drawn
@@ -37,9 +38,30 @@ class Sample(NamedTuple):  # which Python makes faster than other classes: a tho
     noise_scale: float = 1.0  # of its noise, in units of training.noise_std, see hgn.training.noise
 
 
-def epoch_permutation(seed: int, epoch: int, sample_count: int) -> np.ndarray:
-    """The order of an epoch, int64 [sample_count]."""
-    return np.random.Generator(np.random.PCG64([seed, epoch])).permutation(sample_count)
+BLOCK_EPISODES = 8  # that follow each other in publication order: as many as most shards have
+
+
+def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0) -> np.ndarray:
+    """The order of an epoch, int64 [samples]; `first_sample` of each episode, and behind the last one their number.
+
+    All samples are shuffled together; with a `window`, those of about so many episodes at a time: blocks of
+    BLOCK_EPISODES are shuffled, and then the samples of as many blocks as make a window. So a rank needs the shards of
+    two windows at most at a time, and each once an epoch; twice where it lies in two blocks.
+    """
+    generator = np.random.Generator(np.random.PCG64([seed, epoch]))
+    episodes = len(first_sample) - 1
+    if window == 0 or window >= episodes:
+        return generator.permutation(int(first_sample[-1]))
+    blocks = generator.permutation(-(-episodes // BLOCK_EPISODES))
+    together = max(1, window // BLOCK_EPISODES)
+    order = []
+    for start in range(0, len(blocks), together):
+        ranges = [
+            np.arange(first_sample[block * BLOCK_EPISODES], first_sample[min((block + 1) * BLOCK_EPISODES, episodes)])
+            for block in blocks[start : start + together].tolist()
+        ]
+        order.append(generator.permutation(np.concatenate(ranges)))
+    return np.concatenate(order)
 
 
 class EpisodeSampler:
@@ -60,11 +82,18 @@ class EpisodeSampler:
         rank: int = 0,
         world_size: int = 1,
         digest: Callable[[int], str | None] = lambda count: "",
+        window: int = 0,
     ) -> None:
+        """Raises: ConfigError where the state's epoch cannot be gone on with; see `epoch_order` for `window`."""
         assert 0 <= rank < world_size and batch_scenes >= 1
         self.seed, self.batch_scenes, self.rank, self.world_size = seed, batch_scenes, rank, world_size
         self.state = state or SamplerState()
-        self._published, self._digest = published, digest
+        self._published, self._digest, self._window = published, digest, window
+        if self.state.position > 0 and self.state.window != window:
+            raise ConfigError(
+                f"training.shuffle_episodes must be {self.state.window} to go on in the middle of epoch "
+                f"{self.state.epoch}, got {window}; set it so, or start another run"
+            )
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
         self._first_seed = 0  # of an epoch's samples, which have one after the other
@@ -101,9 +130,9 @@ class EpisodeSampler:
                 "in, got others or another order; restore them, or start another run"
             )
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
-        self._order = epoch_permutation(self.seed, epoch, int(self._first_sample[-1]))
+        self._order = epoch_order(self.seed, epoch, self._first_sample, self._window)
         self._first_seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0])
-        self.state = SamplerState(epoch, position, len(frame_counts), found)
+        self.state = SamplerState(epoch, position, len(frame_counts), found, self._window)
 
     def _samples(self, index_K: np.ndarray) -> list[Sample]:
         episode_K = self._first_sample.searchsorted(index_K, side="right") - 1

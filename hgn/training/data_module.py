@@ -177,6 +177,7 @@ class EpisodeDataModule(LightningDataModule):
             rank,
             world_size,
             self.store.digest,
+            self.training.shuffle_episodes,
         )
 
     def _prefetched(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hgn.data.sampler import EpisodeSampler, SamplerState
+from hgn.data.sampler import BLOCK_EPISODES, EpisodeSampler, SamplerState
 from hgn.schema import ConfigError
 
 frame_counts = st.lists(st.integers(2, 9), min_size=1, max_size=6)
@@ -85,6 +85,40 @@ def test_other_shards_are_refused():
     for found in ("other", None):
         with pytest.raises(ConfigError, match="must still hold the shards that epoch 0 began with"):
             EpisodeSampler(0, 1, lambda _: [5, 5], order.state, digest=lambda count, found=found: found)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(2, 5), min_size=1, max_size=60), st.integers(1, 40), st.integers(1, 4), st.integers(0, 99))
+def test_windows(frames: list[int], window: int, world_size: int, cut: int):
+    """With a window each sample still comes once an epoch, on any number of ranks and through an interruption; between
+    two samples of an episode lie no more than those of a window's episodes."""
+    total = sum(frames) - len(frames)
+
+    def ranks(state: SamplerState | None = None) -> list[EpisodeSampler]:
+        orders = range(world_size)
+        return [EpisodeSampler(3, 1, lambda _: frames, state, rank, world_size, window=window) for rank in orders]
+
+    samples: list[tuple[int, int]] = []
+    orders = ranks()
+    while len(samples) < total:
+        if len(samples) == cut // world_size * world_size:
+            orders = ranks(orders[0].state)
+        samples += [sample[:2] for order in orders for sample in order.next_batch()]
+    epoch = samples[:total]
+    assert sorted(epoch) == [(episode, frame) for episode, count in enumerate(frames) for frame in range(count - 1)]
+    if window < len(frames):
+        most = 4 * BLOCK_EPISODES * max(1, window // BLOCK_EPISODES)
+        places = [[i for i, (episode, _) in enumerate(epoch) if episode == e] for e in range(len(frames))]
+        assert all(place[-1] - place[0] < most for place in places)
+
+
+def test_window_cannot_change_within_an_epoch():
+    """Another window is another order: an epoch goes on with its own, and its end with any."""
+    order = EpisodeSampler(0, 1, lambda _: [5] * 20, window=8)
+    take(order, 1)
+    with pytest.raises(ConfigError, match=r"training\.shuffle_episodes must be 8 to go on in the middle of epoch 0"):
+        EpisodeSampler(0, 1, lambda _: [5] * 20, order.state)
+    assert EpisodeSampler(0, 1, lambda _: [5] * 20, SamplerState(1, 0, 20, "", 8)).state.window == 0
 
 
 def test_order_is_the_same_everywhere():

@@ -17,7 +17,7 @@ from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.data.reader import EpisodeStore
-from hgn.data.storage import CACHE_VARIABLE
+from hgn.data.storage import CACHE_VARIABLE, LIMIT_VARIABLE
 from hgn.schema import ConfigError
 from hgn.training.data_module import EpisodeDataModule, agreed_count
 
@@ -109,3 +109,37 @@ def test_ranks_with_other_data_are_refused(folder: Path, here: bool) -> None:
     trainer = SimpleNamespace(world_size=2, global_rank=1, strategy=Strategy())
     with pytest.raises(ConfigError, match=r"must show the same 5 episodes on every node, got others.* rank"):
         agreed_count(EpisodeStore(folder, "train"), trainer)  # type: ignore[arg-type]
+
+
+def test_data_larger_than_the_cache(
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Shuffled in windows, an epoch fetches each shard once through a cache with room for a third of the data, and its
+    batches are those of a reader that has all of it."""
+    folder = make_dataset(make_config(training_scenes=32, validation_scenes=0, test_scenes=0, frames=3))
+    training = replace(SETTINGS[1], shuffle_episodes=8)
+    sizes = [shard.bytes for shard in EpisodeStore(folder, "train").manifest.shards]
+    files = fsspec.filesystem("memory")
+    files.put(str(folder), "/larger", recursive=True)
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(LIMIT_VARIABLE, str(sum(sizes) / 3e9))
+    monkeypatch.setattr(EpisodeStore, "fetch_ahead", lambda store: None)
+    fetched: list[str] = []
+    real = files.cat_file
+    monkeypatch.setattr(files, "cat_file", lambda path, *a, **k: fetched.append(path) or real(path, *a, **k))
+    epoch = 32 * 2 // 2
+
+    def batches(place: Path | str, training: TrainingConfig) -> list[Batch]:
+        feed = EpisodeDataModule(EpisodeStore(place, "train"), SETTINGS[0], training, batches_ahead=0)
+        return list(islice(feed.batches(), epoch))
+
+    for here, there in zip(batches(folder, training), batches("memory://larger", training), strict=True):
+        assert torch.equal(here.window_WN3, there.window_WN3) and here.sampler_state == there.sampler_state
+    once = sorted(name for name in fetched if name.endswith(".tar"))
+    assert len(once) == len(set(once)) == len(sizes) == 7
+    fetched.clear()
+    batches("memory://larger", SETTINGS[1])
+    assert len([name for name in fetched if name.endswith(".tar")]) > 2 * len(sizes)
