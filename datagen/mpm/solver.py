@@ -17,7 +17,7 @@ from datagen.mpm.collider import Collider, build_collider
 from datagen.mpm.device import Device, initialise
 from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.launch import Launch, SceneFailure, Simulated, fixed_substeps, no_counters, particle_bounds
-from datagen.mpm.team_launch import Team, TeamLaunch
+from datagen.mpm.team_launch import MAXIMUM_PARTICLES, Team, TeamLaunch
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.material import material_index
 from hgn.scene.scene import Scene
@@ -165,7 +165,7 @@ def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
 
 def _team(device: Device, scenes: int, most: int) -> Team:
     """Who runs so many scenes soonest, the largest of so many particles."""
-    if device.kind == "cpu":
+    if device.kind == "cpu" or most > MAXIMUM_PARTICLES:
         return Team(0)
     share = device.processors // scenes
     if share > 1 and most > LARGE_PARTICLES * share:

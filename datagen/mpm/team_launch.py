@@ -11,6 +11,7 @@ import numpy as np
 
 from datagen.mpm.launch import Launch, device_array
 from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, TAG, has_solid
+from hgn.schema import ConfigError
 
 import taichi as ti  # isort: skip
 
@@ -18,6 +19,7 @@ from datagen.mpm import team_kernel  # isort: skip
 
 LAUNCH_SECONDS = 3.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
 MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
+MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # whose fields kernels count in int32
 PAUSE = 0.8  # of the time that a launch is expected to take
 SHORT_SECONDS = 0.1  # of a launch that nobody sleeps for
 
@@ -38,6 +40,11 @@ class TeamLaunch(Launch):
     def __init__(self, team: Team, *batch: Any) -> None:
         super().__init__(*batch)
         self.team = team
+        if self.particles > MAXIMUM_PARTICLES:
+            raise ConfigError(
+                f"a batch must hold at most {MAXIMUM_PARTICLES} particles, got {self.particles} of {len(self.scenes)} "
+                "scenes; lower scenes_per_launch"
+            )
         fields = FIELD.solid if has_solid(self.variant) else FIELD.fluid
         self.state = ti.ndarray(ti.f32, 2 * fields * self.particles)
         tag = np.zeros((2, TAG.length, self.particles), np.int32)

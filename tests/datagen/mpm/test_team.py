@@ -6,6 +6,7 @@ A GPU runs it with hundreds of threads a block; here a block has one, and two bl
 import numpy as np
 import pytest
 
+from datagen.mpm import team_launch
 from datagen.mpm.device import Device
 from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, simulate
 from hgn.config import MpmConfig
@@ -71,10 +72,17 @@ def test_blocks_that_wait_for_each_other_all_run_at_once(scenes: int, most: int)
     team = _team(Device("gpu", 1, 132), scenes, most)
     assert team.threads % 32 == 0
     assert team.blocks == 1 or scenes * team.blocks <= 132 * (512 // team.threads)
-    assert _team(Device("cpu", 2), scenes, most) == Team(0)
+    assert _team(Device("cpu", 2), scenes, most) == _team(Device("gpu", 1, 132), 1, 50_000_000) == Team(0)
 
 
 def test_more_blocks_than_run_at_once() -> None:
     """Blocks that would wait for ever are refused."""
     with pytest.raises(ConfigError, match=r"team.blocks must be at most 2, .*, got 3"):
         simulate([mixed(1, 0, (0, 0, 0))], CONFIG, 2, 60.0, team=Team(1, 3))
+
+
+def test_more_particles_than_kernels_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A batch beyond what int32 counts is refused with the remedy."""
+    monkeypatch.setattr(team_launch, "MAXIMUM_PARTICLES", 10)
+    with pytest.raises(ConfigError, match=r"at most 10 particles, got 11 of 1 scenes; lower scenes_per_launch"):
+        simulate([mixed(11, 0, (0, 0, 0))], CONFIG, 2, 60.0, team=Team(1))
