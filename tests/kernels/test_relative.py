@@ -101,7 +101,7 @@ def test_what_flies_in_one_piece() -> None:
     engine = engine_of(network, state)
     run_forward(engine, network, state, origin_S3)
     torch.testing.assert_close(engine.grid.gate_N[: len(expected)].cpu().double(), expected, rtol=0, atol=1e-3)
-    output, together, each = compare(network, state, "fp32", 1.0, 256)
+    output, together, each = compare(network, state, "fp32", 1.0, 512)
     assert max(output, together, *each) < 2e-4
 
 
