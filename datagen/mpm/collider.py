@@ -24,6 +24,7 @@ friction.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,7 @@ from hgn.schema import ConfigError
 
 SEEN, HIDDEN = 0, 1  # the two fields of a node
 ON_SURFACE_CELLS = 0.05  # nearer than this, the direction to the surface is rounding
+MOVE_CELLS = 0.1  # that an obstacle moves at most until its contacts are made anew
 BEARING_CELLS = 0.25  # above a surface, up to where nodes stop motion
 GAP_CELLS = 0.75  # from a surface, where material is that nodes begin to stop
 STENCIL_CELLS = 1.501  # from a particle to its nodes, along each axis, with rounding
@@ -69,8 +71,9 @@ class Collider:
         return int(inside.sum())
 
 
-def build_collider(scene: Scene, band_cells: float) -> Collider:
-    """The contact nodes of all obstacles of a scene; nodes lie at multiples of scene.cell_size.
+def build_collider(scene: Scene, band_cells: float, time: float = 0.0) -> Collider:
+    """The contact nodes of all obstacles of a scene, as they lie at a time in seconds; nodes lie at multiples of
+    scene.cell_size. What moves may go on by MOVE_CELLS.
 
     Any number and size of triangles takes bounded memory. Triangles without area and parts outside the domain
     are left out. Raises: ConfigError when an obstacle has vertices that are not finite, or triangles whose
@@ -82,7 +85,8 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
     doubled = np.zeros(count, bool)
     triangles: dict[bool, list[np.ndarray]] = {False: [np.zeros((0, 3, 3))], True: []}
     owners: dict[bool, list[np.ndarray]] = {False: [np.zeros(0, np.int32)], True: []}
-    for index, obstacle in enumerate(scene.obstacles):
+    obstacles = [placed(obstacle, time) for obstacle in scene.obstacles]
+    for index, obstacle in enumerate(obstacles):
         triangle_F33, rim_F6 = _triangles(obstacle, index, scene.cell_size)
         triangles[obstacle.closed].append(triangle_F33)
         owners[obstacle.closed].append(np.full(len(triangle_F33), index, np.int32))
@@ -94,7 +98,8 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
             for surface, contacts in zip(surfaces, _sheet_contacts(triangle_F33, rim_F6, shape), strict=True):
                 surface.merge(index, contacts)
             centre_F13 = triangle_F33.mean(axis=1, keepdims=True)
-            for node, _ in near_slabs(centre_F13 + WIDENED * (triangle_F33 - centre_F13), STENCIL_CELLS, shape):
+            reach = STENCIL_CELLS if obstacle.motion is None else STENCIL_CELLS + 2 * MOVE_CELLS
+            for node, _ in near_slabs(centre_F13 + WIDENED * (triangle_F33 - centre_F13), reach, shape):
                 doubled[np.ravel_multi_index(node.T, shape)] = True
     node = np.flatnonzero(doubled | np.isfinite(surfaces[SEEN].distance))
     return Collider(
@@ -103,7 +108,7 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
         np.stack([surface.obstacle[node] for surface in surfaces], axis=1),
         np.stack([surface.least[node] for surface in surfaces], axis=1),
         doubled[node],
-        tuple(obstacle for obstacle in scene.obstacles if obstacle.closed and len(obstacle.triangle_F3)),
+        tuple(obstacle for obstacle in obstacles if obstacle.closed and len(obstacle.triangle_F3)),
         build_sweep(
             np.concatenate(triangles[False] + triangles[True]),
             np.concatenate(owners[False] + owners[True]),
@@ -111,6 +116,13 @@ def build_collider(scene: Scene, band_cells: float) -> Collider:
             shape,
         ),
     )
+
+
+def placed(obstacle: Obstacle, time: float) -> Obstacle:
+    """The obstacle where it lies at a time."""
+    if obstacle.motion is None:
+        return obstacle
+    return dataclasses.replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time))
 
 
 class _Surface:

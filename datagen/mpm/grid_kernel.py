@@ -77,7 +77,8 @@ def _particle_to_grid(
     hidden_here = 0
     if ti.static(bool(variant & VARIANT.sheets)):
         if begins == 1.0:
-            hidden[p] = find_hidden(position[p], scene, contact, contact_normal, setting, shape)
+            elapsed = scene_value[scene, VALUE.frame] - scene_value[scene, VALUE.remaining] - step
+            hidden[p] = find_hidden(position[p], scene, elapsed, contact, contact_normal, setting, shape, variant)
         hidden_here = hidden[p]
     C = affine[p]
     stretch = ti.Matrix.zero(ti.f32, 3, 3)
@@ -334,3 +335,4 @@ def begin_frame(
         counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
         if counter[scene, COUNT.status] == STATUS.running:
             scene_value[scene, VALUE.remaining] = frame_s
+            scene_value[scene, VALUE.frame] = frame_s

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from datagen.mpm.collider import MOVE_CELLS, build_collider
 from datagen.mpm.device import Device
 from datagen.mpm.launch import Launch, device_array, device_vectors
 from datagen.mpm.layout import COUNT, STATUS, VALUE, VARIANT, has_solid
+from hgn.scene.scene import Scene
+from hgn.schema import require
 
 import taichi as ti  # isort: skip
 
@@ -17,6 +22,38 @@ from datagen.mpm import grid_kernel  # isort: skip
 
 MAXIMUM_PARTS = 4  # copies of the grid on a CPU, one a thread
 SUBSTEPS_PER_CHECK = 64  # at most; on a GPU each check waits for the device
+
+
+MAXIMUM_MOVE_CELLS = 100.0  # of a moving obstacle in a frame
+
+
+def motion_parts(scenes: Sequence[Scene], begin: float, end: float) -> int:
+    """Into how many parts a frame is cut, so that no obstacle moves by more than MOVE_CELLS in any; 0 where none moves.
+
+    Raises: ConfigError where one moves by more than MAXIMUM_MOVE_CELLS in the frame.
+    """
+    most = 0.0
+    for index, scene in enumerate(scenes):
+        for number, obstacle in enumerate(scene.obstacles):
+            if obstacle.motion is None:
+                continue
+            # keyframes within the frame too: what goes and comes back moves
+            stops = obstacle.motion.time_T[(obstacle.motion.time_T > begin) & (obstacle.motion.time_T < end)]
+            way = 0.0
+            for first, last in itertools.pairwise([begin, *stops, end]):
+                turn, velocity, pivot = obstacle.motion.rates(first, last)
+                arm = np.linalg.norm(obstacle.motion.place(obstacle.vertex_V3, first) - pivot, axis=1).max(initial=0.0)
+                speed = float(np.linalg.norm(velocity) + np.linalg.norm(turn) * arm)
+                way = max(way, speed * (end - begin) / scene.cell_size)
+            require(
+                way <= MAXIMUM_MOVE_CELLS,
+                f"obstacles[{number}].keyframes of scene {index}",
+                f"no faster than {MAXIMUM_MOVE_CELLS:g} cells a frame",
+                f"{way:.4g} from {begin:.4g} s on",
+                "give it more time",
+            )
+            most = max(most, way)
+    return math.ceil(most / MOVE_CELLS - 1e-6)
 
 
 class GridLaunch(Launch):
@@ -49,11 +86,28 @@ class GridLaunch(Launch):
 
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         completed = np.zeros(len(self.scenes), np.int64)
-        for _ in range(frames):
-            grid_kernel.begin_frame(self.frame_s, self.scene_value, self.counter)
-            self._run_frame()
+        moved = False
+        for frame in range(frames):
+            motion = motion_parts(self.scenes, frame * self.frame_s, (frame + 1) * self.frame_s) if self.moving else 0
+            parts = max(motion, 1)
+            for part in range(parts):
+                if motion or moved:
+                    self._move((frame + part / parts) * self.frame_s, (frame + (part + 1) / parts) * self.frame_s)
+                grid_kernel.begin_frame(self.frame_s / parts, self.scene_value, self.counter)
+                self._run_frame()
+                moved = motion > 0
             completed += self.counter.to_numpy()[:, COUNT.status] == STATUS.running
             yield self.position.to_numpy()[None], completed
+
+    def _move(self, begin: float, end: float) -> None:
+        """Makes the contacts of scenes in which obstacles move anew, as they lie at `begin`."""
+        self.colliders = [
+            build_collider(scene, self.config.collider_band_cells, begin) if scene.moves else collider
+            for scene, collider in zip(self.scenes, self.colliders, strict=True)
+        ]
+        self.ghosts = sum(int(collider.doubled_K.sum()) for collider in self.colliders)
+        ti.lang.impl.get_runtime().prog.delete_ndarray(self.contact_normal.arr)
+        self._place_contacts(begin, end)
 
     def _run_frame(self) -> None:
         """Substeps until no scene has time left; the host looks only when the last estimate has run out."""

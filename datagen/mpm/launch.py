@@ -37,7 +37,14 @@ from hgn.schema import ConfigError
 import datagen.mpm.device  # noqa: F401  # isort: skip  # keeps Taichi's banner off stdout
 import taichi as ti  # isort: skip
 
-from datagen.mpm.surface_kernel import LIST_HEAD, NODE_VECTORS, TRIANGLE_VECTORS, place_contacts  # isort: skip
+from datagen.mpm.surface_kernel import (  # isort: skip
+    LIST_HEAD,
+    MOVING_NODE_VECTORS,
+    MOVING_TRIANGLE_VECTORS,
+    NODE_VECTORS,
+    TRIANGLE_VECTORS,
+    place_contacts,
+)
 
 MAXIMUM_BLOCKS = 1024  # along an axis: kernels keep ten bits of it
 
@@ -155,7 +162,9 @@ class Launch(ABC):
         self.scene_nodes = math.prod(self.blocks) * BLOCK_NODES
         # second fields of nodes come last, in blocks of their own
         self.ghosts = sum(int(collider.doubled_K.sum()) for collider in colliders)
-        self.all_blocks = len(scenes) * math.prod(self.blocks) + -(-self.ghosts // BLOCK_NODES)
+        self.moving = any(scene.moves for scene in scenes)
+        ghost_room = self.scene_nodes * len(scenes) if self.moving and self._has_sheets() else self.ghosts
+        self.all_blocks = len(scenes) * math.prod(self.blocks) + -(-ghost_room // BLOCK_NODES)
         if max(self.blocks) > MAXIMUM_BLOCKS:
             raise ConfigError(
                 f"domain_size must be at most {MAXIMUM_BLOCKS * BLOCK} cells a side, got {max(node_counts)}; enlarge "
@@ -171,13 +180,16 @@ class Launch(ABC):
             [(index << MATERIAL_BITS) + np.asarray(scene.material_N, np.int32) for index, scene in enumerate(scenes)]
         )
         laws, row = material_laws(scenes, config)
-        has_contact = any(len(collider.node_K3) for collider in colliders)
-        has_sweep = config.collider_projection and any(len(collider.sweep.base_K3) for collider in colliders)
+        has_contact = self.moving or any(len(collider.node_K3) for collider in colliders)
+        has_sweep = config.collider_projection and (
+            self.moving or any(len(collider.sweep.base_K3) for collider in colliders)
+        )
         self.variant = (
             sum(MATERIAL_VARIANTS[material] for material in np.unique(label & MATERIAL_MASK))
             + VARIANT.contact * has_contact
             + VARIANT.sweep * has_sweep
-            + VARIANT.sheets * (self.ghosts > 0)
+            + VARIANT.sheets * (ghost_room > 0)
+            + VARIANT.moving * self.moving
             + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
             + VARIANT.taichi_elements_water * (config.water_volume_update == "taichi_elements")
             + VARIANT.stiffening_water * (config.water_equation == "stiffening")
@@ -190,24 +202,32 @@ class Launch(ABC):
         self.setting = device_array(self._settings(frame_rate_hz))
         self.scene_value = device_array(self._scene_values(laws, row, stability_fractions))
         self.counter = device_array(np.zeros((len(scenes), COUNT.length), np.int64))
-        self.shape = device_array(self._shape())
         self.node = self._node_array(nodes)
-        self.hidden = ti.ndarray(ti.i32, self.particles if self.ghosts else 1)
+        self.hidden = ti.ndarray(ti.i32, self.particles if ghost_room else 1)
+        self._place_contacts(0.0, self.frame_s)
+
+    def _has_sheets(self) -> bool:
+        return any(not obstacle.closed for scene in self.scenes for obstacle in scene.obstacles)
+
+    def _place_contacts(self, begin: float, end: float) -> None:
+        """Puts the colliders' contacts where kernels read them; what moves does so at its mean rates of a time."""
+        self.shape = device_array(self._shape())
         places, values, vectors = [], [], [np.zeros((1, 3), np.float32)]
         length = 1
-        if has_contact or has_sweep:
+        if self.variant & (VARIANT.contact | VARIANT.sweep):
             length = self.all_blocks * BLOCK_NODES
-            place, value, vector = self._contacts()
+            place, value, vector = self._contacts(begin, end)
             places, values, vectors = [place], [value], [vector]
-        if has_sweep or self.ghosts:
-            place, value, triangle, length = self._sweeps(len(vectors[0]))
+        if self.variant & (VARIANT.sweep | VARIANT.sheets):
+            place, value, triangle, length = self._sweeps(sum(map(len, vectors)), begin, end)
             places, values, vectors = [*places, place], [*values, value], [*vectors, triangle]
         self.contact = ti.ndarray(ti.i32, length)
         self.contact.fill(-1)
         for place, value in zip(places, values, strict=True):
             if len(place):
                 place_contacts(self.contact, device_array(place), device_array(value))
-        self.contact_normal = device_vectors(np.concatenate(vectors))
+        vector = np.concatenate(vectors)
+        self.contact_normal = device_vectors(vector if len(vector) else np.zeros((1, 3), np.float32))
 
     @abstractmethod
     def _node_array(self, nodes: int) -> Any:
@@ -281,7 +301,18 @@ class Launch(ABC):
         setting[SETTING.size : SETTING.size + 3] = self.scenes[0].domain_size
         return setting
 
-    def _contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _rates(self, begin: float, end: float) -> list[np.ndarray]:
+        """Of each scene its obstacles' motion from one time to another, float64 [obstacles, 3, 3]: angular velocity,
+        velocity of a point, and that point.
+        """
+        rates = [np.zeros((max(len(scene.obstacles), 1), 3, 3)) for scene in self.scenes]
+        for own, scene in zip(rates, self.scenes, strict=True):
+            for index, obstacle in enumerate(scene.obstacles):
+                if obstacle.motion is not None:
+                    own[index] = obstacle.motion.rates(begin, end)
+        return rates
+
+    def _contacts(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places of contact nodes, the entry of each (see grid_kernel.substep), and the entries' vectors."""
         places = np.concatenate(
             [
@@ -290,13 +321,19 @@ class Launch(ABC):
             ]
         )
         order = np.argsort(~np.concatenate([collider.doubled_K for collider in self.colliders]), kind="stable")
-        vector = np.zeros((len(order), NODE_VECTORS, 3), np.float32)
+        vector = np.zeros((len(order), MOVING_NODE_VECTORS if self.moving else NODE_VECTORS, 3), np.float32)
         vector[:, :2] = np.concatenate([collider.normal_K23 for collider in self.colliders])[order]
         vector[:, 2, :2] = np.concatenate(
             [friction[own.obstacle_K2] for friction, own in zip(self._frictions(), self.colliders, strict=True)]
         )[order]
         least = [cell_mass(scene) * own.least_K2 for scene, own in zip(self.scenes, self.colliders, strict=True)]
         vector[:, 3, :2] = np.concatenate(least)[order]
+        if self.moving:
+            surface = []
+            for scene, rates, own in zip(self.scenes, self._rates(begin, end), self.colliders, strict=True):
+                turn, velocity, place = np.moveaxis(rates[own.obstacle_K2], 2, 0)
+                surface.append(velocity + np.cross(turn, own.node_K3[:, None] * scene.cell_size - place))
+            vector[:, 4:] = np.concatenate(surface)[order]
         return places[order], np.arange(len(order), dtype=np.int32), vector.reshape(-1, 3)
 
     def _frictions(self) -> list[np.ndarray]:
@@ -313,12 +350,13 @@ class Launch(ABC):
         place = ((x // BLOCK) * np.int32(self.blocks[1]) + y // BLOCK) * np.int32(self.blocks[2]) + z // BLOCK
         return place * np.int32(BLOCK_NODES) + ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK
 
-    def _sweeps(self, first_vector: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    def _sweeps(self, first_vector: int, begin: float, end_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         """Entries of the contact array for the swept test (see grid_kernel.substep): places, values; the triangles'
         vectors; the array's length.
         """
         all_nodes = self.all_blocks * BLOCK_NODES
         sweeps = [collider.sweep for collider in self.colliders]
+        length = MOVING_TRIANGLE_VECTORS if self.moving else TRIANGLE_VECTORS
         lists = sum(len(sweep.begin_K) for sweep in sweeps)
         end = 2 * all_nodes + LIST_HEAD * lists + sum(len(sweep.triangle_L) for sweep in sweeps)
         if end >= 2**31:
@@ -338,17 +376,23 @@ class Launch(ABC):
                 (self._places(sweep.base_K3) + np.int32(all_nodes + index * self.scene_nodes), head),
                 (head, count),
                 (head + 1, sweep.sheets_K),
-                (end + body, first_vector + TRIANGLE_VECTORS * sweep.triangle_L),
+                (end + body, first_vector + length * sweep.triangle_L),
             ):
                 places[filled : filled + len(place)], values[filled : filled + len(place)] = place, value
                 filled += len(place)
-            first_vector += TRIANGLE_VECTORS * len(sweep.triangle_F43)
+            first_vector += length * len(sweep.triangle_F43)
             end += LIST_HEAD * len(count) + len(sweep.triangle_L)
-        vector = np.zeros((sum(len(sweep.triangle_F43) for sweep in sweeps), TRIANGLE_VECTORS, 3), np.float32)
+        vector = np.zeros((sum(len(sweep.triangle_F43) for sweep in sweeps), length, 3), np.float32)
         vector[:, :4] = np.concatenate([sweep.triangle_F43 for sweep in sweeps])
         vector[:, 4, 0] = np.concatenate(
             [friction[sweep.obstacle_F] for friction, sweep in zip(self._frictions(), sweeps, strict=True)]
         )
+        if self.moving:
+            rates = [own[sweep.obstacle_F] for own, sweep in zip(self._rates(begin, end_s), sweeps, strict=True)]
+            turn, velocity, place = np.moveaxis(np.concatenate(rates), 1, 0)
+            cell_size = self.scenes[0].cell_size
+            vector[:, 5] = velocity / cell_size + np.cross(turn, vector[:, 0] - place / cell_size)
+            vector[:, 6] = turn
         return places, values, vector.reshape(-1, 3), end
 
     @abstractmethod

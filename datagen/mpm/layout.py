@@ -77,7 +77,8 @@ class SceneValue(NamedTuple):
     gravity_time: int = 14  # for which gravity acts in the present substep, s: see mls_mpm
     water_density: int = 15  # at rest, in masses of a particle a cell; 0 where it is not known
     wall_friction: int = 16  # 16, 17, 18: of the domain's walls across x, y, z
-    length: int = 19
+    frame: int = 19  # length of the present frame, s
+    length: int = 20
 
 
 class Status(NamedTuple):
@@ -133,7 +134,8 @@ class Variant(NamedTuple):
     stiffening_water: int = 256
     taichi_elements_water: int = 512
     sheets: int = 1024  # some nodes have two fields
-    parts: int = 2048  # times the number of parts
+    moving: int = 2048  # obstacles move
+    parts: int = 4096  # times the number of parts
 
 
 class Field(NamedTuple):

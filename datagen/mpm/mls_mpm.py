@@ -36,7 +36,7 @@ from datagen.mpm.layout import (
     VARIANT,
     has_solid,
 )
-from datagen.mpm.surface_kernel import NODE_VECTORS, hidden_nodes, meet, stop_at_surface
+from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
@@ -356,13 +356,19 @@ def node_velocity(
             if facing >= 0:
                 entry = facing // 2
                 field = facing - 2 * entry
-                friction = contact_normal[NODE_VECTORS * entry + 2][0]
-                least = contact_normal[NODE_VECTORS * entry + 3][0]
+                moving = ti.static(bool(variant & VARIANT.moving))
+                at = ti.static(MOVING_NODE_VECTORS if moving else NODE_VECTORS) * entry
+                friction = contact_normal[at + 2][0]
+                least = contact_normal[at + 3][0]
                 if field == 1:
-                    friction = contact_normal[NODE_VECTORS * entry + 2][1]
-                    least = contact_normal[NODE_VECTORS * entry + 3][1]
+                    friction = contact_normal[at + 2][1]
+                    least = contact_normal[at + 3][1]
                 if mass >= least:
-                    v = meet(v, contact_normal[NODE_VECTORS * entry + field], friction)
+                    if ti.static(moving):
+                        surface = contact_normal[at + 4 + field]
+                        v = meet(v - surface, contact_normal[at + field], friction) + surface
+                    else:
+                        v = meet(v, contact_normal[at + field], friction)
         # walls last: whatever a collider leaves, nothing leaves the domain
         index = ti.Vector(
             [
@@ -493,18 +499,22 @@ def _triangle_list(x, scene: ti.i32, contact: ti.template(), setting: ti.templat
 def find_hidden(
     x,
     scene: ti.i32,
+    elapsed: ti.f32,
     contact: ti.template(),
     contact_normal: ti.template(),
     setting: ti.template(),
     shape: ti.template(),
+    variant: ti.template(),
 ) -> ti.i32:
     """Which of a particle's nodes sheets hide from it (see surface_kernel.hidden_nodes); it shares their second field
-    with the others that they hide them from.
+    with the others that they hide them from. Contacts were placed `elapsed` seconds ago, where any move.
     """
     bits = 0
     list_at = _triangle_list(x, scene, contact, setting, shape)
     if list_at >= 0:
-        bits = hidden_nodes(x * setting[SETTING.inverse_cell_size], list_at, contact, contact_normal)
+        moving = ti.static(bool(variant & VARIANT.moving))
+        scaled = x * setting[SETTING.inverse_cell_size]
+        bits = hidden_nodes(scaled, list_at, elapsed, contact, contact_normal, moving)
     return bits
 
 
@@ -570,7 +580,14 @@ def move(
     if ti.static(bool(variant & VARIANT.sweep)):
         list_at = _triangle_list(x, scene, contact, setting, shape)
         if list_at >= 0:
-            out, speed = stop_at_surface(x, out, v, list_at, scene, contact, contact_normal, counter, setting)
+            moving = ti.static(bool(variant & VARIANT.moving))
+            interval = scene_value[scene, VALUE.interval_elapsed]
+            elapsed = 0.0
+            if ti.static(moving):
+                elapsed = scene_value[scene, VALUE.frame] - scene_value[scene, VALUE.remaining] - interval
+            out, speed = stop_at_surface(
+                x, out, v, list_at, elapsed, interval, scene, contact, contact_normal, counter, setting, moving
+            )
     speed_square = speed.dot(speed)
     bad = _not_finite(speed_square) | _not_finite(out.sum()) | _not_finite(C.sum())
     outside = 0

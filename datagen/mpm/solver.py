@@ -106,7 +106,11 @@ def simulate(
             [scenes[i] for i in occupied], [colliders[i] for i in occupied], config, node_counts, frame_rate_hz,
             own_fractions,
         )  # fmt: skip
-        if team is None:
+        moving = any(scene.moves for scene in batch[0])
+        require(not moving or config.time_step == "adaptive", "time_step", "adaptive where obstacles move", "fixed")
+        if moving:
+            team = Team(0)  # contacts that move are placed between launches
+        elif team is None:
             team = _team(device, len(occupied), max(scene.particle_count for scene in batch[0]))
         _require_at_once(device, team, len(occupied))
         with _arrays_freed_here():

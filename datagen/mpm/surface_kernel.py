@@ -11,7 +11,9 @@ EDGE = 1e-4  # of a triangle's edge: how far past it a crossing still counts, so
 # Vectors of a node's contact: what is free for particles that see it, and for those that a sheet hides it from (zero
 # where all motion is), the friction of each, and the mass from which on the node stops each
 NODE_VECTORS = 4
+MOVING_NODE_VECTORS = 6  # and the surface's velocity in each, domain units a second
 TRIANGLE_VECTORS = 5  # those of datagen.mpm.sweep.Sweep, and its friction
+MOVING_TRIANGLE_VECTORS = 7  # and its first corner's velocity, cells a second, and its angular velocity
 LIST_HEAD = 2  # of a list of triangles: how many, and how many of them sheets', which come first
 STENCIL = 27  # nodes of a particle
 ATTEMPTS = 3  # to end a way before all triangles
@@ -31,9 +33,23 @@ def meet(v, normal, friction: ti.f32):
 
 
 @ti.func
-def hidden_nodes(scaled, list_at: ti.i32, contact: ti.template(), contact_normal: ti.template()) -> ti.i32:
+def _drift(scaled, triangle: ti.i32, contact_normal: ti.template()):
+    """The velocity of a moving triangle where a particle is, cells a second."""
+    return contact_normal[triangle + 5] + contact_normal[triangle + 6].cross(scaled - contact_normal[triangle])
+
+
+@ti.func
+def hidden_nodes(
+    scaled,
+    list_at: ti.i32,
+    elapsed: ti.f32,
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    moving: ti.template(),
+) -> ti.i32:
     """Which of a particle's nodes sheets hide from it: bit 9 i + 3 j + k says that the way to node base + (i, j, k)
     crosses a triangle of a sheet. The particle is at `scaled`, in cells; its base node's list begins at list_at.
+    Triangles have moved for `elapsed` seconds since they were listed; which side nodes lie on was settled then.
     """
     bits = 0
     to_base = ti.floor(scaled - 0.5) - scaled
@@ -45,6 +61,8 @@ def hidden_nodes(scaled, list_at: ti.i32, contact: ti.template(), contact_normal
         offset = scaled - contact_normal[triangle]
         height = normal.dot(offset)
         height_base = height + normal.dot(to_base)
+        if ti.static(moving):
+            height -= elapsed * normal.dot(_drift(scaled, triangle, contact_normal))
         lowest = height_base + 2.0 * ti.min(normal, 0.0).sum()
         highest = height_base + 2.0 * ti.max(normal, 0.0).sum()
         if (height >= 0.0 and lowest < 0.0) or (height < 0.0 and highest >= -ON_TRIANGLE):
@@ -52,7 +70,7 @@ def hidden_nodes(scaled, list_at: ti.i32, contact: ti.template(), contact_normal
             along_2 = across_2.dot(offset)
             for n in range(STENCIL):
                 way = to_base + ti.cast(ti.Vector([n // 9, n // 3 % 3, n % 3]), ti.f32)
-                height_node = height + normal.dot(way)
+                height_node = normal.dot(offset + way)
                 if (height_node < -ON_TRIANGLE) != (height < 0.0):
                     fraction = height / (height - height_node)
                     place_1 = along_1 + fraction * across_1.dot(way)
@@ -63,38 +81,57 @@ def hidden_nodes(scaled, list_at: ti.i32, contact: ti.template(), contact_normal
 
 
 @ti.func
-def _first_crossing(start, end, list_at: ti.i32, contact: ti.template(), contact_normal: ti.template()):
+def _first_crossing(
+    start,
+    end,
+    list_at: ti.i32,
+    elapsed: ti.f32,
+    interval: ti.f32,
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    moving: ti.template(),
+):
     """The triangle that the way from start to end (in cells) meets first, of the list that begins at list_at.
 
     Returns the fraction of the way (2 where there is none), the end without what of it leads through the triangle, the
-    direction that is free there (the triangle's normal on the side of the start), and the friction.
+    direction that is free there (the triangle's normal on the side of the start), the friction, and the triangle's
+    velocity in cells a second. Triangles have moved for `elapsed` seconds when the particle starts.
     """
     first = 2.0
     stop = end
     free = ti.Vector([0.0, 0.0, 0.0])
     friction = 0.0
+    velocity = ti.Vector([0.0, 0.0, 0.0])
     for s in range(list_at + LIST_HEAD, list_at + LIST_HEAD + contact[list_at]):
         triangle = contact[s]
         corner = contact_normal[triangle]
         normal = contact_normal[triangle + 1]
-        before = normal.dot(start - corner)
+        begin = start - corner
+        finish = end - corner
+        drift = ti.Vector([0.0, 0.0, 0.0])
+        if ti.static(moving):  # in the frame in which the triangle lies where it was listed
+            drift = _drift(start, triangle, contact_normal)
+            begin -= elapsed * drift
+            finish -= (elapsed + interval) * drift
+        before = normal.dot(begin)
         if before < 0.0:
             normal = -normal
             before = -before
-        after = normal.dot(end - corner)
+        after = normal.dot(finish)
         if after < CLEARANCE and after < before:
             fraction = 1.0
             if after < 0.0:
                 fraction = before / (before - after)
-            place = start + fraction * (end - start)
-            along_1 = contact_normal[triangle + 2].dot(place - corner)
-            along_2 = contact_normal[triangle + 3].dot(place - corner)
+            place = begin + fraction * (finish - begin)
+            along_1 = contact_normal[triangle + 2].dot(place)
+            along_2 = contact_normal[triangle + 3].dot(place)
             if along_1 >= -EDGE and along_2 >= -EDGE and along_1 + along_2 <= 1.0 + EDGE and fraction < first:
                 first = fraction
                 stop = end + normal * (STOP - after)
                 free = normal
                 friction = contact_normal[triangle + 4][0]
-    return first, stop, free, friction
+                velocity = drift
+    return first, stop, free, friction, velocity
 
 
 @ti.func
@@ -103,11 +140,14 @@ def stop_at_surface(
     out,
     v,
     list_at: ti.i32,
+    elapsed: ti.f32,
+    interval: ti.f32,
     scene: ti.i32,
     contact: ti.template(),
     contact_normal: ti.template(),
     counter: ti.template(),
     setting: ti.template(),
+    moving: ti.template(),
 ):
     """The place that a particle from x reaches on its way to out, and its velocity there.
 
@@ -121,9 +161,14 @@ def stop_at_surface(
     speed = v
     attempt = 0
     while attempt < ATTEMPTS:
-        fraction, stop, free, friction = _first_crossing(start, end, list_at, contact, contact_normal)
+        fraction, stop, free, friction, velocity = _first_crossing(
+            start, end, list_at, elapsed, interval, contact, contact_normal, moving
+        )
         if fraction <= 1.0:
-            speed = meet(speed, free, friction)
+            if ti.static(moving):
+                speed = meet(speed - dx * velocity, free, friction) + dx * velocity
+            else:
+                speed = meet(speed, free, friction)
             end = stop
             moved = stop * dx
             if attempt == 0:
@@ -131,6 +176,8 @@ def stop_at_surface(
             attempt += 1
             if attempt == ATTEMPTS:
                 moved = x
+                if ti.static(moving):
+                    moved += interval * dx * velocity
         else:
             attempt = ATTEMPTS
     return moved, speed

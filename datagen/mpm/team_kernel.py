@@ -375,7 +375,7 @@ def _strain(
         if begins == 1.0:
             x = _vector(state, place, stride, FIELD.position)
             if ti.static(bool(variant & VARIANT.sheets)):
-                hidden[first + p] = find_hidden(x, scene, contact, contact_normal, setting, shape)
+                hidden[first + p] = find_hidden(x, scene, 0.0, contact, contact_normal, setting, shape, variant)
             mark(
                 x, scene, setting[SETTING.inverse_cell_size], shape, block,
                 shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks], live, scene * LIVE.length + LIVE.blocks,

@@ -59,7 +59,12 @@ class InitialState:
 
     @staticmethod
     def of_scene(scene: Scene) -> InitialState:
-        """A scene's initial particles, its obstacles sampled into cells."""
+        """A scene's initial particles, its obstacles sampled into cells.
+
+        Raises: ConfigError where obstacles move: networks know them at rest.
+        """
+        remedy = "leave keyframes out, or run datagen.solve"
+        require(not scene.moves, "obstacles", "at rest for a network", "keyframes", remedy)
         return InitialState(
             scene.position_N3,
             scene.velocity_N3,

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS
+from hgn.scene.motion import Motion
 from hgn.schema import ConfigError, require
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """A static triangle mesh.
+    """A triangle mesh, at rest or with the motion that is given.
 
     `closed` tells a solid (watertight) body from a sheet; the solver treats the two differently.
     """
@@ -28,6 +29,7 @@ class Obstacle:
     triangle_F3: np.ndarray  # int32, indices into vertex_V3
     closed: bool
     friction: float | None = None  # Coulomb coefficient; None: mpm.collider_friction
+    motion: Motion | None = None  # None: at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,11 @@ class Scene:
         for material in (self.material_N.min(), self.material_N.max()) if count else ():
             rule = f"0 to {len(MATERIALS) - 1} ({', '.join(MATERIALS)})"
             require(0 <= material < len(MATERIALS), "material_N", rule, int(material))
+
+    @property
+    def moves(self) -> bool:
+        """Whether any obstacle does."""
+        return any(obstacle.motion is not None for obstacle in self.obstacles)
 
     @property
     def particle_count(self) -> int:

@@ -19,6 +19,7 @@ from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
+from hgn.scene.motion import Motion
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
@@ -32,6 +33,20 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
+class KeyframeEntry:
+    """A pose of an obstacle, from where its entry places it."""
+
+    time: NonNegative[float]  # seconds
+    translation: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z, through its position
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        _require_finite("translation", self.translation)
+        _require_finite("rotation", self.rotation)
+
+
+@dataclass(frozen=True)
 class ObstacleEntry:
     """Either `mesh` (a file, with `scale`) or `shape` (a built-in one, with `size`)."""
 
@@ -42,6 +57,7 @@ class ObstacleEntry:
     position: Vector | None = None  # moves a mesh (origin if absent); the centre of a shape
     rotation: Vector = (0.0, 0.0, 0.0)  # degrees about the fixed x axis, then y, then z
     friction: NonNegative[float] | None = None  # Coulomb coefficient; null: mpm.collider_friction
+    keyframes: tuple[KeyframeEntry, ...] = ()  # poses in order of time; none: at rest
 
     def __post_init__(self) -> None:
         require_bounds(self)
@@ -57,6 +73,18 @@ class ObstacleEntry:
             require(self.position is not None, "position", "given beside shape", self.position)
         _require_finite("position", self.position or (0.0, 0.0, 0.0))
         _require_finite("rotation", self.rotation)
+        self.motion()
+
+    def motion(self) -> Motion | None:
+        """How the obstacle moves, if it does."""
+        if not self.keyframes:
+            return None
+        return Motion(
+            np.array([keyframe.time for keyframe in self.keyframes], np.float64),
+            np.array([keyframe.translation for keyframe in self.keyframes], np.float64),
+            np.stack([euler_rotation(keyframe.rotation) for keyframe in self.keyframes]),
+            self.position or (0.0, 0.0, 0.0),
+        )
 
 
 @dataclass(frozen=True)
@@ -258,7 +286,7 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:
             translation=entry.position or (0.0, 0.0, 0.0),
             rotation=entry.rotation,
         )
-    return dataclasses.replace(obstacle, friction=entry.friction)
+    return dataclasses.replace(obstacle, friction=entry.friction, motion=entry.motion())
 
 
 def _require_inside_walls(name: str, region: Region, position_N3: np.ndarray, file: SceneFile) -> None:

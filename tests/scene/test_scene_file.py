@@ -82,6 +82,18 @@ def test_friction_of_each_surface(tmp_path):
     assert scene.specification["obstacles"][1]["friction"] == 0.3
 
 
+def test_keyframes_are_poses_about_the_position(tmp_path):
+    """An obstacle with keyframes moves from where its entry places it, turned about its position."""
+    keyframes = [{"time": 0}, {"time": 2, "translation": [0.1, 0, 0], "rotation": [0, 90, 0]}]
+    scene = load_scene(write(tmp_path, {"groups": [CUBE], "obstacles": [{**CONE, "keyframes": keyframes}]}))
+    (cone,) = scene.obstacles
+    assert scene.moves and cone.motion is not None
+    assert np.allclose(cone.motion.place(cone.vertex_V3, 0.0), cone.vertex_V3)
+    middle = cone.motion.place(np.array([CONE["position"]]), 1.0)
+    assert np.allclose(middle, [[0.55, 0.2, 0.5]])
+    assert np.allclose(cone.motion.place(np.array([[0.6, 0.2, 0.5]]), 2.0), [[0.6, 0.2, 0.4]])
+
+
 def test_editing_one_group_leaves_the_others(tmp_path):
     """Each group has a random stream of its own."""
     other = {**CUBE, "position": [0.2, 0.5, 0.5]}
@@ -150,6 +162,9 @@ def obstacle_with(**changes: object) -> dict[str, object]:
         (scene_with(gravity=[0, float("inf"), 0]), "gravity must be three finite numbers"),
         (scene_with(floor_friction=-0.1), "floor_friction must be a finite number >= 0, got -0.1"),
         (scene_with(wall_friction=float("nan")), "wall_friction must be a finite number >= 0, got nan"),
+        (obstacle_with(keyframes=[{"time": 1}, {"time": 1}]), r"obstacles\[0\]\.keyframes must be in order of time"),
+        (obstacle_with(keyframes=[{"time": -1}]), r"obstacles\[0\]\.keyframes\[0\]\.time must be .* >= 0"),
+        (obstacle_with(keyframes=[{"time": 0, "rotation": [0, float("inf"), 0]}]), r"\.rotation must be three finite"),
         (obstacle_with(friction=-1), r"obstacles\[0\]\.friction must be a finite number >= 0, got -1"),
         (scene_with(seed=-1), "seed must be a whole number >= 0"),
         (scene_with(seed=0.5), "seed must be a whole number"),

@@ -1,0 +1,94 @@
+"""How an obstacle moves: poses at keyframes, and what lies between them.
+
+Shape legend: T keyframes, P points.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hgn.scene.rotation import rotate
+from hgn.schema import require
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Rigid motion: turned about `pivot`, then moved, from where the obstacle lies in its scene.
+
+    Between keyframes translation is linear and the rate of turning constant, by the shorter way round; before the
+    first and after the last the obstacle stands still.
+    """
+
+    time_T: np.ndarray  # float64, seconds, increasing
+    translation_T3: np.ndarray  # float64, domain units
+    rotation_T33: np.ndarray  # float64
+    pivot: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.time_T, np.float64)
+        ordered = len(times) > 0 and bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
+        require(ordered, "keyframes", "in order of time, at least one, no two at one time", times.tolist())
+        require(times[0] >= 0, "keyframes", "at times >= 0", times.tolist())
+        require(
+            bool(np.isfinite(self.translation_T3).all()), "keyframes", "of finite translations and rotations", "nan"
+        )
+
+    def pose(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation, float64 [3, 3], and translation, float64 [3], at a time in seconds."""
+        last = len(self.time_T) - 1
+        after = int(np.searchsorted(self.time_T, time, side="right"))
+        if after == 0 or after > last:
+            at = min(after, last)
+            return self.rotation_T33[at], self.translation_T3[at]
+        share = (time - self.time_T[after - 1]) / (self.time_T[after] - self.time_T[after - 1])
+        turn = turning(self.rotation_T33[after] @ self.rotation_T33[after - 1].T)
+        begin, end = self.translation_T3[after - 1], self.translation_T3[after]
+        return turned(share * turn) @ self.rotation_T33[after - 1], begin + share * (end - begin)
+
+    def place(self, point_P3: np.ndarray, time: float) -> np.ndarray:
+        """Where points of the obstacle as its scene has it are at a time, float64 [P, 3]."""
+        rotation, translation = self.pose(time)
+        return rotate(np.asarray(point_P3, np.float64) - self.pivot, rotation) + self.pivot + translation
+
+    def rates(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean rates from one time to another: angular velocity, rad/s [3]; velocity [3] of the pivot, and its place
+        [3] at the beginning.
+        """
+        rotation, translation = self.pose(begin)
+        later_rotation, later_translation = self.pose(end)
+        span = end - begin
+        turn = turning(later_rotation @ rotation.T) / span
+        return turn, (later_translation - translation) / span, np.asarray(self.pivot) + translation
+
+
+def turning(rotation_33: np.ndarray) -> np.ndarray:
+    """The axis of a rotation times its angle in radians, at most pi, float64 [3]."""
+    axis = np.array(
+        [
+            rotation_33[2, 1] - rotation_33[1, 2],
+            rotation_33[0, 2] - rotation_33[2, 0],
+            rotation_33[1, 0] - rotation_33[0, 1],
+        ]
+    )
+    sine, cosine = 0.5 * float(np.linalg.norm(axis)), 0.5 * (float(np.trace(rotation_33)) - 1)
+    angle = math.atan2(sine, cosine)
+    if sine > 1e-6:
+        return np.asarray(axis * (0.5 * angle / sine))
+    if cosine > 0:
+        return np.asarray(0.5 * axis)
+    # half a turn: R + I is twice the projection on the axis
+    column = (rotation_33 + np.eye(3))[:, int(np.argmax(np.diag(rotation_33)))]
+    return np.asarray(angle * column / np.linalg.norm(column))
+
+
+def turned(turn: np.ndarray) -> np.ndarray:
+    """The rotation, float64 [3, 3], about an axis by its length in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(turn))
+    cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
+    if angle < 1e-12:
+        return np.asarray(np.eye(3) + cross)
+    once = cross / angle
+    return np.asarray(np.eye(3) + math.sin(angle) * once + (1 - math.cos(angle)) * once @ once)
