@@ -45,6 +45,7 @@ from hgn.schema import ConfigError, to_mapping
 
 _OPEN_PATHS = ("/healthz",)
 _GRACE_S = 5  # for answers that are being sent when the service is stopped; readers go on where they were cut
+_FRESH_S = 0.05  # for which a look at the manifest counts: a thousand readers may ask in a second
 _BACKLOG = 256  # connections that are accepted before any of them is looked at
 _OTHER_FILES = 64
 OPEN_FILES = 1024  # of a process, where nothing else is said
@@ -71,6 +72,7 @@ class Published:
         self.folder = folder
         self._stamp: tuple[int, ...] | None = None
         self._snapshot: Snapshot | None = None
+        self._looked_at = 0.0  # by the loop's clock
         self._shards: dict[str, tuple[str, int]] = {}  # sha256, bytes
         self._listed: Index | None = None  # whose shards these are
         self._reading, self._listing = asyncio.Lock(), asyncio.Lock()
@@ -78,8 +80,15 @@ class Published:
 
     async def snapshot(self) -> Snapshot:
         """Raises: ConfigError when there is no manifest that this version can read."""
-        async with self._reading:
-            return await to_thread.run_sync(self._read, limiter=self._threads)
+        time = asyncio.get_running_loop().time
+        if self._snapshot is None or time() > self._looked_at + _FRESH_S:
+            async with self._reading:
+                if self._snapshot is None or time() > self._looked_at + _FRESH_S:
+                    looked_at = time()
+                    await to_thread.run_sync(self._read, limiter=self._threads)
+                    self._looked_at = looked_at
+        assert self._snapshot is not None
+        return self._snapshot
 
     async def shard(self, name: str) -> tuple[str, int] | None:
         """The sha256 and size of a published shard."""
@@ -90,7 +99,7 @@ class Published:
                     await to_thread.run_sync(self._list, index, limiter=self._threads)
         return self._shards.get(name)
 
-    def _read(self) -> Snapshot:
+    def _read(self) -> None:
         path = self.folder / MANIFEST_NAME
         try:
             status = path.stat()
@@ -104,7 +113,6 @@ class Published:
                 manifest = replace(manifest, shards=self._snapshot.manifest.shards.continued(manifest.shards))
             self._snapshot = Snapshot(content, f'"{hashlib.sha256(content).hexdigest()}"', manifest)
             self._stamp = stamp
-        return self._snapshot
 
     def _list(self, index: Index) -> None:
         known = self._listed
