@@ -30,7 +30,7 @@ from datagen.mpm.layout import (
     constants,
 )
 from hgn.config import MpmConfig
-from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS, MATERIALS
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
@@ -249,10 +249,11 @@ class Launch(ABC):
         value[:, VALUE.smallest_time_step] = np.inf
         value[:, VALUE.stability_fraction] = stability_fractions or self.config.stability_fraction
         shear, bulk = laws[:, CONSTANT.shear], laws[:, CONSTANT.bulk]
-        # per kind and row; hardening may take all stiffness from snow
+        # per material and row; hardening may take all stiffness from snow
         density = laws[:, CONSTANT.density]
         viscous = 4 * laws[:, CONSTANT.viscosity] / (density * self.scenes[0].cell_size)
         least = np.stack([(np.sqrt(3 * bulk / density) + viscous) ** 2, (3 * bulk + 2 * shear) / density, 0 * bulk])
+        assert len(least) == len(MATERIALS)
         for index, scene in enumerate(self.scenes):
             own = slice(self.particle_begin[index], self.particle_begin[index + 1])
             value[index, VALUE.gravity : VALUE.gravity + 3] = scene.gravity

@@ -1,10 +1,7 @@
 """The materials that scenes are made of; an episode stores the index into `MATERIALS`.
 
-To add a material: its name at the end here (old episodes keep their indices), in `FLUIDS` if it is one; its colour in
-`hgn.render.renderer.MATERIAL_COLORS`; its law in `datagen.mpm.constitutive`, switched on by the bit of
-its name in `datagen.mpm.layout.Variant`; its parameters, if it has any, in
-`hgn.config.MpmConfig`, in `datagen.mpm.layout.constants` and below. Data, networks, training and reports go by
-the index.
+To add one: docs/how_to/add_material.md lists the places. Its name goes to the end here, for old episodes keep their
+indices. Data, networks, training and reports go by the index.
 """
 
 from __future__ import annotations
