@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import re
 import threading
 from bisect import bisect_left, bisect_right
@@ -29,7 +30,7 @@ from hgn.config import Split
 from hgn.data.statistics import Moments, Statistics
 from hgn.data.storage import open_storage
 from hgn.schema import ConfigError, NonNegative, from_mapping, require, require_bounds, to_mapping
-from hgn.system.files import sync_file, sync_folder
+from hgn.system.files import errors_name, sync_file, sync_folder
 
 SPLITS = ("train", "validation", "test")
 INDEX_NAME = "index"
@@ -439,14 +440,15 @@ def _append(path: Path, at: int, rows: Sequence[Any]) -> int:
         json.dumps(to_mapping(row), sort_keys=True, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         for row in rows
     )
-    new = not path.exists()
-    with path.open("xb" if new else "r+b") as file:
+    # not asked whether it is there: a network file system may remember that it was not
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
+    with errors_name(path), os.fdopen(os.open(path, flags, 0o644), "r+b") as file:
         if file.seek(0, 2) < at:
             raise ConfigError(f"{path} must have {at} bytes or more, got {file.tell()}; {_REMEDY}")
         file.truncate(at)
         file.seek(at)
         file.write(content)
         sync_file(file)
-    if new:
+    if at == 0:
         sync_folder(path.parent)
     return at + len(content)

@@ -39,7 +39,7 @@ def temporary_file(path: Path) -> Iterator[Path]:
     """
     temporary = temporary_path(path)
     try:
-        with _errors_name(path):
+        with errors_name(path):
             yield temporary
     finally:
         temporary.unlink(missing_ok=True)
@@ -99,14 +99,15 @@ def sync_folder(folder: Path) -> None:
     """Makes renames inside `folder` survive a loss of power."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        with _errors_name(folder):
+        with errors_name(folder):
             os.fsync(descriptor)
     finally:
         os.close(descriptor)
 
 
 @contextlib.contextmanager
-def _errors_name(path: Path) -> Iterator[None]:
+def errors_name(path: Path) -> Iterator[None]:
+    """While it is entered, an OSError that names no file (a full disk) is made to name `path`."""
     try:
         yield
     except OSError as error:
