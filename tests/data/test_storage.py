@@ -121,6 +121,7 @@ def test_service_gives_what_the_folder_holds(folder: Path, serve: Callable[..., 
 
 def test_manifest_is_sent_once(folder: Path, serve: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Polling a manifest that has not changed costs no more than asking."""
+    monkeypatch.setattr("datagen.service.server._FRESH_S", -1.0)  # each poll looks
     url, sizes = serve(), []
     store = EpisodeStore(url, "train")
     files = open_storage(url)._files  # type: ignore[attr-defined]

@@ -121,7 +121,7 @@ def test_what_is_faster_than_the_data_is_said(tmp_path: Path, capsys: pytest.Cap
     [
         ({"data": "data"}, "data must be given together with episode, got 'data'"),
         ({"scene": "funnel", "data": "d", "episode": "e"}, "scene must be left out where data is given, got 'funnel'"),
-        ({"out": "a.png"}, "out must be the name of an HDF5 file, as in rollout.vtkhdf, got 'a.png'"),
+        ({"out": "a.png"}, "out must be the name of a rollout file, as in rollout.vtkhdf, got 'a.png'"),
         ({"seed": -1}, "seed must be a finite number >= 0, got -1"),
     ],
 )

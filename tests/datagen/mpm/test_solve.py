@@ -51,7 +51,7 @@ def test_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for change, message in (
         ({"scene": "none.yaml"}, "scene must be an existing YAML file, got none.yaml"),
         ({"frames": 1}, "frames must be at least 2, got 1"),
-        ({"out": "a.png"}, "out must be the name of an HDF5 file"),
+        ({"out": "a.png"}, "out must be the name of a rollout file"),
         ({"mpm": {"snow_hardning": 5.0}}, "mpm.snow_hardning is not a known key; did you mean snow_hardening?"),
         (
             {"mpm": {"device": "cpu", "maximum_substeps_per_frame": 1}},
