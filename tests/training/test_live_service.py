@@ -145,8 +145,7 @@ def test_stopped_while_its_service_is_away(
         opened.append(index)
         if len(opened) == 12:
             files.cat_file = gone
-            store._opened.clear()
-            store._maps.clear()
+            store._open_shards.clear()
             for shard in (tmp_path / "cache").rglob("*.tar"):
                 shard.unlink()
         return real(store, index)
