@@ -15,10 +15,12 @@ import triton.language as tl
 
 from hgn.kernels.triton_compat import settle_keys
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES
+from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 from hgn.scene.symmetry import CELL_BITS
 
 GEOMETRY_COLUMNS = tl.constexpr(8)
 OBSTACLE_COLUMNS = tl.constexpr(5)
+NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)  # of relative inputs
 FULLY = tl.constexpr(1 << 24)  # disturbed: what counts as 1
 OVERFLOW = tl.constexpr(1)  # more active cells than capacity
 OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
@@ -473,16 +475,16 @@ def prepare_relative_features(
     place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=is_wall, other=0.0)
     size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=is_wall, other=0.0)
     distance = tl.where(upper, size - place, place) + tl.minimum(tl.where(upper, -v, v), 0.0)
-    near = tl.where(is_wall, tl.minimum(tl.maximum(1 - distance / reach, 0.0), 2.0), 0.0)
+    near = tl.where(is_wall, tl.minimum(tl.maximum(1 - distance / reach, 0.0), NEAREST), 0.0)
     gate = tl.minimum(2 * tl.max(near, 1), 1.0)
     value = tl.where(is_wall, near, value)
     if OBSTACLES:
-        # here, and a quarter of a frame's way ahead four times
+        # here, and at steps of the next frame's way
         quarters = tl.arange(0, 8)[None, :]
-        asked = here & (quarters < 5)
+        asked = here & (quarters <= STEPS)
         at = position + row[:, None] * 3 + 0 * quarters
         v_at = velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
-        time = 0.25 * quarters.to(tl.float32)
+        time = quarters.to(tl.float32) / STEPS
         x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
         y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
         z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
@@ -504,6 +506,14 @@ def prepare_relative_features(
     material = tl.load(material_of + row, mask=live, other=0)
     value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
     tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
+
+
+@triton.jit
+def _multiply_rows(x, factor, row, count, OUT: tl.constexpr):
+    """The first three columns of rows of x [N, OUT], times a factor each, in place."""
+    column = tl.arange(0, OUT)[None, :]
+    at, live = x + row[:, None] * OUT + column, (row < count)[:, None] & (column < 3)
+    tl.store(at, tl.load(at, mask=live, other=0.0) * factor[:, None], mask=live)
 
 
 @triton.jit
@@ -532,9 +542,7 @@ def disturb(
     weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=here, other=0.0)
     gate = tl.sum(weight * (most.to(tl.float32) / FULLY), 1)
     tl.store(gate_of + row, gate, mask=row < count)
-    column = tl.arange(0, OUT)[None, :]
-    at, live = output + row[:, None] * OUT + column, (row < count)[:, None] & (column < 3)
-    tl.store(at, tl.load(at, mask=live, other=0.0) * gate[:, None], mask=live)
+    _multiply_rows(output, gate, row, count, OUT)
 
 
 @triton.jit
@@ -545,10 +553,7 @@ def disturb_backward(gradient, gate_of, particle_count, OUT: tl.constexpr, BLOCK
     """
     count = tl.load(particle_count)
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    column = tl.arange(0, OUT)[None, :]
-    at, live = gradient + row[:, None] * OUT + column, (row < count)[:, None] & (column < 3)
-    gate = tl.load(gate_of + row, mask=row < count, other=0.0)
-    tl.store(at, tl.load(at, mask=live, other=0.0) * gate[:, None], mask=live)
+    _multiply_rows(gradient, tl.load(gate_of + row, mask=row < count, other=0.0), row, count, OUT)
 
 
 settle_keys(globals())
