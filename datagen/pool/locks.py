@@ -1,4 +1,4 @@
-"""Claims on episodes, so that several generators share one folder without a coordinator.
+"""Locks on episodes, so that several generators share one folder without a coordinator.
 
 A data set's `.lock` file stands for its state, byte by byte: who changes the manifest locks the first byte, every
 generator shares the second, and an episode that is being made has its byte locked by its generator. The kernel frees

@@ -336,7 +336,7 @@ def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     solvers: list[StoppedWorker] = []
 
-    class Crew:
+    class Workers:
         def start_maker(self) -> Worker:
             return StoppedWorker()
 
@@ -353,6 +353,6 @@ def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest
 
     config, recorder = make_config(training_scenes=1, validation_scenes=0, test_scenes=0), Recorder()
     with DatasetWriter(config) as writer, pytest.raises(TimeoutError):
-        Pool(config, writer, recorder, ONE, Crew()).run()  # type: ignore[arg-type]
+        Pool(config, writer, recorder, ONE, Workers()).run()  # type: ignore[arg-type]
     assert recorder.messages[0].startswith("a worker died (it said nothing for 600 s); it is replaced")
     assert solvers[0].killed and solvers[0].heard_at > 1000

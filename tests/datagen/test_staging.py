@@ -1,4 +1,4 @@
-"""Claims, staged episodes and quarantine: whatever interrupts a writer, the next goes on to the same shards."""
+"""Locks, staged episodes and quarantine: whatever interrupts a writer, the next goes on to the same shards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plain network in float64 with operands rounded as matrix units round them: what rounding alone does to it.
+"""The reference network in float64 with operands rounded as matrix units round them: what rounding alone does to it.
 
 How far a network's outputs and gradients move is one draw of many roundings: of one particle from 2e-4 to 4e-3.
 """

@@ -1,4 +1,4 @@
-"""GNS's fused kernels against the plain network: in Triton's interpreter on a CPU, natively on a GPU."""
+"""GNS's fused kernels against the reference network: in Triton's interpreter on a CPU, natively on a GPU."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GNS's training updates on the device against the plain network under torch's Adam and Muon."""
+"""GNS's training updates on the device against the reference network under torch's Adam and Muon."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_updates_are_those_of_torch(optimizer: str) -> None:
 
 
 def test_wrong_kernels_are_refused() -> None:
-    """Before the first update outputs and gradients are compared with the plain network's on the noisy batch, under
+    """Before the first update outputs and gradients are compared with the reference network's on the noisy batch, under
     symmetries: they agree to rounding, and what computes another network is refused with the remedy."""
     network = gns_of(message_passing_steps=1, cell_size=0.1)
     made, grids = episode(1, 5, True)

@@ -79,7 +79,7 @@ def test_outputs_and_gradients(
     counts: tuple[int, ...], spread: float, changes: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In float32 several scenes in one batch, a single particle, and a single level, with odd numbers of particles and
-    cells, give the outputs and every gradient of the plain network to 1e-5. So few programs run that each takes several
+    cells, give the outputs and every gradient of the reference to 1e-5. So few programs run that each takes several
     tiles, and the last has one fewer."""
     monkeypatch.setattr("hgn.kernels.tuning.RESIDENT_PROGRAMS", 2)
     if len(counts) > 1:
@@ -179,7 +179,7 @@ def test_rounded_reference() -> None:
 )
 def test_whole_networks_on_a_gpu(precision: str, counts: tuple[int, ...], draws: int) -> None:
     """With all levels and steps, in TF32 and float16, the median error of several states is at most 1.5 times that of
-    the plain network in float64 with operands so rounded (and what float16 keeps rounded): that is what rounding does,
+    the reference in float64 with operands so rounded (and what float16 keeps rounded): that is what rounding does,
     most of it by activations next to their kink, and how much is chance for each state."""
     network = network_of(width=128, levels=4, message_passing_steps=4)
     found, explained = [], []
@@ -200,7 +200,7 @@ def test_whole_networks_on_a_gpu(precision: str, counts: tuple[int, ...], draws:
 
 
 def rounding_errors(network: HierarchicalGraphNetwork, state: ParticleState, stored: bool) -> tuple[float, float]:
-    """Relative errors of output and gradients that rounded operands make in the plain network."""
+    """Relative errors of output and gradients that rounded operands make in the reference network."""
     origin_S3, weight_N3 = drawn(network, state)
     output, expected = reference(network, state, origin_S3, weight_N3)
     with rounding(stored):

@@ -106,7 +106,7 @@ def test_lost_scenes_are_dropped() -> None:
 
 
 def test_wrong_kernels_are_refused() -> None:
-    """Before anything is trained on them, the simulation's kernels are compared with the plain network."""
+    """Before anything is trained on them, the simulation's kernels are compared with the reference network."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
     fast = GraphPushforwardPool(network, training_of(precision="fp32"), CELL_SIZE, 0)
     starts = [(placed(scene_with_obstacles(i, 5), network), 2) for i in range(2)]

@@ -78,7 +78,7 @@ def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict) -
 
 @pytest.mark.parametrize(("counts", "obstacles"), [(EVERYWHERE, True), ((1,), False)])
 def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool) -> None:
-    """In float32 outputs and every gradient are those of the plain network in float64 to 2e-5."""
+    """In float32 outputs and every gradient are those of the reference network in float64 to 2e-5."""
     network, state = relative_network(levels=2), moving_state(counts, obstacles)
     output, together, each = compare(network, state, "fp32", 1.0, 256)
     assert max(output, together, *each) < 2e-5

@@ -218,7 +218,7 @@ def test_divergence_names_the_frame() -> None:
 
 
 def test_wrong_kernels_are_refused() -> None:
-    """A rollout whose first output is not the plain network's is refused before it moves anything."""
+    """A rollout whose first output is not the reference network's is refused before it moves anything."""
     plain = network()
     state = Simulator(plain, 60.0, "torch").start([scene(5)])
     rollout = TritonRollout(plain, state, "fp32")

@@ -1,4 +1,4 @@
-"""Training updates on the device against the plain network under torch's Adam."""
+"""Training updates on the device against the reference network under torch's Adam."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CELL_SIZE = 1 / 64
 
 
 def episode(seed: int, particles: int, obstacles: bool, spread: float = 0.12) -> tuple[DeviceEpisode, list]:
-    """Particles that move at random, and the grids that the plain network asks for the same obstacles."""
+    """Particles that move at random, and the grids that the reference network asks for the same obstacles."""
     generator = torch.Generator().manual_seed(seed)
     start = torch.rand(1, particles, 3, generator=generator) * spread + 0.2
     position = start + (torch.randn(HISTORY + 4, particles, 3, generator=generator) * 1e-3).cumsum(0)
@@ -218,7 +218,7 @@ def test_smooth_noise() -> None:
 
 
 def test_wrong_kernels_are_refused() -> None:
-    """Before the first update outputs and gradients are compared with the plain network's on the noisy, jittered batch:
+    """Before the first update outputs and gradients are compared with the reference's on the noisy, jittered batch:
     they agree to rounding, and kernels that compute another network are refused with the remedy."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     made, grids = episode(1, 5, True)

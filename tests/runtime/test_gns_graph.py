@@ -37,7 +37,7 @@ def test_room_to_spare_changes_nothing(kind):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("kind", ["gns", "gns_particles"])
 def test_graphs_equal_the_network(kind):
-    """Captured and replayed on changing states, accelerations equal the plain network's."""
+    """Captured and replayed on changing states, accelerations equal the reference network's."""
     network = gns_of(torch.float32, kind=kind, width=128).cuda()
     graphs = GnsGraphs(network)
     with torch.inference_mode():
