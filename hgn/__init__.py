@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hgn.runtime.divergence import DivergedError as DivergedError
+    from hgn.runtime.live import LiveSimulation as LiveSimulation
     from hgn.runtime.simulator import Simulator as Simulator
     from hgn.scene.mesh import load_mesh as load_mesh
     from hgn.scene.rollout_file import Rollout as Rollout
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "ConfigError": "hgn.schema",
     "DivergedError": "hgn.runtime.divergence",
+    "LiveSimulation": "hgn.runtime.live",
     "Obstacle": "hgn.scene.scene",
     "Rollout": "hgn.scene.rollout_file",
     "Scene": "hgn.scene.scene",

@@ -58,8 +58,8 @@ class Backend:
     def require_parity(self, state: ParticleState, gradients: bool = False, field: str = "precision") -> None:
         """Compares a backend of kernels that this machine has compiled with PyTorch. Raises: ConfigError."""
 
-    def rollout(self, state: ParticleState) -> AbstractContextManager[Rollout]:
-        """A simulation that begins with a state."""
+    def rollout(self, state: ParticleState, room: int = 0) -> AbstractContextManager[Rollout]:
+        """A simulation that begins with a state; backend triton makes `room` for as many particles."""
         self.require_parity(state)
         return nullcontext(SteppedRollout(self.predict, state))
 

@@ -10,7 +10,7 @@ class DivergedError(RuntimeError):
 
     def __init__(self, frame: int, cause: str) -> None:
         super().__init__(f"the simulation diverged at frame {frame}: {cause}; train further, or take other weights")
-        self.frame = frame
+        self.frame, self.cause = frame, cause
 
 
 def diverged(position_N3: torch.Tensor, domain_N3: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,6 @@
 """A simulation frame by frame, by whatever predicts accelerations; and what every backend's simulations can do.
 
-Shape legend: T frames, N particles of all scenes, S scenes.
+Shape legend: T frames, N particles of all scenes, M velocities of a history, S scenes.
 """
 
 from __future__ import annotations
@@ -30,6 +30,12 @@ class Rollout(Protocol):
     def frames(self) -> Iterator[np.ndarray]:
         """Positions float32 [N, 3] of frame after frame, without an end. Raises: DivergedError."""
 
+    def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions [N, 3] and velocity histories [N, M, 3] behind the last frame of `run`."""
+
+    def take(self, state: ParticleState) -> bool:
+        """Goes on with another state; false where there is no room for it, and nothing changes."""
+
 
 @torch.inference_mode()
 def stepped(predict: Callable[[ParticleState], torch.Tensor], state: ParticleState) -> ParticleState:
@@ -56,6 +62,13 @@ class SteppedRollout:
     def diverged(self) -> torch.Tensor:
         """Which particles have come apart from the others, bool [N]."""
         return diverged(self.state.position_N3, self.state.domain_S3[self.state.scene_N])
+
+    def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.state.position_N3, self.state.velocity_NM3
+
+    def take(self, state: ParticleState) -> bool:
+        self.state = state
+        return True
 
     def frames(self) -> Iterator[np.ndarray]:
         while True:

@@ -43,11 +43,11 @@ class TritonBackend(Backend):
         self.idle: dict[int, TritonRollout] = {}  # by number of scenes
 
     @contextmanager
-    def rollout(self, state: ParticleState) -> Iterator[TritonRollout]:
+    def rollout(self, state: ParticleState, room: int = 0) -> Iterator[TritonRollout]:
         """A simulation that begins with a state, and is kept for others once it is over."""
-        rollout = self._reused(state)
+        rollout = self._reused(state, room)
         if rollout is None:
-            rollout = TritonRollout(self.network, state, self.precision)
+            rollout = TritonRollout(self.network, state, self.precision, room=room)
             if len(state.position_N3) <= CHECKED_PARTICLES:
                 rollout.require_parity(self.network, state)
         before = rollout.growths
@@ -60,13 +60,13 @@ class TritonBackend(Backend):
                 del self.idle[next(iter(self.idle))]
             self.idle[state.scene_count] = rollout
 
-    def _reused(self, state: ParticleState) -> TritonRollout | None:
+    def _reused(self, state: ParticleState, room: int) -> TritonRollout | None:
         """An idle simulation of the same network begun anew, its launches captured already; none that fits.
 
         Nobody else has it while it runs, and one that does not fit goes before another is allocated.
         """
-        rollout, count = self.idle.pop(state.scene_count, None), len(state.position_N3)
-        if rollout is None or not rollout.fits(state) or count < LEAST_FILLING * rollout.particles:
+        rollout, wanted = self.idle.pop(state.scene_count, None), max(room, len(state.position_N3))
+        if rollout is None or not rollout.fits(state) or not wanted <= rollout.particles <= wanted / LEAST_FILLING:
             return None
         rollout.use_values(rollout.packed.gather(list(self.network.parameters())))
         rollout.begin(state, new_obstacles=True)

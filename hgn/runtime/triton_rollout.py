@@ -142,6 +142,18 @@ class TritonRollout:
         self.lost.zero_()
         self.grid.status.zero_()
 
+    def take(self, state: ParticleState) -> bool:
+        """Goes on with another state, its obstacles too, if it `fits`."""
+        if not self.fits(state):
+            return False
+        self.begin(state, new_obstacles=True)
+        return True
+
+    def motion(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Copies of positions [N, 3] and velocity histories [N, M, 3] behind the last frame of `run`."""
+        position_N3, velocity_NV = self.position_N3[: self.live], self.velocity_NV[: self.live]
+        return position_N3.clone(), velocity_NV.clone().view(self.live, -1, 3)
+
     def _fill(self, state: ParticleState) -> None:
         count = self.live = len(state.position_N3)
         assert count <= self.particles and state.scene_count == self.scenes

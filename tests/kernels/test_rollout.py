@@ -19,6 +19,7 @@ from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime import triton_rollout
 from hgn.runtime.divergence import DivergedError
+from hgn.runtime.live import LiveSimulation
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
 from hgn.scene.symmetry import Vector
@@ -92,6 +93,31 @@ def test_later_simulations_begin_anew() -> None:
     assert again.backend.idle[1] is not kept
     again.backend.release()
     assert not again.backend.idle
+
+
+def test_scenes_that_change() -> None:
+    """Particles that enter, other obstacles, other gravity and an earlier frame are those of the plain loop; what was
+    captured is used for all of them while there is room, and captured anew where there is not."""
+    paths, growing = [], []
+    for backend, precision in (("torch", "fp32"), ("triton", "fp32")):
+        simulator = Simulator(network(2, inputs="relative"), 60.0, backend, precision)
+        live = LiveSimulation(simulator, scene(4), room=6)
+        first = live._rollout
+        path = [live.step()]
+        state = live.state
+        for count, seed in ((2, 1), (3, 2)):
+            new = scene(count, seed)
+            live.add_particles(new.position_N3, new.velocity_N3, new.material_N)
+            live.replace_obstacles(new)
+            live.set_gravity((0.0, float(seed), 1.0))
+            path += [live.step() for _ in range(2)]
+            growing.append(live._rollout is not first)
+        live.restore(state.position_N3.cpu().numpy(), state.velocity_NM3.cpu().numpy(), 1)
+        paths.append([*path, live.step()])
+        live.close()
+    assert growing == [False, False, False, True]
+    for expected_N3, found_N3 in zip(*paths, strict=True):
+        np.testing.assert_allclose(found_N3, expected_N3, rtol=0, atol=1e-6)
 
 
 def test_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:

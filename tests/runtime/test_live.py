@@ -1,0 +1,187 @@
+"""Scenes that change while they are simulated: what stays must stay to the bit, what changes must be what was asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from network.states import network_of, random_grid
+
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.runtime.divergence import DivergedError
+from hgn.runtime.live import LiveSimulation
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.weights import WeightsInfo
+from hgn.schema import ConfigError
+
+BACKENDS = ("torch", "cpu")
+
+
+def scene(particles: int, seed: int = 0, low: float = 0.05, domain: float = 1.0) -> InitialState:
+    rng = np.random.default_rng(seed)
+    return InitialState(
+        position_N3=(low + 0.1 * rng.random((particles, 3))).astype(np.float32),
+        velocity_N3=rng.normal(0, 0.1, (particles, 3)).astype(np.float32),
+        material_N=rng.integers(0, 3, particles).astype(np.uint8),
+        obstacle_grid=random_grid(seed, 4_000),
+        domain_size=(domain, domain, domain),
+        gravity=(0.0, -9.8, 0.0),
+    )
+
+
+def entering(live: LiveSimulation, other: InitialState) -> np.ndarray:
+    return live.add_particles(other.position_N3, other.velocity_N3, other.material_N)
+
+
+def frames(live: LiveSimulation, count: int) -> np.ndarray:
+    return np.stack([live.step() for _ in range(count)])
+
+
+def small(**changes: object) -> HierarchicalGraphNetwork:
+    return network_of(torch.float32, width=16, levels=2, **changes)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_changes_that_change_nothing(backend: str) -> None:
+    """Frames with nothing added, the same obstacles and the same gravity set between them are bitwise a rollout's."""
+    simulator, first = Simulator(small(), 60.0, backend), scene(40)
+    (expected_TN3,) = simulator.rollout([first], 6)
+    live = LiveSimulation(simulator, first)
+    for frame in range(1, 6):
+        entering(live, scene(0))
+        live.replace_obstacles(first)
+        live.set_gravity(first.gravity)
+        np.testing.assert_array_equal(live.step(), expected_TN3[frame])
+    assert live.frame == 5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_particles_that_enter_are_those_of_a_scene(backend: str) -> None:
+    """Particles added before the first frame move, to the bit, as if the scene had begun with them: histories too."""
+    simulator, first, second = Simulator(small(), 60.0, backend), scene(30), scene(20, 1)
+    joined = {name: np.concatenate([getattr(one, name) for one in (first, second)]) for name in ARRAYS}
+    (expected_TN3,) = simulator.rollout([replace(first, **joined)], 5)
+    live = LiveSimulation(simulator, first)
+    history_AM3 = entering(live, second)
+    np.testing.assert_array_equal(history_AM3, simulator.start([second]).velocity_NM3)
+    np.testing.assert_array_equal(frames(live, 4), expected_TN3[1:])
+
+
+ARRAYS = ("position_N3", "velocity_N3", "material_N")
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_particles_far_away_do_not_matter(backend: str) -> None:
+    """What enters beyond the grid's reach leaves the others' frames as they are, to rounding; what enters among them
+    does not."""
+    simulator, first = Simulator(small(), 60.0, backend), scene(40, domain=20.0)
+    (alone_TN3,) = simulator.rollout([first], 8)
+    reach = {}
+    for low in (0.05, 18.0):
+        live = LiveSimulation(simulator, first)
+        begin_TN3 = frames(live, 3)
+        np.testing.assert_array_equal(begin_TN3, alone_TN3[1:4])
+        entering(live, scene(25, 1, low))
+        reach[low] = np.abs(frames(live, 4)[:, :40] - alone_TN3[4:]).max()
+    assert reach[18.0] < 1e-6 < 1e-5 < reach[0.05]
+
+
+def test_empty_until_particles_enter() -> None:
+    """A scene without particles waits; those that enter move as a scene of their own."""
+    simulator, first = Simulator(small(), 60.0), scene(20)
+    live = LiveSimulation(simulator, scene(0))
+    assert frames(live, 2).shape == (2, 0, 3)
+    entering(live, first)
+    np.testing.assert_array_equal(frames(live, 3), simulator.rollout([first], 4)[0][1:])
+
+
+def test_obstacles_are_replaced() -> None:
+    """From the next frame on particles feel other obstacles, and without any they move as if there were none."""
+    simulator, first = Simulator(small(), 60.0), scene(40)
+    bare = replace(first, obstacle_grid=replace(first.obstacle_grid, **{
+        name: getattr(first.obstacle_grid, name)[:0] for name in ("cell_K3", "normal_K3")
+    }))  # fmt: skip
+    live = LiveSimulation(simulator, first)
+    live.replace_obstacles(bare)
+    np.testing.assert_array_equal(frames(live, 3), simulator.rollout([bare], 4)[0][1:])
+    live.replace_obstacles(scene(0, 5))
+    assert np.abs(live.step() - simulator.rollout([bare], 5)[0][-1]).max() > 1e-6
+
+
+def test_gravity_changes_between_frames() -> None:
+    """Relative inputs: a lone particle falls on under the new gravity from the velocity that it had, by the closed
+    form of the frame's integration: v += g dt^2, x += v."""
+    simulator = Simulator(constant_relative(), 60.0)
+    one = replace(scene(1), velocity_N3=np.zeros((1, 3), np.float32))
+    live = LiveSimulation(simulator, one)
+    before_T13 = frames(live, 2)
+    live.set_gravity((1.8, 3.6, 0.0))
+    after_T13 = frames(live, 3)
+    velocity_3 = (before_T13[1] - before_T13[0])[0].astype(np.float64)
+    step_T1 = np.arange(1, 4)[:, None]
+    rise_T3 = velocity_3 * step_T1 + 0.5 * step_T1 * (step_T1 + 1) * np.array((1.8, 3.6, 0.0)) / 3600
+    np.testing.assert_allclose(after_T13[:, 0], before_T13[1, 0] + rise_T3, rtol=0, atol=2e-6)
+
+
+def constant_relative() -> HierarchicalGraphNetwork:
+    """Relative inputs and an output of zero: free flight."""
+    network = small(inputs="relative")
+    with torch.no_grad():
+        for parameter in network.decode.parameters():
+            parameter.zero_()
+    return network
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_back_in_time(backend: str) -> None:
+    """What is restored with positions and histories of an earlier frame repeats that frame's future to the bit, without
+    those that entered later."""
+    simulator, first = Simulator(small(), 60.0, backend), scene(30)
+    live = LiveSimulation(simulator, first)
+    frames(live, 3)
+    state = live.state
+    position_N3, velocity_NM3 = state.position_N3.numpy().copy(), state.velocity_NM3.numpy().copy()
+    expected_TN3 = frames(live, 3)
+    entering(live, scene(10, 1))
+    frames(live, 2)
+    live.restore(position_N3, velocity_NM3, 3)
+    assert (live.frame, live.particle_count) == (3, 30)
+    np.testing.assert_array_equal(frames(live, 3), expected_TN3)
+
+
+def test_what_is_refused_changes_nothing() -> None:
+    """Materials and gravity that the weights do not know, and arrays that do not fit, are refused by name; the
+    simulation goes on as if nothing had been asked."""
+    network = small(materials=("water", "sand"))
+    info = WeightsInfo(network.config, 60.0, 1 / 64)
+    simulator, first = Simulator(network, 60.0, info=info), scene(20)
+    first.material_N[:] = 0
+    (expected_TN3,) = simulator.rollout([first], 3)
+    live, position_13 = LiveSimulation(simulator, first), np.full((1, 3), 0.5, np.float32)
+    with pytest.raises(ConfigError, match=r"material must be one of the network's \(water, sand\), got snow"):
+        live.add_particles(position_13, 0 * position_13, np.array([2]))
+    with pytest.raises(ConfigError, match=r"velocity_A3 must be of shape \(1, 3\), got \(1, 2\)"):
+        live.add_particles(position_13, position_13[:, :2], np.array([0]))
+    with pytest.raises(ConfigError, match=r"position_A3 must be finite, got nan"):
+        live.add_particles(position_13 * np.nan, 0 * position_13, np.array([0]))
+    with pytest.raises(ConfigError, match="gravity must be the weights'"):
+        live.set_gravity((0.0, 0.0, 0.0))
+    with pytest.raises(ConfigError, match="position_N3 must be at most 20 particles, got 21"):
+        live.restore(np.zeros((21, 3), np.float32), np.zeros((21, 5, 3), np.float32), 0)
+    np.testing.assert_array_equal(frames(live, 2), expected_TN3[1:])
+
+
+def test_divergence_says_at_which_frame_of_the_scene() -> None:
+    """Also behind changes, which begin the backend's own count anew; and the scene can be restored."""
+    live = LiveSimulation(Simulator(small(), 60.0), scene(10))
+    live.step()
+    away_13 = np.full((1, 3), 0.5, np.float32)
+    live.add_particles(away_13, np.full((1, 3), 600.0, np.float32), np.array([0]))
+    with pytest.raises(DivergedError, match="at frame 2: 1 of 11 particles") as raised:
+        live.step()
+    assert raised.value.frame == 2
+    start = Simulator(small(), 60.0).start([scene(10)])
+    live.restore(start.position_N3.numpy(), start.velocity_NM3.numpy(), 0)
+    assert np.isfinite(live.step()).all()
