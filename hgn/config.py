@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from hgn.scene.material import MATERIALS
+from hgn.scene.material import MATERIALS, PAPER_MATERIALS
 from hgn.schema import (
     BelowOne,
     ConfigError,
@@ -84,7 +84,7 @@ class SceneConfig:
     group_count: NonNegative[int] = 4
     group_shapes: tuple[Annotated[str, one_of(*GROUP_SHAPES)], ...] = GROUP_SHAPES
     group_size: Positive[float] = 0.08  # side or diameter
-    materials: tuple[Material, ...] = MATERIALS
+    materials: tuple[Material, ...] = PAPER_MATERIALS
     particles_per_cell: Positive[float] = 8.0
     clearance_cells: NonNegative[float] = 2.0  # between obstacles, groups and walls, in solver cells
     maximum_initial_speed: NonNegative[float] = 0.0  # domain units per second; each group draws one velocity
@@ -317,7 +317,7 @@ class NetworkConfig:
     # gravity are exact
     inputs: Annotated[str, one_of(*NETWORK_INPUTS)] = "absolute"
     contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
-    materials: tuple[Material, ...] = MATERIALS
+    materials: tuple[Material, ...] = PAPER_MATERIALS
     maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
     # of gns_particles: how far apart static particles are, at least, in obstacle cells
     static_spacing_cells: Positive[float] = 0.25

@@ -1,4 +1,4 @@
-"""The constitutive laws of one particle, for Taichi kernels: water, sand, snow (Taichi Elements' materials).
+"""The constitutive laws of one particle, for Taichi kernels: water, sand, snow (Taichi Elements' materials), elastic.
 
 Every law maps the trial deformation of a step to the new state and the Kirchhoff stress (stress times J, per
 initial volume, in pascals). `law` holds a row of constants (layout.Constant) for each kind of material, and `row`
@@ -9,12 +9,13 @@ volume correction v_c for sand (Tampubolon et al. 2017), the plastic volume rati
 
 import taichi as ti
 
-from datagen.mpm.layout import CONSTANT, COUNT
+from datagen.mpm.layout import CONSTANT, COUNT, VARIANT
 from datagen.mpm.svd import svd3
-from hgn.scene.material import SAND, SNOW
+from hgn.scene.material import ELASTIC, SAND, SNOW
 
 # Jp beyond these is rounding: hardening is capped, or nothing is left of it
 SMALLEST_PLASTIC_VOLUME, LARGEST_PLASTIC_VOLUME = 1e-3, 1e3
+LARGEST_VOLUME = 1e12  # of an elastic solid, whose stress goes with its square
 
 
 @ti.func
@@ -129,11 +130,17 @@ def solid(
     row: ti.i32,
     counter: ti.template(),
     scene: ti.i32,
-    sand: ti.template(),
-    snow: ti.template(),
-    taichi_elements_sand: ti.template(),
+    variant: ti.template(),
 ):
-    """Sand and snow from the trial F: new F, new volume, Kirchhoff stress, present stiffness 3 lambda + 2 mu."""
+    """Sand, snow and elastic solids from the trial F: new F, new volume, Kirchhoff stress, and the present stiffness,
+    3 lambda + 2 mu at rest shape.
+
+    Elastic solids are fixed corotated (Stomakhin et al. 2012), tau = 2 mu (F - R) Fᵀ + lambda J (J - 1), as snow is
+    until it yields; stretched they are stiffer by d(tau) / d(log sigma).
+    """
+    sand = ti.static(bool(variant & VARIANT.sand))
+    snow = ti.static(bool(variant & VARIANT.snow))
+    elastic = ti.static(bool(variant & VARIANT.elastic))
     shear = law[row + CONSTANT.shear]
     bulk = law[row + CONSTANT.bulk]
     smallest = law[row + CONSTANT.smallest_singular_value]
@@ -150,9 +157,11 @@ def solid(
     stiffness = 3.0 * bulk + 2.0 * shear
     stress = ti.Vector([0.0, 0.0, 0.0])
     if ti.static(sand):
-        if ti.static(not snow) or material == SAND:
+        if ti.static(not snow and not elastic) or material == SAND:
             log_strain = ti.log(sigma)
-            strain, new_volume_ = _project_sand(log_strain, volume, law, row, taichi_elements_sand)
+            strain, new_volume_ = _project_sand(
+                log_strain, volume, law, row, ti.static(bool(variant & VARIANT.taichi_elements_sand))
+            )
             new_volume = new_volume_
             for i in ti.static(range(3)):
                 if strain[i] != log_strain[i]:
@@ -160,7 +169,7 @@ def solid(
                     plastic += 1
             stress = 2.0 * shear * strain + bulk * strain.sum()
     if ti.static(snow):
-        if ti.static(not sand) or material == SNOW:
+        if ti.static(not sand and not elastic) or material == SNOW:
             h = hardening(volume, law, row)
             ratio = 1.0
             for i in ti.static(range(3)):
@@ -181,6 +190,13 @@ def solid(
             stiffness *= new_h
             J = new_sigma[0] * new_sigma[1] * new_sigma[2]
             stress = 2.0 * shear * h * (new_sigma - 1.0) * new_sigma + bulk * h * J * (J - 1.0)
+    if ti.static(elastic):
+        if ti.static(not sand and not snow) or material == ELASTIC:
+            J = ti.min(sigma[0] * sigma[1] * sigma[2], LARGEST_VOLUME)
+            stress = 2.0 * shear * (sigma - 1.0) * sigma + bulk * J * (J - 1.0)
+            widest = sigma.max()
+            stiffness = 3.0 * bulk * ti.max(1.0, J * (2.0 * J - 1.0))
+            stiffness += 2.0 * shear * ti.max(1.0, widest * (2.0 * widest - 1.0))
     new_F = F
     if plastic > 0:  # recomposed only then: each decomposition costs a rounding of det F
         new_F = _compose(U, new_sigma, V)

@@ -252,7 +252,8 @@ class Launch(ABC):
         # per material and row; hardening may take all stiffness from snow
         density = laws[:, CONSTANT.density]
         viscous = 4 * laws[:, CONSTANT.viscosity] / (density * self.scenes[0].cell_size)
-        least = np.stack([(np.sqrt(3 * bulk / density) + viscous) ** 2, (3 * bulk + 2 * shear) / density, 0 * bulk])
+        solid = (3 * bulk + 2 * shear) / density
+        least = np.stack([(np.sqrt(3 * bulk / density) + viscous) ** 2, solid, 0 * bulk, solid])
         assert len(least) == len(MATERIALS)
         for index, scene in enumerate(self.scenes):
             own = slice(self.particle_begin[index], self.particle_begin[index + 1])

@@ -135,7 +135,8 @@ class Variant(NamedTuple):
     taichi_elements_water: int = 512
     sheets: int = 1024  # some nodes have two fields
     moving: int = 2048  # obstacles move
-    parts: int = 4096  # times the number of parts
+    elastic: int = 4096
+    parts: int = 8192  # times the number of parts
 
 
 class Field(NamedTuple):

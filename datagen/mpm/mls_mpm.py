@@ -310,9 +310,7 @@ def respond(
                 row,
                 counter,
                 scene,
-                ti.static(bool(variant & VARIANT.sand)),
-                ti.static(bool(variant & VARIANT.snow)),
-                ti.static(bool(variant & VARIANT.taichi_elements_sand)),
+                variant,
             )
             new_F = solid_F
             new_volume = solid_volume

@@ -1,4 +1,4 @@
-"""Simulates batches of scenes: MLS-MPM with water, sand, snow and mesh obstacles, on a CPU or a CUDA device.
+"""Simulates batches of scenes: MLS-MPM with water, sand, snow, elastic solids and mesh obstacles, on a CPU or a GPU.
 
 The method is the paper's simulator, Taichi Elements, with the corrections that hgn.config.MpmConfig names.
 Shape legend: T frames, N particles of a scene, B scenes.

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter
 from hgn.scene.scene import Obstacle
 
 # colours as sRGB in [0, 1]; one a material, in the order of hgn.scene.material.MATERIALS
-MATERIAL_COLORS = np.array([(0.13, 0.45, 0.86), (0.87, 0.60, 0.20), (0.70, 0.81, 0.93)], np.float32)
+MATERIAL_COLORS = np.array([(0.13, 0.45, 0.86), (0.87, 0.60, 0.20), (0.70, 0.81, 0.93), (0.36, 0.66, 0.38)], np.float32)
 OBSTACLE_COLOR = np.array((0.60, 0.58, 0.62), np.float32)
 BACKGROUND_COLOR = np.array((1.0, 1.0, 1.0), np.float32)
 FLOOR_COLOR = np.array((0.89, 0.90, 0.92), np.float32)
@@ -338,7 +338,7 @@ class Stage:
         material_S = material_N[order][particle_S]
         lit_S = lit_N[order][particle_S]
         shade_S = (0.76 + 0.38 * lambert_S) * lit_S * (0.80 + 0.20 * z_S)
-        shine_S = np.array((0.30, 0.06, 0.12))[material_S] * gloss_S * lit_S
+        shine_S = np.array((0.30, 0.06, 0.12, 0.20))[material_S] * gloss_S * lit_S
         color_S3 = MATERIAL_COLORS[material_S] * shade_S[:, None].astype(np.float32)
         color_S3 += shine_S[:, None].astype(np.float32)
 

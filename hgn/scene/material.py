@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from hgn.schema import ConfigError
 
-MATERIALS: tuple[str, ...] = ("water", "sand", "snow")
-WATER, SAND, SNOW = range(3)
+MATERIALS: tuple[str, ...] = ("water", "sand", "snow", "elastic")
+WATER, SAND, SNOW, ELASTIC = range(4)
+PAPER_MATERIALS = MATERIALS[:3]  # of data and networks, unless they say otherwise
 FLUIDS: tuple[int, ...] = (WATER,)  # without a deformation gradient: all that they remember is their volume
 MATERIAL_BITS = 4  # of the solver's label of a particle, which holds its material in these and its scene above
 MATERIAL_MASK = (1 << MATERIAL_BITS) - 1

@@ -102,7 +102,7 @@ class GroupEntry:
     density_kg_m3: float | None = None
     sand_friction_angle_deg: float | None = None
     snow_hardening: float | None = None
-    snow_critical_compression: float | None = None  # with 0.9, a stretch of 20 and no hardening, snow is elastic
+    snow_critical_compression: float | None = None
     snow_critical_stretch: float | None = None
     water_tension: float | None = None
     water_viscosity_pa_s: float | None = None

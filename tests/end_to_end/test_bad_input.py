@@ -142,14 +142,18 @@ EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "jso
         (
             "datagen",
             ["scene.materials=[water,lava]"],
-            "scene.materials[1] must be one of water, sand, snow, got 'lava'",
+            "scene.materials[1] must be one of water, sand, snow, elastic, got 'lava'",
         ),
         ("train", ["+training.batchsize=2"], "training.batchsize is not a known key; did you mean batch_scenes?"),
         ("train", ["training.batchsize=2"], "training.batchsize is not a known key; did you mean batch_scenes?"),
         ("train", ["training.maximum_updates=many"], "training.maximum_updates must be a whole number, got 'many'"),
         ("train", ["training.learning_rate=-1"], "training.learning_rate must be a finite number > 0, got -1.0"),
         ("train", ["training.noise_std=nan"], "training.noise_std must be a finite number >= 0, got nan"),
-        ("train", ["network.materials=[lava]"], "network.materials[0] must be one of water, sand, snow, got 'lava'"),
+        (
+            "train",
+            ["network.materials=[lava]"],
+            "network.materials[0] must be one of water, sand, snow, elastic, got 'lava'",
+        ),
         (
             "train",
             ["scene.tilted_gravity_fraction=0.1"],
@@ -196,7 +200,7 @@ def test_values(
     [
         (SCENE.replace("[0.5, 0.8, 0.5]", "[0.5, 0.45, 0.5]"), "particles inside obstacle_0_cone; move or shrink the"),
         (SCENE.replace("[0.5, 0.8, 0.5]", "[0.5, 0.02, 0.5]"), "must lie between the walls, which are 3 cells"),
-        (SCENE.replace("water", "lava"), "groups[0].material must be one of water, sand, snow, got 'lava'"),
+        (SCENE.replace("water", "lava"), "groups[0].material must be one of water, sand, snow, elastic, got 'lava'"),
         (SCENE.replace("size: 0.05", "size: -0.05"), "groups[0].size must be finite and > 0, got -0.05"),
         (SCENE.replace("size: 0.05", "size: .nan"), "groups[0].size must be finite and > 0, got nan"),
         (SCENE.replace("size: 0.05", "size: large"), "groups[0].size must be"),

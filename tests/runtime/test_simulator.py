@@ -250,8 +250,8 @@ def test_no_network_takes_a_huge_gravity(tmp_path: Path, gravity: tuple[float, f
         ({"position_N3": [[0.5, 0.5, 0.5]]}, "position_N3 must be a NumPy array, got 'list'"),
         ({"velocity_N3": np.zeros(3)}, r"velocity_N3 must have shape \(1, 3\), got \(3,\)"),
         ({"material_N": np.zeros(1)}, "material_N must be whole numbers, got 'float64'"),
-        ({"material_N": np.array([-1])}, r"material_N must be 0 to 2 \(water, sand, snow\), got -1"),
-        ({"material_N": np.array([3])}, r"material_N must be 0 to 2 \(water, sand, snow\), got 3"),
+        ({"material_N": np.array([-1])}, r"material_N must be 0 to 3 \(water, sand, snow, elastic\), got -1"),
+        ({"material_N": np.array([4])}, r"material_N must be 0 to 3 \(water, sand, snow, elastic\), got 4"),
     ],
 )
 def test_scenes_of_arrays(change: dict[str, object], message: str) -> None:

@@ -11,7 +11,7 @@ from hgn.config import DatagenConfig, DatasetConfig, SceneConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.group import WALL_CELLS, fill, particle_count, points_in_ball, region_of
-from hgn.scene.material import MATERIALS
+from hgn.scene.material import MATERIALS, PAPER_MATERIALS
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import obstacles_of_episode
@@ -249,7 +249,7 @@ def test_draws_cover_their_ranges():
     records = [record for scene in scenes for record in scene.specification["obstacles"]]
     assert {record["shape"] for record in records} == set(PAPER.obstacle_shapes)
     groups = [record for scene in scenes for record in scene.specification["groups"]]
-    assert {record["material"] for record in groups} == set(MATERIALS)
+    assert {record["material"] for record in groups} == set(PAPER_MATERIALS)
     assert {record["shape"] for record in groups} == {"cube", "sphere"}
     assert 0.27 < np.mean([record["size"] for record in records]) < 0.32
     counts = [scene.particle_count for scene in scenes]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import h5py
@@ -76,6 +77,20 @@ def test_large_source_survives(tmp_path: Path) -> None:
     rollout = dataclasses.replace(make_rollout(), source={"specification": ["x" * 100] * 2000})
     write_rollout(tmp_path / "rollout.h5", rollout)
     assert read_rollout(tmp_path / "rollout.h5").source == rollout.source
+
+
+def test_files_from_before_a_material(tmp_path: Path) -> None:
+    """A file that names the first materials alone is read; one of other names, or another order, is refused."""
+    path = tmp_path / "rollout.h5"
+    write_rollout(path, make_rollout())
+    for names, refused in ((["water", "sand", "snow"], False), (["water", "snow", "sand"], True), (["lava"], True)):
+        with h5py.File(path, "a") as file:
+            file["hgn"].attrs["materials"] = json.dumps(names)
+        if refused:
+            with pytest.raises(ConfigError, match="materials must be water, sand, snow, elastic, got "):
+                read_rollout(path)
+        else:
+            assert (read_rollout(path).material_N == make_rollout().material_N).all()
 
 
 def test_diverged_rollout_is_kept(tmp_path: Path) -> None:
@@ -198,7 +213,7 @@ def test_damaged_contents(tmp_path: Path) -> None:
     [
         ({"position_TN3": np.zeros((2, 3), np.float32)}, "position_TN3 must have shape"),
         ({"material_N": np.zeros(3, np.uint8)}, r"material_N must have shape \(7,\)"),
-        ({"material_N": np.full(7, 9, np.uint8)}, "material_N must be below 3, got 9"),
+        ({"material_N": np.full(7, 9, np.uint8)}, "material_N must be below 4, got 9"),
         ({"frame_rate_hz": float("nan")}, "frame_rate_hz must be a finite number > 0"),
         ({"reference_TN3": np.zeros((2, 6, 3), np.float32)}, "reference_TN3 must have shape"),
     ],

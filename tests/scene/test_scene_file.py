@@ -168,7 +168,7 @@ def obstacle_with(**changes: object) -> dict[str, object]:
         (obstacle_with(friction=-1), r"obstacles\[0\]\.friction must be a finite number >= 0, got -1"),
         (scene_with(seed=-1), "seed must be a whole number >= 0"),
         (scene_with(seed=0.5), "seed must be a whole number"),
-        (group_with(material="lava"), r"groups\[0\]\.material must be one of water, sand, snow, got 'lava'"),
+        (group_with(material="lava"), r"groups\[0\]\.material must be one of water, sand, snow, elastic, got 'lava'"),
         (group_with(shape="torus"), r"groups\[0\]\.shape must be one of cube, sphere, box"),
         (group_with(size=0), r"groups\[0\]\.size must be finite and > 0"),
         (group_with(size=float("nan")), r"groups\[0\]\.size must be finite and > 0"),

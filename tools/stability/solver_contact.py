@@ -18,7 +18,7 @@ import numpy as np
 
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from hgn.config import MpmConfig
-from hgn.scene.material import MATERIALS, SAND, SNOW
+from hgn.scene.material import MATERIALS, PAPER_MATERIALS, SAND, SNOW
 from hgn.scene.rotation import euler_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
 from tools.stability.row import Row
@@ -195,7 +195,7 @@ def contacts(config: MpmConfig) -> list[Row]:
     """Rows of the worst of all OFFSETS, for each orientation and material: free flight, friction, and what is glued."""
     rows = []
     settings = [Setting(offset, turn) for turn in ORIENTATIONS for offset in OFFSETS]
-    places = [(setting, material) for setting in settings for material in range(len(MATERIALS))]
+    places = [(setting, material) for setting in settings for material in range(len(PAPER_MATERIALS))]
     for (turn, kind), errors in _grouped(places, flight_errors(places, config)).items():
         for name in ("below", "leaving"):
             worst = max(error[name] for error in errors)

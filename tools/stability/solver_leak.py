@@ -22,7 +22,7 @@ from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from datagen.mpm.sweep import near_pairs
 from hgn.config import MpmConfig
 from hgn.scene.distance import closest_points, contains
-from hgn.scene.material import MATERIALS
+from hgn.scene.material import MATERIALS, PAPER_MATERIALS
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
@@ -56,7 +56,7 @@ def leaks(base: MpmConfig, seconds: float, block_cells: float, offsets: int = le
         (shape, turn, kind, speed)
         for shape in SHAPES
         for turn in ORIENTATIONS
-        for kind in range(len(MATERIALS))
+        for kind in range(len(PAPER_MATERIALS))
         for speed in SPEEDS
     ]
     frames = 1 + max(1, round(seconds * FRAME_RATE_HZ))

@@ -6,10 +6,10 @@ import taichi as ti
 from numpy.polynomial import Polynomial
 
 from datagen.mpm.constitutive import solid, water
-from datagen.mpm.layout import COUNT, SETTING, VARIANT, constants, lame_parameters, sand_alpha
+from datagen.mpm.layout import COUNT, SETTING, SOLID_VARIANTS, VARIANT, constants, lame_parameters, sand_alpha
 from datagen.mpm.mls_mpm import respond
 from hgn.config import MpmConfig
-from hgn.scene.material import SAND, SNOW, WATER
+from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 
 Matrices = ti.types.ndarray(dtype=ti.types.matrix(3, 3, ti.f32), ndim=1)
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -18,10 +18,10 @@ Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
 @ti.kernel
 def update_solids(
     F: Matrices, volume: Scalars, stress: Matrices, stiffness: Scalars, material: ti.i32, constant: Scalars,
-    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), taichi_elements_sand: ti.template(),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), variant: ti.template(),
 ):  # fmt: skip
     for n in range(F.shape[0]):
-        f, v, s, k = solid(F[n], volume[n], material, constant, 0, counter, 0, True, True, taichi_elements_sand)
+        f, v, s, k = solid(F[n], volume[n], material, constant, 0, counter, 0, variant)
         F[n] = f
         volume[n] = v
         stress[n] = s
@@ -84,8 +84,10 @@ def run(material: int, F_N33: np.ndarray, volume_N: np.ndarray, config: MpmConfi
     F, stress = (ti.Matrix.ndarray(3, 3, ti.f32, count) for _ in range(2))
     F.from_numpy(F_N33.astype(np.float32))
     volume, stiffness, counter = scalars(volume_N), scalars(np.zeros(count)), counters()
-    own = config.sand_volume_correction == "taichi_elements"
-    update_solids(F, volume, stress, stiffness, material, scalars(constants(config)), counter, own)
+    variant = SOLID_VARIANTS
+    if config.sand_volume_correction == "taichi_elements":
+        variant += VARIANT.taichi_elements_sand
+    update_solids(F, volume, stress, stiffness, material, scalars(constants(config)), counter, variant)
     return F.to_numpy(), volume.to_numpy(), stress.to_numpy(), stiffness.to_numpy(), counter.to_numpy()[0]
 
 
@@ -126,6 +128,25 @@ def test_snow(spread: float) -> None:
     new_h = np.minimum(np.exp(10 * (1 - new_Jp)), MpmConfig().snow_maximum_hardening)
     close(stiffness / new_h, np.full(500, 3 * bulk + 2 * shear), 5e-5)
     assert counter[COUNT.hardening_caps] == (np.exp(10 * (1 - new_Jp)) >= MpmConfig().snow_maximum_hardening).sum()
+
+
+@pytest.mark.parametrize("spread", [1e-3, 0.3])
+def test_elastic_solid(spread: float) -> None:
+    """tau = 2 mu (F - R) Fᵀ + lambda J (J - 1) at any stretch, F as it was; the stiffness that the step follows is at
+    least every d(tau) / d(log sigma) in turn, with that of the volume three times.
+    """
+    config = MpmConfig()
+    F = deformations(np.random.default_rng(4), 500, spread)
+    shear, bulk = lame_parameters(config)
+    U, sigma, Vt = np.linalg.svd(F)
+    J = sigma.prod(axis=1)
+    stress = 2 * shear * (F - U @ Vt) @ np.swapaxes(F, 1, 2) + (bulk * J * (J - 1))[:, None, None] * np.eye(3)
+
+    got_F, volume, got_stress, stiffness, counter = run(ELASTIC, F, np.ones(500), config)
+    assert np.array_equal(got_F, F.astype(np.float32)) and (volume == 1).all() and not counter.any()
+    assert np.abs(got_stress - stress).max() < 3e-6 * (2 * shear + np.abs(stress).max())
+    steepest = 3 * bulk * J * (2 * J - 1) + 2 * shear * (sigma * (2 * sigma - 1)).max(axis=1)
+    assert (stiffness > 0.99999 * np.maximum(steepest, 3 * bulk + 2 * shear)).all()
 
 
 @pytest.mark.parametrize(
@@ -277,7 +298,7 @@ def test_stiffening_water() -> None:
     close(stiffness.to_numpy(), 3 * np.maximum(bulk, slope), 1e-4)
 
 
-@pytest.mark.parametrize("material", [SAND, SNOW])
+@pytest.mark.parametrize("material", [SAND, SNOW, ELASTIC])
 def test_elastic_steps_do_not_touch_the_deformation(material: int) -> None:
     """Without plastic flow F is not recomposed: a thousand updates leave every bit as it was."""
     F = np.eye(3) + 1e-3 * np.random.default_rng(3).normal(size=(50, 3, 3)) - 5e-3 * np.eye(3)
@@ -288,12 +309,12 @@ def test_elastic_steps_do_not_touch_the_deformation(material: int) -> None:
     assert np.array_equal(got_volume, volume)
 
 
-@pytest.mark.parametrize("material", [SAND, SNOW])
+@pytest.mark.parametrize("material", [SAND, SNOW, ELASTIC])
 def test_collapsed_and_inverted_deformations(material: int) -> None:
     """Singular, inverted, huge F: finite results with every singular value at least 0.05, each floor counted."""
     F = np.array([np.zeros((3, 3)), -np.eye(3), np.diag([1.0, 1, -1]), np.diag([1.0, 0, 0]), 1e6 * np.eye(3)])
     got, volume, stress, stiffness, counter = run(
-        material, F, np.full(5, 1.0 if material == SNOW else 0.0), MpmConfig()
+        material, F, np.full(5, 0.0 if material == SAND else 1.0), MpmConfig()
     )
     for values in (got, volume, stress, stiffness):
         assert np.isfinite(values).all()

@@ -24,7 +24,7 @@ SHEET = Obstacle(
 def mixed(count: int, seed: int, velocity: tuple, **scene) -> Scene:
     position = np.random.default_rng(seed).uniform((0.3, 0.4, 0.3), (0.5, 0.6, 0.5), (count, 3)).astype(np.float32)
     return Scene(
-        position, np.tile(np.float32(velocity), (count, 1)), (np.arange(count) % 3).astype(np.uint8),
+        position, np.tile(np.float32(velocity), (count, 1)), (np.arange(count) % 4).astype(np.uint8),
         (SHEET,), cell_size=CELL, **scene,
     )  # fmt: skip
 
