@@ -19,6 +19,7 @@ import math
 import os
 import re
 import threading
+from array import array
 from bisect import bisect_left, bisect_right
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
@@ -185,6 +186,7 @@ class _Read:
         self.segments: OrderedDict[int, _Segment] = OrderedDict()
         self.ranges: dict[str, list[tuple[int, int]]] = {split: [] for split in SPLITS}  # of the shards seen, in order
         self.seen: dict[int, int] = {}  # how many of a segment's shards are among these
+        self.particles = {split: array("i") for split in SPLITS}  # of each episode; -1: not looked at
 
     def see(self, segment: int, shards: Sequence[ShardEntry]) -> None:
         """Raises: ConfigError where an episode is listed twice."""
@@ -257,6 +259,19 @@ class Index(Sequence[ShardEntry]):
                 break
             before += len(shard.episodes)
         return shard, shard.episodes[episode - before]
+
+    def particles(self, split: str, episodes: Sequence[int]) -> list[int]:
+        """How many particles these have, by their places in the split; a segment is read for it once."""
+        known = self._read.particles[split]
+        with self._read.lock:
+            known.extend([-1] * (self.totals[split].episodes - len(known)))
+            for episode in episodes:
+                if known[episode] < 0:
+                    segment = self._first_beyond(split, episode)
+                    counts = [e.particles for s in self._segment(segment) if s.split == split for e in s.episodes]
+                    before = self._before(segment)[split].episodes
+                    known[before : before + len(counts)] = array("i", counts)
+        return [known[episode] for episode in episodes]
 
     def digest(self, split: str, episodes: int) -> str | None:
         """The digest of the shards that hold the first `episodes` of a split; none where no shard ends there."""

@@ -141,6 +141,10 @@ class EpisodeStore:
             self._measured += 1
         return self._frames[:count]
 
+    def particles(self, episodes: Sequence[int]) -> list[int]:
+        """How many each of these has, by the index."""
+        return self.manifest.shards.particles(self.split, episodes)
+
     @property
     def episodes(self) -> Sequence[Episode]:
         """The episodes, in publication order; each is opened, and its shard verified, on first use.

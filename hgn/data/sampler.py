@@ -64,13 +64,28 @@ def epoch_order(seed: int, epoch: int, first_sample: np.ndarray, window: int = 0
     return np.concatenate(order)
 
 
+def balanced_parts(size_K: np.ndarray, ranks: int) -> np.ndarray:
+    """Which of K samples each rank takes, int64 [ranks, K / ranks]: as many each, of about the same total size.
+
+    The largest that are left, one for each rank, go to the ranks with the least so far (longest processing time first,
+    Graham 1969, with equal counts). Equal sizes keep their order, so that all ranks find the same.
+    """
+    row_order = np.argsort(-size_K, kind="stable").reshape(-1, ranks)
+    load, parts = np.zeros(ranks), np.empty_like(row_order)
+    for row, largest in enumerate(row_order):
+        parts[row, np.argsort(load, kind="stable")] = largest
+        load += size_K[parts[row]]
+    return parts.T
+
+
 class EpisodeSampler:
     """Walks through epochs in batches and tells each rank its part.
 
     `published(epoch)` is asked once when an epoch begins and returns the number of frames of each published
     episode, oldest publication first; it must return the same on every rank, and a list that continues the
     one of the epoch before. After a resume it may return more than the state's epoch knew: the surplus waits
-    for the next epoch. `digest(count)` tells the first so many from others; see `hgn.data.index`.
+    for the next epoch. `digest(count)` tells the first so many from others; see `hgn.data.index`. `particles(episodes)`
+    is how large these are: with it each rank gets scenes of as many particles, so that none waits for the slowest.
     """
 
     def __init__(
@@ -83,12 +98,14 @@ class EpisodeSampler:
         world_size: int = 1,
         digest: Callable[[int], str | None] = lambda count: "",
         window: int = 0,
+        particles: Callable[[Sequence[int]], Sequence[int]] | None = None,
     ) -> None:
         """Raises: ConfigError where the state's epoch cannot be gone on with; see `epoch_order` for `window`."""
         assert 0 <= rank < world_size and batch_scenes >= 1
         self.seed, self.batch_scenes, self.rank, self.world_size = seed, batch_scenes, rank, world_size
         self.state = state or SamplerState()
         self._published, self._digest, self._window = published, digest, window
+        self._particles = particles if world_size > 1 else None
         if self.state.position > 0 and self.state.window != window:
             raise ConfigError(
                 f"training.shuffle_episodes must be {self.state.window} to go on in the middle of epoch "
@@ -96,22 +113,34 @@ class EpisodeSampler:
             )
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
-        self._first_seed = 0  # of an epoch's samples, which have one after the other
+        self._first_seed = np.uint64(0)  # of an epoch's samples, which have one after the other
         self._begin_epoch(self.state.epoch, self.state.position, self.state.episodes, self.state.digest)
 
     def next_batch(self) -> list[Sample]:
         """This rank's `batch_scenes` samples of the next global batch; advances the state."""
-        total, mine = self.batch_scenes * self.world_size, self.batch_scenes * self.rank
-        samples: list[Sample] = []
+        total = self.batch_scenes * self.world_size
+        episodes, frames, seeds = [], [], []
         taken = 0  # of the global batch, which may run over the end of an epoch
         while taken < total:
             if self.state.position == len(self._order):
                 self._begin_epoch(self.state.epoch + 1, 0, 0, "")
             rest = self._order[self.state.position :][: total - taken]
-            samples += self._samples(rest[max(mine - taken, 0) : max(mine + self.batch_scenes - taken, 0)])
+            episode_K = self._first_sample.searchsorted(rest, side="right") - 1
+            episodes.append(episode_K)
+            frames.append(rest - self._first_sample[episode_K])
+            seeds.append(rest.astype(np.uint64) + self._first_seed)
             self.state = replace(self.state, position=self.state.position + len(rest))
             taken += len(rest)
-        return samples
+        episode_K, frame_K, seed_K = map(np.concatenate, (episodes, frames, seeds))
+        mine = self._part(episode_K)
+        rows = zip(episode_K[mine].tolist(), frame_K[mine].tolist(), seed_K[mine].tolist(), strict=True)
+        return [Sample(episode, frame, splitmix64(seed) >> 1) for episode, frame, seed in rows]
+
+    def _part(self, episode_K: np.ndarray) -> np.ndarray:
+        """Which of a global batch's samples are this rank's."""
+        if self._particles is None:
+            return np.arange(self.batch_scenes * self.rank, self.batch_scenes * (self.rank + 1))
+        return np.sort(balanced_parts(np.asarray(self._particles(episode_K.tolist())), self.world_size)[self.rank])
 
     def _begin_epoch(self, epoch: int, position: int, episodes: int, digest: str) -> None:
         frame_counts = list(self._published(epoch))
@@ -131,11 +160,5 @@ class EpisodeSampler:
             )
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_order(self.seed, epoch, self._first_sample, self._window)
-        self._first_seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0])
+        self._first_seed = np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0]
         self.state = SamplerState(epoch, position, len(frame_counts), found, self._window)
-
-    def _samples(self, index_K: np.ndarray) -> list[Sample]:
-        episode_K = self._first_sample.searchsorted(index_K, side="right") - 1
-        frame_K = index_K - self._first_sample[episode_K]
-        seeds = [splitmix64(self._first_seed + index) >> 1 for index in index_K.tolist()]
-        return list(map(Sample, episode_K.tolist(), frame_K.tolist(), seeds))

@@ -1,4 +1,4 @@
-"""What happens beside the updates: one start on all ranks, checkpoints, monitoring, log lines, stopping.
+"""What happens beside the updates: the same weights on all ranks, checkpoints, monitoring, log lines, stopping.
 
 Files of a run: checkpoints/last.ckpt, checkpoints/best.ckpt (lowest one-step validation error), metrics.jsonl,
 tensorboard/, pictures/.
@@ -34,6 +34,7 @@ from hgn.training import lightning_compat
 from hgn.training.checkpoint import LAST_NAMES
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.data_module import EpisodeDataModule, agreed_count
+from hgn.training.distributed import checksum, same_on_all_ranks
 from hgn.training.errors import (
     REPORTED_FRAMES,
     SquaredError,
@@ -49,10 +50,11 @@ from hgn.training.stop import BY_WEIGHT, StopRequest
 from hgn.training.tensorboard import show_rollout
 
 
-class SameStart(Callback):
-    """All ranks begin at one place: the same update, the same samples next, the same weights and normaliser.
+class SameWeights(Callback):
+    """All ranks begin at one place: the same update, the same samples next, the same weights and normaliser; and at
+    each log line their weights are still the same, bit for bit.
 
-    From then on nothing but gradients travels at an update, but for those where ranks log, save, measure or agree.
+    Nothing but gradients travels at an update, but for those where ranks log, save, measure or agree.
     """
 
     def __init__(self, feed: EpisodeDataModule) -> None:
@@ -73,6 +75,16 @@ class SameStart(Callback):
         # A data set that grows may have shown other statistics to a rank that looked later.
         for tensor in (*pl_module.parameters(), *pl_module.buffers()):
             torch.distributed.broadcast(tensor.detach(), 0)
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Raises: ConfigError on every rank when one of them has other weights."""
+        if trainer.world_size == 1 or trainer.global_step % self.feed.training.log_every:
+            return
+        if not same_on_all_ranks(checksum(pl_module.parameters())):
+            raise ConfigError(
+                f"weights must be the same on all ranks, got others at update {trainer.global_step}: a device or a "
+                "link computes wrongly; find it, and run the same command again to go on from rank 0's last checkpoint"
+            )
 
 
 class Checkpoints(Callback):

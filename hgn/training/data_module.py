@@ -178,6 +178,7 @@ class EpisodeDataModule(LightningDataModule):
             world_size,
             self.store.digest,
             self.training.shuffle_episodes,
+            self.store.particles,
         )
 
     def _prefetched(

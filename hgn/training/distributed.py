@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,21 @@ def averaging_options() -> dict[str, Any]:
 def sum_over_ranks(tensor: torch.Tensor) -> None:
     """Sums a tensor over all ranks, in place. Backend triton does so with an update's gradients, in one message."""
     torch.distributed.all_reduce(tensor)
+
+
+def checksum(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
+    """A number that a change of any one value of these float32 tensors changes: int64 [], on their device."""
+    bits = torch.cat([tensor.detach().flatten() for tensor in tensors]).view(torch.int32)
+    # modulo 2^64 no difference vanishes when it is multiplied by an odd number
+    return (bits * torch.arange(1, 2 * len(bits), 2, device=bits.device)).sum()
+
+
+def same_on_all_ranks(number: torch.Tensor) -> bool:
+    """Whether an int64 number is the same on all ranks; all get the same answer. One message of 16 bytes."""
+    lowest = torch.stack([number, ~number])
+    torch.distributed.all_reduce(lowest, torch.distributed.ReduceOp.MIN)
+    low, high = lowest.tolist()
+    return bool(low == ~high)
 
 
 def _check_restarts() -> None:

@@ -50,7 +50,7 @@ def train_network(
     from lightning.pytorch.loggers import TensorBoardLogger
 
     from hgn.training import lightning_compat
-    from hgn.training.callbacks import Checkpoints, LogLines, Monitor, SameStart, Stopper
+    from hgn.training.callbacks import Checkpoints, LogLines, Monitor, SameWeights, Stopper
     from hgn.training.checkpoint_writer import CheckpointWriter
     from hgn.training.data_module import EpisodeDataModule
     from hgn.training.gradients import GradientGuard
@@ -97,7 +97,7 @@ def train_network(
         strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
         max_steps=training.maximum_updates,
         max_epochs=-1,
-        callbacks=[SameStart(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
+        callbacks=[SameWeights(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],
         plugins=[writer],
         logger=TensorBoardLogger(run, name="", version="tensorboard"),
         default_root_dir=run,

@@ -32,7 +32,7 @@ MEMBERS = {f"{name}.npy": (512, 10_000_000) for name in ("position", "material")
 
 
 def shard(index: int) -> ShardEntry:
-    entry = EpisodeEntry(f"train-{index:06d}", index, 2**62 + index, 0, 4296, 6, MEMBERS)
+    entry = EpisodeEntry(f"train-{index:06d}", index, 2**62 + index, 0, 4296 + index % 1000, 6, MEMBERS)
     name = f"train-{index:06d}-{index + 1:06d}.tar"
     return ShardEntry(name, "train", index, index + 1, f"{index:064x}", 0, (entry,), STATISTICS)
 
@@ -127,6 +127,8 @@ def test_every_way_to_read(tmp_path: Path, small_segments: None) -> None:
         whole = ListedIndex(shards)
         assert [fresh.digest("train", i) for i in range(12)] == [whole.digest("train", i) for i in range(12)]
         assert all(fresh.continues(before, "train") for before in earlier)
+        assert fresh.particles("train", [10, 0, 5]) == [4306, 4296, 4301]
+        assert earlier[0].particles("train", [0]) + index.particles("train", [9, 0]) == [4296, 4305, 4296]
         assert {name: (folder / name).stat().st_size for name, _ in fresh.files()} == dict(fresh.files())
     other = ListedIndex([*shards[:4], dataclasses.replace(shards[4], sha256="a" * 64)])
     assert whole.continues(ListedIndex(shards[:4]), "train") and not whole.continues(other, "train")

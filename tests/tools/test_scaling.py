@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
@@ -37,10 +38,25 @@ def test_rows_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert {row["backend"] for row in rows} == {"torch"}  # without a GPU
     found = [(row["devices"], row["averaged"], row["particle_spread"]) for row in rows]
     assert found == [(1, False, 0), (1, False, 0.17), (2, False, 0), (2, True, 0), (2, True, 0.17)]
-    assert all(row["check"] == "pass" and row["ms"] > 0 and row["efficiency"] > 0 for row in rows)
+    assert all(row["check"] == "pass" and row["ms"] > 0 for row in rows)
+    for row in rows:  # particles a second and device, against one device with scenes of the same kind
+        (base,) = (r for r in rows if r["devices"] == 1 and r["spread"] == row["spread"])
+        rates = [r["particles_per_update"] / r["ms"] for r in (row, base)]
+        assert row["efficiency"] == pytest.approx(rates[0] / rates[1])
     parameters = rows[3]["messages"][0]
     assert parameters % 4 == 0 and parameters > 1000  # one message of all gradients
     assert "| torch | fp32 | 2 | 2 | 0.17 | 1, up to 0.0 MB |" in capsys.readouterr().out
+
+
+def test_scenes_are_balanced() -> None:
+    """Ranks have scenes of as many particles at each update, and the same scenes on as many ranks as when measured."""
+    config = from_mapping(ScalingConfig, {"particle_spread": 0.17, "batches": 20})
+    counts_BRS = measure._particles(config, 4, 0.17)
+    load_BR = counts_BRS.sum(-1)
+    assert counts_BRS.shape == (20, 4, 8) and np.ptp(counts_BRS) > 1000
+    assert (load_BR.max(1) / load_BR.mean(1)).mean() < 1.01
+    sizes = [batch.particles_S for batch in measure._batches(config, 3, 4, 0.17, torch.device("cpu"))]
+    assert sizes == [tuple(row) for row in counts_BRS[:, 3].tolist()]
 
 
 @pytest.fixture
@@ -55,8 +71,8 @@ def averaged(
     group: dist.ProcessGroup, make: type[measure.TorchUpdates | measure.TritonUpdates], config: ScalingConfig
 ) -> measure.Contender:
     device = torch.device("cpu")
-    updates = make(config, measure._batches(config, 0, 0.1, device), device)
-    found = measure.Contender("any", 1, True, 0.1, updates)
+    updates = make(config, measure._batches(config, 0, 1, 0.1, device), device)
+    found = measure.Contender("any", 1, True, 0.1, 80.0, update=updates)
     measure._average(found, group)
     return found
 

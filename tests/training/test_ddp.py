@@ -9,6 +9,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from hgn.config import DatagenConfig, TrainingConfig
 from hgn.data.sampler import EpisodeSampler
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.distributed import default_run, first_rank, layout
+from hgn.training.distributed import checksum, default_run, first_rank, layout
 from hgn.training.module import TrainingModule
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -346,6 +347,60 @@ def test_devices_that_are_not_there(no_launcher: pytest.MonkeyPatch) -> None:
     no_launcher.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match=r"training\.accelerator must be auto or cpu without a GPU, got 'gpu'"):
         layout(TrainingConfig(accelerator="gpu"))
+
+
+def test_checksum() -> None:
+    """Any one other bit, anywhere, is another number; so are two values that change places."""
+    tensors = [torch.arange(6.0).view(2, 3), torch.full((4,), -0.5)]
+    found = {int(checksum(tensors))}
+    for tensor in tensors:
+        for place in range(tensor.numel()):
+            for bit in (0, 22, 30, 31):
+                bits = tensor.view(torch.int32).view(-1)
+                bits[place] ^= -(2**31) if bit == 31 else 2**bit
+                found.add(int(checksum(tensors)))
+                bits[place] ^= -(2**31) if bit == 31 else 2**bit
+    assert len(found) == 1 + 4 * 10
+    assert int(checksum([tensors[0].T.contiguous()])) != int(checksum(tensors[:1]))
+
+
+GPUS = (pytest.mark.multigpu, pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two CUDA devices"))
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "fault", "failing"),
+    [
+        ("cpu", "weights", "1"),
+        *(pytest.param("gpu", fault, rank, marks=GPUS) for fault in ("error", "weights") for rank in ("0", "1")),
+    ],
+)
+def test_no_rank_waits_for_one_that_fails(
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    no_launcher: pytest.MonkeyPatch,
+    warm_python: Path,
+    tmp_path: Path,
+    accelerator: str,
+    fault: str,
+    failing: str,
+) -> None:
+    """Two ranks of Lightning's own launcher end where one of them meets an error of its own, and where one has other
+    weights, which the next log line finds."""
+    config = make_config()
+    make_dataset(config)
+    options: dict[str, Any] = {"accelerator": accelerator, "backend": "torch", "devices": 2, "maximum_updates": 10**6}
+    (tmp_path / "mapping.json").write_text(json.dumps(train_mapping(config, tmp_path / "run", **options)))
+    python = str(warm_python) if accelerator == "cpu" else sys.executable
+    process = subprocess.Popen(
+        [python, str(PROGRAM.with_name("failing_rank.py")), str(tmp_path), fault, failing],
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHON_EXEC": python},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    text = output(process)
+    assert process.returncode != 0
+    assert ("this rank fails" if fault == "error" else "weights must be the same on all ranks, got others at") in text
 
 
 @pytest.mark.parametrize(("local_rank", "expected"), [("0", []), ("1", [signal.SIGKILL])])

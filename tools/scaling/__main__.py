@@ -6,6 +6,7 @@ Prints no time of what fails its check. The JSON holds {"meta": provenance, "row
 from __future__ import annotations
 
 import json
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -14,20 +15,25 @@ import torch
 import torch.multiprocessing
 
 from hgn.command import run_command
+from hgn.config import TrainingConfig
 from hgn.schema import ConfigError, from_mapping, to_mapping
 from hgn.system.files import write_json
+from hgn.system.machine import available_cpus
 from hgn.system.provenance import provenance, without_folders
 from tools.bench.contenders import PASS
+from tools.bench.triton_contenders import OBSTACLE_CELL_SIZE
 from tools.scaling.config import ScalingConfig
 from tools.scaling.measure import measure
 
 EXIT_RED = 1
+CELL_FRACTION = 0.3  # cells of the finest level for each particle of tools.bench.states, about
 
 
 def main(mapping: dict[str, Any]) -> int:
     """Prints tables, and writes JSON where asked to; the exit code is 1 where a check is red."""
     config = from_mapping(ScalingConfig, mapping)
     device_type, count = devices(config)
+    _compile_ahead(config, device_type, count)
     with tempfile.TemporaryDirectory() as folder:
         torch.multiprocessing.spawn(measure, (count, config, device_type, Path(folder)), nprocs=count)
         rows = with_efficiency(json.loads((Path(folder) / "rows.json").read_text()))
@@ -51,12 +57,35 @@ def devices(config: ScalingConfig) -> tuple[str, int]:
     return "cuda", wanted
 
 
+def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
+    """Fills Triton's cache: one process after the other would compile for minutes."""
+    if device_type == "cpu" or "triton" not in config.backends or torch.version.hip is not None:
+        return
+    # Triton, which backend torch does without, is loaded here.
+    from hgn.kernels.update.op import UpdateSettings
+    from hgn.runtime.precompile import Precompilation
+    from hgn.runtime.precompile_program import PrecompileJob
+
+    training = TrainingConfig(batch_scenes=config.scenes)
+    settings = UpdateSettings(config.scenes, training.noise_std, training.grid_jitter, OBSTACLE_CELL_SIZE)
+    particles = config.scenes * config.particles
+    cells = tuple(max(1, int(CELL_FRACTION * particles) >> 2 * level) for level in range(config.network.levels))
+    major, minor = torch.cuda.get_device_capability()
+    job = PrecompileJob(
+        config.network, settings, config.precision, count > 1, False, particles, cells, 10 * major + minor
+    )
+    with Precompilation(job, max(1, available_cpus() - 2)) as precompilation:
+        print(precompilation.wait(), file=sys.stderr)
+
+
 def with_efficiency(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Adds each row's scenes per second and device, against one device alone with the same kind of scenes."""
-    alone = {(row["backend"], row["particle_spread"]): row["ms"] for row in rows if row["devices"] == 1}
-    for row in rows:
-        base = alone.get((row["backend"], row["particle_spread"]))
-        row["efficiency"] = base / row["ms"] if base and row["ms"] else None
+    """Adds each row's particles per second and device, against one device alone with the same kind of scenes."""
+    rates = [row["particles_per_update"] / row["ms"] if row["ms"] else None for row in rows]
+    kinds = [(row["backend"], row["particle_spread"]) for row in rows]
+    alone = {kind: rate for row, kind, rate in zip(rows, kinds, rates, strict=True) if row["devices"] == 1}
+    for row, kind, rate in zip(rows, kinds, rates, strict=True):
+        base = alone.get(kind)
+        row["efficiency"] = rate / base if base and rate else None
     return rows
 
 
@@ -72,7 +101,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         times = ("-", "-") if row["ms"] is None else (f"{row['ms']:.2f}", f"{low:.2f} … {high:.2f}")
         efficiency = "-" if row["efficiency"] is None else f"{row['efficiency']:.3f}"
         work = (row[key] for key in ("backend", "precision", "devices", "scenes", "particle_spread"))
-        lines.append(f"| {' | '.join(map(str, (*work, sent, *times, efficiency, row['check'])))} |")
+        cells = (*work, sent + (", in the graph" if row["one_graph"] else ""), *times, efficiency, row["check"])
+        lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 
 

@@ -24,6 +24,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
+from hgn.data.sampler import balanced_parts
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import kernel_precision, set_matmul_precision, triton_unsupported_reason
 from hgn.runtime.parity import relative_error
@@ -53,6 +54,8 @@ class Contender:
     devices: int
     averaged: bool
     spread: float  # of the particles of a scene
+    particles: float  # of one update, on each device, in the mean
+    one_graph: bool = False  # with the gradients' average in the CUDA graph of the update
     update: TorchUpdates | TritonUpdates | None = field(default=None, repr=False)  # none in processes that take no part
     check: str = PASS
     messages: list[int] = field(default_factory=list)
@@ -72,7 +75,7 @@ class TorchUpdates:
         self.loss: nn.Module = _Loss(module)
         self.parameters = list(network.parameters())
 
-    def average(self, group: dist.ProcessGroup) -> list[int]:
+    def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
         """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
         messages: list[int] = []
 
@@ -126,7 +129,7 @@ class TritonUpdates:
         self.chunk = [device_samples(batch) for batch in batches]
         self.rates = [training.learning_rate] * len(self.chunk)
 
-    def average(self, group: dist.ProcessGroup) -> list[int]:
+    def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
         """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
         messages: list[int] = []
 
@@ -134,7 +137,7 @@ class TritonUpdates:
             messages[:] = [tensor.nbytes]
             dist.all_reduce(tensor, group=group)
 
-        self.ours = self.make(reduce, dist.get_world_size(group))
+        self.ours = self.make(reduce, dist.get_world_size(group), one_graph=one_graph)
         self.gradients()
         return messages
 
@@ -179,8 +182,7 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         backend = "nccl" if device.type == "cuda" else "gloo"
         sizes = [size for size in (1, 2, 4, 8, 16, 32, 64) if size < count] + [count]
         groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
-        batches = {spread: _batches(config, rank, spread, device) for spread in {0.0, config.particle_spread}}
-        contenders = [_prepared(c, config, rank, groups, batches, device) for c in _contenders(config, sizes, device)]
+        contenders = [_prepared(c, config, rank, groups, device) for c in _contenders(config, sizes, device)]
         _alternate(contenders, config, rank)
         for contender in contenders:
             _check_weights(contender, groups, rank)
@@ -201,25 +203,34 @@ def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -
     for backend in config.backends:
         if backend == "triton" and triton_unsupported_reason(device, config.network, config.precision):
             continue
-        for size in sizes:
-            contenders.append(Contender(backend, size, False, 0.0))
-            if size > 1:
-                contenders.append(Contender(backend, size, True, 0.0))
-            if config.particle_spread > 0:
-                contenders.append(Contender(backend, size, size > 1, config.particle_spread))
+        spreads = [0.0] if config.particle_spread == 0 else [0.0, config.particle_spread]
+        cases = [(size, averaged, spread) for size in sizes for averaged in (False, True) for spread in spreads]
+        for size, averaged, spread in cases:
+            if averaged == (size > 1) or (not averaged and spread == 0):
+                particles = float(_particles(config, size, spread).sum(-1).mean())
+                ways = (False, True) if backend == "triton" and averaged else (False,)
+                contenders += [Contender(backend, size, averaged, spread, particles, one_graph) for one_graph in ways]
     return contenders
 
 
-def _batches(config: ScalingConfig, rank: int, spread: float, device: torch.device) -> list[Batch]:
-    """Each rank's own scenes."""
-    generator = np.random.default_rng([rank, 7])
-    batches = []
-    for index in range(config.batches):
-        factors = np.clip(1 + spread * generator.standard_normal(config.scenes), 0.2, 3.0)
-        scenes = [Workload(max(1, round(config.particles * factor)), 1) for factor in factors]
-        first_seed = (rank * config.batches + index) * config.scenes
-        batches.append(batch_of_scenes(scenes, config.network, device, first_seed))
-    return batches
+def _particles(config: ScalingConfig, ranks: int, spread: float) -> np.ndarray:
+    """Of each scene of the updates of so many ranks, int64 [batches, ranks, scenes]; balanced as in a training."""
+    normal = np.stack(
+        [np.random.default_rng([rank, 7]).standard_normal((config.batches, config.scenes)) for rank in range(ranks)], 1
+    )
+    count_BRS = np.maximum((config.particles * np.clip(1 + spread * normal, 0.2, 3.0)).round(), 1).astype(int)
+    return np.stack([count_K[balanced_parts(count_K, ranks)] for count_K in count_BRS.reshape(config.batches, -1)])
+
+
+def _batches(config: ScalingConfig, rank: int, ranks: int, spread: float, device: torch.device) -> list[Batch]:
+    """This rank's scenes of each update, which no other rank has."""
+    counts = _particles(config, ranks, spread)[:, rank].tolist()
+    return [
+        batch_of_scenes(
+            [Workload(count, 1) for count in mine], config.network, device, (index * ranks + rank) * config.scenes
+        )
+        for index, mine in enumerate(counts)
+    ]
 
 
 def _prepared(
@@ -227,12 +238,12 @@ def _prepared(
     config: ScalingConfig,
     rank: int,
     groups: dict[int, dist.ProcessGroup],
-    batches: dict[float, list[Batch]],
     device: torch.device,
 ) -> Contender:
     if rank < contender.devices:
+        batches = _batches(config, rank, contender.devices, contender.spread, device)
         made = TorchUpdates if contender.backend == "torch" else TritonUpdates
-        contender.update = made(config, batches[contender.spread], device)
+        contender.update = made(config, batches, device)
         if contender.averaged:
             _average(contender, groups[contender.devices])
     _agree(contender)
@@ -250,7 +261,7 @@ def _average(contender: Contender, group: dist.ProcessGroup) -> None:
     expected = contender.update.gradients().clone()
     dist.all_reduce(expected, group=group)
     expected /= dist.get_world_size(group)
-    contender.messages = contender.update.average(group)
+    contender.messages = contender.update.average(group, contender.one_graph)
     error = relative_error(contender.update.gradients(), expected)
     if not error <= GRADIENT_BOUND:
         contender.check = f"relative error of averaged gradients {error:.1e} exceeds {GRADIENT_BOUND:.0e}"
@@ -314,7 +325,10 @@ def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> d
         "scenes": config.scenes,
         "particles": config.particles,
         "particle_spread": contender.spread,
+        "spread": "random" if contender.spread else "equal",
+        "particles_per_update": contender.particles,
         "averaged": contender.averaged,
+        "one_graph": contender.one_graph,
         "messages": contender.messages,
         "check": contender.check,
         "ms": None,

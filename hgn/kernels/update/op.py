@@ -177,10 +177,14 @@ class Updates:
         reduce: Callable[[torch.Tensor], None] | None = None,
         ranks: int = 1,
         capacities: tuple[int, ...] = (),
+        one_graph: bool = False,
     ) -> None:
-        """`capacities` are cells of each level to begin with; without, they follow from the first update."""
+        """`capacities` are cells of each level to begin with; without, they follow from the first update. With
+        `one_graph` a CUDA graph holds `reduce` too, which must then be captured without a word to the other ranks.
+        """
         self.network, self.config, self.settings, self.precision = network, network.config, settings, precision
         self.loss_sum, self.counters, self.reduce, self.ranks = loss_sum, counters, reduce, ranks
+        self.one_graph = one_graph
         self.device = device = next(network.parameters()).device
         self.packed = self._layout()
         self.values = self.packed.gather(list(network.parameters()))
@@ -301,7 +305,7 @@ class Updates:
     def _replay(self) -> None:
         if self.device.type == "cuda" and not self._graphs:
             self._capture()
-        if self.reduce is None:
+        if self.reduce is None or len(self._graphs) == 1:
             self._graphs[0].replay() if self._graphs else self.launches()
             return
         self._graphs[0].replay() if self._graphs else self.launches_before_reduction()
@@ -317,8 +321,14 @@ class Updates:
         self._build()
 
     def launches(self) -> None:
-        """All launches of one update."""
+        """All launches of one update, without the other ranks."""
         self.launches_before_reduction()
+        self.launches_after_reduction()
+
+    def _launches_together(self) -> None:
+        assert self.reduce is not None
+        self.launches_before_reduction()
+        self.reduce(self.fused.totals)
         self.launches_after_reduction()
 
     def launches_before_reduction(self) -> None:
@@ -474,14 +484,13 @@ class Updates:
 
     def _capture(self) -> None:
         begun = time.monotonic()
-        parts = (
-            [self.launches] if self.reduce is None else [self.launches_before_reduction, self.launches_after_reduction]
-        )
+        parts = [self.launches_before_reduction, self.launches_after_reduction]
+        if self.reduce is None or self.one_graph:
+            parts = [self.launches if self.reduce is None else self._launches_together]
 
         def warm_up() -> None:
             self.grid.status.fill_(kernel.REPEAT.value)  # compiles and changes nothing
-            for part in parts:
-                part()
+            self.launches()
             self.grid.status.zero_()
 
         self._graphs = captured(parts, warm_up)
