@@ -119,19 +119,18 @@ class EpisodeSampler:
     def next_batch(self) -> list[Sample]:
         """This rank's `batch_scenes` samples of the next global batch; advances the state."""
         total = self.batch_scenes * self.world_size
-        episodes, frames, seeds = [], [], []
+        parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # episodes, frames and seeds of each epoch's
         taken = 0  # of the global batch, which may run over the end of an epoch
         while taken < total:
             if self.state.position == len(self._order):
                 self._begin_epoch(self.state.epoch + 1, 0, 0, "")
             rest = self._order[self.state.position :][: total - taken]
             episode_K = self._first_sample.searchsorted(rest, side="right") - 1
-            episodes.append(episode_K)
-            frames.append(rest - self._first_sample[episode_K])
-            seeds.append(rest.astype(np.uint64) + self._first_seed)
+            frame_K = rest - self._first_sample[episode_K]
+            parts.append((episode_K, frame_K, rest.astype(np.uint64) + self._first_seed))
             self.state = replace(self.state, position=self.state.position + len(rest))
             taken += len(rest)
-        episode_K, frame_K, seed_K = map(np.concatenate, (episodes, frames, seeds))
+        episode_K, frame_K, seed_K = (np.concatenate(part) for part in zip(*parts, strict=True))
         mine = self._part(episode_K)
         rows = zip(episode_K[mine].tolist(), frame_K[mine].tolist(), seed_K[mine].tolist(), strict=True)
         return [Sample(episode, frame, splitmix64(seed) >> 1) for episode, frame, seed in rows]
