@@ -40,7 +40,7 @@ def normalised_acceleration(
 
 
 def propagate(network: HierarchicalGraphNetwork, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-    """Latent particles and their grids to normalised accelerations [N, 3]: steps 1 to 12, without gradients."""
+    """Latent particles and their grids to the decoder's output [N, 3 or 9]: steps 1 to 12, without gradients."""
     # Towards the parent's centre, in fine cells, as in hgn.network.hgn.
     parent_offset_83 = 0.5 - CORNER_83.to(particle_NW)
     rows_of = rows_class(network.config.width, particle_NW.dtype)
@@ -192,7 +192,7 @@ def _to_particles(
     grid: GridHierarchy,
     threads: int,
 ) -> torch.Tensor:
-    """Steps 11 and 12: normalised accelerations [N, 3]."""
+    """Steps 11 and 12: the decoder's output [N, 3 or 9]."""
     count, others, particles = len(cell_CW), len(cell_CW) + len(CORNER_83), len(particle_NW)
     # The shares of the hidden layer of cells, of corners, and of particles.
     table_KW = particle_NW.new_empty(others + particles, particle_NW.shape[1])
@@ -200,20 +200,20 @@ def _to_particles(
     table_KW[count:others] = rows.first_bias - rows.project(2, CORNER_83.to(particle_NW))
     _project(rows, table_KW[others:], threads, (1, particle_NW), (2, grid.fraction_N3))
     runs = _runs(particles, ROWS_AT_ONCE // 8, threads)
-    result_N3, after_NW = particle_NW.new_empty(particles, 3), particle_NW.clone()
+    result, after_NW = particle_NW.new_empty(particles, len(decode.second_bias)), particle_NW.clone()
     own_N1 = (torch.arange(particles) + others)[:, None]
-    all_of = (grid.cell_N8, own_N1, grid.weight_N8, after_NW, result_N3)
-    cell, own, weight, after, result = (x.split_with_sizes(runs) for x in all_of)
+    all_of = (grid.cell_N8, own_N1, grid.weight_N8, after_NW, result)
+    cell, own, weight, after, results = (x.split_with_sizes(runs) for x in all_of)
     corner_8, offset = torch.arange(8) + count, torch.arange(0, 8 * max(runs) + 1, 8)
 
     def add(run: int) -> None:
         ends_N83 = torch.stack(torch.broadcast_tensors(cell[run], corner_8, own[run]), -1)
         segments = Segments(8 * runs[run], offset[: runs[run] + 1], weight[run].flatten())
         rows.add_sums(after[run], Hidden(table_KW, ends_N83.flatten(), 3), segments)
-        result[run].copy_(decode.finish(decode.project(0, after[run], decode.first_bias)))
+        results[run].copy_(decode.finish(decode.project(0, after[run], decode.first_bias)))
 
     for_each(add, range(len(runs)), threads)
-    return result_N3
+    return result
 
 
 def _project(rows: Rows, out_RW: torch.Tensor, threads: int, *values: tuple[int, torch.Tensor]) -> None:

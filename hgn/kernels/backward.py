@@ -224,7 +224,7 @@ class FusedTrainingNetwork(FusedNetwork):
         self.counts[: grid.levels].copy_(grid.counts_L)
         self.counts[grid.levels :].copy_(self.particle_count)
         if self.config.relative:
-            grid.disturb_backward(self.output_gradient, self.particle_count)
+            grid.balance_backward(self.output_gradient, self.particle_count)
         self._mlp_backward(
             packed.decode, self.output_gradient, self.particle_count, self.decode_hidden, g.decode.hidden,
             g.decode.output, into=(self.latent_gradient, 1), norm=False,

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.kernels.grid.op import DeviceGrid
+from hgn.kernels.grid.op import SUMS, DeviceGrid
 from hgn.kernels.packing import PackedMessagePassing, PackedNetwork
 from hgn.kernels.tuning import Tuning
 
-OUT = 16  # the decoder's three outputs, padded
+OUT = SUMS  # the decoder's three outputs, nine with relative inputs, padded
 
 
 class Stored(NamedTuple):

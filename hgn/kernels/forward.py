@@ -148,7 +148,7 @@ class FusedNetwork(Buffers):
         )
         self._mlp(packed.decode, self.decoder_input, self.particle_count, self.output, self.decode_hidden, norm=False)
         if self.config.relative:
-            grid.disturb(self.output, self.particle_count)
+            grid.balance(self.output, self.particle_count)
 
     def _operands(self) -> dict[str, Any]:
         """What every kernel with products takes."""

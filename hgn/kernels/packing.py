@@ -2,7 +2,7 @@
 
 Block of an MLP: the first layer's wide parts, each [hidden, part] row-major; its narrow parts (offsets), each
 transposed to [part, hidden]; bias; second layer [out, hidden]; its bias; the LayerNorm's weight and bias.
-An output of 3 is padded with zero rows to PADDED_OUT. Padding never receives a gradient.
+An output of 3 or 9 is padded with zero rows to PADDED_OUT. Padding never receives a gradient.
 """
 
 from __future__ import annotations

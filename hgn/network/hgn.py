@@ -18,7 +18,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 from hgn.network.mlp import MLP
-from hgn.network.relative import disturbance
+from hgn.network.relative import OUTPUTS, balanced, disturbance
 
 
 class MessagePassing(nn.Module):
@@ -72,7 +72,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
             MessagePassing(config.message_passing_steps, width) for _ in range(config.levels - 1)
         )
         self.cell_to_particle = MLP((width, width, 3), width, width)
-        self.decode = MLP((width,), width, 3, layer_norm=False)
+        self.decode = MLP((width,), width, OUTPUTS if config.relative else 3, layer_norm=False)
 
     def normalised_acceleration(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> torch.Tensor:
         """The network's raw output [N, 3], which the loss compares with the normalised target.
@@ -91,8 +91,8 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         if not self.config.relative:
             return propagate(self.encode_particles(state, grid), grid)
         feature_NF = self.relative_features(state, grid)
-        output_N3 = propagate(self.encode_features(feature_NF, state.material_N), grid)
-        return output_N3 * disturbance(feature_NF, grid, self.config)[:, None]
+        output_N9 = propagate(self.encode_features(feature_NF, state.material_N), grid)
+        return balanced(output_N9, *disturbance(feature_NF, grid, self.config), grid)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""
@@ -101,7 +101,8 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         return build_hierarchy(state.position_N3, state.scene_N, origin_S3, self.config.cell_size, self.config.levels)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-        """Steps 1 to 12: latent particles and their grids to normalised accelerations [N, 3]."""
+        """Steps 1 to 12: latent particles and their grids to the decoder's output, normalised accelerations [N, 3]; with
+        relative inputs [N, 9] for hgn.network.relative.balanced."""
         corner_83 = CORNER_83.to(particle_NW)
         # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
         parent_offset_83 = 0.5 - corner_83
@@ -143,8 +144,8 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         hidden_N8H = cell_N8H + hidden_NH[:, None]
         hidden_N8H -= corner_8H
         change_NW = network.finish(hidden_N8H).mul_(grid.weight_N8[..., None]).sum(1)
-        output_N3: torch.Tensor = self.decode(particle_NW + change_NW)
-        return output_N3
+        output: torch.Tensor = self.decode(particle_NW + change_NW)
+        return output
 
 
 def _scatter(value: torch.Tensor, index: torch.Tensor, count: int) -> torch.Tensor:

@@ -13,9 +13,11 @@ ask:
 | 6 | walls within reach, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals, at the particle and where it is flying to; only with obstacle_features |
 
-The output is multiplied by `disturbance`, which is 0 where nothing moves against anything: what flies freely in one
-piece has exactly the acceleration g, whatever the weights.
-Shape legend: N particles, H velocities, L levels, C cells of a level, S scenes.
+The decoder's nine numbers are an acceleration r and a stress sigma of each particle; `balanced` makes of them what is
+added to gravity. It is 0 where nothing moves against anything: what flies freely in one piece has exactly the
+acceleration g, whatever the weights. And where no surface is within reach it keeps momentum, whatever the weights: a
+coarsest cell's mean is taken out of r, and cells push each other across their faces by antisymmetric impulses alone.
+Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
 from __future__ import annotations
@@ -24,12 +26,14 @@ import torch
 
 from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
-from hgn.network.grid import GridHierarchy
+from hgn.network.grid import DIRECTION_63, GridHierarchy
 from hgn.network.obstacles import ObstacleCells
 
 WALL_LIMIT = 2.0  # of wall_nearness: beyond the plane by the reach
 STEPS_AHEAD = 4  # places looked at on the way of one frame
 QUIET = 0.01  # s_a: changes and differences of velocity below it count by their square; rounding leaves 1e-5 to 1e-4
+OUTPUTS = 9  # of the decoder, a particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
+STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # its columns
 SMALLEST_MASS = 1e-30  # a cell that rounding gave no weight has no velocity either
 
 
@@ -113,23 +117,61 @@ def contact_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch
     return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
 
 
-def disturbance(feature_NF: torch.Tensor, grid: GridHierarchy, config: NetworkConfig) -> torch.Tensor:
-    """How far what is around a particle is from free flight in one piece, [N]: 0 (to rounding) to 1.
+def disturbance(
+    feature_NF: torch.Tensor, grid: GridHierarchy, config: NetworkConfig
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """How far what is around each coarsest cell is from free flight in one piece, and from flight, 0 to 1, [C] each.
 
     A particle is disturbed by a surface within reach, or if a column of history or surroundings is not small against
-    QUIET. A coarsest cell is as disturbed as the most disturbed particle in it and in the cells across its faces:
-    within a frame an impact is felt through a body. A particle takes the mean of its cells'.
+    QUIET (rounding leaves 0). A coarsest cell is as disturbed as the most disturbed particle in it and in the cells
+    across its faces: within a frame an impact is felt through a body. The second is of surfaces alone.
     """
     motion = 3 * (config.velocity_history - 1 + config.levels)
     wall_N6, normal_NK = feature_NF[:, motion + 3 : motion + 9], feature_NF[:, motion + 9 :]
     touch_N = contact_gate(wall_N6, normal_NK if config.obstacle_features else None)
     own_N = (touch_N + (feature_NF[:, :motion] / QUIET).square().sum(-1)).clamp(max=1)
+    cell_N8, coarsest = coarsest_cells(grid), grid.levels[-1]
+
+    def felt(value_N: torch.Tensor) -> torch.Tensor:
+        own_C, value_N8 = value_N.new_zeros(coarsest.cell_count), torch.where(grid.weight_N8 > 0, value_N[:, None], 0)
+        own_C.scatter_reduce_(0, cell_N8.flatten(), value_N8.flatten(), "amax")
+        return own_C.scatter_reduce(0, coarsest.receiver_E, own_C[coarsest.sender_E], "amax")
+
+    return felt(own_N), felt(touch_N)
+
+
+def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
+    """The coarsest cells above each particle's eight, [N, 8]; several may be the same."""
     cell_N8 = grid.cell_N8
     for level in grid.levels[:-1]:
         assert level.parent_C is not None
         cell_N8 = level.parent_C[cell_N8]
-    coarsest = grid.levels[-1]
-    own_C = own_N.new_zeros(coarsest.cell_count)
-    own_C.scatter_reduce_(0, cell_N8.flatten(), torch.where(grid.weight_N8 > 0, own_N[:, None], 0).flatten(), "amax")
-    around_C = own_C.scatter_reduce(0, coarsest.receiver_E, own_C[coarsest.sender_E], "amax")
-    return (grid.weight_N8 * around_C[cell_N8]).sum(1)
+    return cell_N8
+
+
+def balanced(
+    output_N9: torch.Tensor, disturbed_C: torch.Tensor, touched_C: torch.Tensor, grid: GridHierarchy
+) -> torch.Tensor:
+    """Accelerations less gravity, normalised, [N, 3], of the decoder's output and what `disturbance` gives.
+
+    With a particle's shares w_pC of the coarsest cells, their mass M, mean acceleration R and mean stress S, e from a
+    cell to its neighbour C', d disturbed and t touched: a_p = sum_C w_pC d_C (r_p - (1 - t_C) R_C + A_C), where
+    A_C = sum_C' d_C' M_C' / (M_C + M_C') (S_C + S_C') e / 2. Times M_C this is antisymmetric, and no small mass is
+    divided by: sum_p a_p = sum_C d_C t_C M_C R_C, which is 0 where no surface is within reach. (Cells exchange momentum
+    across faces as in finite volumes; a symmetric stress makes no spin.)
+    """
+    level, cell_N8, weight_N8 = grid.levels[-1], coarsest_cells(grid), grid.weight_N8
+    value_N10 = torch.cat([output_N9, torch.ones_like(output_N9[:, :1])], dim=-1)
+    value_N8K = weight_N8[..., None] * value_N10[:, None]
+    sum_CK = value_N8K.new_zeros(level.cell_count, OUTPUTS + 1).index_add(0, cell_N8.flatten(), value_N8K.flatten(0, 1))
+    mass_C = sum_CK[:, -1].detach().clamp(min=SMALLEST_MASS)
+    mean_C9 = sum_CK[:, :OUTPUTS] / mass_C[:, None]
+    stress_C33 = mean_C9[:, torch.tensor(STRESS_33, device=mean_C9.device)]
+    sender_E, receiver_E = level.sender_E, level.receiver_E
+    towards_E31 = DIRECTION_63.to(mean_C9)[level.direction_E, :, None]
+    traction_E3 = ((stress_C33[receiver_E] + stress_C33[sender_E]) @ towards_E31).squeeze(-1)
+    share_E = 0.5 * disturbed_C[sender_E] * mass_C[sender_E] / (mass_C[sender_E] + mass_C[receiver_E])
+    change_C3 = -(1 - touched_C)[:, None] * mean_C9[:, :3]
+    change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * traction_E3)
+    own_N3 = (weight_N8 * disturbed_C[cell_N8]).sum(1)[:, None] * output_N9[:, :3]
+    return own_N3 + (weight_N8[..., None] * change_C3[cell_N8]).sum(1)

@@ -45,7 +45,8 @@ ROOM = 2048 if NATIVE else 64  # for cells on each level
 # frames. Compared in test_network, test_relative, test_neighbours, test_update, test_gns_update and test_rollout.
 ELSEWHERE = {
     *("mark_cells", "fill_tables", "prepare_particles", "prepare_features"),
-    *("sum_motion", "prepare_relative_features", "disturb", "disturb_backward"),
+    *("sum_motion", "prepare_relative_features"),
+    *("sum_coarsest", "balance_cells", "balance_cells_backward", "add_coarsest"),
     *("pack_cells", "find_runs", "walk_neighbours", "check_room"),
     *("draw_waves", "assemble_batch", "loss_gradient", "tell_overflow", "square_norm", "average_values"),
     *("finish_update", "adam", "momentum_directions", "step_blocks", "integrate", "advance"),

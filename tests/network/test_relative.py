@@ -11,10 +11,21 @@ from network.states import gns_of, network_of, random_grid, random_state
 from scene.test_symmetry import CUBE, matrix_of
 
 from hgn.config import NetworkConfig
+from hgn.network.cell_keys import unpack
 from hgn.network.features import Normaliser, ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.relative import QUIET, contact_gate, disturbance, obstacle_normals, relative_features, wall_nearness
+from hgn.network.relative import (
+    QUIET,
+    STRESS_33,
+    balanced,
+    coarsest_cells,
+    contact_gate,
+    disturbance,
+    obstacle_normals,
+    relative_features,
+    wall_nearness,
+)
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import Symmetry, scene_symmetries
 from hgn.schema import ConfigError
@@ -50,12 +61,12 @@ def columns(network: HierarchicalGraphNetwork, state: ParticleState) -> torch.Te
 @pytest.mark.parametrize("counts", [(40, 17, 1), (1,)])
 def test_a_common_velocity_changes_nothing(counts: tuple[int, ...], velocity: tuple[float, float, float]) -> None:
     """Away from surfaces accelerations are the same to rounding with up to 3 m/s more in any direction, whatever the
-    particles do among themselves; and they depend on that."""
+    particles do among themselves; and they depend on that, but for a particle alone, which has none to push."""
     network, state = network_of(inputs="relative"), airborne(counts)
     boosted = replace(state, velocity_NM3=state.velocity_NM3 + torch.tensor(velocity, dtype=torch.float64))
     torch.testing.assert_close(network(boosted), network(state), rtol=0, atol=1e-14)
     stirred = replace(state, velocity_NM3=state.velocity_NM3 * 2)
-    assert float((network(stirred) - network(state)).detach().abs().max()) > 1e-6
+    assert (float((network(stirred) - network(state)).detach().abs().max()) > 1e-6) == (len(state.position_N3) > 1)
 
 
 def test_another_place_changes_nothing() -> None:
@@ -101,7 +112,9 @@ def test_what_is_disturbed_disturbs_its_body() -> None:
     def gates(velocity_NH3: torch.Tensor) -> torch.Tensor:
         changed = replace(state, velocity_NM3=velocity_NH3)
         grid = network.grid(changed)
-        return disturbance(network.relative_features(changed, grid), grid, config)
+        disturbed_C, touched_C = disturbance(network.relative_features(changed, grid), grid, config)
+        assert not touched_C.any()
+        return (grid.weight_N8 * disturbed_C[coarsest_cells(grid)]).sum(1)
 
     scale = float(network.normaliser.acceleration_std[0])
     for slower, full in ((3 * scale, True), (QUIET * scale / 4, False)):
@@ -112,6 +125,29 @@ def test_what_is_disturbed_disturbs_its_body() -> None:
         assert gate_N[3] == pytest.approx(1) if full else 1e-3 < gate_N[3] < 1
         assert (gate_N[:40][near_N[:40]] > 0).all()
     assert gates(state.velocity_NM3).abs().max() < 1e-15
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3])
+def test_momentum_is_kept_where_nothing_touches(levels: int) -> None:
+    """With any weights, the accelerations of particles that move as they please, over many coarsest cells and alone in
+    theirs, sum to gravity's; near a wall they do not, nor do those of a part; and the means of cells differ."""
+    network, state = network_of(inputs="relative", levels=levels), airborne((60, 17, 1, 40))
+    place_N3 = torch.where((state.scene_N == 3)[:, None], 0.35 + state.position_N3 / 2, state.position_N3)
+    state = replace(state, position_N3=place_N3)  # the last scene lies closely
+    extra_N3 = (network(state) - state.gravity_S3[state.scene_N]).detach()
+    for scene in range(state.scene_count):
+        mine_N3 = extra_N3[state.scene_N == scene]
+        assert float(mine_N3.sum(0).abs().max()) < 1e-12 * float(mine_N3.abs().sum()) + 1e-17
+        assert len(mine_N3) == 1 or float(mine_N3[::2].sum(0).abs().max()) > 1e-3 * float(mine_N3.abs().sum())
+    grid = network.grid(state)
+    disturbed_C, touched_C = disturbance(network.relative_features(state, grid), grid, network.config)
+    assert disturbed_C.min() > 0 and not touched_C.any()
+    stressed = torch.cat([torch.zeros(len(extra_N3), 3), torch.randn(len(extra_N3), 6)], 1).double()
+    pushed_N3 = balanced(stressed, disturbed_C, touched_C, grid)
+    assert float(pushed_N3.abs().max()) > 1e-2
+    by_wall = replace(state, domain_S3=state.position_N3.max(0).values.expand(4, 3))
+    extra_N3 = (network(by_wall) - state.gravity_S3[state.scene_N]).detach()
+    assert float(extra_N3[state.scene_N == 0].sum(0).abs().max()) > 1e-2 * float(extra_N3.abs().max())
 
 
 def test_each_scene_has_its_gravity() -> None:
@@ -145,6 +181,32 @@ def test_no_particles() -> None:
         scene_N=state.scene_N[:0],
     )
     assert network(nobody).shape == (0, 3)
+
+
+def turned_outputs(output_N9: torch.Tensor, turn_33: torch.Tensor) -> torch.Tensor:
+    """An acceleration turns as a vector, a stress as a tensor."""
+    stress_N33 = turn_33 @ output_N9[:, torch.tensor(STRESS_33)] @ turn_33.T
+    rows, columns = [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]
+    return torch.cat([output_N9[:, :3] @ turn_33.T, stress_N33[:, rows, columns]], 1)
+
+
+@pytest.mark.parametrize("symmetry", ALL_48, ids=lambda s: f"{s.source}{s.mirrored}")
+def test_impulses_turn_with_the_scene(symmetry: Symmetry) -> None:
+    """What `balanced` makes of outputs turned and mirrored with the scene is turned and mirrored with it."""
+    network, state = network_of(inputs="relative", cell_size=1 / 8), random_state((60,), spread=0.95)
+    turn_33 = torch.tensor(matrix_of(symmetry), dtype=torch.float64)
+    image = replace(state, position_N3=(state.position_N3 - 0.5) @ turn_33.T + 0.5)
+    generator = torch.Generator().manual_seed(4)
+    output_N9 = torch.randn(60, 9, generator=generator, dtype=torch.float64)
+    # of the coarsest cells: functions of their centres' distance from the domain's
+    results = []
+    for outputs, scene in ((output_N9, state), (turned_outputs(output_N9, turn_33), image)):
+        grid = network.grid(scene)
+        coordinate_C3 = unpack(grid.levels[-1].key_C)[1]
+        distance_C = ((coordinate_C3 + 0.5) * 4 / 8 - 0.5).square().sum(1)
+        results.append(balanced(outputs, torch.exp(-distance_C), distance_C / 4, grid))
+    assert float(results[0].norm()) > 1
+    torch.testing.assert_close(results[1], results[0] @ turn_33.T, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("symmetry", ALL_48, ids=lambda s: f"{s.source}{s.mirrored}")

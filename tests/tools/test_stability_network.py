@@ -163,6 +163,14 @@ def test_relative_inputs_take_any_gravity() -> None:
     assert len(rows) == 6 and all(row.held for row in rows.values()), rows
 
 
+def test_relative_inputs_keep_momentum_in_a_collision() -> None:
+    """With any weights two bodies that meet without gravity keep their momentum, as the judge has it, whatever becomes
+    of them."""
+    network = network_of(torch.float32, inputs="relative", message_passing_steps=1)
+    (row,) = motion_of(network, ("collision",)).values()
+    assert row.measured < 1e-5 and row.more["angular"] > 0.01
+
+
 def test_flight_ends_before_the_walls() -> None:
     """No particle of the closed form comes within two finest cells of a wall, where it still is on the next frame."""
     for gravity in GRAVITIES.values():

@@ -18,11 +18,12 @@ from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES, SCENE_LIMIT, pack, unpack
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.relative import QUIET
+from hgn.network.relative import OUTPUTS, QUIET
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
+SUMS = 16  # columns of what goes through the coarsest cells, as many as the decoder's padded output has
 MARGIN_CELLS = 4  # of a window, around what it must hold
 OBSTACLE_COLUMNS = kernel.OBSTACLE_COLUMNS.value
 OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
@@ -118,8 +119,9 @@ class DeviceGrid:
 
     Buffers (int32): counts_L (after clipping), needed_L (before), status (sticky flags); neighbour, parent, octant and
     children of level l as views; per particle cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF.
-    For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other; then
-    disturbed_C of the coarsest cells, in units of FULLY, and gate_N of the particles.
+    For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other; and of the
+    coarsest cells there are disturbed_C2, disturbed and touched by their own particles in units of FULLY, felt_C2, by
+    those across their faces too, and what `balance` sums up and spreads, sum_C and table_C.
     """
 
     def __init__(
@@ -159,11 +161,14 @@ class DeviceGrid:
         self.weight_N8 = torch.zeros(particles, 8, device=device)
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
         self.feature_NF = torch.zeros(particles, features, device=device)
-        # one piece, cleared at once
-        self._moved = torch.zeros(4 * at + self.capacities[-1] if relative else 5, device=device)
-        self.motion_C4 = self._moved[: 4 * at if relative else 4].view(-1, 4)
-        self.disturbed_C = self._moved[4 * at if relative else 4 :].view(torch.int32)
-        self.gate_N = torch.ones(particles if relative else 1, device=device)
+        coarsest = self.capacities[-1] if relative else 0
+        parts = [4 * at if relative else 4, 2 * coarsest, SUMS * coarsest]
+        self._moved = torch.zeros(sum(parts), device=device)  # one piece, cleared at once
+        motion, disturbed, sums = self._moved.split(parts)
+        self.motion_C4, self.sum_C = motion.view(-1, 4), sums.view(-1, SUMS)
+        self.disturbed_C2 = disturbed.view(torch.int32).view(-1, 2)
+        self.felt_C2 = torch.zeros(coarsest, 2, device=device)
+        self.table_C = torch.zeros(coarsest, SUMS, device=device)
         self._at = [row[6] for row in rows]
 
     def neighbour(self, level: int) -> torch.Tensor:
@@ -250,24 +255,36 @@ class DeviceGrid:
         kernel.prepare_relative_features[blocks](
             **arguments, gravity=gravity_S3, scale=std_3, cell_of=self.cell_N8, weight_of=self.weight_N8,
             motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
-            reach=config.contact_reach_cells * config.cell_size, disturbed=self.disturbed_C, quiet=QUIET,
+            reach=config.contact_reach_cells * config.cell_size, disturbed=self.disturbed_C2, quiet=QUIET,
             LEVELS=self.levels,
         )  # fmt: skip
 
-    def disturb(self, output: torch.Tensor, count: torch.Tensor) -> None:
-        """Multiplies output [N, OUT] by how disturbed each particle is, for relative inputs."""
-        kernel.disturb[(triton.cdiv(self.particles, PARTICLE_BLOCK),)](
-            output=output, gate_of=self.gate_N, cell_of=self.cell_N8, weight_of=self.weight_N8, parent=self._parent,
-            neighbour=self.neighbour(self.levels - 1), disturbed=self.disturbed_C, geometry=self.geometry,
-            particle_count=count, capacity=self.capacities[-1], LEVELS=self.levels, OUT=output.shape[1],
-            BLOCK=PARTICLE_BLOCK,
-        )  # fmt: skip
+    def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
+        """From what the decoder puts out [N, OUT] to accelerations less gravity in columns 0 to 2, in place."""
+        self._through_coarsest(output, count, kernel.balance_cells, OUTPUTS, 3)
 
-    def disturb_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
-        """From the gradient of what `disturb` leaves to that of what it was given, in place."""
-        kernel.disturb_backward[(triton.cdiv(self.particles, PARTICLE_BLOCK),)](
-            gradient=gradient, gate_of=self.gate_N, particle_count=count, OUT=gradient.shape[1], BLOCK=PARTICLE_BLOCK
+    def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
+        """From the gradient of what `balance` leaves to that of what it was given, in place."""
+        self.sum_C.zero_()
+        self._through_coarsest(gradient, count, kernel.balance_cells_backward, 3, OUTPUTS)
+
+    def _through_coarsest(self, x: torch.Tensor, count: torch.Tensor, between: Any, taken: int, left: int) -> None:
+        """Sums of the first columns on the coarsest cells, what these make of them, and that back to particles."""
+        particles, capacity, coarsest = self.particles, self.capacities[-1], self.neighbour(self.levels - 1)
+        cells = {"neighbour": coarsest, "geometry": self.geometry, "counts": self.counts_L, "capacity": capacity}
+        pairs = {"cell_of": self.cell_N8, "weight_of": self.weight_N8, "parent": self._parent, "particle_count": count}
+        sizes = {"LEVELS": self.levels, "OUT": x.shape[1], "BLOCK": PARTICLE_BLOCK}
+        kernel.sum_coarsest[(triton.cdiv(max(particles, capacity), PARTICLE_BLOCK),)](
+            x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=self.sum_C, USED=taken,
+            FEEL=taken == OUTPUTS, **sizes,
+        )  # fmt: skip
+        between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
+            sums=self.sum_C, felt=self.felt_C2, motion=self.motion_C4, **cells, table=self.table_C, **sizes
         )
+        kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
+            x=x, table=self.table_C, **pairs, geometry=self.geometry, USED=left,
+            COLUMNS=triton.next_power_of_2(left + 1), **sizes,
+        )  # fmt: skip
 
 
 def feature_arguments(
