@@ -101,8 +101,8 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         return build_hierarchy(state.position_N3, state.scene_N, origin_S3, self.config.cell_size, self.config.levels)
 
     def propagate(self, particle_NW: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
-        """Steps 1 to 12: latent particles and their grids to the decoder's output, normalised accelerations [N, 3]; with
-        relative inputs [N, 9] for hgn.network.relative.balanced."""
+        """Steps 1 to 12: latent particles and their grids to the decoder's output, normalised accelerations [N, 3], or
+        with relative inputs [N, 9], for hgn.network.relative.balanced."""
         corner_83 = CORNER_83.to(particle_NW)
         # Towards the parent's centre, in fine cells: from octant o the parent's centre lies at 1/2 - o.
         parent_offset_83 = 0.5 - corner_83
