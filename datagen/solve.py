@@ -11,6 +11,7 @@ from typing import Any
 
 from hgn.command import run_command
 from hgn.config import SolveConfig
+from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import ConfigError, from_mapping, to_mapping
@@ -43,6 +44,7 @@ def main(mapping: dict[str, Any]) -> int:
         gravity=scene.gravity,
         cell_size=scene.cell_size,
         source={"scene": config.scene, "solver": to_mapping(config.mpm)},
+        entry_frame_N=entry_frames(scene, config.frame_rate_hz) if scene.emits else None,
     )
     out = Path(config.out if config.out is not None else f"rollout/{file.stem}_solver.vtkhdf")
     write_rollout(out, made)

@@ -21,8 +21,10 @@ from hgn.data.lookup import find_episode
 from hgn.render.exchange import require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
 from hgn.runtime.divergence import DivergedError
+from hgn.runtime.live import run_scene
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
+from hgn.scene.emission import at_start, entry_frames
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.scene.scene import Scene
@@ -59,10 +61,10 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     weights = find_weights(config.weights)
     source = {"weights": weights.name, "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
     frames = config.frames
-    reference_TN3 = None
+    reference_TN3 = scene = None
     if config.data is None:
         name, scene = _scene(config, simulator.info)
-        initial = InitialState.of_scene(scene)
+        initial = InitialState.of_scene(at_start(scene))
         obstacles = scene.obstacles
         for sheet in sheets_of_meshes(scene):
             print(f"a sheet, not a solid, for it is not watertight: {sheet}", file=sys.stderr)
@@ -93,12 +95,15 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     print(simulator.backend.note, file=sys.stderr)
     with bar("simulating", total=frames - 1, unit="frame") as progress:
         try:
-            (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
+            if scene is not None and scene.emits:
+                position_TN3 = run_scene(simulator, scene, frames, lambda _: progress.update())
+            else:
+                (position_TN3,) = simulator.rollout([initial], frames, lambda _: progress.update())
         except DivergedError as error:
             raise ConfigError(f"weights must keep the simulation together, got {weights}: {error}") from error
     result = Rollout(
         position_TN3=position_TN3,
-        material_N=initial.material_N,
+        material_N=initial.material_N if scene is None else scene.material_N,
         obstacles=obstacles,
         domain_size=initial.domain_size,
         frame_rate_hz=simulator.frame_rate_hz,
@@ -106,6 +111,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         cell_size=initial.obstacle_grid.cell_size,
         source=source,
         reference_TN3=reference_TN3,
+        entry_frame_N=entry_frames(scene, simulator.frame_rate_hz) if scene is not None and scene.emits else None,
     )
     return save_rollout(config.out or f"rollout/{name}.vtkhdf", result, config.surface), result
 

@@ -141,7 +141,7 @@ def _load(config: RenderConfig) -> Versions:
     others = {}
     for i, (other_name, file) in enumerate(zip(rest, config.others, strict=True)):
         other = read_rollout(file)
-        if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0]):
+        if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0], equal_nan=True):
             raise ConfigError(f"others[{i}] must begin with the same particles as {first}, got {file}")
         if other.frame_rate_hz != rollout.frame_rate_hz:
             raise ConfigError(

@@ -212,6 +212,8 @@ def substep(
 ):
     """Advances every scene that has time left by one substep of its own length.
 
+    Particles that enter later belong to no scene, but to a row of scene_value that never has time.
+
     Order: time step; in the first substep of an interval mark blocks; particles to grid (deformation, plasticity,
     stress), gravity, colliders, walls; in the last grid to particles, advection. `label` holds scene and material of
     each particle, `node` [scenes * blocks * 64] velocity and mass of nodes, `gain` [parts * scenes * blocks * 64] what
@@ -252,10 +254,12 @@ def substep(
             if step > 0.0:
                 copy = (task - scene * parts) * shape[SHAPE.all_blocks]
                 for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
-                    _particle_to_grid(
-                        p, copy, scene, step, position, velocity, affine, deformation, volume, label, law_row, hidden,
-                        node, gain, scene_value, counter, setting, law, shape, contact, contact_normal, variant,
-                    )  # fmt: skip
+                    if label[p] >> MATERIAL_BITS == scene:
+                        _particle_to_grid(
+                            p, copy, scene, step, position, velocity, affine, deformation, volume, label, law_row,
+                            hidden, node, gain, scene_value, counter, setting, law, shape, contact, contact_normal,
+                            variant,
+                        )  # fmt: skip
 
     for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
         global_block = block[shape[SHAPE.all_blocks] + (n >> 6)]
@@ -322,6 +326,32 @@ def start(
         raise_maximum(counter, scene, COUNT.stiffness_bits, initial_stiffness(material, law, law_row[p]))
         speed_square = velocity[p].dot(velocity[p])
         raise_maximum(counter, scene, COUNT.speed_square_bits, speed_square)
+
+
+@ti.kernel
+def enter(
+    which: Integers,
+    own_label: Integers,
+    velocity: Vectors,
+    label: Integers,
+    law_row: Integers,
+    scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    setting: Scalars,
+    law: Scalars,
+):
+    """Particles join their scenes between two intervals: velocities are those of the present, the solver's of the
+    middle of the last interval.
+    """
+    for i in range(which.shape[0]):
+        p = which[i]
+        scene = own_label[p] >> MATERIAL_BITS
+        label[p] = own_label[p]
+        gravity = ti.Vector([scene_value[scene, VALUE.gravity + axis] for axis in range(3)])
+        velocity[p] -= 0.5 * setting[SETTING.leapfrog] * scene_value[scene, VALUE.interval] * gravity
+        stiffness = initial_stiffness(label[p] & MATERIAL_MASK, law, law_row[p])
+        raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
+        raise_maximum(counter, scene, COUNT.speed_square_bits, velocity[p].dot(velocity[p]))
 
 
 @ti.kernel

@@ -96,8 +96,18 @@ class GridLaunch(Launch):
                 grid_kernel.begin_frame(self.frame_s / parts, self.scene_value, self.counter)
                 self._run_frame()
                 moved = motion > 0
-            completed += self.counter.to_numpy()[:, COUNT.status] == STATUS.running
+            self._enter(frame + 1)
+            completed += self.counter.to_numpy()[: len(self.scenes), COUNT.status] == STATUS.running
             yield self.position.to_numpy()[None], completed
+
+    def _enter(self, frame: int) -> None:
+        """The particles that are seen first in a frame join their scenes."""
+        which = np.flatnonzero(self.entry_frame == frame)
+        if len(which):
+            grid_kernel.enter(
+                device_array(which.astype(np.int32)), device_array(self.own_label), self.velocity, self.label,
+                self.law_row, self.scene_value, self.counter, self.setting, self.law,
+            )  # fmt: skip
 
     def _move(self, begin: float, end: float) -> None:
         """Makes the contacts of scenes in which obstacles move anew, as they lie at `begin`."""

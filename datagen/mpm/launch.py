@@ -30,6 +30,7 @@ from datagen.mpm.layout import (
     constants,
 )
 from hgn.config import MpmConfig
+from hgn.scene.emission import entry_frames
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS, MATERIALS
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
@@ -53,7 +54,8 @@ MAXIMUM_BLOCKS = 1024  # along an axis: kernels keep ten bits of it
 class Simulated:
     """One scene's trajectory."""
 
-    position_TN3: np.ndarray  # float32, domain units; frame 0 is the initial state, bitwise
+    # float32, domain units; frame 0 is the initial state, bitwise; NaN before the frame in which a particle enters
+    position_TN3: np.ndarray
     counters: dict[str, Any]  # JSON-able: substeps, smallest_time_step_s, floors hit
 
 
@@ -179,6 +181,11 @@ class Launch(ABC):
         label = np.concatenate(
             [(index << MATERIAL_BITS) + np.asarray(scene.material_N, np.int32) for index, scene in enumerate(scenes)]
         )
+        self.entry_frame = np.concatenate([entry_frames(scene, frame_rate_hz) for scene in scenes])
+        self.own_label = label.astype(np.int32)
+        # one scene more, which never runs: of particles that enter later
+        self.rows = len(scenes) + bool(self.entry_frame.any())
+        label = np.where(self.entry_frame > 0, (len(scenes) << MATERIAL_BITS) + (label & MATERIAL_MASK), label)
         laws, row = material_laws(scenes, config)
         has_contact = self.moving or any(len(collider.node_K3) for collider in colliders)
         has_sweep = config.collider_projection and (
@@ -201,7 +208,9 @@ class Launch(ABC):
         self.law = device_array(laws.ravel())
         self.setting = device_array(self._settings(frame_rate_hz))
         self.scene_value = device_array(self._scene_values(laws, row, stability_fractions))
-        self.counter = device_array(np.zeros((len(scenes), COUNT.length), np.int64))
+        counter = np.zeros((self.rows, COUNT.length), np.int64)
+        counter[len(scenes) :, COUNT.status] = STATUS.waiting
+        self.counter = device_array(counter)
         self.node = self._node_array(nodes)
         self.hidden = ti.ndarray(ti.i32, self.particles if ghost_room else 1)
         self._place_contacts(0.0, self.frame_s)
@@ -245,9 +254,9 @@ class Launch(ABC):
     def _scene_values(
         self, laws: np.ndarray, row: np.ndarray, stability_fractions: Sequence[float] | None
     ) -> np.ndarray:
-        value = np.zeros((len(self.scenes), VALUE.length), np.float32)
+        value = np.zeros((self.rows, VALUE.length), np.float32)
         value[:, VALUE.smallest_time_step] = np.inf
-        value[:, VALUE.stability_fraction] = stability_fractions or self.config.stability_fraction
+        value[: len(self.scenes), VALUE.stability_fraction] = stability_fractions or self.config.stability_fraction
         shear, bulk = laws[:, CONSTANT.shear], laws[:, CONSTANT.bulk]
         # per material and row; hardening may take all stiffness from snow
         density = laws[:, CONSTANT.density]
@@ -406,8 +415,10 @@ class Launch(ABC):
     def run(self, frames: int, on_frame: Callable[[int], None] | None) -> list[Simulated | SceneFailure]:
         """The frames of each scene, the initial state among them, or why it was stopped."""
         trajectory = [np.empty((frames, scene.particle_count, 3), np.float32) for scene in self.scenes]
-        for rows, scene in zip(trajectory, self.scenes, strict=True):
+        absent = []
+        for rows, scene, begin in zip(trajectory, self.scenes, self.particle_begin, strict=False):
             rows[0] = scene.position_N3
+            absent.append(np.arange(frames)[:, None] < self.entry_frame[begin : begin + scene.particle_count])
         if on_frame is not None:
             on_frame(0)
         present, completed = 1, np.zeros(len(self.scenes), np.int64)
@@ -420,12 +431,15 @@ class Launch(ABC):
             present += len(position)
             if (completed < present - 1).all():
                 break
+        for rows, gone in zip(trajectory, absent, strict=True):
+            rows[gone] = np.nan
         status = self.counter.to_numpy()[:, COUNT.status]
         counters = self._counters()
         for index, (own, collider) in enumerate(zip(counters, self.colliders, strict=True)):
             for when, frame in (("start", 0), ("end", -1)):
                 if status[index] == STATUS.running:
-                    own[f"particles_inside_obstacles_at_{when}"] = collider.count_inside(trajectory[index][frame])
+                    present = trajectory[index][frame][~absent[index][frame]]
+                    own[f"particles_inside_obstacles_at_{when}"] = collider.count_inside(present)
         return [
             Simulated(trajectory[index], counters[index])
             if status[index] == STATUS.running

@@ -86,6 +86,7 @@ class Status(NamedTuple):
     not_finite: int = 1
     left_domain: int = 2
     too_many_substeps: int = 3
+    waiting: int = 4  # no scene, but the row of particles that enter later
 
 
 class Setting(NamedTuple):

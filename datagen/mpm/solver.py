@@ -19,6 +19,7 @@ from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.launch import Launch, SceneFailure, Simulated, fixed_substeps, no_counters, particle_bounds
 from datagen.mpm.team_launch import MAXIMUM_PARTICLES, Team, TeamLaunch
 from hgn.config import MpmConfig, SceneConfig
+from hgn.scene.emission import at_entry, require_free_entries
 from hgn.scene.material import material_index
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
@@ -73,6 +74,8 @@ def simulate(
     `cpu_threads` only through the number of parts that particles are summed in, min(cpu_threads, 4). On a GPU
     sums are in no fixed order.
 
+    Particles with an entry time are NaN in the frames before; they enter in free flight from the place given.
+
     A scene that turns non-finite, leaves the domain or needs more than `maximum_substeps_per_frame` ends as a
     SceneFailure with cause and frame. A scene without particles gives [frames, 0, 3].
 
@@ -85,8 +88,10 @@ def simulate(
         return []
     node_counts = _shared_grid(scenes, config)
     low, high = particle_bounds(scenes[0], config)
-    for index, scene in enumerate(scenes):
-        _require_sound(scene, index, low, high)
+    given, scenes = scenes, [at_entry(scene, frame_rate_hz) for scene in scenes]
+    for index, (scene, entered) in enumerate(zip(given, scenes, strict=True)):
+        require_free_entries(scene, entered)
+        _require_sound(entered, index, low, high)
     if colliders is None:
         colliders = [build_collider(scene, config.collider_band_cells) for scene in scenes]
     require(len(colliders) == len(scenes), "colliders", f"one for each of {len(scenes)} scenes", len(colliders))
@@ -108,8 +113,8 @@ def simulate(
         )  # fmt: skip
         moving = any(scene.moves for scene in batch[0])
         require(not moving or config.time_step == "adaptive", "time_step", "adaptive where obstacles move", "fixed")
-        if moving:
-            team = Team(0)  # contacts that move are placed between launches
+        if moving or any(scene.emits for scene in batch[0]):
+            team = Team(0)  # contacts that move are placed between launches, and particles enter there
         elif team is None:
             team = _team(device, len(occupied), max(scene.particle_count for scene in batch[0]))
         _require_at_once(device, team, len(occupied))

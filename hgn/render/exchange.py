@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from hgn.render.pictures import particle_spacing
+from hgn.render.pictures import rollout_spacing
 from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR
 from hgn.scene.material import FLUIDS, MATERIALS
-from hgn.scene.rollout_file import Rollout, frame_velocity, write_rollout
+from hgn.scene.rollout_file import Rollout, rollout_velocity, write_rollout
 from hgn.schema import ConfigError
 from hgn.system.extras import require_installed
 from hgn.system.files import sync_folder
@@ -90,9 +90,10 @@ def fluid_surface(position_N3: np.ndarray, spacing: float) -> tuple[np.ndarray, 
 def _surfaces(rollout: Rollout) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Of each frame."""
     fluid_N = np.isin(rollout.material_N, FLUIDS)
-    spacing = particle_spacing(rollout.position_TN3[0, fluid_N])
-    for position_N3 in rollout.position_TN3:
-        yield fluid_surface(position_N3[fluid_N], spacing)
+    spacing = rollout_spacing(rollout, fluid_N)
+    for frame, position_N3 in enumerate(rollout.position_TN3):
+        present = rollout.present(frame)
+        yield fluid_surface(position_N3[:present][fluid_N[:present]], spacing)
 
 
 def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[], Any]) -> None:
@@ -129,8 +130,8 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
     for obstacle in rollout.obstacles:
         prim = mesh(f"obstacles/{_identifier(obstacle.name)}", OBSTACLE_COLOR)
         fill(prim, obstacle.vertex_V3, obstacle.triangle_F3, Usd.TimeCode.Default())
-    velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
-    width = particle_spacing(rollout.position_TN3[0])
+    velocity_TN3 = rollout_velocity(rollout)
+    width = rollout_spacing(rollout)
     of_material = {}
     for index, name in enumerate(MATERIALS):
         mine_N = np.flatnonzero(rollout.material_N == index)
@@ -145,7 +146,10 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
     water = mesh("surface", MATERIAL_COLORS[FLUIDS[0]]) if surface else None
     surfaces = _surfaces(rollout) if surface else iter(())
     for frame, (position_N3, velocity_N3) in enumerate(zip(rollout.position_TN3, velocity_TN3, strict=True)):
-        for prim, mine_N in of_material.items():
+        for prim, all_N in of_material.items():
+            mine_N = all_N[: np.searchsorted(all_N, rollout.present(frame))]
+            if rollout.entry_frame_N is not None:
+                prim.GetIdsAttr().Set(Vt.Int64Array.FromNumpy(mine_N.astype(np.int64)), frame)
             points = Vt.Vec3fArray.FromNumpy(position_N3[mine_N])
             prim.GetPointsAttr().Set(points, frame)
             prim.GetVelocitiesAttr().Set(Vt.Vec3fArray.FromNumpy(velocity_N3[mine_N]), frame)
@@ -163,7 +167,7 @@ def _identifier(name: str) -> str:
 
 
 def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[], Any]) -> None:
-    velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
+    velocity_TN3 = rollout_velocity(rollout)
     fields = [(name, "<f4") for name in ("x", "y", "z", "vx", "vy", "vz")]
     fields += [(name, "u1") for name in ("material", "red", "green", "blue")]
     row_N = np.zeros(rollout.particle_count, fields)
@@ -172,7 +176,7 @@ def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
         row_N[name] = value_N
     kinds = {"<f4": "float", "u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"comment material: {', '.join(MATERIALS)}"]
-    header += [f"element vertex {len(row_N)}", *(f"property {kinds[kind]} {name}" for name, kind in fields)]
+    properties = [f"property {kinds[kind]} {name}" for name, kind in fields]
     surfaces = _surfaces(rollout) if surface else iter(())
     digits = max(4, len(str(rollout.frame_count - 1)))
     for frame, (position_N3, velocity_N3) in enumerate(zip(rollout.position_TN3, velocity_TN3, strict=True)):
@@ -181,7 +185,9 @@ def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
         for name, value_N in zip(("vx", "vy", "vz"), velocity_N3.T, strict=True):
             row_N[name] = value_N
         target = path.with_stem(f"{path.stem}_{frame:0{digits}d}")
-        target.write_bytes("\n".join((*header, "end_header", "")).encode() + row_N.tobytes())
+        present = rollout.present(frame)
+        head = (*header, f"element vertex {present}", *properties, "end_header", "")
+        target.write_bytes("\n".join(head).encode() + row_N[:present].tobytes())
         if surface:
             _export(path.with_stem(f"{path.stem}_surface_{frame:0{digits}d}"), *next(surfaces))
         progress()

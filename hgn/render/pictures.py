@@ -86,7 +86,7 @@ def compare_picture(
         seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
         _write(picture, (x + width / 2, header / 2), seconds, _text_size(size))
         for row, (_, position_TN3) in enumerate(rows):
-            panel = _panel(stage, position_TN3, frame, rollout.material_N)
+            panel = _panel(stage, position_TN3, frame, rollout)
             picture.paste(panel, (x, header + row * (height + gap)))
     for row, (name, _) in enumerate(rows):
         if name:
@@ -224,10 +224,19 @@ def position_error(rollout: Rollout) -> dict[str, np.ndarray]:
     frames = min(len(rollout.position_TN3), len(rollout.reference_TN3))
     difference = rollout.position_TN3[:frames].astype(np.float64) - rollout.reference_TN3[:frames]
     square_TN = (difference**2).sum(axis=2)
-    error = {"all": square_TN.mean(axis=1)}
+    shown_TN = np.arange(square_TN.shape[1]) < [[rollout.present(frame)] for frame in range(frames)]
+
+    def mean(mine_N: np.ndarray) -> np.ndarray:
+        mine_TN = shown_TN & mine_N
+        total_T = np.where(mine_TN, square_TN, 0.0).sum(axis=1)
+        return np.asarray(
+            np.divide(total_T, mine_TN.sum(axis=1), out=np.full(frames, np.nan), where=mine_TN.any(axis=1))
+        )
+
+    error = {"all": mean(rollout.material_N == rollout.material_N)}
     present = np.unique(rollout.material_N)
     if len(present) > 1:
-        error |= {MATERIALS[i]: square_TN[:, rollout.material_N == i].mean(axis=1) for i in present}
+        error |= {MATERIALS[i]: mean(rollout.material_N == i) for i in present}
     return error
 
 
@@ -258,6 +267,12 @@ def particle_spacing(position_N3: np.ndarray) -> float:
     return max(float(np.median(KDTree(position_N3).query(some, k=4)[0][:, 3])), 1e-6)
 
 
+def rollout_spacing(rollout: Rollout, of_N: np.ndarray | slice = slice(None)) -> float:
+    """`particle_spacing` in the first frame, or where particles enter in the last, of all particles or some."""
+    frame = 0 if rollout.entry_frame_N is None else -1
+    return particle_spacing(rollout.position_TN3[frame, of_N])
+
+
 def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None) -> Rollout:
     """An episode of a data set as a rollout: alone, or as the ground truth of a prediction float32 [T, N, 3].
 
@@ -286,19 +301,20 @@ def check_frames(frames: Sequence[int], frame_count: int) -> None:
 
 
 def _stage(rollout: Rollout, size: int) -> Stage:
-    radius = particle_spacing(rollout.position_TN3[0]) * RADIUS_IN_SPACINGS
+    radius = rollout_spacing(rollout) * RADIUS_IN_SPACINGS
     radius = min(radius, 0.03 * min(rollout.domain_size))
     return Stage(rollout.domain_size, rollout.obstacles, radius, size)
 
 
-def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, material_N: np.ndarray) -> Image.Image:
+def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, rollout: Rollout) -> Image.Image:
+    present = rollout.present(frame)
     if frame < len(position_TN3):
-        position_N3 = position_TN3[frame]
-        panel = stage.draw(position_N3, material_N)
+        position_N3 = position_TN3[frame, :present]
+        panel = stage.draw(position_N3, rollout.material_N[:present])
         lost = int((~np.isfinite(position_N3)).any(axis=1).sum())
         note = f"{lost} of {len(position_N3)} particles not finite" if lost else ""
     else:
-        panel = stage.draw(np.empty((0, 3)), material_N[:0])
+        panel = stage.draw(np.empty((0, 3)), rollout.material_N[:0])
         note = f"ends after {len(position_TN3)} frames"
     if note:
         _write(panel, (panel.width / 2, panel.height * 0.42), note, _text_size(panel.width), halo=3)
@@ -325,7 +341,7 @@ def _animation_picture(
     picture = Image.new("RGB", (len(versions) * (width + gap) - gap, height + 2 * header), _background())
     for column, (label, position_TN3) in enumerate(versions):
         x = column * (width + gap)
-        picture.paste(_panel(stage, position_TN3, frame, rollout.material_N), (x, header))
+        picture.paste(_panel(stage, position_TN3, frame, rollout), (x, header))
         _write(picture, (x + width / 2, header / 2), label, 6 * text // 5)
     seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
     if len(versions) == 1:  # whose legend is as wide as the picture

@@ -5,6 +5,7 @@ Shape legend: N particles, A particles that enter, M velocities of a history.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from types import TracebackType
@@ -17,6 +18,7 @@ from hgn.network.features import ParticleState
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.stepped_rollout import Rollout
+from hgn.scene.emission import at_entry, at_start, entry_frames, require_free_entries
 from hgn.scene.scene import Scene
 from hgn.schema import require
 
@@ -150,6 +152,32 @@ class LiveSimulation:
         elif self._rollout is None or not self._rollout.take(state):
             self.close()
             self._rollout = self._entered.enter_context(self.simulator.backend.rollout(state, self.room))
+
+
+def run_scene(
+    simulator: Simulator, scene: Scene, frames: int, on_frame: Callable[[int], Any] | None = None
+) -> np.ndarray:
+    """`frames` frames of a scene, the initial state among them, in which particles enter as its emitters say: float32
+    [frames, N, 3] in domain units, NaN before a particle enters. `on_frame(t)` is called when frame t is complete.
+
+    Raises: DivergedError, and ConfigError as `Simulator.start` and where an obstacle is in the way of what enters.
+    """
+    entered, entry_N = at_entry(scene, simulator.frame_rate_hz), entry_frames(scene, simulator.frame_rate_hz)
+    require_free_entries(scene, entered)
+    position_TN3 = np.full((frames, scene.particle_count, 3), np.nan, np.float32)
+    count = int((entry_N == 0).sum())
+    position_TN3[0, :count] = scene.position_N3[:count]
+    with LiveSimulation(simulator, at_start(scene), room=scene.particle_count - count) as live:
+        for frame in range(1, frames):
+            position_TN3[frame, :count] = live.step()
+            new = slice(count, int((entry_N <= frame).sum()))
+            if new.stop > count:
+                position_TN3[frame, new] = entered.position_N3[new]
+                live.add_particles(entered.position_N3[new], entered.velocity_N3[new], entered.material_N[new])
+                count = new.stop
+            if on_frame is not None:
+                on_frame(frame)
+    return position_TN3
 
 
 _OF_PARTICLES = ("position_N3", "velocity_N3", "material_N")

@@ -61,10 +61,12 @@ class InitialState:
     def of_scene(scene: Scene) -> InitialState:
         """A scene's initial particles, its obstacles sampled into cells.
 
-        Raises: ConfigError where obstacles move: networks know them at rest.
+        Raises: ConfigError where obstacles move, for networks know them at rest, or where particles enter later.
         """
         remedy = "leave keyframes out, or run datagen.solve"
         require(not scene.moves, "obstacles", "at rest for a network", "keyframes", remedy)
+        remedy = "run hgn.rollout, or hgn.runtime.live.run_scene"
+        require(not scene.emits, "emitters", "left out here, where all particles begin at once", "some", remedy)
         return InitialState(
             scene.position_N3,
             scene.velocity_N3,

@@ -3,7 +3,8 @@
 Two top-level groups:
 
 /VTKHDF  a temporal PolyData of the VTKHDF specification (version 2): one vertex cell a particle, PointData
-         `material` and `velocity`. Topology and materials are stored once; every step points at them again.
+         `material` and `velocity`. Topology and materials are stored once; every step points at them again, at the
+         first of them where particles enter later.
 /hgn     what VTK has no place for: domain, gravity, obstacles, how the rollout was made, the ground truth.
          The specification leaves groups outside /VTKHDF to the writer.
 
@@ -62,6 +63,9 @@ class Rollout:
     # JSON-able: weights and their sha256, the scene's specification, settings
     source: dict[str, Any] = field(default_factory=dict)
     reference_TN3: np.ndarray | None = None  # float32 [R, N, 3], ground truth at the same frame rate
+    # int64 [N], in order: the frame in which each particle is seen first, before which its positions count for nothing
+    # and are read as NaN; None: all are there from the start
+    entry_frame_N: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shape = self.position_TN3.shape
@@ -73,6 +77,10 @@ class Rollout:
             raise ConfigError(f"material_N must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
         if not (self.frame_rate_hz > 0 and math.isfinite(self.frame_rate_hz)):
             raise ConfigError(f"frame_rate_hz must be a finite number > 0, got {self.frame_rate_hz}")
+        if self.entry_frame_N is not None:
+            entry_N = self.entry_frame_N
+            if entry_N.shape != shape[1:2] or (np.diff(entry_N, prepend=0) < 0).any():
+                raise ConfigError(f"entry_frame_N must have shape ({shape[1]},), >= 0 and in order, got {entry_N}")
         if self.reference_TN3 is not None:
             found = self.reference_TN3.shape
             if len(found) != 3 or found[0] < 1 or found[1:] != shape[1:]:
@@ -86,6 +94,12 @@ class Rollout:
     def particle_count(self) -> int:
         return self.position_TN3.shape[1]
 
+    def present(self, frame: int) -> int:
+        """How many particles are there in a frame: the first of all."""
+        if self.entry_frame_N is None:
+            return self.particle_count
+        return int(np.searchsorted(self.entry_frame_N, frame, side="right"))
+
 
 def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray:
     """Velocities that led to each frame, float32 [T, N, 3] in domain units per second.
@@ -96,6 +110,16 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
     velocity_TN3[1:] = np.diff(position_TN3, axis=0) * np.float32(frame_rate_hz)
     if len(velocity_TN3) > 1:
         velocity_TN3[0] = velocity_TN3[1]
+    return velocity_TN3
+
+
+def rollout_velocity(rollout: Rollout) -> np.ndarray:
+    """`frame_velocity` of a rollout; what enters has in its first frame the velocity of its second."""
+    velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
+    if rollout.entry_frame_N is not None:
+        late = np.flatnonzero((rollout.entry_frame_N > 0) & (rollout.entry_frame_N < rollout.frame_count))
+        entry = rollout.entry_frame_N[late]
+        velocity_TN3[entry, late] = velocity_TN3[np.minimum(entry + 1, rollout.frame_count - 1), late]
     return velocity_TN3
 
 
@@ -208,35 +232,38 @@ def read_rollout(path: str | Path) -> Rollout:
 
 def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
     frames, particles = rollout.frame_count, rollout.particle_count
+    present_T = np.array([rollout.present(frame) for frame in range(frames)], np.int64)
+    shown_TN = np.arange(particles) < present_T[:, None]
+    before_T = np.cumsum(present_T) - present_T
     group.attrs["Version"] = np.array(VTKHDF_VERSION, np.int64)
     # VTK compares a fixed-length ASCII string; h5py would otherwise write one of variable length
     group.attrs.create("Type", np.bytes_("PolyData"))
 
-    group["NumberOfPoints"] = np.full(frames, particles, np.int64)
-    group["Points"] = rollout.position_TN3.reshape(-1, 3).astype(np.float32, copy=False)
+    group["NumberOfPoints"] = present_T
+    group["Points"] = rollout.position_TN3[shown_TN].astype(np.float32, copy=False)
     for name in CELL_CATEGORIES:
         cells = particles if name == "Vertices" else 0
         category = group.create_group(name)
-        category["NumberOfCells"] = np.full(frames, cells, np.int64)
-        category["NumberOfConnectivityIds"] = np.full(frames, cells, np.int64)
+        for count in ("NumberOfCells", "NumberOfConnectivityIds"):
+            category[count] = present_T if cells else np.zeros(frames, np.int64)
         category["Connectivity"] = np.arange(cells, dtype=np.int64)
         category["Offsets"] = np.arange(cells + 1, dtype=np.int64)
 
     data = group.create_group("PointData")
     data["material"] = rollout.material_N.astype(np.uint8, copy=False)
-    data["velocity"] = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz).reshape(-1, 3)
+    data["velocity"] = rollout_velocity(rollout)[shown_TN]
 
     steps = group.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(frames)
     steps["Values"] = np.arange(frames) / rollout.frame_rate_hz  # seconds
     steps["PartOffsets"] = np.arange(frames, dtype=np.int64)
     steps["NumberOfParts"] = np.ones(frames, np.int64)
-    steps["PointOffsets"] = np.arange(frames, dtype=np.int64) * particles
+    steps["PointOffsets"] = before_T
     steps["CellOffsets"] = np.zeros((frames, len(CELL_CATEGORIES)), np.int64)
     steps["ConnectivityIdOffsets"] = np.zeros((frames, len(CELL_CATEGORIES)), np.int64)
     offsets = steps.create_group("PointDataOffsets")
     offsets["material"] = np.zeros(frames, np.int64)
-    offsets["velocity"] = np.arange(frames, dtype=np.int64) * particles
+    offsets["velocity"] = before_T
 
 
 def _write_own(group: h5py.Group, rollout: Rollout) -> None:
@@ -255,6 +282,8 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
         entry.attrs["closed"] = bool(obstacle.closed)
         entry["vertices"] = obstacle.vertex_V3.astype(np.float64, copy=False)
         entry["triangles"] = obstacle.triangle_F3.astype(np.int32, copy=False)
+    if rollout.entry_frame_N is not None:
+        group["entry_frame"] = rollout.entry_frame_N.astype(np.int64, copy=False)
     if rollout.reference_TN3 is not None:
         group["reference"] = rollout.reference_TN3.astype(np.float32, copy=False)
 
@@ -294,8 +323,12 @@ def _read(file: h5py.File) -> Rollout:
     material_N = vtk["PointData/material"][()]
     points = vtk["Points"]
     shape = (len(count_T), len(material_N), 3)
-    if points.shape != (shape[0] * shape[1], 3) or (count_T != shape[1]).any():
+    entry_N = own["entry_frame"][()] if "entry_frame" in own else np.zeros(shape[1], np.int64)
+    shown_TN = entry_N <= np.arange(shape[0])[:, None]
+    if points.shape != (shown_TN.sum(), 3) or (count_T != shown_TN.sum(axis=1)).any():
         raise ConfigError(f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")
+    position_TN3 = np.full(shape, np.nan, np.float32)
+    position_TN3[shown_TN] = points[()]
     obstacles = tuple(
         Obstacle(
             name=str(entry.attrs["name"]),
@@ -306,7 +339,7 @@ def _read(file: h5py.File) -> Rollout:
         for _, entry in sorted(own["obstacles"].items())
     )
     return Rollout(
-        position_TN3=points[()].reshape(shape),
+        position_TN3=position_TN3,
         material_N=material_N,
         obstacles=obstacles,
         domain_size=tuple(float(length) for length in own.attrs["domain_size"]),  # type: ignore[arg-type]
@@ -315,6 +348,7 @@ def _read(file: h5py.File) -> Rollout:
         cell_size=float(own.attrs["cell_size"]),
         source=json.loads(own["source"][()]),
         reference_TN3=own["reference"][()] if "reference" in own else None,
+        entry_frame_N=entry_N if "entry_frame" in own else None,
     )
 
 

@@ -52,6 +52,9 @@ class Scene:
     particles_per_cell: float | None = None
     # Coulomb coefficients of the domain's walls across x, y (floor and ceiling) and z
     wall_friction: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # float64 [N], seconds, in order: when each particle enters, at the position and with the velocity given; 0: it is
+    # there from the start. None: all are
+    entry_s_N: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.position_N3)
@@ -79,6 +82,10 @@ class Scene:
                 raise ConfigError(f"material_parameters must be among {', '.join(MATERIAL_PARAMETERS)}, got {name!r}")
             if value.shape != (count,):
                 raise ConfigError(f"material_parameters[{name}] must have shape {(count,)}, got {value.shape}")
+        if self.entry_s_N is not None:
+            require(self.entry_s_N.shape == (count,), "entry_s_N", f"of shape {(count,)}", self.entry_s_N.shape)
+            ordered = bool((np.diff(self.entry_s_N, prepend=0.0) >= 0).all()) and np.isfinite(self.entry_s_N).all()
+            require(bool(ordered), "entry_s_N", "finite, >= 0 and in order", self.entry_s_N)
         require(self.material_N.dtype.kind in "iu", "material_N", "whole numbers", str(self.material_N.dtype))
         for material in (self.material_N.min(), self.material_N.max()) if count else ():
             rule = f"0 to {len(MATERIALS) - 1} ({', '.join(MATERIALS)})"
@@ -88,6 +95,11 @@ class Scene:
     def moves(self) -> bool:
         """Whether any obstacle does."""
         return any(obstacle.motion is not None for obstacle in self.obstacles)
+
+    @property
+    def emits(self) -> bool:
+        """Whether particles enter after the start."""
+        return self.entry_s_N is not None and bool((self.entry_s_N > 0).any())
 
     @property
     def particle_count(self) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ import yaml
 
 from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
 from hgn.scene.distance import contains
-from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
+from hgn.scene.emission import Face
+from hgn.scene.group import WALL_CELLS, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.motion import Motion
 from hgn.scene.rotation import euler_rotation
@@ -26,8 +28,10 @@ from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require, require_bounds, to_mapping
 
 GROUP_SHAPES = ("cube", "sphere", "box")
+EMITTER_SHAPES = ("disc", "rectangle")
 MAXIMUM_PARTICLES = 50_000_000
 MAXIMUM_NODES = 100_000  # of a scene file
+EMITTER_STREAM = 2**31  # of random numbers, apart from those of groups
 
 Vector = tuple[float, float, float]
 
@@ -87,16 +91,11 @@ class ObstacleEntry:
         )
 
 
-@dataclass(frozen=True)
-class GroupEntry:
-    """A solid of one material, filled with random particles."""
+@dataclass(frozen=True, kw_only=True)
+class MaterialEntry:
+    """One material, and its constants in the solver; what is left out is as the solver's settings have it."""
 
-    shape: str  # cube, sphere or box
-    size: float | Vector  # side, diameter, or the three edges of a box
-    position: Vector  # of the centre
     material: str
-    velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
-    # of its material in the solver; what is left out is as the solver's settings have it
     youngs_modulus_pa: float | None = None
     poisson_ratio: float | None = None
     density_kg_m3: float | None = None
@@ -109,15 +108,7 @@ class GroupEntry:
 
     def __post_init__(self) -> None:
         MpmConfig(**self.parameters)  # refuses what the solver cannot bear
-        require(self.shape in GROUP_SHAPES, "shape", f"one of {', '.join(GROUP_SHAPES)}", self.shape)
-        if isinstance(self.size, tuple) != (self.shape == "box"):
-            rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
-            require(False, "size", rule, self.size)
-        for edge in self.edges:
-            require(0 < edge < math.inf, "size", "finite and > 0", self.size)
         material_index(self.material)
-        _require_finite("position", self.position)
-        _require_finite("velocity", self.velocity)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -125,17 +116,71 @@ class GroupEntry:
         given = {name: getattr(self, name) for name in MATERIAL_PARAMETERS}
         return {name: value for name, value in given.items() if value is not None}
 
+
+@dataclass(frozen=True, kw_only=True)
+class GroupEntry(MaterialEntry):
+    """A solid of one material, filled with random particles."""
+
+    shape: str  # cube, sphere or box
+    size: float | Vector  # side, diameter, or the three edges of a box
+    position: Vector  # of the centre
+    velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.shape in GROUP_SHAPES, "shape", f"one of {', '.join(GROUP_SHAPES)}", self.shape)
+        if isinstance(self.size, tuple) != (self.shape == "box"):
+            rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
+            require(False, "size", rule, self.size)
+        for edge in self.edges:
+            require(0 < edge < math.inf, "size", "finite and > 0", self.size)
+        _require_finite("position", self.position)
+        _require_finite("velocity", self.velocity)
+
     @property
     def edges(self) -> Vector:
         """The three edges, or three times the side or diameter."""
         return self.size if isinstance(self.size, tuple) else (self.size, self.size, self.size)
 
 
+@dataclass(frozen=True, kw_only=True)
+class EmitterEntry(MaterialEntry):
+    """A face that particles enter through, as densely as groups are filled."""
+
+    shape: str  # disc or rectangle, across the velocity
+    size: float | tuple[float, float]  # diameter, or the two edges of a rectangle: the first is level
+    position: Vector  # of the centre
+    velocity: Vector  # domain units per second, of what enters
+    stop: NonNegative[float]  # seconds
+    start: NonNegative[float] = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_bounds(self)
+        require(self.shape in EMITTER_SHAPES, "shape", f"one of {', '.join(EMITTER_SHAPES)}", self.shape)
+        if isinstance(self.size, tuple) != (self.shape == "rectangle"):
+            rule = "a list of two edges for a rectangle" if self.shape == "rectangle" else "one number for a disc"
+            require(False, "size", rule, self.size)
+        for edge in self.size if isinstance(self.size, tuple) else (self.size,):
+            require(0 < edge < math.inf, "size", "finite and > 0", self.size)
+        _require_finite("position", self.position)
+        _require_finite("velocity", self.velocity)
+        require(any(self.velocity), "velocity", "other than zero, for it brings the particles in", self.velocity)
+        require(self.stop > self.start, "stop", f"later than start ({self.start:g})", self.stop)
+
+    @property
+    def face(self) -> Face:
+        if isinstance(self.size, tuple):
+            return Face(self.position, self.velocity, edges=self.size)
+        return Face(self.position, self.velocity, radius=0.5 * self.size)
+
+
 @dataclass(frozen=True)
 class SceneFile:
     """What a scene file may say; the defaults are the paper's."""
 
-    groups: tuple[GroupEntry, ...]
+    groups: tuple[GroupEntry, ...] = ()
+    emitters: tuple[EmitterEntry, ...] = ()
     obstacles: tuple[ObstacleEntry, ...] = ()
     domain_size: Vector = (1.0, 1.0, 1.0)
     cell_size: Positive[float] = 1 / 64  # of the solver's grid and of the obstacle cells
@@ -147,7 +192,7 @@ class SceneFile:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(len(self.groups) > 0, "groups", "a list with at least one group", [])
+        require(len(self.groups + self.emitters) > 0, "groups", "a list with at least one group, or emitters", [])
         for axis, length in zip("xyz", self.domain_size, strict=True):
             require(0 < length < math.inf, f"domain_size ({axis})", "a finite number > 0", length)
         _require_finite("gravity", self.gravity)
@@ -225,18 +270,19 @@ def _build(file: SceneFile, folder: Path) -> Scene:
     obstacles = tuple(_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles))
     regions = [region_of(entry.shape, entry.edges, entry.position) for entry in file.groups]
     counts = [particle_count(region, file.particles_per_cell, file.cell_size) for region in regions]
+    entering = [e.face.count(e.stop - e.start, file.particles_per_cell, file.cell_size) for e in file.emitters]
     require(
-        sum(counts) <= MAXIMUM_PARTICLES,
+        sum(counts) + sum(entering) <= MAXIMUM_PARTICLES,
         "groups",
-        f"at most {MAXIMUM_PARTICLES} particles together",
-        sum(counts),
+        f"at most {MAXIMUM_PARTICLES} particles together, with those of emitters",
+        sum(counts) + sum(entering),
         "lower size or particles_per_cell",
     )
-    positions = []
+    positions, times = [], [np.zeros(sum(counts))]
     for index, (entry, region, count) in enumerate(zip(file.groups, regions, counts, strict=True)):
         name = f"groups[{index}] ({entry.shape} of {entry.material})"
         position_N3 = fill(region, count, np.random.Generator(np.random.PCG64([file.seed, index])))
-        _require_inside_walls(name, region, position_N3, file)
+        _require_inside_walls(name, np.array(region.centre), region.reach, position_N3, file)
         for obstacle in obstacles:
             inside = int(contains(position_N3, obstacle).sum())
             if inside:
@@ -245,10 +291,24 @@ def _build(file: SceneFile, folder: Path) -> Scene:
                     f"{obstacle.name}; move or shrink the group or the obstacle"
                 )
         positions.append(position_N3)
+    for index, (emitter, count) in enumerate(zip(file.emitters, entering, strict=True)):
+        name = f"emitters[{index}] ({emitter.shape} of {emitter.material})"
+        rng = np.random.Generator(np.random.PCG64([file.seed, EMITTER_STREAM, index]))
+        position_N3, time_N = emitter.face.draw(emitter.start, emitter.stop, count, rng)
+        _require_inside_walls(name, np.array(emitter.position), emitter.face.reach, position_N3, file)
+        for obstacle in obstacles:
+            if contains(np.concatenate([position_N3, np.array([emitter.position], np.float32)]), obstacle).any():
+                raise ConfigError(f"{name} must be clear of closed obstacles, got it inside {obstacle.name}; move it")
+        positions.append(position_N3)
+        times.append(time_N)
+    entries: list[GroupEntry | EmitterEntry] = [*file.groups, *file.emitters]
+    sizes = counts + entering
+    entry_s_N = np.concatenate(times)
+    order = np.argsort(entry_s_N, kind="stable")  # groups first
     return Scene(
-        position_N3=np.concatenate(positions),
-        velocity_N3=np.repeat(np.array([entry.velocity for entry in file.groups], np.float32), counts, axis=0),
-        material_N=np.repeat(np.array([MATERIALS.index(e.material) for e in file.groups], np.uint8), counts),
+        position_N3=np.concatenate(positions)[order],
+        velocity_N3=np.repeat(np.array([entry.velocity for entry in entries], np.float32), sizes, axis=0)[order],
+        material_N=np.repeat(np.array([MATERIALS.index(e.material) for e in entries], np.uint8), sizes)[order],
         obstacles=obstacles,
         domain_size=file.domain_size,
         cell_size=file.cell_size,
@@ -256,12 +316,13 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         seed=file.seed,
         particles_per_cell=file.particles_per_cell,
         wall_friction=(file.wall_friction, file.floor_friction, file.wall_friction),
-        material_parameters=_material_parameters(file.groups, counts),
-        specification={"kind": "file", **to_mapping(file), "particle_counts": counts},
+        material_parameters={name: value[order] for name, value in _material_parameters(entries, sizes).items()},
+        specification={"kind": "file", **to_mapping(file), "particle_counts": sizes},
+        entry_s_N=entry_s_N[order] if file.emitters else None,
     )
 
 
-def _material_parameters(groups: tuple[GroupEntry, ...], counts: list[int]) -> dict[str, np.ndarray]:
+def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> dict[str, np.ndarray]:
     """What any group gives, per particle, float32 [N]; NaN where its group leaves it open."""
     names = [name for name in MATERIAL_PARAMETERS if any(name in group.parameters for group in groups)]
     return {
@@ -289,16 +350,17 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:
     return dataclasses.replace(obstacle, friction=entry.friction, motion=entry.motion())
 
 
-def _require_inside_walls(name: str, region: Region, position_N3: np.ndarray, file: SceneFile) -> None:
+def _require_inside_walls(
+    name: str, centre: np.ndarray, reach: np.ndarray, position_N3: np.ndarray, file: SceneFile
+) -> None:
     wall = WALL_CELLS * file.cell_size
     high = np.array(file.domain_size) - wall
-    centre = np.array(region.centre)
-    if (centre - region.reach >= wall - 1e-9).all() and (centre + region.reach <= high + 1e-9).all():
+    if (centre - reach >= wall - 1e-9).all() and (centre + reach <= high + 1e-9).all():
         return
     outside = int(((position_N3 < wall) | (position_N3 > high)).any(axis=1).sum())
     raise ConfigError(
         f"{name} must lie between the walls, which are {WALL_CELLS} cells ({wall:g}) thick, got {outside} of "
-        f"{len(position_N3)} particles outside; move or shrink the group, or raise domain_size"
+        f"{len(position_N3)} particles outside; move or shrink it, or raise domain_size"
     )
 
 

@@ -11,9 +11,10 @@ from network.states import network_of, random_grid
 
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.divergence import DivergedError
-from hgn.runtime.live import LiveSimulation
+from hgn.runtime.live import LiveSimulation, run_scene
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo
+from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
 BACKENDS = ("torch", "cpu")
@@ -185,3 +186,31 @@ def test_divergence_says_at_which_frame_of_the_scene() -> None:
     start = Simulator(small(), 60.0).start([scene(10)])
     live.restore(start.position_N3.numpy(), start.velocity_NM3.numpy(), 0)
     assert np.isfinite(live.step()).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_scene_that_particles_enter(backend: str) -> None:
+    """Each particle is there from the frame of its entry on, at first where free flight has it; until another comes
+    the others are bitwise those of a rollout, and then of a simulation that they were added to.
+    """
+    first, new = scene(20), scene(6, seed=1, low=0.4)
+    joined = {
+        name: np.concatenate([getattr(first, name), getattr(new, name)])
+        for name in ("position_N3", "velocity_N3", "material_N")
+    }
+    time = np.repeat([0.0, 0.04, 0.05], [20, 2, 4])
+    emitting = Scene(**joined, entry_s_N=time, gravity=first.gravity)
+    simulator = Simulator(small(), 60.0, backend)
+    path_TN3 = run_scene(simulator, emitting, 6)
+    entry_N = np.repeat([0, 3, 3], [20, 2, 4])
+    assert (np.isfinite(path_TN3).all(axis=2) == (entry_N <= np.arange(6)[:, None])).all()
+    flight = (3 / 60 - time[20:])[:, None]
+    expected = new.position_N3 + flight * new.velocity_N3 + flight**2 / 2 * np.array(first.gravity)
+    np.testing.assert_allclose(path_TN3[3, 20:], expected, atol=1e-6)
+    with LiveSimulation(simulator, Scene(first.position_N3, first.velocity_N3, first.material_N)) as live:
+        np.testing.assert_array_equal(frames(live, 3), path_TN3[1:4, :20])
+        entered = new.velocity_N3 + flight * np.array(first.gravity)
+        live.add_particles(path_TN3[3, 20:], entered.astype(np.float32), new.material_N)
+        np.testing.assert_array_equal(frames(live, 2), path_TN3[4:])
+    with pytest.raises(ConfigError, match="emitters must be left out here, where all particles begin at once"):
+        simulator.rollout([InitialState.of_scene(emitting)], 2)

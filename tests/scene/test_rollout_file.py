@@ -101,6 +101,27 @@ def test_diverged_rollout_is_kept(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_rollout(tmp_path / "rollout.h5").position_TN3, rollout.position_TN3)
 
 
+def test_particles_that_enter(tmp_path: Path) -> None:
+    """A frame's points are those that are there; what is not yet there is read as NaN, with its frame of entry."""
+    entry_N = np.array([0, 0, 0, 1, 1, 3, 9])
+    rollout = dataclasses.replace(make_rollout(), entry_frame_N=entry_N)
+    write_rollout(tmp_path / "rollout.h5", rollout)
+    read = read_rollout(tmp_path / "rollout.h5")
+    np.testing.assert_array_equal(read.entry_frame_N, entry_N)
+    shown_TN = entry_N <= np.arange(FRAMES)[:, None]
+    np.testing.assert_array_equal(read.position_TN3[shown_TN], rollout.position_TN3[shown_TN])
+    assert np.isnan(read.position_TN3[~shown_TN]).all()
+    with h5py.File(tmp_path / "rollout.h5") as file:
+        vtk = file["VTKHDF"]
+        assert vtk["NumberOfPoints"][()].tolist() == vtk["Vertices/NumberOfCells"][()].tolist() == [3, 5, 5, 6]
+        assert vtk["Steps/PointOffsets"][()].tolist() == [0, 3, 8, 13]
+        assert vtk["Steps/PointDataOffsets/velocity"][()].tolist() == [0, 3, 8, 13]
+        expected = (rollout.position_TN3[2] - rollout.position_TN3[1])[3:5] * 60
+        for frame in (1, 2):  # none is known of the frame in which a particle enters
+            begin = vtk["Steps/PointOffsets"][frame]
+            np.testing.assert_allclose(vtk["PointData/velocity"][begin + 3 : begin + 5], expected, rtol=1e-5)
+
+
 def test_vtkhdf_layout(tmp_path: Path) -> None:
     """Datasets have the shapes of a temporal PolyData in VTKHDF; topology is stored once."""
     rollout = make_rollout()
@@ -215,6 +236,7 @@ def test_damaged_contents(tmp_path: Path) -> None:
         ({"material_N": np.zeros(3, np.uint8)}, r"material_N must have shape \(7,\)"),
         ({"material_N": np.full(7, 9, np.uint8)}, "material_N must be below 4, got 9"),
         ({"frame_rate_hz": float("nan")}, "frame_rate_hz must be a finite number > 0"),
+        ({"entry_frame_N": np.array([0, 0, 0, 0, 0, 2, 1])}, r"entry_frame_N must .* in order"),
         ({"reference_TN3": np.zeros((2, 6, 3), np.float32)}, "reference_TN3 must have shape"),
     ],
 )

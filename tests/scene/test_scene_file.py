@@ -140,6 +140,20 @@ def group_with(**changes: object) -> dict[str, object]:
     return {"groups": [{**CUBE, **changes}]}
 
 
+DISC = {
+    "shape": "disc",
+    "size": 0.1,
+    "position": [0.5, 0.8, 0.5],
+    "velocity": [0, -1, 0],
+    "material": "water",
+    "stop": 1,
+}
+
+
+def emitter_with(**changes: object) -> dict[str, object]:
+    return {"emitters": [{**DISC, **changes}]}
+
+
 def obstacle_with(**changes: object) -> dict[str, object]:
     entry = {key: value for key, value in {**CONE, **changes}.items() if value is not None}
     return {"groups": [CUBE], "obstacles": [entry]}
@@ -149,8 +163,20 @@ def obstacle_with(**changes: object) -> dict[str, object]:
     ("mapping", "message"),
     [
         (None, "the file must be a mapping"),
-        ({}, "groups is missing"),
-        ({"groups": []}, "groups must be a list with at least one group"),
+        ({}, "groups must be a list with at least one group, or emitters"),
+        (emitter_with(velocity=[0, 0, 0]), r"emitters\[0\]\.velocity must be other than zero"),
+        (emitter_with(stop=0), r"emitters\[0\]\.stop must be later than start \(0\), got 0"),
+        (emitter_with(start=-1), r"emitters\[0\]\.start must be a finite number >= 0"),
+        (emitter_with(shape="cube"), r"emitters\[0\]\.shape must be one of disc, rectangle, got 'cube'"),
+        (emitter_with(shape="rectangle"), r"emitters\[0\]\.size must be a list of two edges for a rectangle"),
+        (emitter_with(size=-1), r"emitters\[0\]\.size must be finite and > 0, got -1"),
+        (emitter_with(material="lava"), r"emitters\[0\]\.material must be one of water, .*, got 'lava'"),
+        (emitter_with(water_tension=2.0), r"emitters\[0\].*water_tension must be at most 1, got 2"),
+        (emitter_with(position=[0.5, 0.99, 0.5]), r"emitters\[0\] \(disc of water\) must lie between the walls"),
+        (
+            emitter_with(position=[0.5, 0.22, 0.5]) | {"obstacles": [CONE]},
+            r"emitters\[0\] \(disc of water\) must be clear of closed obstacles, got it inside obstacle_0_cone",
+        ),
         (scene_with(gruops=1), "gruops is not a known key; did you mean groups"),
         (scene_with(cell_size=0), "cell_size must be a finite number > 0"),
         (scene_with(cell_size=float("nan")), "cell_size must be a finite number > 0, got nan"),
@@ -177,7 +203,7 @@ def obstacle_with(**changes: object) -> dict[str, object]:
         (group_with(shape="box", size=[0.1, -0.1, 0.1]), r"groups\[0\]\.size must be finite and > 0"),
         (group_with(position=[0.5, float("nan"), 0.5]), r"groups\[0\]\.position must be three finite numbers"),
         (group_with(velocity=[0, float("inf"), 0]), r"groups\[0\]\.velocity must be three finite numbers"),
-        (group_with(position=[5, 0.5, 0.5]), "got 1074 of 1074 particles outside; move or shrink"),
+        (group_with(position=[5, 0.5, 0.5]), "got 1074 of 1074 particles outside; move or shrink it"),
         (obstacle_with(shape="sphere"), r"obstacles\[0\]\.shape must be one of half_box"),
         (obstacle_with(shape=None), r"obstacles\[0\]\.mesh or shape must be given, .* got neither"),
         (obstacle_with(mesh="a.obj"), r"obstacles\[0\]\.mesh or shape must be given, .* got both"),
@@ -196,6 +222,30 @@ def test_every_mistake_is_named(tmp_path, mapping, message):
     """Each mistake in a scene file ends in one error: the file, the field, the rule and the value."""
     with pytest.raises(ConfigError, match=rf"scene\.yaml: {message}|scene\.yaml: .*{message}"):
         load_scene(write(tmp_path, mapping))
+
+
+def test_emitters(tmp_path):
+    """Particles enter through the face while it is open, as many as fill their way; groups come first, then all in the
+    order of their times, each with its material's constants.
+    """
+    disc = DISC | {"velocity": [0, -2, 1], "start": 0.5, "water_tension": 0.5}
+    slot = {"shape": "rectangle", "size": [0.2, 0.05], "position": [0.3, 0.5, 0.5], "velocity": [0, 0, 1.5]}
+    scene = load_scene(write(tmp_path, {"groups": [CUBE], "emitters": [disc, slot | {"material": "sand", "stop": 1}]}))
+    time = scene.entry_s_N
+    body, sand = time == 0, (time > 0) & (scene.material_N == SAND)
+    water = ~body & ~sand
+    assert body.sum() == 1074 and (np.diff(time) >= 0).all()
+    assert water.sum() == round(8 * 64**3 * np.pi * 0.05**2 * 5**0.5 * 0.5)
+    assert sand.sum() == round(8 * 64**3 * 0.2 * 0.05 * 1.5)
+    assert time[water].min() < 0.51 and time[sand].min() < 0.01 and 0.99 < time.max() <= 1
+    offset = scene.position_N3[water] - np.float32(disc["position"])
+    assert np.abs(offset @ np.array([0, -2, 1])).max() < 1e-6
+    assert 0.049 < np.linalg.norm(offset, axis=1).max() <= 0.05 + 1e-6
+    assert np.abs(scene.position_N3[sand] - np.float32(slot["position"])).max(axis=0) == pytest.approx(
+        [0.1, 0.025, 0], abs=1e-3
+    )
+    tension = scene.material_parameters["water_tension"]
+    assert (tension[water] == 0.5).all() and np.isnan(tension[~water]).all()
 
 
 def test_missing_and_broken_files(tmp_path):

@@ -1,0 +1,132 @@
+"""Emitters: faces that material enters through at a speed, as a train of particles that fills its way evenly.
+
+Shape legend: N particles, E particles of an emitter, P points, F triangles.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hgn.scene.group import points_in_ball
+from hgn.scene.scene import Scene
+from hgn.schema import require
+
+WAYS = 256  # of particles that enter, that are tried for obstacles
+
+
+@dataclass(frozen=True)
+class Face:
+    """A disc, or a rectangle where `edges` are not zero, across a velocity. Domain units."""
+
+    centre: tuple[float, float, float]
+    velocity: tuple[float, float, float]  # domain units per second, of what enters
+    radius: float = 0.0
+    edges: tuple[float, float] = (0.0, 0.0)  # the first is level, along x where the velocity is upright
+
+    @property
+    def area(self) -> float:
+        return math.pi * self.radius**2 if self.radius else self.edges[0] * self.edges[1]
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Unit vectors along the two edges, float64 [2, 3]."""
+        along = np.array(self.velocity) / np.linalg.norm(self.velocity)
+        level = np.cross([0.0, 1.0, 0.0], along)
+        level = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(level) < 1e-9 else level / np.linalg.norm(level)
+        return np.stack([level, np.cross(along, level)])
+
+    @property
+    def reach(self) -> np.ndarray:
+        """Half the edges of the bounding box, float64 [3]."""
+        if self.radius:
+            along = np.array(self.velocity) / np.linalg.norm(self.velocity)
+            return np.asarray(self.radius * np.sqrt(np.maximum(1 - along**2, 0.0)))
+        return np.asarray(0.5 * np.array(self.edges) @ np.abs(self.axes))
+
+    def count(self, seconds: float, particles_per_cell: float, cell_size: float) -> int:
+        """How many particles enter in so long, as densely as groups are filled."""
+        volume = self.area * float(np.linalg.norm(self.velocity)) * seconds
+        return round(particles_per_cell * volume / cell_size**3)
+
+    def draw(self, start: float, stop: float, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Where and when particles enter: points of the face, float32 [E, 3], and times in order, float64 [E].
+
+        One enters in each of `count` equal parts of the time.
+        """
+        place = points_in_ball(count, 2, rng) * self.radius if self.radius else None
+        if place is None:
+            place = (rng.random((count, 2)) - 0.5) * np.array(self.edges)
+        time = start + (stop - start) * (np.arange(count) + rng.random(count)) / max(count, 1)
+        return (np.array(self.centre) + place @ self.axes).astype(np.float32), time
+
+
+def entry_frames(scene: Scene, frame_rate_hz: float) -> np.ndarray:
+    """The frame in which each particle is seen first, int64 [N]: the first at its time of entry or after it."""
+    if scene.entry_s_N is None:
+        return np.zeros(scene.particle_count, np.int64)
+    return np.maximum(np.ceil(scene.entry_s_N * frame_rate_hz - 1e-9), 0).astype(np.int64)
+
+
+def at_entry(scene: Scene, frame_rate_hz: float) -> Scene:
+    """The scene with each particle as it is in the frame in which it is seen first: in free flight from the face."""
+    if scene.entry_s_N is None:
+        return scene
+    time_N1 = (entry_frames(scene, frame_rate_hz) / frame_rate_hz - scene.entry_s_N)[:, None]
+    time_N1[scene.entry_s_N <= 0] = 0.0
+    gravity = np.array(scene.gravity)
+    position_N3 = scene.position_N3 + time_N1 * scene.velocity_N3 + 0.5 * time_N1**2 * gravity
+    return dataclasses.replace(
+        scene,
+        position_N3=position_N3.astype(np.float32),
+        velocity_N3=(scene.velocity_N3 + time_N1 * gravity).astype(np.float32),
+    )
+
+
+def at_start(scene: Scene) -> Scene:
+    """The scene with the particles alone that are there from the start."""
+    count = int((scene.entry_s_N <= 0).sum()) if scene.entry_s_N is not None else scene.particle_count
+    return dataclasses.replace(
+        scene,
+        position_N3=scene.position_N3[:count],
+        velocity_N3=scene.velocity_N3[:count],
+        material_N=scene.material_N[:count],
+        material_parameters={name: value[:count] for name, value in scene.material_parameters.items()},
+        entry_s_N=None,
+    )
+
+
+def require_free_entries(scene: Scene, entered: Scene) -> None:
+    """Raises ConfigError where an obstacle, as it lies at first, stands in the way from an emitter to where particles
+    are seen first (`entered`, of `at_entry`).
+    """
+    if scene.entry_s_N is None:
+        return
+    late = np.flatnonzero(scene.entry_s_N > 0)
+    late = late[:: -(-len(late) // WAYS) or 1]
+    start, way = scene.position_N3[late].astype(np.float64), (entered.position_N3 - scene.position_N3)[late]
+    for obstacle in scene.obstacles:
+        hit = np.zeros(len(late), bool)
+        corner = obstacle.vertex_V3[obstacle.triangle_F3]
+        for index in range(len(late)):
+            hit[index] = _crosses(start[index], way[index].astype(np.float64), corner)
+        rule = "clear of obstacles for the first frame of what enters"
+        require(not hit.any(), "emitters", rule, f"{hit.mean():.0%} of it through {obstacle.name}", "move one of them")
+
+
+def _crosses(start_3: np.ndarray, way_3: np.ndarray, corner_F33: np.ndarray) -> bool:
+    """Whether a way meets a triangle (Möller and Trumbore 1997)."""
+    edge_1, edge_2 = corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0]
+    across = np.cross(way_3, edge_2)
+    determinant = (edge_1 * across).sum(axis=1)
+    determinant = np.where(determinant == 0, np.nan, determinant)
+    offset = start_3 - corner_F33[:, 0]
+    share_1 = (offset * across).sum(axis=1) / determinant
+    normal = np.cross(offset, edge_1)
+    share_2 = (normal @ way_3) / determinant
+    fraction = (edge_2 * normal).sum(axis=1) / determinant
+    inside = (share_1 >= 0) & (share_2 >= 0) & (share_1 + share_2 <= 1) & (fraction >= 0) & (fraction <= 1)
+    return bool(inside.any())

@@ -1,0 +1,90 @@
+"""Emitters: what enters flies freely from the face, at the rate of its train, and no particle is lost or made."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from datagen.mpm.solver import Simulated, simulate
+from hgn.config import MpmConfig
+from hgn.scene.emission import Face, entry_frames
+from hgn.scene.material import SNOW, WATER
+from hgn.scene.scene import Obstacle, Scene
+from hgn.schema import ConfigError
+
+CELL = 1 / 16
+CONFIG = MpmConfig(device="cpu")
+RATE_HZ = 60.0
+STOP = 0.15
+
+
+def jet(material: int, face: Face, **scene) -> Scene:
+    """A body of 40 particles far from it, and what enters through a face in 0.15 s."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(0.2, 0.28, (40, 3))
+    place, time = face.draw(0.0, STOP, face.count(STOP, 8.0, CELL), rng)
+    velocity = np.repeat([(0.0, 0.0, 0.0), face.velocity], [40, len(place)], axis=0)
+    return Scene(
+        np.concatenate([body, place]).astype(np.float32), velocity.astype(np.float32),
+        np.full(40 + len(place), material, np.uint8), cell_size=CELL, particles_per_cell=8.0,
+        entry_s_N=np.concatenate([np.zeros(40), time]), **scene,
+    )  # fmt: skip
+
+
+UP = Face((0.5, 0.35, 0.5), (0.3, 2.0, 0.0), radius=0.06)
+ASIDE = Face((0.7, 0.65, 0.45), (-1.5, 0.0, 0.4), edges=(0.15, 0.1))
+
+
+def test_what_enters_flies_freely_and_none_is_lost() -> None:
+    """A face of area A at speed v brings in rho A v t, to a particle at any time and exactly in the end; whatever the
+    material, the centre of what entered is where free flight from the face has it, within 2e-4 of its way.
+    """
+    scenes = [jet(WATER, UP), jet(SNOW, ASIDE)]
+    for scene, face, outcome in zip(scenes, (UP, ASIDE), simulate(scenes, CONFIG, 12, RATE_HZ), strict=True):
+        assert isinstance(outcome, Simulated), outcome
+        late = scene.entry_s_N > 0
+        rate = face.area * np.linalg.norm(face.velocity) * 8 / CELL**3
+        assert late.sum() == round(rate * STOP)
+        present_TN = np.isfinite(outcome.position_TN3).all(axis=2)
+        assert present_TN[:, ~late].all() and present_TN[-1].all()
+        for frame, present_N in enumerate(present_TN):
+            time = frame / RATE_HZ
+            assert abs(present_N[late].sum() - rate * min(time, STOP)) <= 1
+            if present_N[late].sum():
+                flight = np.maximum(time - scene.entry_s_N, 0)[:, None]
+                way = flight * scene.velocity_N3 + 0.5 * flight**2 * np.array(scene.gravity)
+                off = outcome.position_TN3[frame].astype(np.float64) - scene.position_N3 - way
+                mine = late & present_N
+                assert np.linalg.norm(off[mine].mean(axis=0)) < 2e-4 * np.linalg.norm(way[mine], axis=1).mean() + 1e-6
+
+
+def test_emitters_leave_their_batch_alone() -> None:
+    """A scene that particles enter is the same, bitwise, alone and beside others, and these are what they are alone."""
+    emitting = jet(WATER, UP)
+    still = dataclasses.replace(
+        emitting, position_N3=emitting.position_N3[:40], velocity_N3=emitting.velocity_N3[:40],
+        material_N=emitting.material_N[:40], entry_s_N=None,
+    )  # fmt: skip
+    together = simulate([still, emitting, still], CONFIG, 6, RATE_HZ)
+    for scene, outcome in zip((still, emitting, still), together, strict=True):
+        (alone,) = simulate([scene], CONFIG, 6, RATE_HZ)
+        assert isinstance(alone, Simulated) and isinstance(outcome, Simulated)
+        assert np.array_equal(alone.position_TN3, outcome.position_TN3, equal_nan=True)
+        assert alone.counters == outcome.counters
+
+
+def test_an_obstacle_in_the_way_is_refused() -> None:
+    """A sheet between the face and where particles are first seen would let them through."""
+    corner = np.array([[0.0, 0.36, 0], [1, 0.36, 0], [1, 0.36, 1], [0, 0.36, 1]])
+    sheet = Obstacle("sheet", corner, np.array([[0, 1, 2], [0, 2, 3]], np.int32), False)
+    with pytest.raises(ConfigError, match=r"emitters must be clear of obstacles for the first frame .* through sheet"):
+        simulate([jet(WATER, UP, obstacles=(sheet,))], CONFIG, 3, RATE_HZ)
+
+
+def test_entry_frames() -> None:
+    """A particle is seen first in the frame at its time of entry or after it; those of the start in frame 0."""
+    scene = Scene(
+        np.full((4, 3), 0.5, np.float32), np.zeros((4, 3), np.float32), np.zeros(4, np.uint8),
+        entry_s_N=np.array([0.0, 0.001, 1 / 60, 0.02]),
+    )  # fmt: skip
+    assert entry_frames(scene, 60.0).tolist() == [0, 1, 1, 2]
