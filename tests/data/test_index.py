@@ -25,6 +25,7 @@ from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import Moments, Statistics
 from hgn.schema import ConfigError
+from tools.studies.many_shards import Count
 
 MANY = 10_000
 STATISTICS = Statistics(*2 * [Moments(10**6, (0.1, 0.2, 1 / 3), (0.1, 0.2, 1 / 3))])
@@ -45,27 +46,6 @@ def listed(config: DatagenConfig, count: int) -> Path:
     shards = ListedIndex([shard(i) for i in range(count)])
     Manifest(identity_hash(identity), identity, requested, count, shards).save(folder)
     return folder
-
-
-class Count:
-    """Lines of ours that are run, and bytes that are read and written, while it is entered."""
-
-    def __enter__(self) -> Count:
-        self.lines, self._before = 0, self._bytes()
-        sys.settrace(self._trace)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        sys.settrace(None)
-        self.read, self.written = (b - a for a, b in zip(self._before, self._bytes(), strict=True))
-
-    def _trace(self, frame: Any, event: str, argument: object) -> Any:
-        self.lines += event == "line"
-        return self._trace if f"{os.sep}data" in frame.f_code.co_filename else None
-
-    def _bytes(self) -> tuple[int, int]:
-        numbers = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
-        return int(numbers["rchar"]), int(numbers["wchar"])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts bytes in /proc")
