@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_dir
 
 from hgn import config
 from hgn.hydra_compat import registered_dataclasses
-from hgn.scene.scene_file import GroupEntry, ObstacleEntry, SceneFile
+from hgn.scene.scene_file import EmitterEntry, GroupEntry, ObstacleEntry, SceneFile
 
 COLUMNS = 100
 README_LINES, README_COMMANDS, ENTRY_LINES = 130, 12, 2
@@ -196,8 +196,9 @@ def test_every_command_is_listed() -> None:
 
 
 def test_scene_files_are_described_whole() -> None:
-    """The page on scene files has each field that the file, a group and an obstacle may have, and each shape."""
+    """The page on scene files has each field that the file and its entries may have, and each shape."""
     text = (ROOT / "docs" / "how_to" / "scene_files.md").read_text()
     rows = {cell for line in text.splitlines() if line.startswith("| `") for cell in CODE.findall(line.split("|")[1])}
-    fields = {f"`{field.name}`" for cls in (SceneFile, GroupEntry, ObstacleEntry) for field in dataclasses.fields(cls)}
+    entries = (SceneFile, GroupEntry, EmitterEntry, ObstacleEntry)
+    fields = {f"`{field.name}`" for entry in entries for field in dataclasses.fields(entry)}
     assert rows == fields | {f"`{shape}`" for shape in config.OBSTACLE_SHAPES}

@@ -164,21 +164,20 @@ def glued_below(cases: Sequence[tuple[Setting, int]], config: MpmConfig) -> list
     return fractions
 
 
-def acting_frictions(cases: Sequence[tuple[Setting, bool, int]], friction: float, config: MpmConfig) -> list[float]:
-    """The Coulomb coefficient that acts on a block of a material that slides on a sheet, or on a body where the second
-    of a case is true, as gravity points down a slope: what its centre's acceleration lacks, over the force that presses
-    it on.
+def acting_frictions(cases: Sequence[tuple[Setting, str, int]], friction: float, config: MpmConfig) -> list[float]:
+    """The Coulomb coefficient that acts on a block of a material that slides on a sheet, a body or the domain's floor
+    (which lies as the grid does), as gravity points down a slope: what its centre's acceleration lacks, over the force
+    that presses it on.
     """
     sine, cosine = math.sin(math.radians(SLOPE_DEG)), math.cos(math.radians(SLOPE_DEG))
     gravity = (GRAVITY * sine, -GRAVITY * cosine, 0.0)
-    low = (START_CELLS - SLIDING_CELLS[0] / 2, 0.5, -SLIDING_CELLS[2] / 2)
-    scenes = [
-        block(
-            setting, material, low, SLIDING_CELLS, (body(setting) if closed else sheet(setting),),
-            (SLIDING_SPEED, 0.0, 0.0), gravity,
-        )
-        for setting, closed, material in cases
-    ]  # fmt: skip
+    scenes = []
+    for setting, surface, material in cases:
+        obstacles = {"sheet": (sheet(setting),), "body": (body(setting),), "floor": ()}[surface]
+        up = 0.5 if obstacles else 0.5 + config.wall_cells - 1 - DOMAIN_CELLS / 2
+        low = (START_CELLS - SLIDING_CELLS[0] / 2, up, -SLIDING_CELLS[2] / 2)
+        scene = block(setting, material, low, SLIDING_CELLS, obstacles, (SLIDING_SPEED, 0.0, 0.0), gravity)
+        scenes.append(dataclasses.replace(scene, wall_friction=(0.0, friction, 0.0)))
     config = dataclasses.replace(config, collider_friction=friction)
     first = round(SETTLING_S * FRAME_RATE_HZ)
     frames = 1 + round((SETTLING_S + SLIDING_S) * FRAME_RATE_HZ)
@@ -206,16 +205,17 @@ def contacts(config: MpmConfig) -> list[Row]:
         worst = max(fractions)
         case = f"contact, glued below a sheet {turn}, {MATERIALS[kind]}"
         rows.append(Row(case, 0.0, worst, worst == 0, "of the particles, at most"))
-    for closed, surface in ((False, "a sheet"), (True, "a body")):
+    for surface in ("sheet", "body", "floor"):
         for friction in FRICTIONS:
-            places = [(setting, material) for setting in settings for material in FRICTION_ERRORS]
-            cases = [(setting, closed, kind) for setting, kind in places]
+            own = [Setting(0.0)] if surface == "floor" else settings
+            places = [(setting, material) for setting in own for material in FRICTION_ERRORS]
+            cases = [(setting, surface, kind) for setting, kind in places]
             for (turn, kind), acting in _grouped(places, acting_frictions(cases, friction, config)).items():
                 worst = max(acting, key=lambda value: abs(value - friction))
                 held = abs(worst / friction - 1) <= FRICTION_ERRORS[kind]
                 beyond = f"mean {np.mean(acting):.4g}; within {FRICTION_ERRORS[kind]:.0%} wanted"
                 rows.append(
-                    Row(f"contact, friction on {surface} {turn}, {MATERIALS[kind]}", friction, worst, held, beyond)
+                    Row(f"contact, friction on a {surface} {turn}, {MATERIALS[kind]}", friction, worst, held, beyond)
                 )
     return rows
 

@@ -47,13 +47,14 @@ def test_nothing_is_glued_below_a_sheet() -> None:
 
 @pytest.mark.parametrize("friction", FRICTIONS)
 def test_friction_acts_as_set(friction: float) -> None:
-    """On a sheet sand and snow are braked by the coefficient that is set within 5 and 10 %; on a flat face sand too,
-    wherever it lies between the nodes.
+    """On a sheet and the domain's floor sand and snow are braked by the coefficient that is set within 5 and 10 %; on a
+    flat face sand too, wherever it lies between the nodes.
     """
-    cases = [(Setting(offset, "aligned", CELL), False, kind) for offset in (0.0, 0.3, 0.5) for kind in (SAND, SNOW)]
+    cases = [(Setting(offset, "aligned", CELL), "sheet", kind) for offset in (0.0, 0.3, 0.5) for kind in (SAND, SNOW)]
+    cases += [(Setting(0.0, "aligned", CELL), "floor", kind) for kind in (SAND, SNOW)]
     if friction == FRICTIONS[-1]:
         cases += [
-            (Setting(offset, "aligned", CELL), True, SAND) for offset in (0, 0.2, 0.34, 0.36, 0.41, 0.5, 0.7, 0.9)
+            (Setting(offset, "aligned", CELL), "body", SAND) for offset in (0, 0.2, 0.34, 0.36, 0.41, 0.5, 0.7, 0.9)
         ]
     for case, acting in zip(cases, acting_frictions(cases, friction, CONFIG), strict=True):
         assert acting == pytest.approx(friction, rel=FRICTION_ERRORS[case[2]]), case
