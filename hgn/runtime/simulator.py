@@ -6,7 +6,7 @@ Shape legend: T frames, N particles of all scenes, S scenes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.runtime.backend import Backend, build, choose, set_matmul_precision
+from hgn.runtime.differentiable import Inputs, Pose, simulate
 from hgn.runtime.stepped_rollout import stepped
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.episode import Episode
@@ -195,6 +196,29 @@ class Simulator:
         yield state.position_N3.cpu().numpy()
         with self.backend.rollout(state) as rollout:
             yield from rollout.frames()
+
+    def differentiable(
+        self,
+        scene: Scene,
+        frames: int,
+        *,
+        position_N3: torch.Tensor | None = None,
+        velocity_N3: torch.Tensor | None = None,
+        gravity_3: torch.Tensor | None = None,
+        domain_size_3: torch.Tensor | None = None,
+        poses: Mapping[int, Pose] | None = None,
+        smoothing: float = 0.0,
+    ) -> torch.Tensor:
+        """`rollout` of a scene with gradients: positions [frames, N, 3] as a tensor, in the network's precision.
+
+        What is given takes the place of the scene's own: positions and velocities [N, 3], gravity [3] (relative inputs
+        only), the domain's size [3], in domain units and seconds; `poses` turns and shifts obstacles by their number.
+        `smoothing`, in obstacle cells up to 1, makes normals continuous (hgn.network.posed_obstacles). Always computed
+        by PyTorch, one frame's work in memory at a time. docs/how_to/gradients.md says what is differentiable.
+        Raises: ConfigError and DivergedError as `rollout`.
+        """
+        inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses, smoothing)
+        return simulate(self.network, self.start([scene]), scene, self.frame_rate_hz, frames, inputs)
 
     def _require_scene_fits(self, scene: InitialState) -> None:
         info, cell_size = self._info, scene.obstacle_grid.cell_size

@@ -39,8 +39,13 @@ class Rollout(Protocol):
 
 @torch.inference_mode()
 def stepped(predict: Callable[[ParticleState], torch.Tensor], state: ParticleState) -> ParticleState:
+    """One frame later, without gradients."""
+    return advanced(state, predict(state))
+
+
+def advanced(state: ParticleState, acceleration_N3: torch.Tensor) -> ParticleState:
     """One frame later: v += a, x += v. Velocity is kept as state, not as a difference of positions."""
-    velocity_N3 = state.velocity_NM3[:, 0] + predict(state)
+    velocity_N3 = state.velocity_NM3[:, 0] + acceleration_N3
     history_NM3 = torch.cat([velocity_N3[:, None], state.velocity_NM3[:, :-1]], dim=1)
     return replace(state, position_N3=state.position_N3 + velocity_N3, velocity_NM3=history_NM3)
 

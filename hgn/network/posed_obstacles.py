@@ -1,0 +1,71 @@
+"""Obstacles whose pose may have gradients: normals looked up in each obstacle's own frame, and turned with it.
+
+An obstacle's cells are made once, where the scene has it. A particle is expressed in that frame, x' = R^T (x - t - c)
++ c with pivot c, and the normal found there is turned back, R n: its direction follows the rotation exactly. Which cell
+a particle lies in is piecewise constant: a shift has no gradient, and no gradient says that a surface comes nearer.
+With `smoothing` s the normal is the mean over a cube of s cells around the particle, which is continuous and piecewise
+polynomial in position and pose; 0 is what networks were trained with.
+Shape legend: N particles, K obstacle cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from hgn.network.cell_keys import find, pack
+from hgn.network.grid import CORNER_83
+from hgn.network.obstacles import ObstacleCells
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where an obstacle is, against where its scene has it: x -> R (x - c) + c + t."""
+
+    rotation_33: torch.Tensor
+    pivot_3: torch.Tensor  # c, domain units
+    translation_3: torch.Tensor  # t, domain units
+
+    def place(self, position_N3: torch.Tensor) -> torch.Tensor:
+        """Points of the obstacle where it was, to where it is."""
+        return (position_N3 - self.pivot_3) @ self.rotation_33.T + self.pivot_3 + self.translation_3
+
+    def undo(self, position_N3: torch.Tensor) -> torch.Tensor:
+        """The inverse: points into the frame in which the obstacle's cells were made."""
+        return (position_N3 - self.translation_3 - self.pivot_3) @ self.rotation_33 + self.pivot_3
+
+
+@dataclass(frozen=True, eq=False)
+class PosedObstacleCells(ObstacleCells):
+    """Cells of the obstacles that stay, as in ObstacleCells, and of each that has a placement. One scene."""
+
+    placed: tuple[tuple[ObstacleCells, Placement], ...] = ()
+    smoothing: float = 0.0  # side of the cube that normals are the mean over, in cells, 0 to 1
+
+    def normals(self, position_N3: torch.Tensor, scene_N: torch.Tensor) -> torch.Tensor:
+        """n_o of each particle, [N, 3]: the sum over obstacles, of length 1 at most."""
+        normal_N3 = smoothed_normals(self, position_N3, scene_N, self.smoothing)
+        for cells, placement in self.placed:
+            own_N3 = smoothed_normals(cells, placement.undo(position_N3), scene_N, self.smoothing)
+            normal_N3 = normal_N3 + own_N3 @ placement.rotation_33.T
+        square_N1 = normal_N3.square().sum(-1, keepdim=True)
+        return torch.where(square_N1 > 1, normal_N3 * square_N1.clamp(min=1).rsqrt(), normal_N3)
+
+
+def smoothed_normals(
+    cells: ObstacleCells, position_N3: torch.Tensor, scene_N: torch.Tensor, smoothing: float
+) -> torch.Tensor:
+    """The mean of the cells' normals over a cube of `smoothing` cells around each particle, [N, 3]."""
+    if len(cells.key_K) == 0:
+        return torch.zeros_like(position_N3)
+    if smoothing == 0:
+        return ObstacleCells.normals(cells, position_N3, scene_N)
+    grid_N3 = position_N3 / cells.cell_size
+    low_N3 = torch.floor(grid_N3 - 0.5 * smoothing).detach()
+    upper_N3 = ((grid_N3 + 0.5 * smoothing - low_N3 - 1) / smoothing).clamp(0, 1)  # share of the cube in the next cell
+    corner_83 = CORNER_83.to(position_N3.device)
+    weight_N8 = torch.where(corner_83.bool(), upper_N3[:, None], 1 - upper_N3[:, None]).prod(-1)
+    index_N8, found_N8 = find(cells.key_K, pack(scene_N[:, None], low_N3.long()[:, None] + corner_83))
+    normal_N83 = cells.normal_K3.to(position_N3.dtype)[index_N8]
+    return ((weight_N8 * found_N8)[..., None] * normal_N83).sum(1)

@@ -1,0 +1,183 @@
+"""A simulation through which PyTorch takes gradients, by what it starts from and where its obstacles are.
+
+What has exact gradients, what only within a cell, and how long they can be trusted: docs/how_to/gradients.md.
+Shape legend: T frames, N particles, H velocities, P surface particles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch.func import functional_call
+from torch.utils.checkpoint import checkpoint
+
+from hgn.network.base import ParticleNetwork
+from hgn.network.features import ParticleState
+from hgn.network.grid import GridRangeError
+from hgn.network.obstacles import ObstacleCells, SurfaceParticles
+from hgn.network.posed_obstacles import Placement, PosedObstacleCells
+from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
+from hgn.runtime.stepped_rollout import advanced
+from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
+from hgn.scene.scene import Obstacle, Scene
+from hgn.schema import ConfigError, require
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """How an obstacle lies against its scene's: turned about a pivot, then shifted. What is None stays."""
+
+    rotation_3: torch.Tensor | None = None  # axis times angle, radians
+    translation_3: torch.Tensor | None = None  # domain units
+    pivot_3: tuple[float, float, float] | None = None  # domain units; None: the middle of the bounding box
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What replaces a scene's own: tensors, with gradients where they are asked for. Units: domain units, seconds."""
+
+    position_N3: torch.Tensor | None = None
+    velocity_N3: torch.Tensor | None = None
+    gravity_3: torch.Tensor | None = None
+    domain_size_3: torch.Tensor | None = None
+    poses: Mapping[int, Pose] | None = None  # by the obstacle's number in the scene
+    smoothing: float = 0.0
+
+
+def simulate(
+    network: ParticleNetwork, start: ParticleState, scene: Scene, frame_rate_hz: float, frames: int, inputs: Inputs
+) -> torch.Tensor:
+    """Positions [T, N, 3]; `start` is the scene's state at frame 0, as the simulator has it.
+
+    The backward pass computes each frame again (torch.utils.checkpoint), so that it holds what one frame needs and the
+    states between. The network's own weights have no gradients. Raises: ConfigError, DivergedError.
+    """
+    require(frames >= 1, "frames", "at least 1", frames)
+    require(0 <= inputs.smoothing <= 1, "smoothing", "0 to 1 cells", inputs.smoothing)
+    state = _started(network, start, scene, frame_rate_hz, inputs)
+    weights = {name: tensor.detach() for name, tensor in network.state_dict(keep_vars=True).items()}
+
+    def step(state: ParticleState) -> tuple[torch.Tensor, torch.Tensor]:
+        after = advanced(state, functional_call(network, weights, (state,)))
+        return after.position_N3, after.velocity_NM3
+
+    positions = [state.position_N3]
+    for frame in range(1, frames):
+        try:
+            position_N3, velocity_NM3 = _checkpointed(step, state)
+        except GridRangeError as error:
+            raise DivergedError(frame, str(error)) from None
+        state = replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
+        lost = int(diverged(position_N3.detach(), state.domain_S3.detach()[state.scene_N]).sum())
+        if lost:
+            raise DivergedError(frame, describe_diverged(lost, len(position_N3)))
+        positions.append(position_N3)
+    return torch.stack(positions)
+
+
+def _checkpointed(
+    step: Callable[[ParticleState], tuple[torch.Tensor, torch.Tensor]], state: ParticleState
+) -> tuple[torch.Tensor, torch.Tensor]:
+    if not torch.is_grad_enabled():
+        return step(state)
+    result: tuple[torch.Tensor, torch.Tensor] = checkpoint(step, state, use_reentrant=False, preserve_rng_state=False)
+    return result
+
+
+def _started(
+    network: ParticleNetwork, start: ParticleState, scene: Scene, frame_rate_hz: float, inputs: Inputs
+) -> ParticleState:
+    """The state at frame 0 with what replaces the scene's, in the network's precision."""
+    config, device = network.config, start.position_N3.device
+    dtype = next(network.parameters()).dtype
+
+    def given(name: str, value: torch.Tensor | None, default: np.ndarray, shape: tuple[int, ...]) -> torch.Tensor:
+        tensor = torch.as_tensor(default) if value is None else value
+        require(tuple(tensor.shape) == shape, name, f"of shape {shape}", tuple(tensor.shape))
+        return tensor.to(device, torch.float64)  # as the simulator computes its history
+
+    require(
+        inputs.gravity_3 is None or config.relative,
+        "gravity_3",
+        "left out for a network of absolute inputs, which knows no gravity but its data's",
+        "a tensor",
+        "take weights of relative inputs",
+    )
+    count = len(scene.position_N3)
+    position_N3 = given("position_N3", inputs.position_N3, scene.position_N3, (count, 3))
+    velocity_N3 = given("velocity_N3", inputs.velocity_N3, scene.velocity_N3, (count, 3)) / frame_rate_hz
+    gravity_3 = given("gravity_3", inputs.gravity_3, np.array(scene.gravity), (3,)) / frame_rate_hz**2
+    domain_3 = given("domain_size_3", inputs.domain_size_3, np.array(scene.domain_size), (3,))
+    age_H1 = torch.arange(config.velocity_history, device=device, dtype=torch.float64)[:, None] + 0.5
+    obstacles, surface = _obstacles(network, start, scene, inputs, dtype)
+    return replace(
+        start,
+        position_N3=position_N3.to(dtype),
+        velocity_NM3=(velocity_N3[:, None] - age_H1 * gravity_3).to(dtype),  # as hgn.scene.history has it
+        domain_S3=domain_3[None].to(dtype),
+        gravity_S3=gravity_3[None].to(dtype),
+        obstacles=obstacles,
+        surface=surface,
+    )
+
+
+def _obstacles(
+    network: ParticleNetwork, start: ParticleState, scene: Scene, inputs: Inputs, dtype: torch.dtype
+) -> tuple[ObstacleCells | None, SurfaceParticles | None]:
+    poses, config, device = inputs.poses or {}, network.config, start.position_N3.device
+    for number in poses:
+        rule = f"0 to {len(scene.obstacles) - 1}" if scene.obstacles else "left out: the scene has no obstacles"
+        require(number in range(len(scene.obstacles)), "poses", rule, number)
+    if not poses and inputs.smoothing == 0:
+        return start.obstacles, start.surface
+    staying = [obstacle for i, obstacle in enumerate(scene.obstacles) if i not in poses]
+    placements = {i: _placement(scene.obstacles[i], pose, device, dtype) for i, pose in poses.items()}
+    obstacles, surface = None, None
+    if config.obstacle_features:
+        rest = _cells(scene, staying, device)
+        placed = tuple((_cells(scene, [scene.obstacles[i]], device), placement) for i, placement in placements.items())
+        obstacles = PosedObstacleCells(rest.key_K, rest.normal_K3, rest.cell_size, placed, inputs.smoothing)
+    if config.obstacle_particles:
+        points = [_points(scene, staying, config.static_spacing_cells, device, dtype)]
+        for i, placement in placements.items():
+            own_P3 = _points(scene, [scene.obstacles[i]], config.static_spacing_cells, device, dtype)
+            points.append(placement.place(own_P3))
+        position_P3 = torch.cat(points)
+        scene_P = torch.zeros(len(position_P3), dtype=torch.int64, device=device)
+        surface = SurfaceParticles(position_P3, scene_P) if len(position_P3) else None
+    return obstacles, surface
+
+
+def _cells(scene: Scene, obstacles: list[Obstacle], device: torch.device) -> ObstacleCells:
+    # uncut by the domain: an obstacle may be moved into it
+    grid: ObstacleGrid = build_obstacle_grid(obstacles, scene.cell_size, scene.seed)
+    cells = ObstacleCells.of([grid])
+    if cells is None:
+        cells = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), scene.cell_size)
+    return cells.to(device)
+
+
+def _points(
+    scene: Scene, obstacles: list[Obstacle], spacing_cells: float, device: torch.device, dtype: torch.dtype
+) -> torch.Tensor:
+    point_P3 = surface_points(obstacles, scene.cell_size, 0, spacing_cells=spacing_cells)
+    return torch.from_numpy(point_P3).to(device, dtype)
+
+
+def _placement(obstacle: Obstacle, pose: Pose, device: torch.device, dtype: torch.dtype) -> Placement:
+    middle_3 = 0.5 * (obstacle.vertex_V3.min(axis=0) + obstacle.vertex_V3.max(axis=0))
+    pivot_3 = torch.as_tensor(middle_3 if pose.pivot_3 is None else pose.pivot_3)
+    parts = {}
+    for name in ("rotation_3", "translation_3"):
+        value = getattr(pose, name)
+        parts[name] = torch.zeros(3, dtype=torch.float64) if value is None else value
+        if tuple(parts[name].shape) != (3,):
+            raise ConfigError(f"poses {name} must be of shape (3,), got {tuple(parts[name].shape)}")
+    x, y, z = parts["rotation_3"].to(device, torch.float64).unbind()
+    zero = torch.zeros_like(x)
+    cross_33 = torch.stack([torch.stack(row) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))])
+    rotation_33 = torch.linalg.matrix_exp(cross_33)  # smooth at no rotation, too
+    return Placement(rotation_33.to(dtype), pivot_3.to(device, dtype), parts["translation_3"].to(device, dtype))

@@ -1,0 +1,138 @@
+"""Gradients through a simulation: against central differences in float64, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from network.states import gns_of, network_of
+
+from hgn.network.base import ParticleNetwork
+from hgn.network.obstacles import ObstacleCells
+from hgn.network.posed_obstacles import Placement, PosedObstacleCells
+from hgn.runtime.differentiable import Pose
+from hgn.runtime.divergence import DivergedError
+from hgn.runtime.simulator import Simulator
+from hgn.scene.obstacle_grid import build_obstacle_grid
+from hgn.scene.scene import Scene
+from hgn.scene.shapes import shape_obstacle
+from hgn.schema import ConfigError
+
+FRAMES = 30
+STEP = 1e-8  # of the central differences in float64: roundoff leaves about 1e-7 of the slope
+PARTICLES = 12
+
+
+def scene() -> Scene:
+    """Particles of all materials that fall on a cone, a bowl around both."""
+    rng = np.random.default_rng(0)
+    return Scene(
+        position_N3=(np.array([0.4, 0.42, 0.4]) + 0.15 * rng.random((PARTICLES, 3))).astype(np.float32),
+        velocity_N3=rng.normal(0, 0.2, (PARTICLES, 3)).astype(np.float32),
+        material_N=rng.integers(0, 3, PARTICLES).astype(np.uint8),
+        obstacles=(
+            shape_obstacle("cone", 0.2, (0.5, 0.38, 0.5)),
+            shape_obstacle("square", 0.2, (0.5, 0.36, 0.5)),
+        ),
+    )
+
+
+def network(kind: str, dtype: torch.dtype = torch.float64) -> ParticleNetwork:
+    if kind.startswith("gns"):
+        return gns_of(dtype, kind=kind, message_passing_steps=2, static_spacing_cells=2.0)
+    return network_of(dtype, inputs=kind)
+
+
+INPUTS = {
+    "position_N3": torch.from_numpy(scene().position_N3).double(),
+    "velocity_N3": torch.from_numpy(scene().velocity_N3).double(),
+    "gravity_3": torch.tensor([0.3, -9.8, 0.1], dtype=torch.float64),
+    "domain_size_3": torch.tensor([1.0, 1.1, 0.6], dtype=torch.float64),
+    "rotation_3": torch.tensor([0.1, 0.2, -0.3], dtype=torch.float64),
+    "translation_3": torch.tensor([0.01, -0.02, 0.015], dtype=torch.float64),
+}
+
+
+def positions(simulator: Simulator, inputs: dict[str, torch.Tensor], smoothing: float) -> torch.Tensor:
+    rest = {name: value for name, value in inputs.items() if name not in ("rotation_3", "translation_3")}
+    pose = Pose(inputs["rotation_3"], inputs["translation_3"])
+    return simulator.differentiable(scene(), FRAMES, **rest, poses={0: pose}, smoothing=smoothing)
+
+
+@pytest.mark.parametrize(("kind", "smoothing"), [("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0)])
+def test_gradients_are_those_of_central_differences(kind: str, smoothing: float) -> None:
+    """Over 30 frames, along a random direction of each input, where no particle changes a cell between both sides."""
+    simulator = Simulator(network(kind), 60.0, "torch")
+    inputs = {name: value.clone().requires_grad_() for name, value in INPUTS.items()}
+    if kind != "relative":
+        del inputs["gravity_3"]
+    generator = torch.Generator().manual_seed(1)
+    weight_TN3 = torch.randn(FRAMES, PARTICLES, 3, generator=generator, dtype=torch.float64)
+    (positions(simulator, inputs, smoothing) * weight_TN3).sum().backward()
+    for name, value in inputs.items():
+        direction = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+        with torch.no_grad():
+            high_TN3, low_TN3 = (
+                positions(simulator, inputs | {name: value + step * direction}, smoothing) for step in (STEP, -STEP)
+            )
+        cell_size = simulator.network.config.cell_size
+        crossed = (high_TN3 / cell_size - 0.5).floor() != (low_TN3 / cell_size - 0.5).floor()
+        difference = ((high_TN3 - low_TN3) * weight_TN3).sum() / (2 * STEP)
+        slope = (value.grad * direction).sum()
+        assert not bool(crossed.any()), name
+        torch.testing.assert_close(slope, difference, rtol=1e-3, atol=0, msg=lambda text, name=name: f"{name}: {text}")
+
+
+@pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles"])
+def test_positions_are_those_of_a_rollout(kind: str) -> None:
+    """What nothing replaces moves as in a rollout."""
+    simulator = Simulator(network(kind, torch.float32), 60.0, "torch")
+    (expected_TN3,) = simulator.rollout([scene()], 6)
+    found_TN3 = simulator.differentiable(scene(), 6)
+    assert not found_TN3.requires_grad
+    np.testing.assert_allclose(found_TN3.numpy(), expected_TN3, rtol=0, atol=2e-6)
+
+
+def test_normals_turn_with_their_obstacle() -> None:
+    """A plate turned by a quarter has its normal along the turned axis, at the turned place and nowhere else; the mean
+    over a cube falls off linearly across its layer of cells."""
+    cell_size, still = 1 / 64, torch.zeros(1, dtype=torch.int64)
+    grid = build_obstacle_grid([shape_obstacle("square", 0.2, (0.5, 0.4921875, 0.5))], cell_size, 0)
+    cells = ObstacleCells.of([grid])
+    assert cells is not None
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    centre = torch.tensor([0.5, 0.4921875, 0.5])
+    placement = Placement(quarter, centre, torch.tensor([0.1, 0.0, 0.0]))
+    empty = ObstacleCells(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3), cell_size)
+    for smoothing, shares in ((0.0, (1, 1, 0)), (1.0, (1, 0.6, 0))):
+        posed = PosedObstacleCells(empty.key_K, empty.normal_K3, cell_size, ((cells, placement),), smoothing)
+        for offset, share in zip((0.0, 0.4, 1.2), shares, strict=True):
+            point_N3 = (centre + torch.tensor([0.1 + offset * cell_size, 0.03, 0.0]))[None]
+            normal_3 = posed.normals(point_N3, still)[0].abs()
+            np.testing.assert_allclose(normal_3.numpy(), [share, 0, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames": 0}, "frames must be at least 1, got 0"),
+        ({"smoothing": 1.5}, "smoothing must be 0 to 1 cells, got 1.5"),
+        ({"gravity_3": torch.zeros(3)}, "gravity_3 must be left out for a network of absolute inputs"),
+        ({"position_N3": torch.zeros(3)}, r"position_N3 must be of shape \(12, 3\), got \(3,\)"),
+        ({"poses": {2: Pose()}}, "poses must be 0 to 1, got 2"),
+        ({"poses": {0: Pose(rotation_3=torch.zeros(1))}}, r"rotation_3 must be of shape \(3,\), got \(1,\)"),
+    ],
+)
+def test_what_is_refused(options: dict[str, Any], message: str) -> None:
+    """By name, with the rule."""
+    with pytest.raises(ConfigError, match=message):
+        Simulator(network("absolute"), 60.0, "torch").differentiable(scene(), **({"frames": 2} | options))
+
+
+def test_divergence_names_the_frame() -> None:
+    """What flies out of reach ends the simulation as in a rollout."""
+    velocity_N3 = torch.full((PARTICLES, 3), 100.0)
+    with pytest.raises(DivergedError, match="diverged at frame 1: 12 of 12 particles"):
+        Simulator(network("absolute"), 60.0, "torch").differentiable(scene(), 4, velocity_N3=velocity_N3)
