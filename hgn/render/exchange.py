@@ -18,6 +18,7 @@ import trimesh
 from hgn.render.pictures import rollout_spacing
 from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR
 from hgn.scene.material import FLUIDS, MATERIALS
+from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import Rollout, rollout_velocity, write_rollout
 from hgn.schema import ConfigError
 from hgn.system.extras import require_installed
@@ -35,7 +36,8 @@ def save_rollout(
 ) -> Path:
     """Writes `rollout` in the form that the name's ending asks for; returns the (first) file.
 
-    `.usdc`, `.usda`, `.usd`: one USD stage. `.ply`: NAME_0000.ply, NAME_0001.ply, …, NAME_obstacle_0.ply, …
+    `.usdc`, `.usda`, `.usd`: one USD stage. `.ply`: NAME_0000.ply, NAME_0001.ply, …, NAME_obstacle_0.ply, …, and of an
+    obstacle that moves NAME_obstacle_0_0000.ply, ….
     Anything else: VTKHDF. With `surface` USD and PLY also hold the fluid's surface; `progress` is called once a frame.
     Raises: ConfigError for a surface in VTKHDF; ModuleNotFoundError without the extra `files`.
     """
@@ -127,9 +129,12 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
         prim.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(triangle_F3.reshape(-1).astype(np.int32)), time)
         prim.GetExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(points), time)
 
+    moving = []
     for obstacle in rollout.obstacles:
         prim = mesh(f"obstacles/{_identifier(obstacle.name)}", OBSTACLE_COLOR)
         fill(prim, obstacle.vertex_V3, obstacle.triangle_F3, Usd.TimeCode.Default())
+        if obstacle.motion is not None:
+            moving.append((prim.AddTransformOp(), obstacle.motion))
     velocity_TN3 = rollout_velocity(rollout)
     width = rollout_spacing(rollout)
     of_material = {}
@@ -156,8 +161,17 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
             prim.GetExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(points), frame)
         if water is not None:
             fill(water, *next(surfaces), frame)
+        for transform, motion in moving:
+            transform.Set(Gf.Matrix4d(_row_matrix(motion, frame / rollout.frame_rate_hz)), frame)
         progress()
     stage.GetRootLayer().Save()
+
+
+def _row_matrix(motion: Motion, time: float) -> list[list[float]]:
+    """The pose at a time for row vectors, as USD multiplies: (x, 1) M."""
+    rotation_33, _ = motion.pose(time)
+    (origin_3,) = motion.place(np.zeros((1, 3)), time)
+    return [[*row, 0.0] for row in rotation_33.T.tolist()] + [[*origin_3.tolist(), 1.0]]
 
 
 def _identifier(name: str) -> str:
@@ -192,7 +206,13 @@ def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
             _export(path.with_stem(f"{path.stem}_surface_{frame:0{digits}d}"), *next(surfaces))
         progress()
     for index, obstacle in enumerate(rollout.obstacles):
-        _export(path.with_stem(f"{path.stem}_obstacle_{index}"), obstacle.vertex_V3, obstacle.triangle_F3)
+        if obstacle.motion is None:
+            _export(path.with_stem(f"{path.stem}_obstacle_{index}"), obstacle.vertex_V3, obstacle.triangle_F3)
+            continue
+        for frame in range(rollout.frame_count):
+            vertex_V3 = obstacle.motion.place(obstacle.vertex_V3, frame / rollout.frame_rate_hz)
+            target = path.with_stem(f"{path.stem}_obstacle_{index}_{frame:0{digits}d}")
+            _export(target, vertex_V3, obstacle.triangle_F3)
 
 
 def _export(path: Path, vertex_V3: np.ndarray, triangle_F3: np.ndarray) -> None:

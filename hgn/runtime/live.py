@@ -167,7 +167,7 @@ def run_scene(
     position_TN3 = np.full((frames, scene.particle_count, 3), np.nan, np.float32)
     count = int((entry_N == 0).sum())
     position_TN3[0, :count] = scene.position_N3[:count]
-    with LiveSimulation(simulator, at_start(scene), room=scene.particle_count - count) as live:
+    with LiveSimulation(simulator, at_start(scene), room=scene.particle_count) as live:
         for frame in range(1, frames):
             position_TN3[frame, :count] = live.step()
             new = slice(count, int((entry_N <= frame).sum()))

@@ -47,17 +47,35 @@ def build_obstacle_grid(
 
     Raises: ConfigError for a bad cell size, or a surface too large to sample.
     """
+    return grid_of_samples(*surface_samples(obstacles, cell_size, seed, domain_size), cell_size)
+
+
+def surface_samples(
+    obstacles: Sequence[Obstacle],
+    cell_size: float,
+    seed: int,
+    domain_size: tuple[float, float, float] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The points that `build_obstacle_grid` takes normals from, float64 [S, 3], and their triangles' unit normals.
+
+    They may be turned and moved with an obstacle, to have the cells of other places without sampling it again.
+    Raises: ConfigError as `build_obstacle_grid`.
+    """
     corner_F33, point_S3, owner_S = _samples(obstacles, cell_size, seed, domain_size)
+    normal_S3 = area_vectors(corner_F33[owner_S])
+    return point_S3, normal_S3 / np.sqrt((normal_S3 * normal_S3).sum(axis=1, keepdims=True))
+
+
+def grid_of_samples(point_S3: np.ndarray, normal_S3: np.ndarray, cell_size: float) -> ObstacleGrid:
+    """The mean normal of every cell that holds a sample, from points and unit normals of `surface_samples`."""
     if len(point_S3) == 0:
         return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
     floor_S3 = np.floor(point_S3 / cell_size)
     key_S, low, extent = _lexicographic_keys(floor_S3)
-    normal_S3 = area_vectors(corner_F33[owner_S])
-    normal_S3 /= np.sqrt((normal_S3 * normal_S3).sum(axis=1, keepdims=True))
     to_centre_S3 = (floor_S3 + 0.5) * cell_size - point_S3
     away = (normal_S3 * to_centre_S3).sum(axis=1) < 0
-    normal_S3[away] *= -1
+    normal_S3 = np.where(away[:, None], -normal_S3, normal_S3)
 
     key_K, cell_S, count_K = np.unique(key_S, return_inverse=True, return_counts=True)
     sum_K3 = np.stack([np.bincount(cell_S, normal_S3[:, axis], len(key_K)) for axis in range(3)], axis=1)

@@ -2,9 +2,10 @@
 
 Two top-level groups:
 
-/VTKHDF  a temporal PolyData of the VTKHDF specification (version 2): one vertex cell a particle, PointData
-         `material` and `velocity`. Topology and materials are stored once; every step points at them again, at the
-         first of them where particles enter later.
+/VTKHDF  a temporal PolyData of the VTKHDF specification (version 2): the obstacles' triangles, whose vertices come
+         first in each step, and one vertex cell a particle. PointData `material` (255 on obstacles) and `velocity`,
+         CellData `obstacle` (the number of each, -1 of particles). Topology and materials are stored once; every step
+         points at them again, at the first of the particles where some enter later.
 /hgn     what VTK has no place for: domain, gravity, obstacles, how the rollout was made, the ground truth.
          The specification leaves groups outside /VTKHDF to the writer.
 
@@ -30,6 +31,7 @@ import numpy as np
 from hgn.config import is_mesh_file
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
+from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
 from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
@@ -38,7 +40,9 @@ from hgn.schema import ConfigError
 from hgn.system.files import sync_folder, temporary_path
 
 FORMAT_NAME = "hgn rollout"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 1 had no obstacles in /VTKHDF
+OBSTACLE_MATERIAL = 255
+MOTION_FIELDS = ("time_T", "translation_T3", "rotation_T33")
 VTKHDF_VERSION = (2, 0)  # the oldest that knows temporal PolyData, so that older ParaViews open the file too
 CELL_CATEGORIES = ("Vertices", "Lines", "Polygons", "Strips")  # in the order of Steps/CellOffsets
 
@@ -232,38 +236,71 @@ def read_rollout(path: str | Path) -> Rollout:
 
 def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
     frames, particles = rollout.frame_count, rollout.particle_count
-    present_T = np.array([rollout.present(frame) for frame in range(frames)], np.int64)
-    shown_TN = np.arange(particles) < present_T[:, None]
-    before_T = np.cumsum(present_T) - present_T
     group.attrs["Version"] = np.array(VTKHDF_VERSION, np.int64)
     # VTK compares a fixed-length ASCII string; h5py would otherwise write one of variable length
     group.attrs.create("Type", np.bytes_("PolyData"))
+    time_T = np.arange(frames) / rollout.frame_rate_hz  # seconds
+    vertex_TV3, triangle_F3, obstacle_F = _triangles(rollout.obstacles, time_T)
+    vertices, triangles = vertex_TV3.shape[1], len(triangle_F3)
+    present_T = np.array([rollout.present(frame) for frame in range(frames)], np.int64)
+    points_T = present_T + vertices
+    before_T = np.cumsum(points_T) - points_T
 
-    group["NumberOfPoints"] = present_T
-    group["Points"] = rollout.position_TN3[shown_TN].astype(np.float32, copy=False)
+    group["NumberOfPoints"] = points_T
+    group["Points"] = _stacked(vertex_TV3, rollout.position_TN3, present_T)
+    cells = {"Vertices": vertices + np.arange(particles)[:, None], "Polygons": triangle_F3}
+    cells_T = {"Vertices": present_T, "Polygons": np.full(frames, triangles)}
     for name in CELL_CATEGORIES:
-        cells = particles if name == "Vertices" else 0
+        cell_C = cells.get(name, np.zeros((0, 1)))
+        number_T = cells_T.get(name, np.zeros(frames, np.int64))
         category = group.create_group(name)
-        for count in ("NumberOfCells", "NumberOfConnectivityIds"):
-            category[count] = present_T if cells else np.zeros(frames, np.int64)
-        category["Connectivity"] = np.arange(cells, dtype=np.int64)
-        category["Offsets"] = np.arange(cells + 1, dtype=np.int64)
+        category["NumberOfCells"] = number_T
+        category["NumberOfConnectivityIds"] = number_T * cell_C.shape[1]
+        category["Connectivity"] = cell_C.reshape(-1).astype(np.int64)
+        category["Offsets"] = np.arange(len(cell_C) + 1, dtype=np.int64) * cell_C.shape[1]
 
     data = group.create_group("PointData")
-    data["material"] = rollout.material_N.astype(np.uint8, copy=False)
-    data["velocity"] = rollout_velocity(rollout)[shown_TN]
+    material_V = np.full(vertices, OBSTACLE_MATERIAL, np.uint8)
+    data["material"] = np.concatenate([material_V, rollout.material_N.astype(np.uint8, copy=False)])
+    velocity_TV3 = frame_velocity(vertex_TV3, rollout.frame_rate_hz)
+    data["velocity"] = _stacked(velocity_TV3, rollout_velocity(rollout), present_T)
+    group["CellData/obstacle"] = np.concatenate([np.full(particles, -1, np.int32), obstacle_F])
 
     steps = group.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(frames)
-    steps["Values"] = np.arange(frames) / rollout.frame_rate_hz  # seconds
+    steps["Values"] = time_T
     steps["PartOffsets"] = np.arange(frames, dtype=np.int64)
     steps["NumberOfParts"] = np.ones(frames, np.int64)
     steps["PointOffsets"] = before_T
     steps["CellOffsets"] = np.zeros((frames, len(CELL_CATEGORIES)), np.int64)
     steps["ConnectivityIdOffsets"] = np.zeros((frames, len(CELL_CATEGORIES)), np.int64)
-    offsets = steps.create_group("PointDataOffsets")
-    offsets["material"] = np.zeros(frames, np.int64)
-    offsets["velocity"] = before_T
+    steps["PointDataOffsets/material"] = np.zeros(frames, np.int64)
+    steps["PointDataOffsets/velocity"] = before_T
+    steps["CellDataOffsets/obstacle"] = particles - present_T
+
+
+def _triangles(obstacles: tuple[Obstacle, ...], time_T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices of all obstacles at each time, float32 [T, V, 3], the triangles [F, 3], and the obstacle of each [F]."""
+    places = [np.zeros((len(time_T), 0, 3), np.float32)]
+    triangles, first = [np.zeros((0, 3), np.int64)], 0
+    for obstacle in obstacles:
+        rest_V3, motion = obstacle.vertex_V3, obstacle.motion
+        moved = [rest_V3 if motion is None else motion.place(rest_V3, time) for time in time_T]
+        places.append(np.stack(moved).astype(np.float32))
+        triangles.append(obstacle.triangle_F3.astype(np.int64) + first)
+        first += len(rest_V3)
+    counts = [len(obstacle.triangle_F3) for obstacle in obstacles]
+    number_F = np.repeat(np.arange(len(obstacles), dtype=np.int32), counts)
+    return np.concatenate(places, axis=1), np.concatenate(triangles), number_F
+
+
+def _stacked(value_TV3: np.ndarray, value_TN3: np.ndarray, present_T: np.ndarray) -> np.ndarray:
+    """The vertices' and the first particles' rows of each frame, one frame after another, float32 [rows, 3]."""
+    if not value_TV3.shape[1] and (present_T == value_TN3.shape[1]).all():
+        return value_TN3.reshape(-1, 3).astype(np.float32, copy=False)
+    parts = zip(value_TV3, value_TN3, present_T, strict=True)
+    rows = [part for row_V3, row_N3, count in parts for part in (row_V3, row_N3[:count])]
+    return np.concatenate(rows).astype(np.float32, copy=False)
 
 
 def _write_own(group: h5py.Group, rollout: Rollout) -> None:
@@ -282,6 +319,10 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
         entry.attrs["closed"] = bool(obstacle.closed)
         entry["vertices"] = obstacle.vertex_V3.astype(np.float64, copy=False)
         entry["triangles"] = obstacle.triangle_F3.astype(np.int32, copy=False)
+        if obstacle.motion is not None:
+            entry.attrs["pivot"] = np.array(obstacle.motion.pivot, np.float64)
+            for name in MOTION_FIELDS:
+                entry[name.rpartition("_")[0]] = getattr(obstacle.motion, name)
     if rollout.entry_frame_N is not None:
         group["entry_frame"] = rollout.entry_frame_N.astype(np.int64, copy=False)
     if rollout.reference_TN3 is not None:
@@ -309,9 +350,9 @@ def _check_format(file: h5py.File, path: Path) -> None:
             f"in group /hgn; got {path} with format {name!r}"
         )
     version = int(own.attrs.get("format_version", -1))
-    if version != FORMAT_VERSION:
+    if version not in (1, FORMAT_VERSION):
         raise ConfigError(
-            f"rollout format_version must be {FORMAT_VERSION}, got {version} in {path}; "
+            f"rollout format_version must be 1 or {FORMAT_VERSION}, got {version} in {path}; "
             "read it with the version of hgn that wrote it, or write it again"
         )
 
@@ -320,26 +361,28 @@ def _read(file: h5py.File) -> Rollout:
     own, vtk = file["hgn"], file["VTKHDF"]
     _same_materials(json.loads(own.attrs["materials"]))
     count_T = vtk["NumberOfPoints"][()]
-    material_N = vtk["PointData/material"][()]
-    points = vtk["Points"]
+    points, material_P = vtk["Points"], vtk["PointData/material"][()]
+    vertices = len(material_P) - len(vtk["Vertices/Connectivity"])  # of the obstacles, before the particles
+    material_N = material_P[vertices:]
     shape = (len(count_T), len(material_N), 3)
     entry_N = own["entry_frame"][()] if "entry_frame" in own else np.zeros(shape[1], np.int64)
-    shown_TN = entry_N <= np.arange(shape[0])[:, None]
-    if points.shape != (shown_TN.sum(), 3) or (count_T != shown_TN.sum(axis=1)).any():
+    shown_TP = np.concatenate([np.zeros(vertices, np.int64), entry_N]) <= np.arange(shape[0])[:, None]
+    if points.shape != (shown_TP.sum(), 3) or (count_T != shown_TP.sum(axis=1)).any():
         raise ConfigError(f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")
-    position_TN3 = np.full(shape, np.nan, np.float32)
-    position_TN3[shown_TN] = points[()]
+    position_TP3 = np.full((*shown_TP.shape, 3), np.nan, np.float32)
+    position_TP3[shown_TP] = points[()]
     obstacles = tuple(
         Obstacle(
             name=str(entry.attrs["name"]),
             vertex_V3=entry["vertices"][()],
             triangle_F3=entry["triangles"][()],
             closed=bool(entry.attrs["closed"]),
+            motion=_read_motion(entry) if "time" in entry else None,
         )
         for _, entry in sorted(own["obstacles"].items())
     )
     return Rollout(
-        position_TN3=position_TN3,
+        position_TN3=position_TP3[:, vertices:],
         material_N=material_N,
         obstacles=obstacles,
         domain_size=tuple(float(length) for length in own.attrs["domain_size"]),  # type: ignore[arg-type]
@@ -350,6 +393,17 @@ def _read(file: h5py.File) -> Rollout:
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
     )
+
+
+def _read_motion(entry: h5py.Group) -> Motion:
+    arrays = {name: entry[name.rpartition("_")[0]][()] for name in MOTION_FIELDS}
+    count = len(arrays["time_T"])
+    shapes = ((count,), (count, 3), (count, 3, 3))
+    for (name, value), shape in zip(arrays.items(), shapes, strict=True):
+        if value.shape != shape:
+            raise ConfigError(f"{entry.name}: {name} must have shape {shape}, got {value.shape}")
+    x, y, z = (float(value) for value in entry.attrs["pivot"])
+    return Motion(**arrays, pivot=(x, y, z))
 
 
 def _same_materials(names: list[str]) -> None:

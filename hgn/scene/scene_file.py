@@ -8,6 +8,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +21,7 @@ import yaml
 from hgn.config import OBSTACLE_SHAPES, MpmConfig, config_directory
 from hgn.scene.distance import contains
 from hgn.scene.emission import Face
-from hgn.scene.group import WALL_CELLS, fill, particle_count, region_of
+from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.motion import Motion
 from hgn.scene.rotation import euler_rotation
@@ -119,28 +121,43 @@ class MaterialEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class GroupEntry(MaterialEntry):
-    """A solid of one material, filled with random particles."""
+    """A solid of one material, filled with random particles; or `particles`, a file of them."""
 
-    shape: str  # cube, sphere or box
-    size: float | Vector  # side, diameter, or the three edges of a box
-    position: Vector  # of the centre
+    shape: str | None = None  # cube, sphere or box
+    size: float | Vector | None = None  # side, diameter, or the three edges of a box
+    position: Vector | None = None  # of the centre
+    particles: str | None = None  # .npz with position and perhaps velocity [N, 3], relative to the scene file
     velocity: Vector = (0.0, 0.0, 0.0)  # domain units per second
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _require_finite("velocity", self.velocity)
+        given = [name for name in ("shape", "size", "position") if getattr(self, name) is not None]
+        if self.particles is not None:
+            require(not given, given[0] if given else "", "left out beside particles", "one")
+            return
+        for name in ("shape", "size", "position"):
+            require(name in given, name, "given", None, "or particles, a file of them")
         require(self.shape in GROUP_SHAPES, "shape", f"one of {', '.join(GROUP_SHAPES)}", self.shape)
         if isinstance(self.size, tuple) != (self.shape == "box"):
             rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
             require(False, "size", rule, self.size)
         for edge in self.edges:
             require(0 < edge < math.inf, "size", "finite and > 0", self.size)
+        assert self.position is not None
         _require_finite("position", self.position)
-        _require_finite("velocity", self.velocity)
 
     @property
     def edges(self) -> Vector:
         """The three edges, or three times the side or diameter."""
+        assert self.size is not None
         return self.size if isinstance(self.size, tuple) else (self.size, self.size, self.size)
+
+    @property
+    def region(self) -> Region:
+        """What a shape fills."""
+        assert self.shape is not None and self.position is not None
+        return region_of(self.shape, self.edges, self.position)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,8 +285,11 @@ def sheets_of_meshes(scene: Scene) -> list[str]:
 
 def _build(file: SceneFile, folder: Path) -> Scene:
     obstacles = tuple(_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles))
-    regions = [region_of(entry.shape, entry.edges, entry.position) for entry in file.groups]
-    counts = [particle_count(region, file.particles_per_cell, file.cell_size) for region in regions]
+    stored = {i: _read_particles(entry, i, folder, file) for i, entry in enumerate(file.groups) if entry.particles}
+    counts = [
+        len(stored[i][0]) if i in stored else particle_count(entry.region, file.particles_per_cell, file.cell_size)
+        for i, entry in enumerate(file.groups)
+    ]
     entering = [e.face.count(e.stop - e.start, file.particles_per_cell, file.cell_size) for e in file.emitters]
     require(
         sum(counts) + sum(entering) <= MAXIMUM_PARTICLES,
@@ -279,8 +299,11 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         "lower size or particles_per_cell",
     )
     positions, times = [], [np.zeros(sum(counts))]
-    for index, (entry, region, count) in enumerate(zip(file.groups, regions, counts, strict=True)):
-        name = f"groups[{index}] ({entry.shape} of {entry.material})"
+    for index, (entry, count) in enumerate(zip(file.groups, counts, strict=True)):
+        if index in stored:
+            positions.append(stored[index][0])
+            continue
+        region, name = entry.region, f"groups[{index}] ({entry.shape} of {entry.material})"
         position_N3 = fill(region, count, np.random.Generator(np.random.PCG64([file.seed, index])))
         _require_inside_walls(name, np.array(region.centre), region.reach, position_N3, file)
         for obstacle in obstacles:
@@ -303,11 +326,15 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         times.append(time_N)
     entries: list[GroupEntry | EmitterEntry] = [*file.groups, *file.emitters]
     sizes = counts + entering
+    velocity_N3 = np.repeat(np.array([entry.velocity for entry in entries], np.float32), sizes, axis=0)
+    begins = np.cumsum(sizes) - sizes
+    for index, (_, own_N3) in stored.items():
+        velocity_N3[begins[index] : begins[index] + sizes[index]] += own_N3
     entry_s_N = np.concatenate(times)
     order = np.argsort(entry_s_N, kind="stable")  # groups first
     return Scene(
         position_N3=np.concatenate(positions)[order],
-        velocity_N3=np.repeat(np.array([entry.velocity for entry in entries], np.float32), sizes, axis=0)[order],
+        velocity_N3=velocity_N3[order],
         material_N=np.repeat(np.array([MATERIALS.index(e.material) for e in entries], np.uint8), sizes)[order],
         obstacles=obstacles,
         domain_size=file.domain_size,
@@ -320,6 +347,32 @@ def _build(file: SceneFile, folder: Path) -> Scene:
         specification={"kind": "file", **to_mapping(file), "particle_counts": sizes},
         entry_s_N=entry_s_N[order] if file.emitters else None,
     )
+
+
+def _read_particles(entry: GroupEntry, index: int, folder: Path, file: SceneFile) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities, float32 [N, 3], as a file has them."""
+    assert entry.particles is not None
+    path, field = folder / entry.particles, f"groups[{index}].particles"
+    require(
+        path.suffix == ".npz" and path.is_file(), field, "an existing .npz file", path, "relative to the scene file"
+    )
+    arrays = {}
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            for name in ("position", "velocity"):
+                if name in stored:
+                    arrays[name] = np.asarray(stored[name], np.float32)
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, TypeError) as error:
+        raise ConfigError(f"{field} must be a readable .npz file, got {path}: {error}") from error
+    require("position" in arrays, field, "a file with an array named position", path)
+    shape = (arrays["position"].size // 3, 3)
+    for name, value in arrays.items():
+        require(value.shape == shape, f"{field}: {name}", f"of shape {shape}", value.shape)
+        require(bool(np.isfinite(value).all()), f"{field}: {name}", "finite", float("nan"))
+    position_N3 = arrays["position"]
+    outside = int(((position_N3 < 0) | (position_N3 > np.array(file.domain_size))).any(axis=1).sum())
+    require(outside == 0, f"{field}: position", "inside the domain", f"{outside} outside")
+    return position_N3, arrays.get("velocity", np.zeros_like(position_N3))
 
 
 def _material_parameters(groups: Sequence[MaterialEntry], counts: list[int]) -> dict[str, np.ndarray]:

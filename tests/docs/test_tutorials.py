@@ -120,7 +120,12 @@ def test_train(here: Path) -> None:
 
 def test_program(here: Path) -> None:
     """Weights in a program: a scene file as a whole, frame by frame from particles and a mesh, one that changes."""
-    fewer = {"frames=300": "frames=2", "frame == 300": "frame == 1", "range(120)": "range(2)", "frame == 60": "frame == 0"}
+    fewer = {
+        "frames=300": "frames=2",
+        "frame == 300": "frame == 1",
+        "range(120)": "range(2)",
+        "frame == 60": "frame == 0",
+    }
     runner = Runner(SETTINGS, fewer, INSTALLS)
     runner.run(TUTORIALS / "program.md")
     assert runner.names["frame"] == 1 and (here / "my_scene.vtkhdf").is_file()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from hgn.render.exchange import fluid_surface, save_rollout
 from hgn.render.pictures import particle_spacing
 from hgn.rollout import main as rollout_main
 from hgn.scene.material import MATERIALS
+from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import Rollout, frame_velocity
+from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
@@ -68,6 +71,37 @@ def test_usd_is_read_back(tmp_path: Path, rollout: Rollout) -> None:
     surface = UsdGeom.Mesh(stage.GetPrimAtPath("/World/surface"))
     first, last = (np.array(surface.GetPointsAttr().Get(frame)) for frame in (0, 2))
     np.testing.assert_allclose(last.mean(0) - first.mean(0), (0.02, -0.004, 0), atol=SPACING / 2)
+
+
+def test_what_enters_and_what_moves(tmp_path: Path, rollout: Rollout) -> None:
+    """USD and PLY hold the particles that are there, and obstacles at each frame where their motion has them."""
+    position_TN3 = rollout.position_TN3.copy()
+    position_TN3[0, -7:] = np.nan
+    entry_N = np.repeat([0, 1], [len(rollout.material_N) - 7, 7])
+    turns = np.stack([np.eye(3), euler_rotation((0.0, 60.0, 30.0))])
+    motion = Motion(np.array([0.0, 2 / 60]), np.array([(0.0, 0.0, 0.0), (0.1, 0.2, 0.3)]), turns, (0.5, 0.4, 0.3))
+    box, sheet = rollout.obstacles
+    moving = replace(
+        rollout, position_TN3=position_TN3, entry_frame_N=entry_N, obstacles=(replace(box, motion=motion), sheet)
+    )
+    stage = Usd.Stage.Open(str(save_rollout(tmp_path / "a.usdc", moving, surface=True)))
+    save_rollout(tmp_path / "a.ply", moving, surface=True)
+    for frame in range(3):
+        found = [UsdGeom.Points(stage.GetPrimAtPath(f"/World/particles/{name}")) for name in MATERIALS[:2]]
+        for points, index in zip(found, (0, 1), strict=True):
+            there_N = np.flatnonzero((rollout.material_N == index) & np.isfinite(position_TN3[frame, :, 0]))
+            np.testing.assert_array_equal(points.GetIdsAttr().Get(frame), there_N)
+            np.testing.assert_array_equal(points.GetPointsAttr().Get(frame), position_TN3[frame, there_N])
+            assert np.isfinite(np.array(points.GetVelocitiesAttr().Get(frame))).all()
+        cloud = trimesh.load(tmp_path / f"a_000{frame}.ply")
+        assert len(cloud.vertices) == np.isfinite(position_TN3[frame, :, 0]).sum()
+        expected_V3 = motion.place(box.vertex_V3, frame / 60)
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/obstacles/my_box_1"))
+        to_world = np.array(UsdGeom.XformCache(frame).GetLocalToWorldTransform(mesh.GetPrim()))
+        corner_V3 = np.array(mesh.GetPointsAttr().Get()) @ to_world[:3, :3] + to_world[3, :3]
+        np.testing.assert_allclose(corner_V3, expected_V3, atol=1e-6)
+        ply = trimesh.load(tmp_path / f"a_obstacle_0_000{frame}.ply", process=False)
+        np.testing.assert_allclose(ply.vertices, expected_V3, atol=1e-6)
 
 
 def test_ply_is_read_back(tmp_path: Path, rollout: Rollout) -> None:

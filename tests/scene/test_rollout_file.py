@@ -12,6 +12,7 @@ import pytest
 
 from hgn.config import SceneConfig
 from hgn.scene.episode import Episode
+from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import (
@@ -20,8 +21,10 @@ from hgn.scene.rollout_file import (
     frame_velocity,
     obstacles_of_episode,
     read_rollout,
+    rollout_velocity,
     write_rollout,
 )
+from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
@@ -104,7 +107,7 @@ def test_diverged_rollout_is_kept(tmp_path: Path) -> None:
 def test_particles_that_enter(tmp_path: Path) -> None:
     """A frame's points are those that are there; what is not yet there is read as NaN, with its frame of entry."""
     entry_N = np.array([0, 0, 0, 1, 1, 3, 9])
-    rollout = dataclasses.replace(make_rollout(), entry_frame_N=entry_N)
+    rollout = dataclasses.replace(make_rollout(), obstacles=(), entry_frame_N=entry_N)
     write_rollout(tmp_path / "rollout.h5", rollout)
     read = read_rollout(tmp_path / "rollout.h5")
     np.testing.assert_array_equal(read.entry_frame_N, entry_N)
@@ -123,8 +126,11 @@ def test_particles_that_enter(tmp_path: Path) -> None:
 
 
 def test_vtkhdf_layout(tmp_path: Path) -> None:
-    """Datasets have the shapes of a temporal PolyData in VTKHDF; topology is stored once."""
+    """Datasets have the shapes of a temporal PolyData in VTKHDF: the obstacles' vertices and then the particles in each
+    step; topology is stored once."""
     rollout = make_rollout()
+    vertices, triangles = 7, 5
+    whole = PARTICLES + vertices
     write_rollout(tmp_path / "rollout.h5", rollout)
     with h5py.File(tmp_path / "rollout.h5") as file:
         vtk = file["VTKHDF"]
@@ -132,13 +138,15 @@ def test_vtkhdf_layout(tmp_path: Path) -> None:
         assert vtk.attrs["Type"] == b"PolyData"
         kind = h5py.h5a.open(vtk.id, b"Type").get_type()
         assert not kind.is_variable_str()
-        assert vtk["NumberOfPoints"][()].tolist() == [PARTICLES] * FRAMES
-        assert vtk["Points"].shape == (FRAMES * PARTICLES, 3)
-        assert vtk["Vertices/Connectivity"][()].tolist() == list(range(PARTICLES))
+        assert vtk["NumberOfPoints"][()].tolist() == [whole] * FRAMES
+        assert vtk["Points"].shape == (FRAMES * whole, 3)
+        assert vtk["Vertices/Connectivity"][()].tolist() == list(range(vertices, whole))
         assert vtk["Vertices/Offsets"][()].tolist() == list(range(PARTICLES + 1))
-        for name, cells in (("Vertices", PARTICLES), ("Lines", 0), ("Polygons", 0), ("Strips", 0)):
+        assert vtk["Polygons/Connectivity"][:6].tolist() == [0, 1, 2, 3, 4, 5]
+        sizes = {"Vertices": (PARTICLES, 1), "Lines": (0, 1), "Polygons": (triangles, 3), "Strips": (0, 1)}
+        for name, (cells, corners) in sizes.items():
             assert vtk[name]["NumberOfCells"][()].tolist() == [cells] * FRAMES
-            assert vtk[name]["NumberOfConnectivityIds"][()].tolist() == [cells] * FRAMES
+            assert vtk[name]["NumberOfConnectivityIds"][()].tolist() == [cells * corners] * FRAMES
             assert vtk[name]["Offsets"].shape == (cells + 1,)
         steps = vtk["Steps"]
         assert steps.attrs["NSteps"] == FRAMES
@@ -147,14 +155,95 @@ def test_vtkhdf_layout(tmp_path: Path) -> None:
         assert steps["NumberOfParts"][()].tolist() == [1] * FRAMES
         assert steps["CellOffsets"].shape == steps["ConnectivityIdOffsets"].shape == (FRAMES, 4)
         assert not steps["CellOffsets"][()].any()
+        assert vtk["CellData/obstacle"][()].tolist() == [-1] * PARTICLES + [0, 1, 1, 1, 1]
         for step in range(FRAMES):
-            start = steps["PointOffsets"][step]
+            start = steps["PointOffsets"][step] + vertices
             np.testing.assert_array_equal(vtk["Points"][start : start + PARTICLES], rollout.position_TN3[step])
-            start = steps["PointDataOffsets/material"][step]
+            start = steps["PointDataOffsets/material"][step] + vertices
             np.testing.assert_array_equal(vtk["PointData/material"][start : start + PARTICLES], rollout.material_N)
-            start = steps["PointDataOffsets/velocity"][step]
+            start = steps["PointDataOffsets/velocity"][step] + vertices
             expected = frame_velocity(rollout.position_TN3, 60.0)[step]
             np.testing.assert_array_equal(vtk["PointData/velocity"][start : start + PARTICLES], expected)
+
+
+def moving_rollout() -> Rollout:
+    """A particle less in the first two frames, and an obstacle that turns and moves beside one at rest."""
+    rollout = make_rollout(None)
+    entry_N = np.zeros(PARTICLES, np.int64)
+    entry_N[-1] = 2
+    rollout.position_TN3[:2, -1] = np.nan
+    quarter = np.stack([np.eye(3), euler_rotation((0.0, 90.0, 0.0))])
+    times_T = np.array([0.0, (FRAMES - 1) / 60])
+    motion = Motion(times_T, np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)]), quarter, (0.5, 0.5, 0.5))
+    still, moving = rollout.obstacles
+    return dataclasses.replace(
+        rollout, entry_frame_N=entry_N, obstacles=(still, dataclasses.replace(moving, motion=motion))
+    )
+
+
+def test_what_enters_and_what_moves(tmp_path: Path) -> None:
+    """Particles without a position yet come back as such, obstacles with their motion."""
+    written = moving_rollout()
+    write_rollout(tmp_path / "a.vtkhdf", written)
+    read = read_rollout(tmp_path / "a.vtkhdf")
+    np.testing.assert_array_equal(read.position_TN3, written.position_TN3)
+    still, moving = read.obstacles
+    assert still.motion is None and moving.motion is not None
+    expected = written.obstacles[1].motion
+    for time in (0.0, 0.01, 1.0):
+        np.testing.assert_array_equal(
+            moving.motion.place(moving.vertex_V3, time), expected.place(moving.vertex_V3, time)
+        )
+
+
+def test_files_of_format_1_are_read(tmp_path: Path) -> None:
+    """They had no obstacles in /VTKHDF."""
+    written = make_rollout()
+    write_rollout(tmp_path / "a.vtkhdf", dataclasses.replace(written, obstacles=()))
+    with h5py.File(tmp_path / "a.vtkhdf", "a") as file:
+        del file["VTKHDF/CellData"], file["VTKHDF/Steps/CellDataOffsets"]
+        file["hgn"].attrs["format_version"] = 1
+    np.testing.assert_array_equal(read_rollout(tmp_path / "a.vtkhdf").position_TN3, written.position_TN3)
+
+
+def test_vtk_reads_it(tmp_path: Path) -> None:
+    """VTK's own reader has, at each time, the particles that are there and the obstacles where they then are, with
+    material, velocity and the obstacle's number."""
+    pytest.importorskip("vtkmodules", reason="vtk is not installed (half a gigabyte): pip install vtk")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    rollout = moving_rollout()
+    write_rollout(tmp_path / "a.vtkhdf", rollout)
+    reader = vtkHDFReader()
+    reader.SetFileName(str(tmp_path / "a.vtkhdf"))
+    reader.Update()
+    assert reader.GetNumberOfSteps() == FRAMES
+    velocity_TN3, before_V3 = rollout_velocity(rollout), None
+    for frame in range(FRAMES):
+        reader.UpdateTimeStep(frame / 60)
+        data = reader.GetOutputDataObject(0)
+        count = PARTICLES - (frame < 2)
+        point_P3 = vtk_to_numpy(data.GetPoints().GetData())
+        particle_N = [data.GetVerts().GetConnectivityArray().GetValue(i) for i in range(data.GetNumberOfVerts())]
+        np.testing.assert_array_equal(point_P3[particle_N], rollout.position_TN3[frame, :count])
+        material_P, velocity_P3 = (
+            vtk_to_numpy(data.GetPointData().GetArray(name)) for name in ("material", "velocity")
+        )
+        assert material_P.tolist() == [255] * 7 + rollout.material_N[:count].tolist()
+        np.testing.assert_array_equal(velocity_P3[particle_N], velocity_TN3[frame, :count])
+        assert np.isfinite(velocity_P3).all()
+        places = [
+            o.vertex_V3 if o.motion is None else o.motion.place(o.vertex_V3, frame / 60) for o in rollout.obstacles
+        ]
+        vertex_V3 = np.concatenate(places)
+        np.testing.assert_allclose(point_P3[:7], vertex_V3, atol=1e-6)
+        if before_V3 is not None:
+            np.testing.assert_allclose(velocity_P3[:7], 60 * (vertex_V3 - before_V3), atol=1e-4)
+        before_V3 = vertex_V3
+        corner_F3 = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
+        assert corner_F3.tolist() == [[0, 1, 2], *(rollout.obstacles[1].triangle_F3 + 3).tolist()]
+        assert vtk_to_numpy(data.GetCellData().GetArray("obstacle")).tolist() == [-1] * count + [0, 1, 1, 1, 1]
 
 
 def test_frame_velocity() -> None:
@@ -210,7 +299,7 @@ def test_other_format_and_version(tmp_path: Path) -> None:
     write_rollout(path, make_rollout())
     with h5py.File(path, "a") as file:
         file["hgn"].attrs["format_version"] = 99
-    with pytest.raises(ConfigError, match="format_version must be 1, got 99"):
+    with pytest.raises(ConfigError, match="format_version must be 1 or 2, got 99"):
         read_rollout(path)
 
 

@@ -281,3 +281,48 @@ def test_numbers_as_people_write_them(tmp_path, text, value):
     (tmp_path / "scene.yaml").write_text(f"groups: [{group}]\n")
     scene = load_scene(tmp_path / "scene.yaml")
     np.testing.assert_array_equal(np.unique(scene.material_parameters["density_kg_m3"]), np.float32(value))
+
+
+def test_particles_of_a_file(tmp_path: Path) -> None:
+    """A group's particles are those of an .npz, with its velocities and the group's own; beside shapes and without."""
+    position_N3 = np.random.default_rng(0).random((9, 3)).astype(np.float32)
+    np.savez(tmp_path / "own.npz", position=position_N3, velocity=2 * position_N3)
+    np.savez(tmp_path / "still.npz", position=position_N3[:4])
+    (tmp_path / "scene.yaml").write_text("""
+groups:
+  - {particles: own.npz, material: sand, velocity: [0, 1, 0]}
+  - {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: water}
+  - {particles: still.npz, material: snow}
+""")
+    scene = load_scene(tmp_path / "scene.yaml")
+    cube = scene.particle_count - 13
+    np.testing.assert_array_equal(scene.position_N3[:9], position_N3)
+    np.testing.assert_array_equal(scene.position_N3[-4:], position_N3[:4])
+    np.testing.assert_allclose(scene.velocity_N3[:9], 2 * position_N3 + np.array([0, 1, 0], np.float32))
+    assert not scene.velocity_N3[9:].any()
+    assert scene.material_N.tolist() == [1] * 9 + [0] * cube + [2] * 4
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (None, "must be an existing .npz file"),
+        (b"PK no zip", "must be a readable .npz file"),
+        ({"velocity": np.zeros((2, 3))}, "must be a file with an array named position"),
+        ({"position": np.zeros((2, 2))}, r"position must be of shape \(1, 3\), got \(2, 2\)"),
+        ({"position": np.full((2, 3), np.nan)}, "position must be finite, got nan"),
+        ({"position": np.full((2, 3), 1.5)}, "position must be inside the domain, got '2 outside'"),
+        ({"position": np.full((2, 3), 0.5), "velocity": np.zeros((1, 3))}, r"velocity must be of shape \(2, 3\)"),
+        ({"position": np.array([{}], object)}, "must be a readable .npz file"),
+    ],
+)
+def test_particles_that_cannot_be_taken(tmp_path: Path, arrays: object, message: str) -> None:
+    """Each fault of a file of particles is named with the group's field; objects are never unpickled."""
+    path = tmp_path / "own.npz"
+    if isinstance(arrays, dict):
+        np.savez(path, **arrays)
+    elif arrays is not None:
+        path.write_bytes(arrays)
+    (tmp_path / "scene.yaml").write_text("groups: [{particles: own.npz, material: sand}]")
+    with pytest.raises(ConfigError, match=rf"groups\[0\].particles.*{message}"):
+        load_scene(tmp_path / "scene.yaml")

@@ -1,0 +1,132 @@
+"""Obstacles that are moved about by hand: sampled once, placed again and again.
+
+Shape legend: V vertices, S surface samples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hgn.runtime.simulator import InitialState
+from hgn.scene.mesh import load_mesh
+from hgn.scene.motion import Motion
+from hgn.scene.obstacle_grid import grid_of_samples, surface_points, surface_samples
+from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
+from hgn.scene.scene import Obstacle
+from hgn.scene.scene_file import ObstacleEntry
+from hgn.scene.shapes import shape_obstacle
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+_numbers = itertools.count()
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """An obstacle about its own origin, not yet turned or moved: what all its places have in common."""
+
+    entry: ObstacleEntry  # its position and rotation do not count
+    mesh: Obstacle
+    cell_size: float
+    mesh_file: bytes | None = None
+    number: int = field(default_factory=lambda: next(_numbers))
+
+    @cached_property
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points on the surface and their normals, float64 [S, 3]."""
+        return surface_samples((self.mesh,), self.cell_size, seed=0)
+
+    @property
+    def name(self) -> str:
+        return f"{self.number}_{Path(self.entry.mesh).stem if self.entry.mesh else self.entry.shape}"
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObstacle:
+    """A body at a place: position in domain units, rotation in degrees about the fixed x axis, then y, then z."""
+
+    body: Body
+    position: Vector
+    rotation: Vector = (0.0, 0.0, 0.0)
+
+    @cached_property
+    def rotation_33(self) -> np.ndarray:
+        return euler_rotation(self.rotation)
+
+    @property
+    def wxyz(self) -> Quaternion:
+        """The rotation as a quaternion."""
+        x, y, z, w = Rotation.from_matrix(self.rotation_33).as_quat()
+        return float(w), float(x), float(y), float(z)
+
+    @property
+    def entry(self) -> ObstacleEntry:
+        """As a scene file has it."""
+        return dataclasses.replace(self.body.entry, position=self.position, rotation=self.rotation)
+
+    def turned(self, degrees: float) -> PlacedObstacle:
+        """Turned further about the vertical."""
+        matrix = euler_rotation((0.0, degrees, 0.0)) @ self.rotation_33
+        x, y, z = Rotation.from_matrix(matrix).as_euler("xyz", degrees=True)
+        return dataclasses.replace(self, rotation=(float(x), float(y), float(z)))
+
+    def mesh(self, motion: Motion | None = None) -> Obstacle:
+        """The triangles where they are."""
+        mesh = self.body.mesh
+        vertex_V3 = round_to_float32(rotate(mesh.vertex_V3, self.rotation_33) + np.array(self.position))
+        return dataclasses.replace(mesh, name=self.body.name, vertex_V3=vertex_V3, motion=motion)
+
+    @cached_property
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """The body's, where they are."""
+        point_S3, normal_S3 = self.body.samples
+        matrix = self.rotation_33
+        return rotate(point_S3, matrix) + np.array(self.position), rotate(normal_S3, matrix)
+
+
+def placed_by(entry: ObstacleEntry, folder: Path, cell_size: float) -> PlacedObstacle:
+    """The obstacle of an entry. Raises: ConfigError for a mesh that cannot be read, or is too large to sample."""
+    if entry.mesh is not None:
+        path = folder / entry.mesh
+        mesh = load_mesh(path, scale=1.0 if entry.scale is None else entry.scale)
+        body = Body(entry, mesh, cell_size, path.read_bytes())
+    else:
+        assert entry.shape is not None and entry.size is not None
+        body = Body(entry, shape_obstacle(entry.shape, entry.size), cell_size)
+    placed = PlacedObstacle(body, entry.position or (0.0, 0.0, 0.0), entry.rotation)
+    _ = placed.samples
+    return placed
+
+
+def placed_at_rest(obstacle: Obstacle, cell_size: float) -> PlacedObstacle:
+    """An obstacle as it stands, to be moved about the middle of its bounding box."""
+    vertex_V3 = obstacle.vertex_V3
+    x, y, z = (0.5 * (vertex_V3.min(axis=0) + vertex_V3.max(axis=0))).tolist()
+    mesh = dataclasses.replace(obstacle, vertex_V3=vertex_V3 - (x, y, z))
+    file = trimesh.exchange.obj.export_obj(trimesh.Trimesh(mesh.vertex_V3, mesh.triangle_F3, process=False))
+    return PlacedObstacle(Body(ObstacleEntry(mesh=f"{obstacle.name}.obj"), mesh, cell_size, file.encode()), (x, y, z))
+
+
+def with_obstacles(scene: InitialState, obstacles: Sequence[PlacedObstacle]) -> InitialState:
+    """The scene with these obstacles alone; cells more than one outside the domain are left out."""
+    cell_size = scene.obstacle_grid.cell_size
+    empty = (np.zeros((0, 3)), np.zeros((0, 3)))
+    parts = [empty, *(obstacle.samples for obstacle in obstacles)]
+    point_S3, normal_S3 = (np.concatenate(part) for part in zip(*parts, strict=True))
+    near = ((point_S3 >= -cell_size) & (point_S3 < np.array(scene.domain_size) + cell_size)).all(axis=1)
+    return dataclasses.replace(
+        scene,
+        obstacle_grid=grid_of_samples(point_S3[near], normal_S3[near], cell_size),
+        sampled=lambda spacing_cells: surface_points(
+            [obstacle.mesh() for obstacle in obstacles], cell_size, 0, scene.domain_size, spacing_cells
+        ),
+    )

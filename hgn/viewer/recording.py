@@ -1,0 +1,142 @@
+"""The frames of a scene that changes, for going back in time and for the rollout file.
+
+Shape legend: N particles, M velocities of a history, T frames.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from hgn.scene.motion import Motion
+from hgn.scene.rollout_file import Rollout
+from hgn.schema import require
+from hgn.viewer.placed import PlacedObstacle, Vector
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What a frame showed. Particles keep their order; those that enter later come behind."""
+
+    position_N3: np.ndarray  # float32, domain units
+    velocity_N3: np.ndarray  # float32, domain units per frame
+    obstacles: tuple[PlacedObstacle, ...]
+    gravity: Vector
+
+    @property
+    def bytes(self) -> int:
+        return self.position_N3.nbytes + self.velocity_N3.nbytes
+
+
+class Recording:
+    """The last frames of a simulation, as many as fit into `limit_bytes`, and never fewer than a history needs."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        self.limit_bytes, self.bytes, self.first = limit_bytes, 0, 0
+        self.frames: deque[Frame] = deque()
+        # of each particle: the frame it entered behind, its material, and its velocities then and before, newest first
+        self.entered_N = np.zeros(0, np.int64)
+        self.material_N = np.zeros(0, np.uint8)
+        self.entry_NM3 = np.zeros((0, 1, 3), np.float32)
+
+    @property
+    def last(self) -> int:
+        """The number of the newest frame."""
+        return self.first + len(self.frames) - 1
+
+    @property
+    def earliest(self) -> int:
+        """The first frame whose velocity histories are known whole."""
+        return 0 if self.first == 0 else self.first + self.entry_NM3.shape[1] - 1
+
+    def enter(self, material_A: np.ndarray, velocity_AM3: np.ndarray) -> None:
+        """Particles that are in the next frame for the first time."""
+        behind = np.full(len(material_A), max(self.last, 0))
+        self.entered_N = np.concatenate([self.entered_N, behind])
+        self.material_N = np.concatenate([self.material_N, np.asarray(material_A, np.uint8)])
+        old_NM3 = self.entry_NM3[:, : velocity_AM3.shape[1]]
+        lacking = velocity_AM3.shape[1] - old_NM3.shape[1]  # of weights with a longer history than those before
+        old_NM3 = np.concatenate([old_NM3, np.repeat(old_NM3[:, -1:], lacking, axis=1)], axis=1)
+        self.entry_NM3 = np.concatenate([old_NM3, velocity_AM3])
+
+    def append(self, frame: Frame) -> None:
+        """The next frame."""
+        self.frames.append(frame)
+        self.bytes += frame.bytes
+        while self.bytes > self.limit_bytes and len(self.frames) > self.entry_NM3.shape[1] + 1:
+            self.bytes -= self.frames.popleft().bytes
+            self.first += 1
+
+    def __getitem__(self, frame: int) -> Frame:
+        return self.frames[frame - self.first]
+
+    def history(self, frame: int) -> np.ndarray:
+        """Velocity histories of a frame's particles, float32 [N, M, 3] in domain units per frame, newest first."""
+        rule = f"between {self.earliest} and {self.last}, the frames that are kept"
+        require(self.earliest <= frame <= self.last, "frame", rule, frame)
+        count, length = len(self[frame].position_N3), self.entry_NM3.shape[1]
+        history_NM3 = np.empty((count, length, 3), np.float32)
+        for row in range(length):
+            then = frame - row
+            there = 0
+            if then >= self.first:
+                velocity_N3 = self[then].velocity_N3[:count]
+                there = len(velocity_N3)
+                history_NM3[:there, row] = velocity_N3
+            later = np.arange(there, count)
+            history_NM3[there:, row] = self.entry_NM3[later, np.minimum(self.entered_N[later] - then, length - 1)]
+        return history_NM3
+
+    def back_to(self, frame: int) -> None:
+        """Forgets all frames behind one, and the particles that entered there."""
+        while self.last > frame:
+            self.bytes -= self.frames.pop().bytes
+        count = len(self[frame].position_N3)
+        self.entered_N, self.material_N = self.entered_N[:count], self.material_N[:count]
+        self.entry_NM3 = self.entry_NM3[:count]
+
+    def rollout(self, domain_size: Vector, frame_rate_hz: float, cell_size: float, source: dict[str, str]) -> Rollout:
+        """All frames that are kept, and in which of them each particle entered.
+
+        An obstacle is in all frames, at rest where it first stood until it was placed, and where it last stood since.
+        """
+        count = len(self.frames[-1].position_N3)
+        position_TN3 = np.full((len(self.frames), count, 3), np.nan, np.float32)
+        for position_N3, frame in zip(position_TN3, self.frames, strict=True):
+            position_N3[: len(frame.position_N3)] = frame.position_N3
+        entry_N = np.searchsorted([len(frame.position_N3) for frame in self.frames], np.arange(count), side="right")
+        places: dict[int, list[tuple[int, PlacedObstacle]]] = {}
+        for index, frame in enumerate(self.frames):
+            for obstacle in frame.obstacles:
+                places.setdefault(obstacle.body.number, []).append((index, obstacle))
+        return Rollout(
+            position_TN3=position_TN3,
+            material_N=self.material_N[:count],
+            obstacles=tuple(path[0][1].mesh(_motion(path, frame_rate_hz)) for path in places.values()),
+            domain_size=domain_size,
+            frame_rate_hz=frame_rate_hz,
+            gravity=self.frames[-1].gravity,
+            cell_size=cell_size,
+            source=dict(source),
+            entry_frame_N=entry_N if entry_N.any() else None,
+        )
+
+
+def _motion(path: list[tuple[int, PlacedObstacle]], frame_rate_hz: float) -> Motion | None:
+    """From the places that an obstacle had in some frames; none if they are all one."""
+    keys = {0: path[0][1]}
+    for (_, before), (index, after) in pairwise(path):
+        if (before.position, before.rotation) != (after.position, after.rotation):
+            keys |= {index - 1: before, index: after}
+    if len(keys) == 1:
+        return None
+    first = path[0][1]
+    return Motion(
+        np.array(list(keys), np.float64) / frame_rate_hz,
+        np.array([np.subtract(place.position, first.position) for place in keys.values()]),
+        np.stack([place.rotation_33 @ first.rotation_33.T for place in keys.values()]),
+        first.position,
+    )

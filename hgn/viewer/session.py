@@ -1,0 +1,320 @@
+"""A scene that someone plays with: what the page's buttons do, without the page.
+
+Shape legend: N particles, C candidates to enter.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import zipfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.spatial import KDTree
+
+from hgn.runtime.divergence import DivergedError
+from hgn.runtime.live import LiveSimulation
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.scene.distance import contains
+from hgn.scene.group import WALL_CELLS, Region, fill, particle_count
+from hgn.scene.material import MATERIALS, material_index
+from hgn.scene.rollout_file import Rollout
+from hgn.scene.scene import Scene
+from hgn.scene.scene_file import ObstacleEntry, SceneFile
+from hgn.schema import from_mapping, require, to_mapping
+from hgn.viewer.placed import PlacedObstacle, Vector, placed_at_rest, placed_by, with_obstacles
+from hgn.viewer.recording import Frame, Recording
+
+CLEARANCE = 1.25  # spacings of particles at rest, within which no drop enters
+FULL_SHARE = 0.5  # of what leaves a spout in a frame: where there is more, nothing leaves
+
+
+@dataclass(frozen=True)
+class Spout:
+    """Where a material runs from, straight down: domain units, and domain units per second."""
+
+    position: Vector  # of the disc's centre
+    material: str = "water"
+    diameter: float = 0.08
+    speed: float = 1.0
+
+    def __post_init__(self) -> None:
+        material_index(self.material)
+        require(0 < self.diameter < math.inf, "diameter", "finite and > 0", self.diameter)
+        require(0 <= self.speed < math.inf, "speed", "finite and >= 0", self.speed)
+
+
+class PlaySession:
+    """One simulation with its past. Not for several threads at once."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        scene: Scene,
+        folder: Path = Path(),
+        maximum_particles: int = 40_000,
+        keep_bytes: int = 1 << 30,
+        weights: str = "",
+    ) -> None:
+        """`folder` is where the scene's meshes lie; `keep_bytes` of past frames are kept for going back.
+
+        Raises: ConfigError for a scene that the weights cannot take, or more than `maximum_particles`.
+        """
+        rule, remedy = f"at most {maximum_particles}", "raise particles"
+        require(scene.particle_count <= maximum_particles, "scene's particles", rule, scene.particle_count, remedy)
+        self.simulator, self.weights = simulator, weights
+        self.maximum_particles, self.keep_bytes = maximum_particles, keep_bytes
+        self.particles_per_cell = scene.particles_per_cell or 8.0
+        self.random = np.random.default_rng(scene.seed)
+        self.spout: Spout | None = None
+        self._owed = 0.0  # particles, of a spout
+        initial = InitialState.of_scene(replace(scene, obstacles=()))
+        require(not scene.moves, "obstacles", "at rest for a network", "keyframes", "leave keyframes out")
+        self.obstacles: tuple[PlacedObstacle, ...] = tuple(self._placed_by(scene, folder))
+        self._begin, self._begin_obstacles = with_obstacles(initial, self.obstacles), self.obstacles
+        self.live = LiveSimulation(simulator, self._begin, maximum_particles)
+        self._record_first()
+
+    def restart(self) -> None:
+        """Back to the scene as it was opened, with the weights of now."""
+        live = LiveSimulation(self.simulator, self._begin, self.maximum_particles)
+        self.live.close()
+        self.live, self.obstacles, self.spout = live, self._begin_obstacles, None
+        self._record_first()
+
+    def _record_first(self) -> None:
+        state = self.live.state
+        self.recording = Recording(self.keep_bytes)
+        self.recording.enter(self._begin.material_N, state.velocity_NM3.cpu().numpy())
+        self._record(state.position_N3.cpu().numpy())
+
+    @property
+    def frame(self) -> int:
+        """The number of the newest frame."""
+        return self.recording.last
+
+    @property
+    def newest(self) -> Frame:
+        return self.recording.frames[-1]
+
+    def materials(self) -> np.ndarray:
+        """Of the newest frame's particles, indices into MATERIALS, uint8 [N]."""
+        return self.recording.material_N[: len(self.newest.position_N3)]
+
+    @property
+    def domain_size(self) -> Vector:
+        return self.live.scene.domain_size
+
+    @property
+    def cell_size(self) -> float:
+        return self.live.scene.obstacle_grid.cell_size
+
+    @property
+    def gravity(self) -> Vector:
+        return self.live.scene.gravity
+
+    def step(self) -> None:
+        """One frame, behind what the spout gives.
+
+        Raises: DivergedError; the scene then is as it was a frame earlier.
+        """
+        if self.spout is not None:
+            self._run(self.spout)
+        try:
+            position_N3 = self.live.step()
+        except DivergedError:
+            self.rewind(self.frame)
+            raise
+        self._record(position_N3)
+
+    def _record(self, position_N3: np.ndarray) -> None:
+        velocity_N3 = self.live.state.velocity_NM3[:, 0].cpu().numpy()
+        self.recording.append(Frame(position_N3.copy(), velocity_N3.copy(), self.obstacles, self.gravity))
+
+    def rewind(self, frame: int) -> None:
+        """Goes back; what came behind that frame is forgotten. The future repeats itself until something is changed.
+
+        Raises: ConfigError for a frame that is not kept.
+        """
+        history_NM3 = self.recording.history(frame)
+        then = self.recording[frame]
+        self.live.restore(then.position_N3, history_NM3, frame)
+        if then.obstacles != self.obstacles:
+            self._set_obstacles(then.obstacles)
+        if then.gravity != self.gravity:
+            self.live.set_gravity(then.gravity)
+        self.recording.back_to(frame)
+
+    # what enters
+
+    def drop(self, material: str, position: Vector, diameter: float, speed: float = 0.0) -> int:
+        """A ball of a material, moving down; as far as there is place for it. Returns how many particles entered.
+
+        Raises: ConfigError for a material that the weights do not know.
+        """
+        spout = Spout(position, material, diameter, speed)
+        region = Region(self._inside(position, 0.5 * diameter), radius=0.5 * diameter)
+        count = particle_count(region, self.particles_per_cell, self.cell_size)
+        position_C3 = fill(region, count, self.random)
+        return self._enter(position_C3[self._free(position_C3)], spout)
+
+    def _run(self, spout: Spout) -> int:
+        """What leaves a spout in one frame: as dense as the material at rest."""
+        length = spout.speed / self.simulator.frame_rate_hz
+        radius = 0.5 * spout.diameter
+        centre = self._inside(spout.position, radius, 0.5 * length)
+        volume_cells = math.pi * radius**2 * length / self.cell_size**3
+        self._owed += self.particles_per_cell * volume_cells
+        count = int(self._owed)
+        self._owed -= count
+        distance_C, angle_C = radius * np.sqrt(self.random.random(count)), 2 * np.pi * self.random.random(count)
+        height_C = length * (self.random.random(count) - 0.5)
+        offset_C3 = np.stack([distance_C * np.cos(angle_C), height_C, distance_C * np.sin(angle_C)], axis=1)
+        away_3 = np.array([radius, 0.5 * length, radius])
+        there_A3 = self._between(np.array(centre) - away_3, np.array(centre) + away_3) - centre
+        if (np.hypot(there_A3[:, 0], there_A3[:, 2]) < radius).sum() > FULL_SHARE * count:
+            return 0  # what left it has not gone
+        return self._enter((np.array(centre) + offset_C3).astype(np.float32), spout)
+
+    def _inside(self, position: Vector, radius: float, half_height: float | None = None) -> Vector:
+        """The nearest place where a ball or a disc is between the walls."""
+        wall = WALL_CELLS * self.cell_size
+        reach = np.array([radius, radius if half_height is None else half_height, radius]) + wall
+        high = np.maximum(np.array(self.domain_size) - reach, reach)
+        x, y, z = np.clip(position, reach, high)
+        return float(x), float(y), float(z)
+
+    def _enter(self, position_C3: np.ndarray, spout: Spout) -> int:
+        """Those of the candidates enter that are not in a closed obstacle, and not too many."""
+        position_C3 = position_C3[: max(0, self.maximum_particles - self.live.particle_count)]
+        for obstacle in self.obstacles:
+            if obstacle.body.mesh.closed:
+                position_C3 = position_C3[~contains(position_C3, obstacle.mesh())]
+        count = len(position_C3)
+        if count:
+            velocity_C3 = np.tile(np.array([0.0, -spout.speed, 0.0], np.float32), (count, 1))
+            material_C = np.full(count, material_index(spout.material), np.uint8)
+            self.recording.enter(material_C, self.live.add_particles(position_C3, velocity_C3, material_C))
+        return count
+
+    def _free(self, position_C3: np.ndarray) -> np.ndarray:
+        """Where no other particle is near, bool [C]."""
+        near = CLEARANCE * self.cell_size / self.particles_per_cell ** (1 / 3)
+        low, high = position_C3.min(axis=0) - near, position_C3.max(axis=0) + near
+        there_N3 = self._between(low, high)
+        if not len(there_N3):
+            return np.ones(len(position_C3), bool)
+        distance_C, _ = KDTree(there_N3).query(position_C3, distance_upper_bound=near)
+        return np.asarray(distance_C >= near)  # infinite where nothing is nearer
+
+    def _between(self, low_3: np.ndarray, high_3: np.ndarray) -> np.ndarray:
+        """The particles in a box, float32 [N, 3]."""
+        position_N3 = self.live.state.position_N3.cpu().numpy()
+        return position_N3[((position_N3 >= low_3) & (position_N3 <= high_3)).all(axis=1)]
+
+    # what stands in the way
+
+    def _placed_by(self, scene: Scene, folder: Path) -> list[PlacedObstacle]:
+        if scene.specification.get("kind") != "file":  # a random scene's obstacles have no entries
+            return [placed_at_rest(obstacle, scene.cell_size) for obstacle in scene.obstacles]
+        entries = from_mapping(SceneFile, {k: v for k, v in scene.specification.items() if k in _FIELDS}).obstacles
+        return [placed_by(entry, folder, scene.cell_size) for entry in entries]
+
+    def add_obstacle(self, entry: ObstacleEntry, folder: Path = Path()) -> PlacedObstacle:
+        """An obstacle of a shape, or of a mesh file in a folder. Raises: ConfigError as a scene file."""
+        placed = placed_by(entry, folder, self.cell_size)
+        self._set_obstacles((*self.obstacles, placed))
+        return placed
+
+    def move_obstacle(self, moved: PlacedObstacle) -> None:
+        """The obstacle of the same body is there from now on; nothing happens where it was removed."""
+        self._set_obstacles(tuple(moved if o.body is moved.body else o for o in self.obstacles))
+
+    def remove_obstacle(self, number: int) -> None:
+        """By the number of its body."""
+        self._set_obstacles(tuple(o for o in self.obstacles if o.body.number != number))
+
+    def _set_obstacles(self, obstacles: tuple[PlacedObstacle, ...]) -> None:
+        self.live.replace_obstacles(with_obstacles(self.live.scene, obstacles))
+        self.obstacles = obstacles
+
+    # what moves it all
+
+    def set_gravity(self, gravity: Vector) -> None:
+        """Raises: ConfigError for what the weights cannot take."""
+        self.live.set_gravity(gravity)
+
+    def use_weights(self, simulator: Simulator, weights: str = "") -> None:
+        """Goes on with other weights, from the positions and velocities of now.
+
+        Raises: ConfigError for weights that do not take the scene, or whose frames are longer or shorter.
+        """
+        rate = self.simulator.frame_rate_hz
+        require(simulator.frame_rate_hz == rate, "weights", f"of {rate} frames a second", simulator.frame_rate_hz)
+        newest, history_NM3 = self.newest, self.recording.history(self.frame)
+        velocity_N3 = newest.velocity_N3 * np.float32(rate)
+        now = replace(self.live.scene, position_N3=newest.position_N3, velocity_N3=velocity_N3)
+        live = LiveSimulation(simulator, replace(now, material_N=self.materials()), self.maximum_particles)
+        if live.state.velocity_NM3.shape[1] == history_NM3.shape[1]:
+            live.restore(newest.position_N3, history_NM3, self.frame)
+        live.frame = self.frame
+        self.recording.enter(np.zeros(0, np.uint8), live.state.velocity_NM3[:0].cpu().numpy())
+        self.live.close()
+        self.live, self.simulator, self.weights = live, simulator, weights
+
+    # what is taken away
+
+    def scene_archive(self) -> bytes:
+        """The scene as it is now: a zip of `scene.yaml`, a file of particles for each material, and the meshes.
+
+        Raises: ConfigError where there is no particle, which no scene file may lack.
+        """
+        require(len(self.newest.position_N3) > 0, "scene's particles", "more than none to be saved", 0, "pour some")
+        newest, rate = self.newest, self.simulator.frame_rate_hz
+        groups, obstacles, files = [], [], {}
+        for index, name in enumerate(MATERIALS):
+            mine_N = self.materials() == index
+            if not mine_N.any():
+                continue
+            buffer = io.BytesIO()
+            low = np.zeros(3, np.float32)
+            position_N3 = np.clip(newest.position_N3[mine_N], low, np.array(self.domain_size, np.float32))
+            np.savez_compressed(buffer, position=position_N3, velocity=newest.velocity_N3[mine_N] * np.float32(rate))
+            files[f"{name}.npz"] = buffer.getvalue()
+            groups.append({"particles": f"{name}.npz", "material": name})
+        for obstacle in self.obstacles:
+            body = obstacle.body
+            entry = {key: value for key, value in to_mapping(obstacle.entry).items() if value not in (None, [], ())}
+            if body.mesh_file is not None:
+                assert body.entry.mesh is not None
+                entry["mesh"] = f"{body.number}_{Path(body.entry.mesh).name}"
+                files[entry["mesh"]] = body.mesh_file
+            obstacles.append(entry)
+        mapping = {
+            "domain_size": list(self.domain_size),
+            "cell_size": self.cell_size,
+            "gravity": list(self.gravity),
+            "particles_per_cell": self.particles_per_cell,
+            "obstacles": obstacles,
+            "groups": groups,
+        }
+        files["scene.yaml"] = yaml.safe_dump(mapping, sort_keys=False, default_flow_style=None).encode()
+        archive = io.BytesIO()
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+            for name, content in files.items():
+                file.writestr(name, content)
+        return archive.getvalue()
+
+    def rollout(self) -> Rollout:
+        """All frames that are kept."""
+        rate = self.simulator.frame_rate_hz
+        return self.recording.rollout(
+            self.domain_size, rate, self.cell_size, {"weights": self.weights, "scene": "play"}
+        )
+
+
+_FIELDS = {field.name for field in dataclasses.fields(SceneFile)}

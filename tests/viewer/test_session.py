@@ -1,0 +1,260 @@
+"""What the page's buttons do, without a page."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from network.states import network_of
+
+from hgn.runtime.divergence import DivergedError
+from hgn.runtime.simulator import Simulator
+from hgn.scene.rollout_file import read_rollout, write_rollout
+from hgn.scene.scene import Scene
+from hgn.scene.scene_file import ObstacleEntry, load_scene
+from hgn.schema import ConfigError
+from hgn.viewer.session import PlaySession, Spout
+
+SCENE = """
+cell_size: 0.03125
+obstacles:
+  - {shape: half_box, size: 0.5, position: [0.5, 0.3, 0.5], rotation: [0, 30, 0]}
+  - {mesh: ramp.obj, scale: 0.3, position: [0.2, 0.2, 0.2]}
+groups:
+  - {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: water}
+  - {shape: cube, size: 0.1, position: [0.5, 0.7, 0.5], material: snow, velocity: [0, -0.5, 0]}
+"""
+
+
+def free_flight() -> Simulator:
+    """A network of relative inputs whose output is zero."""
+    network = network_of(torch.float32, width=16, levels=2, inputs="relative")
+    with torch.no_grad():
+        for parameter in network.decode.parameters():
+            parameter.zero_()
+    return Simulator(network, 60.0, "cpu")
+
+
+def simulator(factor: float = 1.0) -> Simulator:
+    network = network_of(torch.float32, width=16, levels=2, inputs="relative")
+    network.normaliser.acceleration_std.mul_(factor)
+    return Simulator(network, 60.0, "cpu")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    ramp = Path(__file__).parents[2] / "conf/example/ramp.obj"
+    (tmp_path / "ramp.obj").write_bytes(ramp.read_bytes())
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    return tmp_path
+
+
+@pytest.fixture
+def session(folder: Path) -> PlaySession:
+    return PlaySession(simulator(), load_scene(folder / "scene.yaml"), folder)
+
+
+def steps(session: PlaySession, count: int) -> np.ndarray:
+    """The newest positions after some frames."""
+    for _ in range(count):
+        session.step()
+    return session.newest.position_N3
+
+
+def test_untouched_it_is_a_rollout(session: PlaySession, folder: Path) -> None:
+    """Frames are those of a rollout of the scene, to rounding of the cells' normals; the file has each of them."""
+    scene = load_scene(folder / "scene.yaml")
+    (expected_TN3,) = simulator().rollout([scene], 5)
+    steps(session, 4)
+    write_rollout(folder / "played.vtkhdf", session.rollout())
+    played = read_rollout(folder / "played.vtkhdf")
+    np.testing.assert_allclose(played.position_TN3, expected_TN3, rtol=0, atol=2e-4)
+    for found, expected in zip(played.obstacles, scene.obstacles, strict=True):
+        np.testing.assert_allclose(found.vertex_V3, expected.vertex_V3, rtol=0, atol=1e-7)
+
+
+def test_spout(session: PlaySession) -> None:
+    """A spout gives as many particles a frame as its material has at rest in what leaves it, from its disc, at its
+    speed, until it is closed; and none while what it gave is still there."""
+    session.use_weights(free_flight())
+    session.set_gravity((0.0, 0.0, 0.0))
+    session.spout = Spout((0.25, 0.9, 0.75), "sand", diameter=0.1, speed=0.6)
+    before = len(session.newest.position_N3)
+    steps(session, 30)
+    session.spout = None
+    poured_A3 = session.newest.position_N3[before:]
+    expected = 8 * np.pi * 0.05**2 * 0.6 * 0.5 / session.cell_size**3
+    assert len(poured_A3) == pytest.approx(expected, abs=1)
+    assert (session.materials()[before:] == 1).all()
+    entry_A3 = session.recording.entry_NM3[before:, 0]
+    np.testing.assert_allclose(entry_A3[:, 1], -0.6 / 60, atol=1e-6)
+    assert len(steps(session, 2)) == before + len(poured_A3)
+    count = session.drop("water", (0.75, 0.8, 0.25), 0.2)
+    session.spout = Spout((0.75, 0.8, 0.25))
+    assert len(steps(session, 5)) == before + len(poured_A3) + count
+
+
+def test_nothing_enters_where_there_is_no_place(session: PlaySession) -> None:
+    """Not among particles, not in closed obstacles, not beyond the limit, not in the walls."""
+    assert session.drop("water", (0.5, 0.5, 0.5), 0.06) == 0
+    session.add_obstacle(ObstacleEntry(shape="cone", size=0.3, position=(0.2, 0.8, 0.8)))
+    assert session.drop("water", (0.2, 0.75, 0.8), 0.06) == 0
+    assert session.drop("water", (9.0, -9.0, 0.5), 0.1) > 0
+    entered_A3 = session.live.state.position_N3.numpy()[len(session.newest.position_N3) :]
+    wall = 3 * session.cell_size
+    assert (entered_A3 >= wall - 1e-6).all() and (entered_A3 <= 1 - wall + 1e-6).all()
+    session.maximum_particles = session.live.particle_count + 5
+    assert session.drop("snow", (0.8, 0.8, 0.2), 0.2) == 5
+    with pytest.raises(ConfigError, match=r"material must be one of water, sand, snow.*, got 'lava'"):
+        session.drop("lava", (0.8, 0.8, 0.2), 0.2)
+
+
+def test_obstacles_act_where_they_are_put(session: PlaySession) -> None:
+    """Cells with normals follow an obstacle that is moved and turned, those of one that is removed go; turning is about
+    the vertical through the obstacle's position."""
+    for obstacle in session.obstacles:
+        session.remove_obstacle(obstacle.body.number)
+    assert len(session.live.scene.obstacle_grid.cell_K3) == 0
+    plate = session.add_obstacle(ObstacleEntry(shape="square", size=0.2, position=(0.5, 0.31, 0.5)))
+    session.move_obstacle(replace(plate.turned(45), position=(0.5, 0.72, 0.5)))
+    grid = session.live.scene.obstacle_grid
+    assert set(grid.cell_K3[:, 1]) == {int(0.72 / session.cell_size)}
+    np.testing.assert_allclose(np.abs(grid.normal_K3[:, 1]), 1, atol=1e-5)
+    reach = 0.2 / np.sqrt(2)
+    (moved,) = session.obstacles
+    low, high = moved.mesh().vertex_V3.min(0), moved.mesh().vertex_V3.max(0)
+    np.testing.assert_allclose(low, (0.5 - reach, 0.72, 0.5 - reach), atol=1e-6)
+    np.testing.assert_allclose(high, (0.5 + reach, 0.72, 0.5 + reach), atol=1e-6)
+    assert moved.entry.rotation == pytest.approx((0, 45, 0))
+
+
+def test_going_back_repeats_to_the_bit(session: PlaySession) -> None:
+    """After going back to a frame its future is the same again, with the obstacles and gravity of then, and particles
+    that entered a frame before with their histories."""
+    steps(session, 2)
+    session.drop("snow", (0.3, 0.8, 0.3), 0.08)
+    steps(session, 1)
+    expected_N3 = steps(session, 3).copy()
+    plate, _ = session.obstacles
+    session.move_obstacle(replace(plate, position=(0.5, 0.6, 0.5)))
+    session.set_gravity((3.0, 0.0, 0.0))
+    session.drop("water", (0.7, 0.8, 0.7), 0.1)
+    later_N3 = steps(session, 3)
+    assert len(later_N3) > len(expected_N3)
+    session.rewind(3)
+    assert session.frame == 3 and session.gravity == (0.0, -9.8, 0.0) and session.obstacles[0] is plate
+    np.testing.assert_array_equal(steps(session, 3), expected_N3)
+    session.rewind(2)
+    assert len(session.materials()) == load_count(session)
+    session.restart()
+    assert session.frame == 0
+
+
+def load_count(session: PlaySession) -> int:
+    return len(session.recording[0].position_N3)
+
+
+def test_what_is_kept_is_bounded(session: PlaySession) -> None:
+    """Frames beyond the limit are forgotten, going back to them is refused with the frames that are kept, and the
+    oldest that is kept repeats to the bit."""
+    session.recording.limit_bytes = 12 * session.recording.bytes
+    steps(session, 20)
+    recording = session.recording
+    assert (len(recording.frames), recording.first, recording.earliest) == (12, 9, 13)
+    expected_N3 = recording[20].position_N3
+    with pytest.raises(ConfigError, match="frame must be between 13 and 20, the frames that are kept, got 12"):
+        session.rewind(12)
+    session.rewind(13)
+    np.testing.assert_array_equal(steps(session, 7), expected_N3)
+
+
+def test_the_scene_is_saved(session: PlaySession, tmp_path: Path) -> None:
+    """The archive is a scene file: the particles with their velocities, the obstacles where they are, the gravity."""
+    session.set_gravity((1.0, -2.0, 0.5))
+    session.add_obstacle(ObstacleEntry(shape="cone", size=0.2, position=(0.8, 0.2, 0.8), rotation=(10, 20, 30)))
+    session.drop("sand", (0.3, 0.8, 0.3), 0.1)
+    steps(session, 3)
+    with zipfile.ZipFile(io.BytesIO(session.scene_archive())) as archive:
+        archive.extractall(tmp_path / "saved")
+    saved = load_scene(tmp_path / "saved" / "scene.yaml")
+    order_N = np.argsort(session.materials(), kind="stable")
+    np.testing.assert_array_equal(saved.position_N3, session.newest.position_N3[order_N])
+    np.testing.assert_allclose(saved.velocity_N3, 60 * session.newest.velocity_N3[order_N], rtol=1e-6)
+    np.testing.assert_array_equal(saved.material_N, np.sort(session.materials()))
+    assert saved.gravity == (1.0, -2.0, 0.5) and saved.cell_size == session.cell_size
+    for found, expected in zip(saved.obstacles, session.obstacles, strict=True):
+        np.testing.assert_allclose(found.vertex_V3, expected.mesh().vertex_V3, rtol=0, atol=1e-6)
+    again = PlaySession(simulator(), saved, tmp_path / "saved")
+    assert len(again.live.scene.obstacle_grid.cell_K3) == len(session.live.scene.obstacle_grid.cell_K3)
+
+
+def test_the_rollout_is_saved(session: PlaySession, tmp_path: Path) -> None:
+    """Each particle is in the frames since it entered, and nowhere before; obstacles move as they were moved."""
+    steps(session, 2)
+    box, _ = session.obstacles
+    begin = box.mesh().vertex_V3
+    session.move_obstacle(replace(box.turned(90), position=(0.5, 0.35, 0.45)))
+    session.drop("sand", (0.3, 0.8, 0.3), 0.1)
+    steps(session, 2)
+    write_rollout(tmp_path / "a.vtkhdf", session.rollout())
+    rollout = read_rollout(tmp_path / "a.vtkhdf")
+    count = load_count(session)
+    assert np.isnan(rollout.position_TN3[:3, count:]).all() and np.isfinite(rollout.position_TN3[3:]).all()
+    for frame in range(5):
+        np.testing.assert_array_equal(
+            rollout.position_TN3[frame, : len(session.recording[frame].position_N3)],
+            session.recording[frame].position_N3,
+        )
+    moved, rest = rollout.obstacles
+    assert rest.motion is None and moved.motion is not None
+    np.testing.assert_allclose(moved.motion.place(moved.vertex_V3, 2 / 60), begin, atol=1e-6)
+    now = session.obstacles[0].mesh().vertex_V3
+    np.testing.assert_allclose(moved.motion.place(moved.vertex_V3, 3 / 60), now, atol=1e-6)
+
+
+def test_other_weights_go_on_from_here(session: PlaySession) -> None:
+    """The state is kept to the bit, histories too, and what follows is the other network's; a rate or a material that
+    does not fit is refused and nothing changes."""
+    steps(session, 3)
+    state = session.live.state
+    with pytest.raises(ConfigError, match=r"weights must be of 60.0 frames a second, got 30.0"):
+        session.use_weights(Simulator(network_of(torch.float32), 30.0))
+    with pytest.raises(ConfigError, match=r"material must be one of the network's \(sand\), got water"):
+        session.use_weights(Simulator(network_of(torch.float32, materials=("sand",)), 60.0))
+    assert session.live.state.position_N3 is state.position_N3
+    session.use_weights(simulator(2.0))
+    for name in ("position_N3", "velocity_NM3", "material_N"):
+        np.testing.assert_array_equal(getattr(session.live.state, name), getattr(state, name))
+    other_N3 = steps(session, 1)
+    session.rewind(3)
+    session.use_weights(simulator())
+    assert not np.array_equal(steps(session, 1), other_N3) and session.frame == 4
+
+
+def test_divergence_is_taken_back(session: PlaySession) -> None:
+    """What throws the scene apart is said, and the scene is as it was a frame before."""
+    before_N3 = steps(session, 2)
+    session.drop("water", (0.3, 0.8, 0.3), 0.1, speed=600.0)
+    with pytest.raises(DivergedError, match="at frame 3"):
+        session.step()
+    assert session.frame == 2 and session.live.particle_count == len(before_N3)
+    assert np.isfinite(steps(session, 2)).all()
+
+
+def test_scenes_that_cannot_be_played() -> None:
+    """Too many particles are refused by the setting's name; an empty scene plays, and cannot be saved."""
+    cloud_N3 = np.random.default_rng(0).random((30, 3)).astype(np.float32)
+    scene = Scene(cloud_N3, 0 * cloud_N3, np.zeros(30, np.uint8))
+    with pytest.raises(ConfigError, match="scene's particles must be at most 20, got 30; raise particles"):
+        PlaySession(simulator(), scene, maximum_particles=20)
+    empty = PlaySession(simulator(), Scene(cloud_N3[:0], cloud_N3[:0], np.zeros(0, np.uint8)))
+    empty.step()
+    with pytest.raises(ConfigError, match="scene's particles must be more than none to be saved, got 0; pour some"):
+        empty.scene_archive()
+    assert empty.drop("water", (0.5, 0.5, 0.5), 0.05) > 0
+    assert len(steps(empty, 2)) > 0
