@@ -20,6 +20,15 @@ EPSILON = tl.constexpr(1e-5)  # torch.nn.LayerNorm's
 
 
 @triton.jit
+def elements(row, WIDTH: tl.constexpr, WIDE: tl.constexpr):
+    """Where the rows' elements [R, W] lie in a tensor; WIDE where it has more than int32 can count."""
+    at = row[:, None] * WIDTH
+    if WIDE:
+        at = row.to(tl.int64)[:, None] * WIDTH
+    return at + tl.arange(0, WIDTH)[None, :]
+
+
+@triton.jit
 def nearest_tf32(x):
     """float32 rounded to 10 bits of mantissa, ties away from zero, as cvt.rna does.
 

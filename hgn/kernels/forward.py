@@ -21,9 +21,12 @@ from hgn.kernels.packing import PackedMLP, PackedNetwork, rounded_to_tf32
 from hgn.kernels.particle_cell.kernel import particle_cell_forward
 from hgn.kernels.triton_compat import capability, interpreting
 from hgn.kernels.tuning import LIGHT_BLOCK, Tuning, many
+from hgn.schema import require
 
 PRECISIONS = ("fp32", "tf32", "fp16")
 CLEAR_ROWS = 64
+ADDRESSED = 2**31  # elements of a tensor, in int32; edges of more are addressed in 64 bits
+REMEDY = "take fewer at once, or backend torch"
 NONE = -1  # where a product has no bias
 
 
@@ -31,6 +34,15 @@ def feature_columns(config: NetworkConfig) -> int:
     """Columns of the encoder's input: features, one-hot material, padding to a power of two that matrix units take."""
     used = config.feature_width - config.material_embedding + len(config.materials)
     return max(16, triton.next_power_of_2(used))
+
+
+def _require_room(grid: DeviceGrid, width: int, training: bool) -> None:
+    """Raises: ConfigError where a tensor has more elements than int32 can count, but for edges without gradients."""
+    pairs, edges = (8, 6) if training else (1, 1)
+    for what, count, each in (("particles", grid.particles, pairs), ("cells", grid.capacities[0], edges)):
+        most = (ADDRESSED - 1) // (each * width)
+        purpose = "an update" if training else "a simulation"
+        require(count <= most, f"{what} of {purpose} with backend triton", f"at most {most:,}", count, REMEDY)
 
 
 class FusedNetwork(Buffers):
@@ -53,8 +65,7 @@ class FusedNetwork(Buffers):
         tuning: Tuning | None = None,
     ) -> None:
         assert precision in PRECISIONS
-        # elements are addressed in int32: 2 million particles, 2.7 million cells at width 128
-        assert max(8 * grid.particles, 6 * grid.capacities[0]) * config.width < 2**31, "too large for one launch"
+        _require_room(grid, config.width, training)
         self.config, self.packed, self.grid, self.precision = config, packed, grid, precision
         self.values, self.training, self.width = values, training, config.width
         self.particle_count = particle_count
@@ -279,7 +290,7 @@ class FusedNetwork(Buffers):
                 edge_out=block.edge[m] if not last else block.cell[m], sum_out=block.sum[m],
                 **block.edge_stored[m]._asdict(), capacity=rows, FIRST=m == 0, STORE_EDGE=not last,
                 SAVE=self.training, ROWS=8 * edge_size, DENSE=self.tuning.dense, OVERLAP=overlap,
-                AHEAD=self.tuning.dense and many(rows), num_warps=edge_warps,
+                AHEAD=self.tuning.dense and many(rows), WIDE=6 * rows * self.width >= ADDRESSED, num_warps=edge_warps,
                 maxnreg=self.tuning.light_registers if light else None, launch_pdl=overlap,
             )  # fmt: skip
             cell_mlp_forward[self.tuning.row_programs(rows, size, loops)](

@@ -23,6 +23,7 @@ from hgn.kernels.blocks import (
     added,
     chosen_rows,
     column_sums,
+    elements,
     high_and_low,
     inside,
     leaky_backward,
@@ -59,6 +60,7 @@ def _senders(neighbour, slot, owner, used, count, capacity):
 def _edge_rows(
     send, receive, edge_in, tile, owner, slot, other, count,
     FIRST: tl.constexpr, BY_PRODUCT: tl.constexpr, WIDTH: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr,
+    WIDE: tl.constexpr,
 ):  # fmt: skip
     """A tile's rows: of `receive` (by cell if BY_PRODUCT, else by edge), of `send`, and of the edges unless FIRST."""
     column = tl.arange(0, WIDTH)
@@ -75,7 +77,7 @@ def _edge_rows(
     if FIRST:
         edge = sent
     else:
-        edge_at = (owner * 6 + slot)[:, None] * WIDTH + column[None, :]
+        edge_at = elements(owner * 6 + slot, WIDTH, WIDE)
         edge = tl.load(edge_in + edge_at, mask=there, other=0.0)
     return received, sent, edge
 
@@ -85,7 +87,7 @@ def edge_forward(
     send, receive, edge_in, neighbour, count_ptr, weights, values, own_at, second_at, second_bias_at,
     norm_weight_at, norm_bias_at, edge_out, sum_out, hidden, normalised, rstd, capacity,
     FIRST: tl.constexpr, STORE_EDGE: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, ROWS: tl.constexpr,
-    DENSE: tl.constexpr, PRECISION: tl.constexpr, OVERLAP: tl.constexpr, AHEAD: tl.constexpr,
+    DENSE: tl.constexpr, PRECISION: tl.constexpr, OVERLAP: tl.constexpr, AHEAD: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
     """Paper steps 2, 4, … (fig. 5): the edges' new features [C, 6, W] and their sums by receiver [C, W]; send and
     receive [C, W] are the cells' products with the edge MLP's first two parts, receive with the bias.
@@ -133,7 +135,7 @@ def edge_forward(
         if OVERLAP:
             gdc_wait()
         received, sent, edge = _edge_rows(
-            send, receive, edge_in, tile, owner, slot, other, count, FIRST, BY_PRODUCT, WIDTH, SUMS, BLOCK
+            send, receive, edge_in, tile, owner, slot, other, count, FIRST, BY_PRODUCT, WIDTH, SUMS, BLOCK, WIDE
         )
     while tile * BLOCK < count:
         if OVERLAP and not AHEAD:
@@ -150,10 +152,10 @@ def edge_forward(
             later = _senders(neighbour, slot, later_owner, used, count, capacity)
         there = (other >= 0)[:, None]
         place = owner * 6 + slot
-        edge_at = place[:, None] * WIDTH + column[None, :]
+        edge_at = elements(place, WIDTH, WIDE)
         if not AHEAD:
             received, sent, edge = _edge_rows(
-                send, receive, edge_in, tile, owner, slot, other, count, FIRST, BY_PRODUCT, WIDTH, SUMS, BLOCK
+                send, receive, edge_in, tile, owner, slot, other, count, FIRST, BY_PRODUCT, WIDTH, SUMS, BLOCK, WIDE
             )
         if BY_PRODUCT:
             if FIRST:
@@ -185,7 +187,7 @@ def edge_forward(
         if AHEAD:
             received, sent, edge = _edge_rows(
                 send, receive, edge_in, tile + tl.num_programs(0), later_owner, slot, later, count, FIRST,
-                BY_PRODUCT, WIDTH, SUMS, BLOCK,
+                BY_PRODUCT, WIDTH, SUMS, BLOCK, WIDE,
             )  # fmt: skip
         if STORE_EDGE:
             if SAVE:
