@@ -47,6 +47,7 @@ TimeIntegration = Annotated[str, one_of("leapfrog", "symplectic_euler")]
 NetworkKind = Annotated[str, one_of(*NETWORK_KINDS)]
 SymmetryName = Annotated[str, one_of(*SYMMETRIES)]
 TrainingBackendName = Annotated[str, one_of(*TRAINING_BACKENDS)]
+GradientMessages = Annotated[str, one_of("fp32", "bf16")]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
 
@@ -411,6 +412,7 @@ class TrainingConfig:
     accelerator: Processor = "auto"  # or cpu, gpu
     devices: OneOrMore | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
     nodes: OneOrMore | None = None  # machines; null: as launched, without a launcher one
+    gradient_messages: GradientMessages = "fp32"  # between ranks; bf16: half the bytes, for slow networks
     precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
     backend: TrainingBackendName = "auto"  # torch, triton (kernels in CUDA graphs); auto: triton where it runs
     minimum_episodes: Positive[int] = 1  # training starts once that many training episodes are published

@@ -30,7 +30,7 @@ from hgn.training.checkpoint import (
     sampler_state_of_checkpoint,
     updates_of_checkpoint,
 )
-from hgn.training.distributed import sum_over_ranks
+from hgn.training.distributed import RoundedSum, sum_over_ranks
 from hgn.training.muon import Muon
 from hgn.training.noise import jittered_origin, perturbed_window
 from hgn.training.pushforward import PushforwardPool
@@ -142,8 +142,10 @@ class TrainingModule(LightningModule):
             self._pool = PushforwardPool(self.result, config, self.trainer.global_rank)
         if not self.automatic_optimization:
             # Triton, which backend torch does without, is loaded here.
+            from hgn.kernels.update.op import TAIL
             from hgn.training.graph_trainer import GraphTrainer
 
+            sums = RoundedSum(-TAIL) if self.training_config.gradient_messages == "bf16" else sum_over_ranks
             optimizer = self.optimizers(use_pl_optimizer=False)
             assert isinstance(optimizer, torch.optim.Adam)
             self._graph_trainer = GraphTrainer(
@@ -153,7 +155,7 @@ class TrainingModule(LightningModule):
                 self.data.obstacle_cell_size,
                 self.loss_sum,
                 self.gradient_counters,
-                sum_over_ranks if self.trainer.world_size > 1 else None,
+                sums if self.trainer.world_size > 1 else None,
                 self.trainer.world_size,
                 self.averaged,
                 self.trainer.global_rank,

@@ -94,7 +94,9 @@ def train_network(
         accelerator=training.accelerator,
         devices=devices,
         num_nodes=nodes,
-        strategy=lightning_compat.gradient_averaging(backend) if devices * nodes > 1 else "auto",
+        strategy=(
+            lightning_compat.gradient_averaging(backend, training.gradient_messages) if devices * nodes > 1 else "auto"
+        ),
         max_steps=training.maximum_updates,
         max_epochs=-1,
         callbacks=[SameWeights(feed), guard, lines, monitor, checkpoints, Stopper(stop, checkpoints), final],

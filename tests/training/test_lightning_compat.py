@@ -52,7 +52,7 @@ def test_canary(tmp_path):
     trainer.lr_scheduler_configs[0].scheduler.step()
     assert trainer.optimizers[0].param_groups[0]["lr"] == 0.1**7
     assert not lightning_compat.received_sigterm(trainer)
-    strategies = [lightning_compat.gradient_averaging(path) for path in ("torch", "triton")]
+    strategies = [lightning_compat.gradient_averaging(path, "fp32") for path in ("torch", "triton")]
     assert [type(strategy).configure_ddp is type(strategies[0]).configure_ddp for strategy in strategies] == [
         True,
         False,
