@@ -1,5 +1,7 @@
 """The laws of one particle against a float64 reference that follows the published formulas."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import taichi as ti
@@ -326,7 +328,7 @@ def test_collapsed_and_inverted_deformations(material: int) -> None:
 
 
 class Element:
-    """One particle of sand or snow that is strained step by step, as an element of soil is in a laboratory."""
+    """One particle that is strained step by step, as an element of soil is in a laboratory."""
 
     def __init__(self, material: int, config: MpmConfig) -> None:
         self.material, self.config = material, config
@@ -438,3 +440,76 @@ def test_simple_shear_of_sand(law: str, sine: float) -> None:
     assert stress[0, 1] / -stress[1, 1] == pytest.approx(sine, rel=0.01)
     assert stress[0, 0] / stress[1, 1] == pytest.approx(1, rel=0.02)
     assert 2 * stress[2, 2] / (stress[0, 0] + stress[1, 1]) == pytest.approx(1, rel=0.02)
+
+
+# Stomakhin et al. 2013, table 2; the cap is the solver's own
+PUBLISHED_SNOW = MpmConfig(
+    youngs_modulus_pa=1.4e5, poisson_ratio=0.2, snow_hardening=10.0, snow_critical_compression=0.025,
+    snow_critical_stretch=0.0075, snow_maximum_hardening=1e9,
+)  # fmt: skip
+
+
+def strained(config: MpmConfig, last: float, steps: int = 400) -> Element:
+    """Snow strained along one axis, its sides held, to `last` of its length."""
+    element = Element(SNOW, config)
+    for _ in range(steps):
+        element.step(np.diag([last ** (1 / steps) - 1, 0, 0]))
+    return element
+
+
+@pytest.mark.parametrize("length", [0.985, 0.75, 0.6, 1.005, 1.2])
+def test_snow_hardens_and_breaks_as_published(length: float) -> None:
+    """Pressed or stretched along one axis, snow bears exp(xi (1 - Jp)) times the stress at its critical compression or
+    stretch (Stomakhin et al. 2013): with Jp the length over the critical one, within 2 %. Pressed to 0.6 it bears 47
+    times what it yields at first; stretched to 1.2 a seventh of that. Unloaded it gives way by the hardened modulus.
+    """
+    config = PUBLISHED_SNOW
+    shear, bulk = lame_parameters(config)
+    bounded = np.clip(length, 0.975, 1.0075)
+    factor = np.exp(10 * (1 - length / bounded))
+    element = strained(config, length)
+    _, stress, _ = element.answer(np.zeros((3, 3)))
+    along = factor * (2 * shear * (bounded - 1) * bounded + bulk * bounded * (bounded - 1))
+    assert stress[0, 0] == pytest.approx(along, rel=0.02)
+    assert stress[1, 1] == pytest.approx(factor * bulk * bounded * (bounded - 1), rel=0.02)
+    if length < 1:
+        relieved = element.step(np.diag([1e-3, 0, 0]))[0, 0] - stress[0, 0]
+        slope = 2 * shear * bounded * (2 * bounded - 1) + bulk * bounded * (2 * bounded - 1)
+        assert relieved == pytest.approx(1e-3 * factor * slope, rel=0.03)
+
+
+def test_where_the_cap_of_hardening_begins() -> None:
+    """The default cap, 20, leaves the published law where exp(10 (1 - Jp)) does: at Jp = 0.70, 0.683 of the length."""
+    capped = dataclasses.replace(PUBLISHED_SNOW, snow_maximum_hardening=MpmConfig().snow_maximum_hardening)
+    for length, same in ((0.70, True), (0.65, False)):
+        one, other = (strained(c, length, 100).answer(np.zeros((3, 3)))[1][0, 0] for c in (PUBLISHED_SNOW, capped))
+        assert (other == pytest.approx(one, rel=1e-4)) == same
+        assert abs(other) <= abs(one)
+
+
+@pytest.mark.parametrize("shear_strain", [0.01, 0.5, 2.0])
+def test_simple_shear_of_an_elastic_solid(shear_strain: float) -> None:
+    """Sheared by g without a change of volume, a fixed corotated solid turns by R = [[c, s], [-s, c]] with tan = g / 2:
+    it bears 2 mu (g - s) along, 2 mu (1 + g² - c - s g) and 2 mu (1 - c) across (Poynting's effect).
+    """
+    element = Element(ELASTIC, MpmConfig())
+    drive = np.zeros((3, 3))
+    drive[0, 1] = shear_strain / 50
+    for _ in range(50):
+        stress = element.step(drive)
+    shear, _ = lame_parameters(MpmConfig())
+    c, s = np.array([2, shear_strain]) / np.hypot(2, shear_strain)
+    expected = np.zeros((3, 3))
+    expected[0, 1] = expected[1, 0] = shear_strain - s
+    expected[0, 0], expected[1, 1] = 1 + shear_strain**2 - c - s * shear_strain, 1 - c
+    assert stress == pytest.approx(2 * shear * expected, abs=3e-5 * shear * (1 + shear_strain**2))
+
+
+def test_stretch_of_an_elastic_solid_with_free_sides() -> None:
+    """Pulled by 1 % with free sides it bears Young's modulus times the strain, and narrows by Poisson's ratio."""
+    config, element = MpmConfig(), Element(ELASTIC, MpmConfig())
+    for _ in range(10):
+        gradient = np.diag([1e-3, -config.poisson_ratio * 1e-3, -config.poisson_ratio * 1e-3])
+        stress = element.step(gradient)
+    assert stress[0, 0] == pytest.approx(config.youngs_modulus_pa * 0.01, rel=0.02)
+    assert abs(stress[1, 1]) < 0.01 * stress[0, 0]
