@@ -17,7 +17,7 @@ from hgn.scene.material import ELASTIC, WATER
 from hgn.scene.scene import Scene
 from tools.stability import solver_validation
 from tools.stability.row import Row
-from tools.stability.solver_validation import column_rows, edge, repose, rest
+from tools.stability.solver_validation import column_rows, edge, heights, repose, rest
 
 CELL = 1 / 16
 WALL = 2  # cells: the last node that stops motion, and three from the other end
@@ -230,6 +230,12 @@ def test_sand_column_and_its_laws(low_column: tuple[Row, Row]) -> None:
     low, _ = low_column
     assert low.measured < low.predicted
     assert "walls" not in low.beyond
+
+
+def test_published_heights_of_columns() -> None:
+    """Low columns keep their top, glass beads no more than 0.74; for tall ones two publications differ by a third."""
+    assert heights(0.5) == (0.5,) and heights(1.5) == (0.74,)
+    assert heights(4.0) == pytest.approx((0.74, 1.109), abs=1e-3)
 
 
 def test_height_of_a_low_column(low_column: tuple[Row, Row]) -> None:
