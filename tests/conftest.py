@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,7 +23,7 @@ if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
 
 import interpreter
 import torch
-from processes import wait_until
+import warm_server
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # kernels run in Triton's interpreter; said before any of them is defined
@@ -48,6 +47,12 @@ LONGEST_FILES = (  # ten seconds and more of one core; begun last, one of them w
     *("network/test_network", "kernels/test_network", "training/test_train", "training/test_resume"),
     *("tools/test_bench", "scene/test_random_scene", "training/test_live_service", "end_to_end/test_wheel"),
 )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """All processes of these tests share a warm interpreter; the first that asks for it has it started."""
+    if not hasattr(config, "workerinput"):
+        config.add_cleanup(warm_server.WarmServer().stop)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -112,18 +117,6 @@ def make_dataset(backend: Backend) -> Callable[[DatagenConfig], Path]:
 
 
 @pytest.fixture(scope="session")
-def warm_python(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def warm_python() -> Path:
     """An interpreter that has the training stack loaded, see warm_server.py."""
-    folder, tests = tmp_path_factory.mktemp("warm"), Path(__file__).parent
-    interpreter, address = folder / "python", folder / "socket"
-    interpreter.write_text(f'#!/bin/sh\nexec {sys.executable} -SEs {tests / "warm_client.py"} {address} "$@"\n')
-    interpreter.chmod(0o755)
-    environment = os.environ | {"PYTHONPATH": str(tests.parent), "OMP_NUM_THREADS": "1"}
-    server = subprocess.Popen([sys.executable, str(tests / "warm_server.py"), str(address)], env=environment)
-    try:
-        wait_until(lambda: address.exists() or server.poll() is not None)
-        assert server.poll() is None
-        yield interpreter
-    finally:
-        server.kill()
-        server.wait()
+    return Path(os.environ[warm_server.VARIABLE]) / "python"

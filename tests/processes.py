@@ -1,10 +1,14 @@
-"""Waiting for processes that a test has started."""
+"""Processes that tests start, and waiting for them."""
 
 from __future__ import annotations
 
+import os
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+TESTS = Path(__file__).parent
 
 
 def wait_until(condition: Callable[[], object], seconds: float = 90.0) -> None:
@@ -12,6 +16,16 @@ def wait_until(condition: Callable[[], object], seconds: float = 90.0) -> None:
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.02)
+
+
+def run_compiled(python: Path, folder: Path, program: str, *arguments: str) -> str:
+    """Runs a program of the tests with Triton compiling into `folder`, not interpreting; what it printed."""
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    environment |= {"TRITON_CACHE_DIR": str(folder), "PYTHONPATH": str(TESTS.parent)}
+    command = [str(python), str(TESTS / program), *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
 
 
 def processes_of_session(session: int) -> list[int]:

@@ -1,6 +1,6 @@
 """A Python that has the training stack loaded: each program that it is asked to run is a fork of it.
 
-Loading PyTorch and Lightning takes seconds, and the tests start dozens of trainings. `python warm_server.py SOCKET`
+Loading PyTorch and Lightning takes seconds, and the tests start dozens of trainings. `python warm_server.py LISTENER`
 loads them once and forks, before any thread or device exists, for each request of warm_client.py, which stands in for
 the interpreter: same arguments, folder, environment, network, standard streams, signals and exit status.
 """
@@ -13,10 +13,14 @@ import json
 import os
 import random
 import runpy
+import select
 import selectors
 import signal
 import socket
+import subprocess
 import sys
+import tempfile
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +31,48 @@ PRELOADED = (
     *("hgn.rollout", "hgn.evaluate", "hgn.export", "hgn.train", "hgn.training.session", "hgn.training.tensorboard"),
 )
 REQUEST_BYTES = 1 << 20
+VARIABLE = "HGN_TESTS_WARM"  # the folder with the interpreter, `python`, in the environment of a run's processes
 
 
-def serve(path: str) -> dict[str, Any]:
+class WarmServer:
+    """Makes the interpreter, whose first caller has the server started."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="hgn-tests-")
+        folder, here = Path(self._folder.name), Path(__file__).parent
+        os.environ[VARIABLE] = str(folder)
+        command = f'exec {sys.executable} -SEs {here / "warm_client.py"} {folder / "socket"} "$@"'
+        (folder / "python").write_text(f"#!/bin/sh\n{command}\n")
+        (folder / "python").chmod(0o755)
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(folder / "socket"))
+        self._listener.listen(64)
+        self._wake, self._ended = socket.socketpair()
+        self._server: subprocess.Popen[bytes] | None = None
+        self._thread = threading.Thread(target=self._start_when_asked)
+        self._thread.start()
+
+    def _start_when_asked(self) -> None:
+        environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+        environment |= {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+        if self._listener in select.select([self._listener, self._wake], [], [])[0]:
+            number = self._listener.fileno()
+            command = [sys.executable, __file__, str(number)]
+            self._server = subprocess.Popen(command, env=environment, pass_fds=[number])
+        self._listener.close()  # where the server has ended, its clients are refused
+
+    def stop(self) -> None:
+        self._ended.close()
+        self._thread.join()
+        self._wake.close()
+        if self._server is not None:
+            self._server.kill()
+            self._server.wait()
+        self._folder.cleanup()
+
+
+def serve(listener: socket.socket) -> dict[str, Any]:
     """Forks for each request; returns a request in the child alone."""
-    listener = socket.socket(socket.AF_UNIX)
-    listener.bind(path)
-    listener.listen(64)
     wake_read, wake_write = os.pipe()
     os.set_blocking(wake_write, False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
@@ -110,7 +149,7 @@ def run(request: dict[str, Any]) -> None:
         sys.modules.pop(arguments[1], None)  # runpy warns of a program that is loaded already
         runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
     else:
-        sys.path[:0] = paths
+        sys.path[:0] = [str(Path(arguments[0]).parent), *paths]
         sys.argv = arguments
         runpy.run_path(arguments[0], run_name="__main__")
 
@@ -123,4 +162,4 @@ if __name__ == "__main__":
     for name in PRELOADED:
         importlib.import_module(name)
     Plugins.instance()  # Hydra's own, of which each command would look for all
-    run(serve(sys.argv[1]))
+    run(serve(socket.socket(fileno=int(sys.argv[1]))))

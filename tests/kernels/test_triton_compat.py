@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from kernels.ptx import hazards
+from processes import run_compiled
 
 from hgn.kernels.triton_compat import TESTED_VERSIONS, unsupported_reason
 
@@ -19,14 +17,10 @@ SAFE = {("particle_cell_backward", "tf32")}
 
 
 @pytest.fixture(scope="module")
-def lines(tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
+def lines(warm_python: Path, tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
     """Of compiled_program.py, by words."""
-    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
-    environment |= {"TRITON_CACHE_DIR": str(tmp_path_factory.mktemp("triton")), "PYTHONPATH": str(CHECKOUT)}
-    command = [sys.executable, str(Path(__file__).with_name("compiled_program.py"))]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return [line.split() for line in done.stdout.splitlines()]
+    text = run_compiled(warm_python, tmp_path_factory.mktemp("triton"), "kernels/compiled_program.py")
+    return [line.split() for line in text.splitlines()]
 
 
 def test_versions_that_were_not_read_are_refused() -> None:

@@ -70,6 +70,12 @@ def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[Data
     return str(make_dataset(make_config(frames=FRAMES)))
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without their figures, which take most of the time."""
+    monkeypatch.setattr("tools.error_vs_time.run.draw", lambda *_: [])
+
+
 def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """Every contender gets a row with the report's keys on the same scenes; a solver that fails is counted."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
@@ -128,6 +134,7 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     )
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What has not begun by then is named, and the report is written without it; a shorter rollout of the solver is
     scored as far as it goes, and each setting is simulated once."""
@@ -162,6 +169,7 @@ def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.Monkey
     assert all(left["cause"] == "the time was over" for left in report["meta"]["not_run"])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_data_can_be_the_reference(data: str, tmp_path: Path) -> None:
     """Without a solver the data itself is the reference, and what moves like it has no error."""
     out = tmp_path / "report"
@@ -216,6 +224,7 @@ def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys:
         network_contenders(replace(config, backend="triton"), CPU, [episode])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_counts_most_comes_first(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -430,6 +439,7 @@ def test_a_report_goes_on_where_it_was_cut_off(data: str, tmp_path: Path, monkey
         return fake_simulate(scenes, config, *more, stability_fractions=stability_fractions, **others)
 
     monkeypatch.setattr(datagen.mpm.solver, "simulate", noted)
+    monkeypatch.setattr("tools.error_vs_time.run.draw", lambda *_: [])
     weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
     first, second = tmp_path / "first", tmp_path / "second"
     options = {"data": data, "weights": weights, "mpm_grids": [64], "mpm_steps": [0.5], **SHORT}
@@ -463,6 +473,7 @@ def test_a_report_goes_on_where_it_was_cut_off(data: str, tmp_path: Path, monkey
             main({"out": "x", "earlier": [str(other)]})
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_nobody_foresaw_stops_one_contender(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -484,6 +495,7 @@ def test_what_nobody_foresaw_stops_one_contender(
     assert "Traceback" in (told := capsys.readouterr().err) and "1 of the measurements failed" in told
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_that_is_killed_leaves_whole_points(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After each contender the file holds its errors and its run times."""
     weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from tools.scaling import measure
 from tools.scaling.__main__ import main
 from tools.scaling.config import ScalingConfig
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 SMALL: dict[str, Any] = {
     "particles": 40,
     "scenes": 2,
@@ -27,11 +30,15 @@ SMALL: dict[str, Any] = {
 }
 
 
-def test_rows_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rows_of_every_case(warm_python: Path, tmp_path: Path) -> None:
     """Two processes train alone and together, with equal and with unequal scenes, all checked and timed, and
     the table shows them."""
     path = tmp_path / "reports" / "scaling.json"
-    assert main(SMALL | {"json": str(path)}) == 0
+    command = [str(warm_python), str(Path(__file__).with_name("scaling_program.py"))]
+    done = subprocess.run(
+        [*command, json.dumps(SMALL | {"json": str(path)})], env=ENVIRONMENT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
     report = json.loads(path.read_text())
     assert {"device", "versions", "commit", "date", "command", "config"} <= report["meta"].keys()
     rows = report["rows"]
@@ -45,7 +52,7 @@ def test_rows_of_every_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         assert row["efficiency"] == pytest.approx(rates[0] / rates[1])
     parameters = rows[3]["messages"][0]
     assert parameters % 4 == 0 and parameters > 1000  # one message of all gradients
-    assert "| torch | fp32 | 2 | 2 | 0.17 | 1, up to 0.0 MB |" in capsys.readouterr().out
+    assert "| torch | fp32 | 2 | 2 | 0.17 | 1, up to 0.0 MB |" in done.stdout
 
 
 def test_scenes_are_balanced() -> None:

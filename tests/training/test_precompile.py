@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from processes import run_compiled
 
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.runtime.precompile import Precompilation, frame_sizes
 from hgn.runtime.precompile_program import FrameJob, PrecompileJob, job_of, job_text
 from hgn.training.precompile import job_of_training
-
-CHECKOUT = Path(__file__).parents[2]
 
 
 def job(batch_scenes: int = 8) -> PrecompileJob:
@@ -79,17 +76,18 @@ def test_an_interruption_ends_them(started: list[Precompilation]) -> None:
     assert all(process.poll() is not None for process in ahead._processes)
 
 
-def test_the_launches_are_those_of_an_update(tmp_path: Path) -> None:
+def test_the_launches_are_those_of_an_update(warm_python: Path, tmp_path: Path) -> None:
     """Without memory and without a GPU the same kernels with the same specialisations are found as on tensors that
     exist, and one of them is compiled into Triton's cache."""
-    run_compiled(tmp_path, "precompile_program.py")
+    run_compiled(warm_python, tmp_path, "training/precompile_program.py")
     assert list(tmp_path.glob("*/*.cubin"))
 
 
 @pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
+def keys(warm_python: Path, tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
     """Of a small update: as it launches, from behind, and a GNS's."""
-    text = run_compiled(tmp_path_factory.mktemp("triton"), "precompile_keys.py", "launch", "behind", "gns")
+    folder = tmp_path_factory.mktemp("triton")
+    text = run_compiled(warm_python, folder, "training/precompile_keys.py", "launch", "behind", "gns")
     return [part.split("\n") for part in text.split("\n\n")]
 
 
@@ -109,13 +107,3 @@ def test_an_update_of_gns_never_asks_the_device(keys: list[list[str]]) -> None:
         "gns_encode_layers_backward",
         "momentum_directions",
     }
-
-
-def run_compiled(folder: Path, program: str, *arguments: str) -> str:
-    """Runs a program of this folder with Triton compiling into `folder`, not interpreting; what it printed."""
-    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
-    environment |= {"TRITON_CACHE_DIR": str(folder), "PYTHONPATH": str(CHECKOUT)}
-    command = [sys.executable, str(Path(__file__).with_name(program)), *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()

@@ -1,0 +1,14 @@
+"""scaling_program.py MAPPING: python -m tools.scaling whose ranks are forks of this process, which has all loaded."""
+
+from __future__ import annotations
+
+import json
+import sys
+from functools import partial
+
+import torch.multiprocessing
+
+from tools.scaling.__main__ import main
+
+torch.multiprocessing.spawn = partial(torch.multiprocessing.start_processes, start_method="fork")
+sys.exit(main(json.loads(sys.argv[1])))
