@@ -397,7 +397,7 @@ class TrainingConfig:
     # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
     # all frames alike
     frame_importance: BelowOne[float] = 0.0
-    # episodes whose samples are shuffled together, for data larger than the cache or the memory; 0: all
+    # episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all
     shuffle_episodes: NonNegative[int] = 0
     symmetry: SymmetryName = (
         "none"  # gravity: samples are turned and mirrored at random, by what keeps gravity and domain

@@ -33,11 +33,12 @@ class EpisodeTensors:
 
 @dataclass(frozen=True, eq=False)
 class UpdateChunk:
-    """The samples of successive updates, and the episodes among them that no chunk had before."""
+    """The samples of successive updates, and the episodes among them that are not held since a chunk before."""
 
     samples: tuple[tuple[Sample, ...], ...]
     episodes: dict[int, EpisodeTensors]
     sampler_state: SamplerState  # the order's state once these are trained on
+    dropped: tuple[int, ...] = ()  # episodes that need not be held any more, before these are placed
     starts: tuple[tuple[int, int], ...] = ()  # episodes and frames that the network is to simulate from before it
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from itertools import islice
 from typing import Any, TypeVar
 
 import torch
@@ -17,7 +19,7 @@ from hgn.data.batch import Batch, BatchSample, UpdateSamples
 from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk, whole_episode
 from hgn.data.importance import FrameImportance
 from hgn.data.reader import EpisodeStore
-from hgn.data.sampler import EpisodeSampler, Sample, SamplerState
+from hgn.data.sampler import BLOCK_EPISODES, EpisodeSampler, Sample, SamplerState
 from hgn.data.storage import without_patience
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
@@ -101,7 +103,8 @@ class EpisodeDataModule(LightningDataModule):
         """The same samples, those of many updates at once. A chunk ends wherever something is due between updates."""
         order = self._order()
         begun = update = self._update()
-        handed_out: set[int] = set()  # episodes
+        held: OrderedDict[int, None] = OrderedDict()  # episodes that the trainer has, the longest unused first
+        room = self._room()
 
         def draw() -> tuple[tuple[list[tuple[Sample, ...]], Starts], SamplerState]:
             nonlocal update
@@ -113,12 +116,23 @@ class EpisodeDataModule(LightningDataModule):
         def read(drawn: tuple[list[tuple[Sample, ...]], Starts], state: SamplerState) -> UpdateChunk:
             samples, starts = drawn
             needed = {sample.episode for batch in samples for sample in batch} | {index for index, _ in starts}
-            new = sorted(needed - handed_out)
-            handed_out.update(new)
+            new = sorted(needed - held.keys())
+            for episode in sorted(needed):
+                held[episode] = None
+                held.move_to_end(episode)
+            dropped = list(islice(held, max(0, len(held) - max(room, len(needed)))))
+            for episode in dropped:
+                del held[episode]
             episodes = self._whole(new)
-            return UpdateChunk(tuple(self._weighted(update) for update in samples), episodes, state, starts)
+            drawn_frames = tuple(self._weighted(update) for update in samples)
+            return UpdateChunk(drawn_frames, episodes, state, tuple(dropped), starts)
 
         yield from self._prefetched(draw, read)
+
+    def _room(self) -> int:
+        """How many episodes stay on the device: two windows of the order, where it has windows."""
+        window = self.training.shuffle_episodes
+        return 2 * max(window, BLOCK_EPISODES) if window else sys.maxsize
 
     def _update(self) -> int:
         """The number of the next update."""

@@ -82,6 +82,8 @@ class GraphTrainer:
 
         Raises: ConfigError when positions are not finite, or before the first update when the kernels are wrong here.
         """
+        for index in chunk.dropped:
+            del self._episodes[index]
         with self._timed("placing episodes"):
             for index, episode in chunk.episodes.items():
                 self._episodes[index] = self._placed(episode)

@@ -53,7 +53,7 @@ exit "$highest"
 """
 SCONTROL = """#!/usr/bin/env bash
 echo "$@" >> "$SLURM_FAKE/scontrol.log"
-if [[ $1 == show ]]; then echo localhost; fi
+if [[ $1 == show ]]; then [[ $2 == hostnames ]] && echo localhost || echo "PreemptTime=${PREEMPTED:-None}"; fi
 """
 # hands a signal to the tasks of the job's steps
 SCANCEL = """#!/usr/bin/env bash
@@ -257,26 +257,32 @@ def test_slurm_trains_with_torchrun(
 
 
 @pytest.mark.parametrize(
-    ("script", "code", "returned", "requeued"),
+    ("script", "code", "returned", "requeued", "preempted"),
     [
-        ("slurm/train.sbatch", 138, 0, True),
-        ("slurm/train.sbatch", 143, 143, False),
-        ("slurm/train.sbatch", 2, 2, False),
-        ("slurm/train_torchrun.sbatch", 1, 1, False),
-        ("slurm/train_torchrun.sbatch", 0, 0, False),
-        ("slurm/generate_array.sbatch", 130, 0, True),
-        ("slurm/generate_array.sbatch", 2, 2, False),
-        ("slurm/generate.sbatch", 130, 0, True),
-        ("slurm/generate.sbatch", 143, 143, False),
-        ("slurm/generate.sbatch", 0, 0, False),
+        ("slurm/train.sbatch", 138, 0, True, "None"),
+        ("slurm/train.sbatch", 143, 143, False, "None"),
+        ("slurm/train.sbatch", 2, 2, False, "None"),
+        ("slurm/train_torchrun.sbatch", 1, 1, False, "None"),
+        ("slurm/train_torchrun.sbatch", 0, 0, False, "None"),
+        ("slurm/generate_array.sbatch", 130, 0, True, "None"),
+        ("slurm/generate_array.sbatch", 2, 2, False, "None"),
+        ("slurm/generate.sbatch", 130, 0, True, "None"),
+        ("slurm/generate.sbatch", 143, 143, False, "None"),
+        ("slurm/generate.sbatch", 0, 0, False, "None"),
+        ("slurm/train.sbatch", 143, 0, True, "2026-01-01T00:00:00"),
+        ("slurm/train.sbatch", 2, 2, False, "2026-01-01T00:00:00"),
+        ("slurm/train_torchrun.sbatch", 1, 0, True, "2026-01-01T00:00:00"),
+        ("slurm/generate.sbatch", 143, 0, True, "2026-01-01T00:00:00"),
+        ("slurm/generate_array.sbatch", 143, 0, True, "2026-01-01T00:00:00"),
     ],
 )
 def test_time_limit(
-    slurm: dict[str, str], tmp_path: Path, script: str, code: int, returned: int, requeued: bool
+    slurm: dict[str, str], tmp_path: Path, script: str, code: int, returned: int, requeued: bool, preempted: str
 ) -> None:
-    """Stopped by the signal before the time limit, a job is queued again; cancelled or failed, it is not."""
+    """Stopped by the signal before the time limit, or told to make room, a job is queued again; cancelled or failed, it
+    is not."""
     write_program(tmp_path / "programs", "srun", f"#!/usr/bin/env bash\nexit {code}\n")
-    assert run(script, cwd=tmp_path, **slurm, **ARRAY).returncode == returned
+    assert run(script, cwd=tmp_path, **slurm, **ARRAY, PREEMPTED=preempted).returncode == returned
     log = tmp_path / "scontrol.log"
     assert ("requeue 4711\n" in (log.read_text() if log.exists() else "")) == requeued
 

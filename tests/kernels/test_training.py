@@ -18,7 +18,8 @@ from hgn.network.build import build_network
 from hgn.runtime.backend import choose, pick, training_unsupported_reason, triton_unsupported_reason
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
-from hgn.training.data_module import UPDATES_AT_ONCE, chunk_length
+from hgn.training.data_module import UPDATES_AT_ONCE, EpisodeDataModule, chunk_length
+from hgn.training.graph_trainer import GraphTrainer
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
@@ -81,6 +82,36 @@ def test_fast_training_is_the_plain_one(
         for name in ("torch", "triton")
     ]
     assert len(monitored[0]) == 1 and monitored[1] == pytest.approx(monitored[0], rel=1e-3)
+
+
+@pytest.mark.skipif(device().type != "cpu", reason="on a GPU sums are taken in another order each time")
+def test_a_quarter_of_the_data_is_enough(
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A training that holds 16 of 64 episodes at a time ends with the weights of one that holds all, bitwise."""
+    config = make_config(training_scenes=64, validation_scenes=1, test_scenes=0, frames=3)
+    make_dataset(config)
+    monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
+    updates = {"maximum_updates": 10, "batch_scenes": 4, "log_every": 2, "checkpoint_every": 10, "monitor_every": 10}
+    ends, most = [], []
+    original = GraphTrainer.run
+    for room in (16, 64):
+        sizes: list[int] = []
+
+        def run(trainer: GraphTrainer, *arguments: Any, sizes: list[int] = sizes) -> None:
+            original(trainer, *arguments)
+            sizes.append(len(trainer._episodes))
+
+        monkeypatch.setattr(GraphTrainer, "run", run)
+        monkeypatch.setattr(EpisodeDataModule, "_room", lambda feed, room=room: room)
+        assert train.main(run_mapping(config, tmp_path / str(room), shuffle_episodes=8, **updates)) == 0
+        ends.append(read_checkpoint(tmp_path / str(room) / "checkpoints" / "last.ckpt")["state_dict"])
+        most.append(max(sizes))
+    assert most[0] <= 16 < most[1]
+    assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
 
 
 def test_fast_training_of_gns_is_the_plain_one(

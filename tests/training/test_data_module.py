@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import fsspec
+import numpy as np
 import pytest
 import torch
 from training.runs import NETWORK, TRAINING
@@ -143,3 +144,29 @@ def test_data_larger_than_the_cache(
     fetched.clear()
     batches("memory://larger", SETTINGS[1])
     assert len([name for name in fetched if name.endswith(".tar")]) > 2 * len(sizes)
+
+
+def test_data_larger_than_the_device(
+    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]
+) -> None:
+    """Backend triton holds two windows of the order, here a quarter of the data, through two epochs: every sample's
+    episode is held when it is trained on, and is the one that a trainer of all of the data has."""
+    folder = make_dataset(make_config(training_scenes=64, validation_scenes=0, test_scenes=0, frames=4))
+    store = EpisodeStore(folder, "train")
+    training = replace(SETTINGS[1], shuffle_episodes=8, batch_scenes=4, log_every=2)
+    feed = EpisodeDataModule(store, SETTINGS[0], training, batches_ahead=0)
+    held: dict[int, EpisodeTensors] = {}
+    brought, most, samples = 0, 0, 0
+    for chunk in feed.chunks():
+        for index in chunk.dropped:
+            del held[index]
+        assert not held.keys() & chunk.episodes.keys()
+        held |= chunk.episodes
+        brought, most = brought + len(chunk.episodes), max(most, len(held))
+        for sample in (sample for update in chunk.samples for sample in update):
+            samples += 1
+            expected = store.episodes[sample.episode].position_TN3
+            assert np.array_equal(held[sample.episode].position_TN3[-len(expected) :].numpy(), expected)
+        if samples >= 2 * 64 * 3:
+            break
+    assert most <= 16 and brought <= 2 * 64 + 8  # each once an epoch
