@@ -10,9 +10,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from hgn.scene.material import MATERIALS, PAPER_MATERIALS
+from hgn.scene.material import MATERIAL_NAME, MATERIALS, PAPER_MATERIALS
 from hgn.schema import (
     BelowOne,
+    Bound,
     ConfigError,
     FewLayers,
     Fraction,
@@ -36,6 +37,10 @@ BACKENDS = ("auto", "torch", "triton", "cpu")
 TRAINING_BACKENDS = ("auto", "torch", "triton")
 PRECISIONS = ("fp32", "tf32", "fp16")
 Material = Annotated[str, one_of(*MATERIALS)]
+MaterialName = Annotated[
+    str,
+    Bound("a name of lower-case letters, digits and _", lambda name: MATERIAL_NAME.fullmatch(name) is not None),
+]
 Processor = Annotated[str, one_of("auto", "cpu", "gpu")]
 BackendName = Annotated[str, one_of(*BACKENDS)]
 Precision = Annotated[str, one_of(*PRECISIONS)]
@@ -302,6 +307,32 @@ class UploadConfig:
 
 
 @dataclass(frozen=True)
+class ImportConfig:
+    """`python -m hgn.import_trajectories`, beside `from`: the folder to read."""
+
+    out: str  # a new folder, for a data set
+    # deepmind, geoelements, lagrangebench, neuralmpm or plain; auto: by the files
+    format: Annotated[str, one_of("auto", "deepmind", "geoelements", "lagrangebench", "neuralmpm", "plain")] = "auto"
+    history: OneOrMore = 5  # first frames, which a network is shown before it predicts; network.velocity_history
+    # names by particle type, as in {7: goop}, beside those that the format gives
+    materials: dict[str, str] = field(default_factory=dict)
+    boundary_types: tuple[int, ...] | None = None  # types of particles that are obstacles; null: the format's
+    # of metadata.json where null; the set's own unit of length, seconds
+    bounds: tuple[tuple[float, float], ...] | None = None  # low and high of each axis
+    dimensions: int | None = None
+    dt: float | None = None  # between frames
+    radius: float | None = None  # of neighbours: the networks' cells
+    gravity: tuple[float, ...] | None = None  # length per second squared; null: the metadata's, or estimated
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        require(self.out != "", "out", "a folder name", self.out)
+        for kind, name in self.materials.items():
+            rule = "a name of lower-case letters, digits and _"
+            require(MATERIAL_NAME.fullmatch(name) is not None, f"materials[{kind}]", rule, name)
+
+
+@dataclass(frozen=True)
 class NetworkConfig:
     """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
 
@@ -318,7 +349,8 @@ class NetworkConfig:
     # gravity are exact
     inputs: Annotated[str, one_of(*NETWORK_INPUTS)] = "absolute"
     contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
-    materials: tuple[Material, ...] = PAPER_MATERIALS
+    materials: tuple[MaterialName, ...] = PAPER_MATERIALS
+    dimensions: int = 3  # 2: z is that of a plane; imported data alone have it
     maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
     # of gns_particles: how far apart static particles are, at least, in obstacle cells
     static_spacing_cells: Positive[float] = 0.25
@@ -326,6 +358,7 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         require_bounds(self)
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
+        require(self.dimensions in (2, 3), "dimensions", "2 or 3", self.dimensions)
         if self.relative:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
             rule = "at least 2 with inputs=relative, which are of differences"
@@ -447,9 +480,13 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     run: str = "runs/obstacles"
+    # the data set is one of hgn.import_trajectories, which says what `scene` and `dataset` are: +experiment=imported
+    imported: bool = False
 
     def __post_init__(self) -> None:
         require(self.run != "", "run", "a folder name", self.run)
+        rule, dimensions = "3 for data that are not imported", self.network.dimensions
+        require(self.imported or dimensions == 3, "network.dimensions", rule, dimensions)
         upright = self.scene.zero_gravity_fraction == 0 and self.scene.tilted_gravity_fraction == 0
         rule = "relative where scene.zero_gravity_fraction or scene.tilted_gravity_fraction is above 0"
         require(self.network.relative or upright, "network.inputs", rule, self.network.inputs)
@@ -467,7 +504,8 @@ class TrainConfig:
             f"at most dataset.frames - 2 = {frames - 2} where pushforward_fraction > 0",
             training.pushforward_frames,
         )
-        unknown = [name for name in self.scene.materials if name not in self.network.materials]
+        names = () if self.imported else self.scene.materials
+        unknown = [name for name in names if name not in self.network.materials]
         require(not unknown, "network.materials", "all of scene.materials", list(self.network.materials))
 
     @property

@@ -35,6 +35,7 @@ from hgn.training.checkpoint import (
 from hgn.training.dataset import PublishedEpisodes, is_complete, wait_for_episodes
 from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
 from hgn.training.generator import Generator
+from hgn.training.imported import require_network_fits, settings_of_imported
 from hgn.training.session import precompile_kernels, train_network
 from hgn.training.stop import StopRequest
 
@@ -45,13 +46,15 @@ def main(mapping: dict[str, Any]) -> int:
     name = mapping.pop("name", "unnamed")
     if mapping.get("run") is None:
         mapping["run"] = str(default_run(name))
-    config = from_mapping(TrainConfig, mapping)
+    config = from_mapping(TrainConfig, settings_of_imported(mapping))
     if not first_on_machine():
         # whoever started this rank has ended, by an error of its own say: no time-out is waited for
         die_with_parent(signal.SIGKILL)
     layout(config.training)
     folder, run = config.dataset.folder, Path(config.run)
-    if EpisodeStore.available(folder):
+    if config.imported:
+        require_network_fits(config, Manifest.load(folder))
+    elif EpisodeStore.available(folder):
         require_same_dataset(Manifest.load(folder).config, config.datagen, folder)
     stop = StopRequest()
     stop.listen()
@@ -92,7 +95,13 @@ def _checkpoint_to_resume(config: TrainConfig, folder: Path) -> tuple[Path, Samp
         if damaged is not None:
             raise damaged
         return None
-    check_checkpoint(checkpoint, config, identity_hash(dataset_identity(config.datagen)), path)
+    imported = config.imported
+    asked = (
+        Manifest.load(config.dataset.folder).config_hash
+        if imported
+        else identity_hash(dataset_identity(config.datagen))
+    )
+    check_checkpoint(checkpoint, config, asked, path)
     return path, sampler_state_of_checkpoint(checkpoint)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tarfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,9 +16,10 @@ from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.data.manifest import EpisodeEntry, ShardEntry
 from hgn.data.reader import read_episode
+from hgn.data.shard import episode_tar, locate_members, tar_end
 from hgn.data.statistics import episode_statistics, merge_statistics
 from hgn.data.storage import file_sha256
-from hgn.scene.episode import Episode, encode_episode
+from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 from hgn.system.files import sync_file, temporary_file
 
@@ -37,12 +38,12 @@ def stage_episode(folder: Path, episode: Episode) -> None:
     `episode.solver["dataset"]` holds `config_hash` and `attempt`, by which a later run knows the episode.
     Raises: OSError (a full disk), ConfigError (positions that are not finite).
     """
-    stage_parts(folder, episode.key, _tar_of(episode))
+    stage_parts(folder, episode.key, episode_tar(episode))
 
 
 def pack_episode(episode: Episode) -> bytes:
     """The tar file of one episode. Raises: ConfigError (positions that are not finite)."""
-    return b"".join(_tar_of(episode))
+    return b"".join(episode_tar(episode))
 
 
 def stage_parts(folder: Path, key: str, parts: Iterable[bytes]) -> None:
@@ -78,24 +79,6 @@ def _seal(digest: Any) -> bytes:
     return f"sha256 {digest.hexdigest()}\n".encode()
 
 
-def _tar_of(episode: Episode) -> Iterator[bytes]:
-    """The parts of its tar: the same episode gives the same bytes, for there are no times, no owners, a fixed mode."""
-    written = 0
-    for name, data in encode_episode(episode).items():
-        info = tarfile.TarInfo(f"{episode.key}.{name}")
-        info.size, info.mtime, info.mode = len(data), 0, 0o644
-        header, rest = info.tobuf(tarfile.GNU_FORMAT), bytes(-len(data) % tarfile.BLOCKSIZE)
-        written += len(header) + len(data) + len(rest)
-        yield from (header, data, rest)
-    yield _tar_end(written)
-
-
-def _tar_end(written: int) -> bytes:
-    """What follows the last member: two empty blocks, and as many as fill a record."""
-    end = 2 * tarfile.BLOCKSIZE
-    return bytes(end + -(written + end) % tarfile.RECORDSIZE)
-
-
 def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
     """Writes the members of several staged tars as one. Raises: ConfigError where one is not what was staged."""
     written = 0
@@ -108,23 +91,7 @@ def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
             for start in range(0, length, _COPY_BYTES):
                 file.write(staged.read(min(_COPY_BYTES, length - start)))
         written += length
-    file.write(_tar_end(written))
-
-
-def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
-    """Where each member's data lies in a tar: key -> name after `<key>.` -> (offset, bytes).
-
-    Raises: ConfigError when the file is not a whole tar.
-    """
-    located: dict[str, dict[str, tuple[int, int]]] = {}
-    try:
-        with tarfile.open(path, mode="r:") as tar:
-            for info in tar:
-                key, _, name = info.name.partition(".")
-                located.setdefault(key, {})[name] = (info.offset_data, info.size)
-    except tarfile.TarError as error:
-        raise ConfigError(f"{path} must be a whole tar, got {error}; delete it and run the generator again") from None
-    return located
+    file.write(tar_end(written))
 
 
 def inspect_shard(path: Path, shard: ShardRange, config: DatagenConfig) -> ShardEntry:

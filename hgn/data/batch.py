@@ -132,7 +132,7 @@ def make_batch(
     gravity_S3 = np.array([frame_gravity(episode) for episode in episodes], np.float32)
     return Batch(
         window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
-        material_N=material_rows(np.concatenate([episode.material_N for episode in episodes]), network.materials),
+        material_N=torch.cat([material_rows(e.material_N, network.materials, e.materials) for e in episodes]),
         scene_N=torch.from_numpy(np.repeat(np.arange(len(episodes)), particles)),
         particles_S=particles,
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),

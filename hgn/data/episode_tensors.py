@@ -48,7 +48,7 @@ def whole_episode(episode: Episode, network: NetworkConfig) -> EpisodeTensors:
     grid, seen = episode.obstacle_grid, len(episode.obstacle_grid.cell_K3) if network.obstacle_features else 0
     return EpisodeTensors(
         torch.from_numpy(np.concatenate([past, episode.position_TN3], dtype=np.float32)),
-        material_rows(episode.material_N, network.materials).int(),
+        material_rows(episode.material_N, network.materials, episode.materials).int(),
         torch.from_numpy(np.array(grid.cell_K3[:seen], np.int32)),
         torch.from_numpy(np.array(grid.normal_K3[:seen], np.float32)),
         episode.domain_size,
@@ -66,4 +66,5 @@ def frame_gravity(episode: Episode) -> Vector:
 def shown_symmetries(episode: Episode, network: NetworkConfig) -> tuple[Symmetry, ...]:
     """What training may show instead of the scene: where inputs are relative, gravity turns with it."""
     kept = (0.0, 0.0, 0.0) if network.relative else episode.gravity
-    return scene_symmetries(kept, episode.domain_size, episode.obstacle_grid.cell_size)
+    size, cell_size = episode.domain_size, episode.obstacle_grid.cell_size
+    return scene_symmetries(kept, size, cell_size, int(not episode.imported), episode.dimensions)

@@ -134,7 +134,7 @@ class EpisodeStore:
     def frames(self, count: int | None = None) -> list[int]:
         """Frames of each episode, of the first `count` only. Where all have as many the index is not read for it."""
         count, config = len(self) if count is None else count, self.manifest.config
-        if "long_fraction" not in config:
+        if "frames" in config and "long_fraction" not in config:
             return [config["frames"]] * count
         for shard in self.manifest.shards.since(self._measured):
             self._frames += [entry.frames for entry in shard.episodes if shard.split == self.split]
@@ -215,7 +215,9 @@ class EpisodeStore:
         found = (episode.seed, episode.particle_count, episode.frame_count)
         expected = (entry.seed, entry.particles, entry.frames)
         config = self.manifest.config
-        lengths = {config["frames"], config.get("long_frames", config["frames"])}
+        # imported episodes are of any length
+        frames = config.get("frames", entry.frames)
+        lengths = {frames, config.get("long_frames", frames)}
         if found != expected or entry.frames not in lengths:
             raise ConfigError(
                 f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames {expected}, and as many "

@@ -18,6 +18,9 @@ from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError
 
+# The standard deviation of accelerations along an axis without motion: positions end with it, divisions do not.
+STILL = 1e-30
+
 
 @dataclass(frozen=True, eq=False)
 class ParticleState:
@@ -55,17 +58,25 @@ class Normaliser(nn.Module):
             self.register_buffer(f"{quantity}_mean", torch.zeros(3))
             self.register_buffer(f"{quantity}_std", torch.ones(3))
 
-    def set(self, quantity: str, mean_3: torch.Tensor, std_3: torch.Tensor, noise_std: float) -> None:
-        """Sets `velocity` or `acceleration` from the data's statistics. An axis without spread keeps a tiny one."""
+    def set(
+        self, quantity: str, mean_3: torch.Tensor, std_3: torch.Tensor, noise_std: float, dimensions: int = 3
+    ) -> None:
+        """Sets `velocity` or `acceleration` from the data's statistics. An axis without spread keeps a tiny one.
+
+        Axes from `dimensions` on get STILL: whatever a network says of them, nothing moves along them by as much as
+        rounding.
+        """
         getattr(self, f"{quantity}_mean").copy_(mean_3)
         total_3 = torch.sqrt(std_3.double() ** 2 + noise_std**2).clamp(min=1e-9)
         getattr(self, f"{quantity}_std").copy_(total_3)
+        getattr(self, f"{quantity}_mean")[dimensions:] = 0.0
+        getattr(self, f"{quantity}_std")[dimensions:] = 1.0 if quantity == "velocity" else STILL
 
-    def set_isotropic(self, acceleration_std_3: torch.Tensor, noise_std: float) -> None:
+    def set_isotropic(self, acceleration_std_3: torch.Tensor, noise_std: float, dimensions: int = 3) -> None:
         """For relative inputs: no means, and one scale everywhere, the root mean square of the axes' with the noise."""
         for quantity in ("velocity", "acceleration"):
-            scale = acceleration_std_3.double().square().mean().sqrt().expand(3)
-            self.set(quantity, torch.zeros(3), scale, noise_std)
+            scale = acceleration_std_3[:dimensions].double().square().mean().sqrt().expand(3)
+            self.set(quantity, torch.zeros(3), scale, noise_std, dimensions)
 
     def feature_scale(self, relative: bool) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and standard deviation [3] of what features show of velocities: relative ones are of accelerations."""
@@ -88,15 +99,15 @@ def wall_distances(position_N3: torch.Tensor, domain_N3: torch.Tensor, maximum: 
     return distance_N6.clamp(-maximum, maximum) / maximum
 
 
-def material_rows(material_N: np.ndarray, materials: Sequence[str]) -> torch.Tensor:
-    """Indices into a network's material list, int64 [N], from indices into MATERIALS.
+def material_rows(material_N: np.ndarray, materials: Sequence[str], names: Sequence[str] = MATERIALS) -> torch.Tensor:
+    """Indices into a network's material list, int64 [N], from indices into `names`.
 
     Raises: ConfigError when the network does not know a material.
     """
-    row = [materials.index(name) if name in materials else -1 for name in MATERIALS]
+    row = [materials.index(name) if name in materials else -1 for name in names]
     rows_N = np.asarray(row, np.int64)[material_N]
     if (rows_N < 0).any():
-        unknown = MATERIALS[int(material_N[rows_N < 0][0])]
+        unknown = names[int(material_N[rows_N < 0][0])]
         raise ConfigError(
             f"material must be one of the network's ({', '.join(materials)}), got {unknown}; "
             "take weights that were trained with it"

@@ -16,8 +16,8 @@ import numpy as np
 import trimesh
 
 from hgn.render.pictures import rollout_spacing
-from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR
-from hgn.scene.material import FLUIDS, MATERIALS
+from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
+from hgn.scene.material import FLUIDS
 from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import Rollout, rollout_velocity, write_rollout
 from hgn.schema import ConfigError
@@ -138,7 +138,7 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
     velocity_TN3 = rollout_velocity(rollout)
     width = rollout_spacing(rollout)
     of_material = {}
-    for index, name in enumerate(MATERIALS):
+    for index, name in enumerate(rollout.materials):
         mine_N = np.flatnonzero(rollout.material_N == index)
         if len(mine_N):
             prim = UsdGeom.Points.Define(stage, f"/World/particles/{name}")
@@ -146,7 +146,7 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
             prim.CreateWidthsAttr(Vt.FloatArray([width]))
             prim.SetWidthsInterpolation(UsdGeom.Tokens.constant)
             prim.GetPrim().CreateAttribute("primvars:material", Sdf.ValueTypeNames.String).Set(name)
-            colour(prim, MATERIAL_COLORS[index])
+            colour(prim, PARTICLE_COLORS[index])
             of_material[prim] = mine_N
     water = mesh("surface", MATERIAL_COLORS[FLUIDS[0]]) if surface else None
     surfaces = _surfaces(rollout) if surface else iter(())
@@ -186,10 +186,10 @@ def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
     fields += [(name, "u1") for name in ("material", "red", "green", "blue")]
     row_N = np.zeros(rollout.particle_count, fields)
     row_N["material"] = rollout.material_N
-    for name, value_N in zip(("red", "green", "blue"), 255 * MATERIAL_COLORS[rollout.material_N].T, strict=True):
+    for name, value_N in zip(("red", "green", "blue"), 255 * PARTICLE_COLORS[rollout.material_N].T, strict=True):
         row_N[name] = value_N
     kinds = {"<f4": "float", "u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"comment material: {', '.join(MATERIALS)}"]
+    header = ["ply", "format binary_little_endian 1.0", f"comment material: {', '.join(rollout.materials)}"]
     properties = [f"property {kinds[kind]} {name}" for name, kind in fields]
     surfaces = _surfaces(rollout) if surface else iter(())
     digits = max(4, len(str(rollout.frame_count - 1)))

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont, PngImagePlugin
 from scipy.spatial import KDTree
 
-from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, Stage, to_bytes
+from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS, Stage, to_bytes
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
@@ -236,7 +236,7 @@ def position_error(rollout: Rollout) -> dict[str, np.ndarray]:
     error = {"all": mean(rollout.material_N == rollout.material_N)}
     present = np.unique(rollout.material_N)
     if len(present) > 1:
-        error |= {MATERIALS[i]: mean(rollout.material_N == i) for i in present}
+        error |= {rollout.materials[i]: mean(rollout.material_N == i) for i in present}
     return error
 
 
@@ -398,7 +398,8 @@ def spread(count: int, wanted: int) -> list[int]:
 
 def _legend(picture: Image.Image, y: float, rollout: Rollout, text_size: int) -> None:
     """Swatches of what is in the scene, in the middle of the line at height y."""
-    entries: list[tuple[str, np.ndarray]] = [(MATERIALS[i], MATERIAL_COLORS[i]) for i in np.unique(rollout.material_N)]
+    present = np.unique(rollout.material_N)
+    entries: list[tuple[str, np.ndarray]] = [(rollout.materials[i], PARTICLE_COLORS[i]) for i in present]
     if rollout.obstacles:
         entries.append(("obstacle", OBSTACLE_COLOR))
     font = _font(text_size)

@@ -21,6 +21,11 @@ from hgn.scene.scene import Obstacle
 
 # colours as sRGB in [0, 1]; one a material, in the order of hgn.scene.material.MATERIALS
 MATERIAL_COLORS = np.array([(0.13, 0.45, 0.86), (0.87, 0.60, 0.20), (0.70, 0.81, 0.93), (0.36, 0.66, 0.38)], np.float32)
+# of the other materials that imported sets bring, over and over
+_FURTHER = np.array([(0.80, 0.29, 0.53), (0.93, 0.83, 0.30), (0.56, 0.42, 0.75), (0.45, 0.45, 0.48)], np.float32)
+_GLOSS = np.array((0.30, 0.06, 0.12, 0.20))
+PARTICLE_COLORS = np.concatenate([MATERIAL_COLORS, np.tile(_FURTHER, (64, 1))])[:256]  # by a rollout's indices
+PARTICLE_GLOSS = np.concatenate([_GLOSS, np.full(256, 0.12)])[:256]
 OBSTACLE_COLOR = np.array((0.60, 0.58, 0.62), np.float32)
 BACKGROUND_COLOR = np.array((1.0, 1.0, 1.0), np.float32)
 FLOOR_COLOR = np.array((0.89, 0.90, 0.92), np.float32)
@@ -338,8 +343,8 @@ class Stage:
         material_S = material_N[order][particle_S]
         lit_S = lit_N[order][particle_S]
         shade_S = (0.76 + 0.38 * lambert_S) * lit_S * (0.80 + 0.20 * z_S)
-        shine_S = np.array((0.30, 0.06, 0.12, 0.20))[material_S] * gloss_S * lit_S
-        color_S3 = MATERIAL_COLORS[material_S] * shade_S[:, None].astype(np.float32)
+        shine_S = PARTICLE_GLOSS[material_S] * gloss_S * lit_S
+        color_S3 = PARTICLE_COLORS[material_S] * shade_S[:, None].astype(np.float32)
         color_S3 += shine_S[:, None].astype(np.float32)
 
         depth_S = depth_N[particle_S]

@@ -21,7 +21,8 @@ from hgn.runtime.differentiable import Inputs, Pose, simulate
 from hgn.runtime.stepped_rollout import stepped
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.episode import Episode
-from hgn.scene.history import ballistic_velocities
+from hgn.scene.history import ballistic_velocities, require_past
+from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid, surface_points
 from hgn.scene.rollout_file import cell_obstacles, episode_surface
 from hgn.scene.scene import Obstacle, Scene
@@ -37,13 +38,16 @@ class InitialState:
 
     position_N3: np.ndarray
     velocity_N3: np.ndarray
-    material_N: np.ndarray  # index into MATERIALS
+    material_N: np.ndarray  # index into `materials`
     obstacle_grid: ObstacleGrid
     domain_size: tuple[float, float, float]
     gravity: tuple[float, float, float]
     # Points on the obstacles so many cells apart, for networks that see them as particles; none: of the cells alone, a
     # square each.
     sampled: Callable[[float], np.ndarray] | None = None
+    materials: tuple[str, ...] = MATERIALS
+    past_HN3: np.ndarray | None = None  # frames before this one, oldest first; none: free flight
+    dimensions: int = 3
 
     @staticmethod
     def of_episode(episode: Episode) -> InitialState:
@@ -56,6 +60,9 @@ class InitialState:
             episode.domain_size,
             episode.gravity,
             lambda spacing_cells: episode_surface(episode, spacing_cells),
+            episode.materials,
+            episode.past_HN3,
+            episode.dimensions,
         )
 
     @staticmethod
@@ -77,6 +84,18 @@ class InitialState:
             scene.gravity,
             lambda spacing_cells: _surface(scene.obstacles, scene.cell_size, spacing_cells),
         )
+
+    def velocities(self, history: int, frame_rate_hz: float) -> np.ndarray:
+        """Displacements in the frames up to now, newest first, float32 [N, history, 3], domain units per frame.
+
+        Raises: ConfigError where fewer frames before this one are known.
+        """
+        if self.past_HN3 is None:
+            gravity_3 = np.array(self.gravity, np.float64) / frame_rate_hz**2
+            return ballistic_velocities(self.velocity_N3 / frame_rate_hz, gravity_3, history)
+        require_past(self.past_HN3, history)
+        path_TN3 = np.concatenate([self.past_HN3[len(self.past_HN3) - history :], self.position_N3[None]])
+        return np.ascontiguousarray(np.diff(path_TN3, axis=0)[::-1].transpose(1, 0, 2))
 
     def surface(self, spacing_cells: float) -> np.ndarray:
         """Points on the obstacles, no closer than `spacing_cells` cells, float32 [P, 3]."""
@@ -141,11 +160,8 @@ class Simulator:
         for scene in scenes:
             self._require_scene_fits(scene)
         gravity_S3 = np.array([scene.gravity for scene in scenes], np.float64).reshape(-1, 3) / self.frame_rate_hz**2
-        velocities = [
-            ballistic_velocities(scene.velocity_N3 / self.frame_rate_hz, gravity_3, config.velocity_history)
-            for scene, gravity_3 in zip(scenes, gravity_S3, strict=True)
-        ]
-        material_N = material_rows(np.concatenate([scene.material_N for scene in scenes]), config.materials)
+        velocities = [scene.velocities(config.velocity_history, self.frame_rate_hz) for scene in scenes]
+        material_N = torch.cat([material_rows(s.material_N, config.materials, s.materials) for s in scenes])
         counts = [len(scene.position_N3) for scene in scenes]
         position_N3 = np.concatenate([scene.position_N3 for scene in scenes]).astype(np.float32)
         obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes]) if config.obstacle_features else None
@@ -222,6 +238,8 @@ class Simulator:
 
     def _require_scene_fits(self, scene: InitialState) -> None:
         info, cell_size = self._info, scene.obstacle_grid.cell_size
+        dimensions = self.network.config.dimensions
+        require(scene.dimensions == dimensions, "dimensions", f"the network's {dimensions}", scene.dimensions)
         if info is None:
             return
         if info.network.relative:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from hgn.scene.material import MATERIALS
+from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError, from_mapping
 
@@ -28,6 +28,8 @@ VELOCITY_MEMBER = "velocity.npy"
 MATERIAL_MEMBER = "material.npy"
 OBSTACLE_CELL_MEMBER = "obstacle_cell.npy"
 OBSTACLE_NORMAL_MEMBER = "obstacle_normal.npy"
+PAST_MEMBER = "past.npy"  # these two in imported episodes alone, where there are any
+BOUNDARY_MEMBER = "boundary.npy"
 PARAMETER_PREFIX = "parameter_"
 DESCRIPTION_MEMBER = "json"
 
@@ -46,7 +48,7 @@ class Episode:
     key: str  # sample name inside the data set, without dots: train-000012
     position_TN3: np.ndarray  # float32, domain units
     initial_velocity_N3: np.ndarray  # float32, domain units per second
-    material_N: np.ndarray  # uint8, index into MATERIALS
+    material_N: np.ndarray  # uint8, index into `materials`
     obstacle_grid: ObstacleGrid
     domain_size: tuple[float, float, float]
     gravity: tuple[float, float, float]  # domain units per second squared
@@ -56,6 +58,9 @@ class Episode:
     solver: dict[str, Any]  # settings and counters: substeps, projections, floors hit
     # per-particle material parameters that differ from the solver's defaults, float32 [N] by name
     material_parameters: dict[str, np.ndarray] = field(default_factory=dict)
+    materials: tuple[str, ...] = MATERIALS  # imported sets bring names of their own, behind these
+    past_HN3: np.ndarray | None = None  # float32, the frames before frame 0, oldest first; none: free flight
+    boundary_P3: np.ndarray | None = None  # float32, particles at rest that obstacles were given as
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.key):
@@ -73,8 +78,13 @@ class Episode:
             if not _NAME.fullmatch(name):
                 raise ConfigError(f"{self.key}: parameter names must be letters, digits, - and _, got {name!r}")
             self._check_array(PARAMETER_PREFIX + name, value, np.float32, (count,))
-        if count and int(self.material_N.max()) >= len(MATERIALS):
-            raise ConfigError(f"{self.key}: material must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
+        for name, array, shape in (
+            ("past", self.past_HN3, (-1, count, 3)),
+            ("boundary", self.boundary_P3, (-1, 3)),
+        ):
+            if array is not None:
+                self._check_array(name, array, np.float32, (len(array), *shape[1:]))
+        require_materials(f"{self.key}: material", self.material_N, self.materials)
         for name, number in (
             ("frame_rate_hz", self.frame_rate_hz),
             ("cell_size", self.obstacle_grid.cell_size),
@@ -85,6 +95,16 @@ class Episode:
             raise ConfigError(f"{self.key}: domain_size must be finite and > 0, got {self.domain_size!r}")
         if not all(math.isfinite(value) for value in self.gravity):
             raise ConfigError(f"{self.key}: gravity must be finite, got {self.gravity!r}")
+
+    @property
+    def imported(self) -> bool:
+        """Whether another program made it: hgn.import_trajectories."""
+        return self.specification.get("kind") == "imported"
+
+    @property
+    def dimensions(self) -> int:
+        """Of its motion: 2 where z is that of a plane, always."""
+        return int(self.specification.get("dimensions", 3))
 
     @property
     def frame_count(self) -> int:
@@ -117,6 +137,7 @@ class _Description:
     gravity: tuple[float, float, float]
     frame_rate_hz: float
     cell_size: float
+    materials: tuple[str, ...] = MATERIALS
 
 
 def encode_episode(episode: Episode) -> dict[str, bytes]:
@@ -135,6 +156,9 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
         OBSTACLE_CELL_MEMBER: _encode_array(episode.obstacle_grid.cell_K3, "<i4"),
         OBSTACLE_NORMAL_MEMBER: _encode_array(episode.obstacle_grid.normal_K3, "<f4"),
     }
+    for name, array in ((PAST_MEMBER, episode.past_HN3), (BOUNDARY_MEMBER, episode.boundary_P3)):
+        if array is not None:
+            members[name] = _encode_array(array, "<f4")
     for name in sorted(episode.material_parameters):
         members[f"{PARAMETER_PREFIX}{name}.npy"] = _encode_array(episode.material_parameters[name], "<f4")
     description = {
@@ -147,6 +171,8 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
         "frame_rate_hz": episode.frame_rate_hz,
         "cell_size": episode.obstacle_grid.cell_size,
     }
+    if episode.materials != MATERIALS:
+        description["materials"] = list(episode.materials)
     try:
         text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":"))
     except (TypeError, ValueError) as error:
@@ -172,13 +198,14 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
     description = _decode_description(key, bytes(members[DESCRIPTION_MEMBER]))
     arrays: dict[str, np.ndarray] = {}
     parameters: dict[str, np.ndarray] = {}
-    formats = {
+    needed = {
         POSITION_MEMBER: ("<f4", 3),
         VELOCITY_MEMBER: ("<f4", 2),
         MATERIAL_MEMBER: ("|u1", 1),
         OBSTACLE_CELL_MEMBER: ("<i4", 2),
         OBSTACLE_NORMAL_MEMBER: ("<f4", 2),
     }
+    formats = needed | {PAST_MEMBER: ("<f4", 3), BOUNDARY_MEMBER: ("<f4", 2)}
     for name, data in members.items():
         if name in formats:
             arrays[name] = decode_array(f"{key}.{name}", data, *formats[name])
@@ -187,7 +214,7 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
             parameters[parameter] = decode_array(f"{key}.{name}", data, "<f4", 1)
         elif name != DESCRIPTION_MEMBER:
             raise ConfigError(f"{key}.{name} is not a known member; known: {', '.join((*formats, 'json'))}")
-    for name in formats:
+    for name in needed:
         if name not in arrays:
             raise ConfigError(f"{key}: member {name} is missing; generate the data set again")
     episode = Episode(
@@ -207,6 +234,9 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         specification=description.specification,
         solver=description.solver,
         material_parameters=parameters,
+        materials=description.materials,
+        past_HN3=arrays.get(PAST_MEMBER),
+        boundary_P3=arrays.get(BOUNDARY_MEMBER),
     )
     if scan_positions:
         _require_finite_positions(episode)

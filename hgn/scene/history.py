@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hgn.scene.episode import Episode
+from hgn.schema import require
 
 
 def ballistic_positions(
@@ -42,7 +43,15 @@ def ballistic_velocities(velocity_N3: np.ndarray, gravity_3: np.ndarray, history
 
 
 def frames_before(episode: Episode, first: int) -> np.ndarray:
-    """The frames `first` (negative) to -1 of an episode, float32 [-first, N, 3]: where free flight came from."""
+    """The frames `first` (negative) to -1 of an episode, float32 [-first, N, 3].
+
+    Where free flight came from, or what an imported episode has of them.
+
+    Raises: ConfigError when that is too little.
+    """
+    if episode.past_HN3 is not None:
+        require_past(episode.past_HN3, -first)
+        return np.array(episode.past_HN3[len(episode.past_HN3) + first :])
     return ballistic_positions(
         episode.position_TN3[0],
         episode.initial_velocity_N3,
@@ -50,6 +59,13 @@ def frames_before(episode: Episode, first: int) -> np.ndarray:
         episode.frame_rate_hz,
         range(first, 0),
     )
+
+
+def require_past(past_HN3: np.ndarray, history: int) -> None:
+    """Raises ConfigError unless there are as many frames before frame 0 as a network wants velocities."""
+    remedy = "import the trajectories again with a larger history=…"
+    rule = f"at most the {len(past_HN3)} frames that the imported episodes have before their first"
+    require(history <= len(past_HN3), "network.velocity_history", rule, history, remedy)
 
 
 def window(episode: Episode, frame: int, history: int, ahead: int = 1) -> np.ndarray:

@@ -6,6 +6,11 @@ indices. Data, networks, training and reports go by the index.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
 from hgn.schema import ConfigError
 
 MATERIALS: tuple[str, ...] = ("water", "sand", "snow", "elastic")
@@ -37,3 +42,15 @@ def material_index(name: str, field: str = "material") -> int:
     if name not in MATERIALS:
         raise ConfigError(f"{field} must be one of {', '.join(MATERIALS)}, got {name!r}")
     return MATERIALS.index(name)
+
+
+MATERIAL_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")  # of an imported set's materials
+
+
+def require_materials(owner: str, material_N: np.ndarray, materials: Sequence[str]) -> None:
+    """Raises ConfigError unless the indices of field `owner` stay below the number of `materials`, which are names."""
+    for name in materials:
+        if MATERIAL_NAME.fullmatch(name) is None:
+            raise ConfigError(f"{owner}: materials must be names of lower-case letters, digits and _, got {name!r}")
+    if len(material_N) and int(material_N.max()) >= len(materials):
+        raise ConfigError(f"{owner} must be below {len(materials)}, got {int(material_N.max())}")

@@ -30,7 +30,7 @@ import numpy as np
 
 from hgn.config import is_mesh_file
 from hgn.scene.episode import Episode
-from hgn.scene.material import MATERIALS
+from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
 from hgn.scene.rotation import quaternion_rotation
@@ -58,7 +58,7 @@ class Rollout:
     """
 
     position_TN3: np.ndarray  # float32, domain units
-    material_N: np.ndarray  # uint8, index into MATERIALS
+    material_N: np.ndarray  # uint8, index into `materials`
     obstacles: tuple[Obstacle, ...]
     domain_size: tuple[float, float, float]
     frame_rate_hz: float
@@ -70,6 +70,7 @@ class Rollout:
     # int64 [N], in order: the frame in which each particle is seen first, before which its positions count for nothing
     # and are read as NaN; None: all are there from the start
     entry_frame_N: np.ndarray | None = None
+    materials: tuple[str, ...] = MATERIALS
 
     def __post_init__(self) -> None:
         shape = self.position_TN3.shape
@@ -77,8 +78,7 @@ class Rollout:
             raise ConfigError(f"position_TN3 must have shape (frames >= 1, particles, 3), got {shape}")
         if self.material_N.shape != shape[1:2]:
             raise ConfigError(f"material_N must have shape ({shape[1]},), got {self.material_N.shape}")
-        if len(self.material_N) and int(self.material_N.max()) >= len(MATERIALS):
-            raise ConfigError(f"material_N must be below {len(MATERIALS)}, got {int(self.material_N.max())}")
+        require_materials("material_N", self.material_N, self.materials)
         if not (self.frame_rate_hz > 0 and math.isfinite(self.frame_rate_hz)):
             raise ConfigError(f"frame_rate_hz must be a finite number > 0, got {self.frame_rate_hz}")
         if self.entry_frame_N is not None:
@@ -157,11 +157,14 @@ def _is_here(record: dict[str, Any]) -> bool:
 
 @functools.lru_cache(maxsize=1024)
 def episode_surface(episode: Episode, spacing_cells: float) -> np.ndarray:
-    """Points on the surfaces of an episode's obstacles, no closer than `spacing_cells` cells, float32 [P, 3].
+    """Points on the surfaces of an episode's obstacles, no closer than `spacing_cells` cells, float32 [P, 3]; of an
+    imported one the particles that its obstacles were given as.
 
     Kept for the episodes used last; sampling takes some tenths of a second.
     """
     grid = episode.obstacle_grid
+    if episode.boundary_P3 is not None:
+        return np.array(episode.boundary_P3)
     return surface_points(obstacles_of_episode(episode), grid.cell_size, 0, spacing_cells=spacing_cells)
 
 
@@ -226,7 +229,7 @@ def read_rollout(path: str | Path) -> Rollout:
     with file:
         _check_format(file, path)
         try:
-            _require_own_data(file)
+            require_own_data(file)
             return _read(file)
         except ConfigError as error:
             raise ConfigError(f"rollout must be consistent, got {path}: {error}; write it again") from error
@@ -306,7 +309,7 @@ def _stacked(value_TV3: np.ndarray, value_TN3: np.ndarray, present_T: np.ndarray
 def _write_own(group: h5py.Group, rollout: Rollout) -> None:
     group.attrs["format"] = FORMAT_NAME
     group.attrs["format_version"] = FORMAT_VERSION
-    group.attrs["materials"] = json.dumps(MATERIALS)
+    group.attrs["materials"] = json.dumps(rollout.materials)
     group.attrs["frame_rate_hz"] = float(rollout.frame_rate_hz)
     group.attrs["domain_size"] = np.array(rollout.domain_size, np.float64)
     group.attrs["gravity"] = np.array(rollout.gravity, np.float64)
@@ -329,14 +332,14 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
         group["reference"] = rollout.reference_TN3.astype(np.float32, copy=False)
 
 
-def _require_own_data(group: h5py.Group, depth: int = 0) -> None:
+def require_own_data(group: h5py.Group, depth: int = 0) -> None:
     """Raises ConfigError where a file names others, which HDF5 would read with this one's reader's rights."""
     for name in group:
         if not isinstance(group.get(name, getlink=True), h5py.HardLink) or depth > _DEPTH:
             raise ConfigError(f"{group.name} must hold its data itself, got a link in {name}")
         item = group[name]
         if isinstance(item, h5py.Group):
-            _require_own_data(item, depth + 1)
+            require_own_data(item, depth + 1)
         elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
             raise ConfigError(f"{item.name} must lie in the file itself, got data of another file")
 
@@ -359,7 +362,6 @@ def _check_format(file: h5py.File, path: Path) -> None:
 
 def _read(file: h5py.File) -> Rollout:
     own, vtk = file["hgn"], file["VTKHDF"]
-    _same_materials(json.loads(own.attrs["materials"]))
     count_T = vtk["NumberOfPoints"][()]
     points, material_P = vtk["Points"], vtk["PointData/material"][()]
     vertices = len(material_P) - len(vtk["Vertices/Connectivity"])  # of the obstacles, before the particles
@@ -392,6 +394,7 @@ def _read(file: h5py.File) -> Rollout:
         source=json.loads(own["source"][()]),
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
+        materials=tuple(json.loads(own.attrs["materials"])),
     )
 
 
@@ -404,8 +407,3 @@ def _read_motion(entry: h5py.Group) -> Motion:
             raise ConfigError(f"{entry.name}: {name} must have shape {shape}, got {value.shape}")
     x, y, z = (float(value) for value in entry.attrs["pivot"])
     return Motion(**arrays, pivot=(x, y, z))
-
-
-def _same_materials(names: list[str]) -> None:
-    if tuple(names) != MATERIALS[: len(names)]:  # files made before a material was added have the first of them
-        raise ConfigError(f"materials must be {', '.join(MATERIALS)}, got {', '.join(names)}")

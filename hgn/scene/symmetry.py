@@ -50,18 +50,27 @@ class Symmetry:
 
 
 @lru_cache(maxsize=256)
-def scene_symmetries(gravity: Vector, domain_size: Vector, cell_size: float) -> tuple[Symmetry, ...]:
+def scene_symmetries(
+    gravity: Vector, domain_size: Vector, cell_size: float, less: int = 1, dimensions: int = 3
+) -> tuple[Symmetry, ...]:
     """All exchanges and mirrors of axes that keep gravity and the domain; the identity first.
 
     Any gravity is allowed: without one all 48 symmetries of a cube remain, with an oblique one perhaps the identity
-    alone. `cell_size` is the solver's.
+    alone. `cell_size` is the solver's, whose box is `less` than the domain by a cell. An imported set's is the domain;
+    where that is no whole number of cells, an axis is not mirrored. Axes from `dimensions` on stay as they are.
     """
-    x, y, z = (round(length / cell_size) - 1 for length in domain_size)
+    x, y, z = (round(length / cell_size) - less for length in domain_size)
     cells = x, y, z
+    whole = [
+        less or abs(n * cell_size - length) < 1e-4 * cell_size for n, length in zip(cells, domain_size, strict=True)
+    ]
     symmetries = []
     for s0, s1, s2 in permutations(range(3)):
         for m0, m1, m2 in product((False, True), repeat=3):
             symmetry = Symmetry((s0, s1, s2), (m0, m1, m2), cells, cell_size)
+            moved = [s != axis or m for axis, (s, m) in enumerate(zip(symmetry.source, symmetry.mirrored, strict=True))]
+            if any(moved[dimensions:]) or any(m and not w for m, w in zip(symmetry.mirrored, whole, strict=True)):
+                continue
             if symmetry.direction(gravity) == gravity and [domain_size[s] for s in symmetry.source] == [*domain_size]:
                 symmetries.append(symmetry)
     return tuple(symmetries)

@@ -22,7 +22,7 @@ class _Lines:
         sys.stderr.flush()
 
 
-def bar(what: str, total: int, initial: int = 0, unit: str = "it") -> tqdm[Any]:
+def bar(what: str, total: int | None, initial: int = 0, unit: str = "it") -> tqdm[Any]:
     """A tqdm bar on stderr. Where stderr is no terminal: one line at most every 15 seconds."""
     terminal = sys.stderr.isatty()
     return tqdm(

@@ -16,7 +16,6 @@ from hgn.data.batch import Batch, make_batch
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.backend import Backend
 from hgn.scene.episode import Episode
-from hgn.scene.material import MATERIALS
 
 REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts
 Predictor = Callable[[Batch], torch.Tensor]  # accelerations [N, 3] in frame units
@@ -144,7 +143,7 @@ def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode])
     curves: dict[str, list[np.ndarray]] = {}
     for path_TN3, episode in zip(predicted, episodes, strict=True):
         reference_TN3 = episode.position_TN3[: len(path_TN3)]
-        parts = {MATERIALS[index]: episode.material_N == index for index in np.unique(episode.material_N)}
+        parts = {episode.materials[index]: episode.material_N == index for index in np.unique(episode.material_N)}
         for name, chosen in {"all": slice(None), **parts}.items():
             mse_T = np.full(frames, np.nan)
             mse_T[: len(path_TN3)] = position_mse(path_TN3[:, chosen], reference_TN3[:, chosen])

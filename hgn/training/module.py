@@ -64,15 +64,15 @@ class TrainingModule(LightningModule):
 
     def set_statistics(self, statistics: Statistics) -> None:
         """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
-        noise = self.training_config.noise_std
+        noise, axes = self.training_config.noise_std, self.network.config.dimensions
         if self.network.config.relative:
-            self.network.normaliser.set_isotropic(torch.tensor(statistics.acceleration.std), noise)
+            self.network.normaliser.set_isotropic(torch.tensor(statistics.acceleration.std), noise, axes)
             self._begin_average()
             return
         for quantity in ("velocity", "acceleration"):
             moments = getattr(statistics, quantity)
             mean_3, std_3 = torch.tensor(moments.mean), torch.tensor(moments.std)
-            self.network.normaliser.set(quantity, mean_3, std_3, noise)
+            self.network.normaliser.set(quantity, mean_3, std_3, noise, axes)
         self._begin_average()
 
     def load_weights(self, network: ParticleNetwork) -> None:
@@ -112,10 +112,9 @@ class TrainingModule(LightningModule):
         config = self.training_config
         if config.symmetry != "none":
             batch = under_symmetries(batch, drawn_symmetries(batch))
-        window_WN3 = perturbed_window(
-            batch, config.noise_std, config.noise_correlated_fraction, self.network.config.cell_size
-        )
-        origin_S3 = jittered_origin(batch, self.network.config.cell_size) if config.grid_jitter else None
+        cell_size, axes = self.network.config.cell_size, self.network.config.dimensions
+        window_WN3 = perturbed_window(batch, config.noise_std, config.noise_correlated_fraction, cell_size, axes)
+        origin_S3 = jittered_origin(batch, cell_size, axes) if config.grid_jitter else None
         target_N3 = self.network.target(batch.acceleration(window_WN3), batch.gravity_S3[batch.scene_N])
         predicted_N3 = (self.backend or self.network).normalised_acceleration(batch.state(window_WN3), origin_S3)
         return batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))

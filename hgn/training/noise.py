@@ -69,14 +69,16 @@ def correlated_walk(
     return height_NK @ amplitude_MK3
 
 
-def perturbed_window(batch: Batch, std_last: float, correlated: float = 0.0, cell_size: float = 1.0) -> torch.Tensor:
+def perturbed_window(
+    batch: Batch, std_last: float, correlated: float = 0.0, cell_size: float = 1.0, dimensions: int = 3
+) -> torch.Tensor:
     """A copy of the batch's window with noise in its question, [W, N, 3]; the batch stays as it is.
 
     The walk runs through the velocities, positions follow as their sums. The next position moves with the
     last one, so the target becomes v_true^{n+1} - v_noisy^n: the network learns to undo the velocity error
     (the rule of GNS, Sanchez-Gonzalez et al. 2020). `correlated` is the fraction of the variance that neighbours have
     in common: in a rollout a body's particles err together, which independent noise, averaged over them, never shows.
-    Each scene's noise is `batch.noise_scale_S` times that.
+    Each scene's noise is `batch.noise_scale_S` times that. Axes from `dimensions` on have none.
     """
     window_WN3 = batch.window_WN3
     if std_last == 0:
@@ -94,15 +96,18 @@ def perturbed_window(batch: Batch, std_last: float, correlated: float = 0.0, cel
             std = scale * std_last * math.sqrt(correlated)
             velocity_MN3 = velocity_MN3 + correlated_walk(position_N3, history, std, cell_size, generator)
         first += count
+        velocity_MN3[..., dimensions:] = 0.0
         position_MN3 = velocity_MN3.cumsum(0)
         shift.append(torch.cat([torch.zeros_like(position_MN3[:1]), position_MN3, position_MN3[-1:]]))
     return window_WN3 + torch.cat(shift, dim=1)
 
 
-def jittered_origin(batch: Batch, cell_size: float) -> torch.Tensor:
-    """Grid origins uniform in [-cell_size, 0]^3, one for each scene, [S, 3]."""
+def jittered_origin(batch: Batch, cell_size: float, dimensions: int = 3) -> torch.Tensor:
+    """Grid origins uniform in [-cell_size, 0]^3, one for each scene, [S, 3]; 0 on axes from `dimensions` on."""
     origins = []
     for seed in batch.seeds_S:
         generator = torch.Generator().manual_seed(seed ^ JITTER_STREAM)
         origins.append(-cell_size * torch.rand(3, generator=generator))
-    return torch.stack(origins).to(batch.window_WN3)
+    origin_S3 = torch.stack(origins)
+    origin_S3[:, dimensions:] = 0.0
+    return origin_S3.to(batch.window_WN3)

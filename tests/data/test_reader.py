@@ -14,12 +14,12 @@ import pytest
 from written_files import first_release
 
 import hgn.data.storage
-from datagen.pool.shard import locate_members
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, SceneConfig
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
+from hgn.data.shard import locate_members
 from hgn.schema import ConfigError
 
 MakeConfig = Callable[..., DatagenConfig]

@@ -16,11 +16,11 @@ from written_files import MakeConfig, MakeDataset, Stage, claim_all, hashes, sna
 import datagen.pool.shard
 import datagen.pool.writer
 from datagen.pool.plan import scene_seed
-from datagen.pool.shard import locate_members
 from datagen.pool.writer import MAXIMUM_REPLACEMENTS, DatasetWriter
 from hgn.config import DatagenConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
+from hgn.data.shard import locate_members
 from hgn.schema import ConfigError
 
 

@@ -20,11 +20,11 @@ import webdataset
 from written_files import MakeConfig, MakeDataset, Stage, claim_all, hashes
 
 from datagen.pool.plan import ShardRange
-from datagen.pool.shard import locate_members
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
+from hgn.data.shard import locate_members
 from hgn.data.statistics import Moments
 from hgn.schema import ConfigError
 

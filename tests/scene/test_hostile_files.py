@@ -19,9 +19,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scene.test_rollout_file import make_rollout
 
-from datagen.pool.shard import locate_members
 from hgn.config import NetworkConfig, SolveConfig
 from hgn.data.index import parse_json
+from hgn.data.shard import locate_members
 from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene

@@ -63,7 +63,7 @@ def assemble_batch(
     domain, gravity, obstacle_table, particle_count, mean, std, noise_step, waves, jitter, scenes,
     obstacle_cell_size,
     HISTORY: tl.constexpr, SYMMETRY: tl.constexpr, NOISE: tl.constexpr, WAVES: tl.constexpr,
-    SCENES: tl.constexpr, BLOCK: tl.constexpr,
+    DIMENSIONS: tl.constexpr, SCENES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Windows with noise in the question (paper sec. 3.3): a random walk of velocity noise, positions follow;
     with NOISE each particle has its own, with WAVES a part comes from the waves of its scene, see draw_waves.
@@ -72,7 +72,7 @@ def assemble_batch(
     size and gravity as the sample shows them; gravity is zero with absolute inputs. Grid origins are uniform in
     [-jitter, 0]. Noise and jitter are Philox numbers of the sample's seed: they depend on nothing else. With SYMMETRY
     the window is the image of the stored one; velocities come from the stored positions, for mirrored ones are rounded.
-    SCENES: a power of two, at least `scenes`.
+    SCENES: a power of two, at least `scenes`. Axes from DIMENSIONS on have neither noise nor jitter.
 
     Reference: hgn.training.noise; test: tests/kernels/test_update.py.
     """
@@ -88,7 +88,7 @@ def assemble_batch(
         seed = tl.load(table + scene * SAMPLE_COLUMNS + 3, mask=there, other=0)
         for axis in tl.static_range(3):
             draw = tl.rand(seed, scene * 0 + JITTER_OFFSET + axis)
-            tl.store(origin + scene * 3 + axis, -jitter * draw, mask=there)
+            tl.store(origin + scene * 3 + axis, -jitter * draw if axis < DIMENSIONS else 0.0 * draw, mask=there)
             size = tl.load(vectors + scene * 6 + axis, mask=there, other=0.0)
             tl.store(domain + scene * 3 + axis, size, mask=there)
             pull = tl.load(vectors + scene * 6 + 3 + axis, mask=there, other=0.0)
@@ -139,9 +139,9 @@ def assemble_batch(
         before = tl.load(column, mask=live, other=0.0)
         v = walk
         for k in tl.static_range(HISTORY):
-            if NOISE:
+            if NOISE and axis < DIMENSIONS:
                 walk += noise_row * tl.randn(seed_row, ((own * HISTORY + k) * 3 + axis).to(tl.int32))
-            if WAVES > 0:
+            if WAVES > 0 and axis < DIMENSIONS:
                 walk += tl.sum(height * tl.load(wave + 4 + k * 3 + axis), 1)
             moved += walk
             now = tl.load(column + (k + 1) * frame, mask=live, other=0.0)

@@ -399,7 +399,7 @@ class Updates:
             jitter=config.cell_size if settings.grid_jitter else 0.0, scenes=settings.scenes,
             obstacle_cell_size=settings.obstacle_cell_size, HISTORY=config.velocity_history,
             SYMMETRY=settings.symmetry, NOISE=own_step > 0, WAVES=CORRELATED_WAVES if wave_step > 0 else 0,
-            SCENES=triton.next_power_of_2(settings.scenes), BLOCK=BLOCK,
+            DIMENSIONS=config.dimensions, SCENES=triton.next_power_of_2(settings.scenes), BLOCK=BLOCK,
         )  # fmt: skip
 
     def _grid(self) -> None:

@@ -1,0 +1,1 @@
+"""Trajectories of other programs, read without running or unpickling anything of theirs."""

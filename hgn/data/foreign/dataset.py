@@ -1,0 +1,133 @@
+"""An imported set as a data set's folder: shards, index and, last, the manifest."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hgn.config import ImportConfig
+from hgn.data.foreign.episodes import Converter, obstacle_cell_size
+from hgn.data.foreign.formats import find_format, read_split, set_info
+from hgn.data.foreign.gravity import estimate_gravity
+from hgn.data.foreign.trajectory import SetInfo, Trajectory
+from hgn.data.identity import identity_hash
+from hgn.data.index import EpisodeEntry, ListedIndex, ShardEntry
+from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
+from hgn.data.shard import episode_tar, locate_members, tar_end
+from hgn.data.statistics import Statistics, episode_statistics, merge_statistics
+from hgn.data.storage import file_sha256
+from hgn.scene.episode import SCHEMA_VERSION, Episode
+from hgn.schema import ConfigError, require
+from hgn.system.files import sync_file, sync_folder, temporary_file
+
+SHARD_BYTES = 128 << 20
+LOOKED_AT = 4  # trajectories, for gravity and for the spacing of boundaries
+
+
+def import_set(source: Path, config: ImportConfig, progress: Callable[[Episode], Any] = lambda _: None) -> Manifest:
+    """Reads the trajectories of a folder and writes them as a data set; tells each episode to `progress`.
+
+    Raises: ConfigError naming file and field for what cannot be read; OSError. The manifest is written last: without
+    one an import that broke off is begun again.
+    """
+    out = Path(config.out)
+    require(not (out / MANIFEST_NAME).exists(), "out", "a new folder", config.out, "this holds a data set")
+    info = set_info(source, find_format(source, config.format), config)
+    first = list(itertools.islice(read_split(source, "train", info), LOOKED_AT))
+    require(bool(first), "from", f"a folder with training trajectories ({info.format})", str(source))
+    gravity = info.gravity or _estimated(first, info)
+    still = [points for points in (_boundary(trajectory, info) for trajectory in first) if len(points)]
+    converter = Converter(info, gravity, config.history, obstacle_cell_size(info, still))
+    del first, still
+    out.mkdir(parents=True, exist_ok=True)
+    shards: list[ShardEntry] = []
+    for split in SPLITS:
+        episodes = (
+            converter.episode(trajectory, f"{split}-{index:06d}", index)
+            for index, trajectory in enumerate(read_split(source, split, info))
+        )
+        shards += _shards(out, split, episodes, progress)
+    identity = {
+        "schema_version": SCHEMA_VERSION,
+        "imported": {
+            "format": info.format,
+            "dimensions": info.dimensions,
+            "radius": info.radius,
+            "history": config.history,
+            "domain_size": list(converter.domain_size),
+            "obstacle_cell_size": converter.obstacle_cell_size,
+            "obstacles": converter.with_obstacles,
+            "materials": [name for name in converter.materials if name in converter.present],
+            "gravity": list((*gravity, 0.0)[:3]),
+            "several_gravities": len(converter.gravities) > 1,
+            "maximum_initial_speed": converter.maximum_initial_speed,
+            "content": hashlib.sha256("".join(shard.sha256 for shard in shards).encode()).hexdigest(),
+        },
+        "frame_rate_hz": 1 / info.frame_dt_s,
+        "seed": 0,
+    }
+    requested = {split: sum(len(shard.episodes) for shard in shards if shard.split == split) for split in SPLITS}
+    return Manifest(identity_hash(identity), identity, requested, len(shards), ListedIndex(shards)).save(out)
+
+
+def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
+    free = [t.position_TND[:, ~np.isin(t.type_N, list(info.boundary_types))] for t in first]
+    found = estimate_gravity(free, info.frame_dt_s)
+    size = float(np.linalg.norm(found))
+    if info.gravity_size is not None and abs(size - info.gravity_size) > 0.1 * info.gravity_size:
+        raise ConfigError(
+            f"gravity must be given where what flies does not show metadata.json's g_ext_magnitude of "
+            f"{info.gravity_size:g}, got {size:.3g}; as in gravity=[0,-{info.gravity_size:g}]"
+        )
+    return found
+
+
+def _boundary(trajectory: Trajectory, info: SetInfo) -> np.ndarray:
+    fixed_PD = trajectory.position_TND[0, np.isin(trajectory.type_N, list(info.boundary_types))]
+    own = trajectory.boundary_PD
+    return fixed_PD if own is None else np.concatenate([fixed_PD, own])
+
+
+def _shards(
+    folder: Path, split: str, episodes: Iterator[Episode], progress: Callable[[Episode], Any]
+) -> Iterator[ShardEntry]:
+    """Writes shard after shard, each whole or not at all."""
+    waiting = next(episodes, None)
+    first = 0
+    while waiting is not None:
+        with temporary_file(folder / f"{split}.tar") as temporary:
+            taken: list[tuple[str, int, int, int, Statistics]] = []
+            written = 0
+            with temporary.open("wb") as file:
+                while waiting is not None and (not taken or written < SHARD_BYTES):
+                    *parts, _ = episode_tar(waiting)
+                    written += sum(file.write(part) for part in parts)
+                    taken.append(_noted(waiting))
+                    progress(waiting)
+                    waiting = next(episodes, None)
+                file.write(tar_end(written))
+                sync_file(file)
+            stop = first + len(taken)
+            target = folder / f"{split}-{first:06d}-{stop:06d}.tar"
+            located = locate_members(temporary)
+            temporary.replace(target)
+        entries = tuple(
+            EpisodeEntry(key, first + place, seed, 0, particles, frames, located[key])
+            for place, (key, seed, particles, frames, _) in enumerate(taken)
+        )
+        yield ShardEntry(
+            target.name, split, first, stop, file_sha256(target), target.stat().st_size, entries,
+            merge_statistics(statistics for *_, statistics in taken),
+        )  # fmt: skip
+        first = stop
+    sync_folder(folder)
+
+
+def _noted(episode: Episode) -> tuple[str, int, int, int, Statistics]:
+    statistics = episode_statistics(episode.position_TN3)
+    return episode.key, episode.seed, episode.particle_count, episode.frame_count, statistics

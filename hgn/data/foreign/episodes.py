@@ -1,0 +1,187 @@
+"""Trajectories as episodes of this project.
+
+Lengths keep the set's unit, and the box begins at the origin. Networks' cells are the set's radius wide, obstacle cells
+in proportion (`obstacle_cell_size`). A flat set lies on a plane across z that runs through centres of cells, so that a
+grid hierarchy has one layer of cells on each level; its walls across z are out of reach.
+Shape legend: T frames, N particles, P particles of the boundary, K obstacle cells, H frames before frame 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hgn.config import NetworkConfig
+from hgn.data.foreign.boundary import boundary_grid, spacing
+from hgn.data.foreign.trajectory import SetInfo, Trajectory
+from hgn.scene.episode import Episode
+from hgn.scene.material import MATERIALS
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.schema import ConfigError, require
+
+CELL_OF_RADIUS = 1 / 64 / NetworkConfig.cell_size  # the paper's obstacle cells, in its networks' cells
+AT_REST = 1e-3  # of the radius: by so much particles of the boundary may move
+OUTSIDE = 0.01  # of the particles may begin farther than a radius outside of the box
+
+
+@dataclass(eq=False)
+class Converter:
+    """Makes episodes of a set's trajectories, and notes what they hold."""
+
+    info: SetInfo
+    gravity: tuple[float, ...]  # length per second squared, of trajectories without their own
+    history: int
+    obstacle_cell_size: float
+    present: set[str] = field(default_factory=set)  # materials
+    gravities: set[tuple[float, float, float]] = field(default_factory=set)
+    maximum_initial_speed: float = 0.0  # length per second
+    with_obstacles: bool = False
+
+    def __post_init__(self) -> None:
+        names = self.info.materials.values()
+        self.materials = (*MATERIALS, *sorted({name for name in names if name not in MATERIALS}))
+        low_D, high_D = np.array(self.info.bounds).T
+        self.offset = (*(float(value) for value in low_D), 0.0)[:3]
+        size = [float(value) for value in high_D - low_D]
+        self.plane = 0.0
+        if self.info.dimensions == 2:
+            self.plane = flat_plane(self.info.radius, self.obstacle_cell_size)
+            size.append(2 * self.plane)
+        x, y, z = size
+        self.domain_size = x, y, z
+
+    def episode(self, trajectory: Trajectory, key: str, index: int) -> Episode:
+        """Raises: ConfigError naming the trajectory, for unknown types, moving boundaries, too few frames, and
+        particles outside of the box.
+        """
+        info, name = self.info, trajectory.name
+        frames, first = len(trajectory.position_TND), self.history
+        require(frames >= first + 2, f"{name}: position", f"{first} + 2 frames or more, for history={first}", frames)
+        fixed_N = np.isin(trajectory.type_N, list(info.boundary_types))
+        position_TN3 = self._placed(trajectory.position_TND)
+        still_TP3, free_TN3 = position_TN3[:, fixed_N], position_TN3[:, ~fixed_N]
+        moved = float(np.abs(still_TP3 - still_TP3[:1]).max(initial=0))
+        if moved > AT_REST * info.radius:
+            raise ConfigError(
+                f"{name}: particles of types {sorted(info.boundary_types)} must be at rest, got a motion by "
+                f"{moved:.3g}: networks know obstacles at rest; say which types are obstacles with boundary_types=[...]"
+            )
+        self._require_inside(name, free_TN3[0])
+        boundary_P3 = still_TP3[0]
+        if trajectory.boundary_PD is not None:
+            boundary_P3 = np.concatenate([boundary_P3, self._placed(trajectory.boundary_PD)])
+        grid = self._grid(trajectory, boundary_P3)
+        gravity = trajectory.gravity or self.gravity
+        x, y, z = (*gravity, 0.0)[:3]
+        # what takes frame 0 from the frame before it, in free flight
+        velocity_N3 = (free_TN3[first].astype(np.float64) - free_TN3[first - 1]) / info.frame_dt_s
+        velocity_N3 += 0.5 * info.frame_dt_s * np.array((x, y, z))
+        material_N = self._materials(name, trajectory.type_N[~fixed_N])
+        self.present |= {self.materials[i] for i in np.unique(material_N)}
+        self.gravities.add((x, y, z))
+        speed = float(np.linalg.norm(velocity_N3, axis=-1).max(initial=0))
+        self.maximum_initial_speed = max(self.maximum_initial_speed, speed)
+        self.with_obstacles |= len(grid.cell_K3) > 0
+        own: Mapping[str, np.ndarray] = {}
+        if trajectory.property_N is not None:
+            own = {"material_property": trajectory.property_N[~fixed_N]}
+        return Episode(
+            key=key,
+            position_TN3=free_TN3[first:],
+            initial_velocity_N3=velocity_N3.astype(np.float32),
+            material_N=material_N,
+            obstacle_grid=grid,
+            domain_size=self.domain_size,
+            gravity=(x, y, z),
+            frame_rate_hz=1 / info.frame_dt_s,
+            seed=index,
+            specification={
+                "kind": "imported",
+                "format": info.format,
+                "trajectory": name,
+                "dimensions": info.dimensions,
+                "offset": list(self.offset),  # what was taken from positions
+            },
+            solver={},
+            material_parameters=dict(own),
+            materials=self.materials if set(self.materials) != set(MATERIALS) else MATERIALS,
+            past_HN3=free_TN3[:first],
+            boundary_P3=boundary_P3 if len(boundary_P3) else None,
+        )
+
+    def _placed(self, position_xD: np.ndarray) -> np.ndarray:
+        """Positions from the box's corner on, float32 [..., 3]; those of a box at the origin as they are."""
+        offset_D = np.array(self.offset[: self.info.dimensions])
+        placed = np.empty((*position_xD.shape[:-1], 3), np.float32)
+        placed[..., 2] = self.plane
+        placed[..., : self.info.dimensions] = position_xD - offset_D if offset_D.any() else position_xD
+        return placed
+
+    def _require_inside(self, name: str, position_N3: np.ndarray) -> None:
+        reach = self.info.radius
+        beyond_N3 = (position_N3 < -reach) | (position_N3 > np.array(self.domain_size) + reach)
+        outside = beyond_N3.any(-1).mean() if len(position_N3) else 0.0
+        if outside > OUTSIDE:
+            place_N3 = position_N3.astype(np.float64) + self.offset
+            corners = (place_N3.min(0), place_N3.max(0))
+            found = [[round(float(c[axis]), 4) for c in corners] for axis in range(self.info.dimensions)]
+            raise ConfigError(
+                f"bounds must hold the particles, got {[list(pair) for pair in self.info.bounds]} with {outside:.0%} "
+                f"of those of {name} outside, which lie in {found}; give bounds=…"
+            )
+
+    def _grid(self, trajectory: Trajectory, boundary_P3: np.ndarray) -> ObstacleGrid:
+        cell_size, cell_K3 = self.obstacle_cell_size, trajectory.obstacle_cell_K3
+        if cell_K3 is not None:
+            assert trajectory.obstacle_normal_K3 is not None
+            order = np.lexsort(np.asarray(cell_K3).T[::-1])
+            normal_K3 = trajectory.obstacle_normal_K3[order].astype(np.float32)
+            return ObstacleGrid(cell_size, np.asarray(cell_K3)[order].astype(np.int32), normal_K3)
+        if not len(boundary_P3):
+            return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+        return boundary_grid(boundary_P3, self.info.dimensions, cell_size)
+
+    def _materials(self, name: str, type_N: np.ndarray) -> np.ndarray:
+        names = self.info.materials
+        unknown = sorted({int(number) for number in np.unique(type_N)} - set(names))
+        if unknown:
+            remedy = f"give it one, as in materials={{{unknown[0]}: clay}}"
+            raise ConfigError(f"{name}: particle_type must have a name for each number, got {unknown}; {remedy}")
+        index = {number: self.materials.index(value) for number, value in names.items()}
+        material_N = np.zeros(len(type_N), np.uint8)
+        for number in np.unique(type_N):
+            material_N[type_N == number] = index[int(number)]
+        return material_N
+
+
+def obstacle_cell_size(info: SetInfo, boundaries: list[np.ndarray]) -> float:
+    """The width of obstacle cells: the paper's in proportion to the radius, and none between particles of a boundary.
+
+    Mirrors keep cells and box where it is a whole number of cells wide, so the width is brought there on x.
+    """
+    if info.obstacle_cell_size is not None:
+        return float(info.obstacle_cell_size)
+    apart = max((spacing(points) for points in boundaries), default=0.0)
+    wanted = max(CELL_OF_RADIUS * info.radius, 1.001 * apart)
+    low, high = info.bounds[0]
+    return (high - low) / max(1, int((high - low) / wanted + 1e-6))
+
+
+def flat_plane(radius: float, obstacle_cell: float) -> float:
+    """A z in the middle between two faces of cells of both sizes, whose cell networks find exactly.
+
+    (z / radius - 1/2) is a whole number in float32, however it is computed: a division, a product with the reciprocal,
+    either with or without rounding before the subtraction. It is 16 radii or more away from the origin, beyond what
+    walls are seen from.
+    """
+    cell = np.float32(radius)
+    inverse = np.float32(1) / cell
+    for layer in range(16, 4096):
+        z, wanted = np.float32((layer + 0.5) * radius), np.float32(layer + 0.5)
+        unrounded = np.float32(np.float64(z) * np.float64(inverse) - 0.5)
+        middle = 0.1 < float(z) / obstacle_cell % 1 < 0.9
+        if z / cell == wanted and z * inverse == wanted and unrounded == layer and middle:
+            return float(z)
+    raise ConfigError(f"radius must be one that float32 divides by, got {radius}; give radius=… with fewer digits")

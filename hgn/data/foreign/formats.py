@@ -1,0 +1,309 @@
+"""The formats of particle trajectories: which files, what is in them, and what their numbers mean.
+
+| format | files | made by |
+|---|---|---|
+| deepmind | {split}.tfrecord, metadata.json | google-deepmind/deepmind-research, learning_to_simulate |
+| geoelements | {split}.npz of pickled arrays, metadata.json | geoelements/gns |
+| lagrangebench | {split}.h5, metadata.json | tumaer/lagrangebench |
+| neuralmpm | {split}/sim_{i}.h5 | OmerRochman/NeuralMPM |
+| plain | {split}.npz or {split}.h5, metadata.json | docs/how_to/import.md |
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from hgn.config import ImportConfig
+from hgn.data.foreign.npz import read_npz
+from hgn.data.foreign.tfrecord import parse_sequence_example, read_records
+from hgn.data.foreign.trajectory import FLUID, SetInfo, Trajectory, checked, floats
+from hgn.scene.rollout_file import require_own_data
+from hgn.schema import ConfigError, require
+
+SPLIT_NAMES = {"train": ("train",), "validation": ("valid", "validation"), "test": ("test",)}
+# types of particles: of DeepMind's sets, which geoelements and NeuralMPM keep, and of LagrangeBench's
+_DEEPMIND = {0: "rigid", FLUID: "fluid", 5: "water", 6: "sand", 7: "goop"}
+_LAGRANGEBENCH = {0: "fluid", 3: "rigid"}
+_DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError)  # what h5py raises
+
+
+def find_format(folder: Path, asked: str) -> str:
+    """The format of a folder's files. Raises: ConfigError where there are none, or none of the format asked for."""
+    require(folder.is_dir(), "from", "a folder with trajectories", str(folder))
+    found = []
+    if _file(folder, "train", ".tfrecord"):
+        found.append("deepmind")
+    if any((folder / name).is_dir() for name in SPLIT_NAMES["train"]):
+        found.append("neuralmpm")
+    if archive := _file(folder, "train", ".npz"):
+        _, first = next(read_npz(archive), ("", np.zeros(0)))
+        found.append("geoelements" if first.dtype.hasobject else "plain")
+    if _file(folder, "train", ".h5"):
+        metadata = _metadata(folder)
+        bench = {"solver", "write_every", "periodic_boundary_conditions"} & set(metadata)
+        found.append("lagrangebench" if bench else "plain")
+    names = "train.tfrecord, train.npz, train.h5 or train/sim_0.h5"
+    require(bool(found), "from", f"a folder with {names}", str(folder), "see docs/how_to/import.md")
+    if asked == "auto":
+        require(len(found) == 1, "format", f"one of {', '.join(found)}, which {folder} has", asked)
+        return found[0]
+    ours = {"lagrangebench", "plain"}  # the same files
+    require(asked in found or (asked in ours and bool(ours & set(found))), "format", " or ".join(found), asked)
+    return asked
+
+
+def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
+    """What the metadata say of a set, and the command line instead of it.
+
+    Raises: ConfigError naming what is missing or wrong, and for periodic boxes and forces that change with time.
+    """
+    raw = _metadata(folder)
+    if isinstance(raw.get("train"), Mapping):  # geoelements' may differ between training and rollout
+        raw = dict(raw["train"])
+    if any(np.ravel(raw.get("periodic_boundary_conditions", False))):
+        raise ConfigError(
+            f"{folder}/metadata.json: periodic_boundary_conditions must be false on every axis, got "
+            f"{raw['periodic_boundary_conditions']}: cells and walls of the networks end at the box, and do not meet "
+            "their other side"
+        )
+    if "context_mean" in raw:
+        raise ConfigError(
+            f"{folder}/metadata.json: context_mean must be absent, got a set with step_context: no network here takes "
+            "a force that changes with time"
+        )
+    types, boundary = (_LAGRANGEBENCH, {1, 2}) if name == "lagrangebench" else (_DEEPMIND, {3})
+    if name == "plain":
+        types = types | {_number(key, folder): str(value) for key, value in raw.get("materials", {}).items()}
+        boundary = {int(value) for value in raw.get("boundary_types", boundary)}
+    types = types | {_number(key, folder): value for key, value in config.materials.items()}
+    bounds: Any = config.bounds or raw.get("bounds")
+    dimensions: Any = config.dimensions or raw.get("dim") or (len(bounds) if bounds else None)
+    dt: Any = config.dt or raw.get("dt")
+    radius: Any = config.radius or raw.get("default_connectivity_radius")
+    for key, value in {"bounds": bounds, "dt": dt, "radius": radius}.items():
+        rule = f"given where {folder}/metadata.json does not say it"
+        require(value is not None, key, rule, value, f"as in {key}={_EXAMPLES[key]}")
+    gravity: Any = config.gravity if config.gravity is not None else raw.get("gravity")
+    size = raw.get("g_ext_magnitude")
+    if gravity is None and size == 0:
+        gravity = (0.0,) * int(dimensions)
+    try:
+        every = float(raw.get("write_every", 1)) if name == "lagrangebench" and config.dt is None else 1.0
+        return SetInfo(
+            format=name,
+            dimensions=int(dimensions),
+            frame_dt_s=float(dt) * every,
+            bounds=tuple((float(low), float(high)) for low, high in bounds),
+            radius=float(radius),
+            materials=types,
+            boundary_types=frozenset(boundary if config.boundary_types is None else config.boundary_types),
+            ignored_types=frozenset({-1} if name == "lagrangebench" else ()),
+            gravity=None if gravity is None else tuple(float(value) for value in gravity),
+            gravity_size=None if size is None else float(size),
+            obstacle_cell_size=raw.get("obstacle_cell_size"),
+            raw=raw,
+        )
+    except (TypeError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{folder}/metadata.json must hold dim, dt, bounds as numbers, got {error}") from None
+
+
+def read_split(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+    """The trajectories of a split, one after the other, in the order of their names; none where there is no file.
+
+    Raises: ConfigError naming the file, the trajectory and the field that is missing, cut, altered or of a wrong type.
+    """
+    return _READERS[info.format](folder, split, info)
+
+
+def _read_deepmind(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+    path = _file(folder, split, ".tfrecord")
+    for number, record in enumerate(read_records(path) if path else ()):
+        name = f"{path}: record {number}"
+        context, lists = parse_sequence_example(record, name)
+        types = _joined(f"{name}: particle_type", context.get("particle_type"), "<i8")
+        flat = _joined(f"{name}: position", lists.get("position"), "<f4")
+        frames: Any = info.raw.get("sequence_length")
+        require(isinstance(frames, int), f"{folder}/metadata.json: sequence_length", "a whole number", frames)
+        shape = (int(frames) + 1, len(types), info.dimensions)  # one frame more, from which the first velocity comes
+        if flat.size != np.prod(shape):
+            rule = f"{np.prod(shape)} numbers for sequence_length + 1, particles and dim {shape}"
+            raise ConfigError(f"{name}: position must have {rule}, got {flat.size}")
+        position_TND, type_N = checked(name, flat.reshape(shape), types, info.dimensions)
+        yield Trajectory(name, position_TND, type_N)
+
+
+def _joined(name: str, parts: list[bytes] | None, dtype: str) -> np.ndarray:
+    if not parts:
+        raise ConfigError(f"{name} is missing; the record must have it as bytes")
+    data = b"".join(parts)
+    size = np.dtype(dtype).itemsize
+    require(len(data) % size == 0, name, f"whole numbers of {size} bytes", f"{len(data)} bytes")
+    return np.frombuffer(data, dtype)
+
+
+def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+    path = _file(folder, split, ".npz")
+    for member, array in read_npz(path) if path else ():
+        several = member == "gns_data"
+        for number, entry in enumerate(array if several else [array]):
+            name = f"{path}: {member}" + (f"[{number}]" if several else "")
+            parts = list(entry) if isinstance(entry, (tuple, list, np.ndarray)) else []
+            if len(parts) not in (2, 3):
+                raise ConfigError(
+                    f"{name} must be (position, particle_type) or these and material_property, got {entry!r:.60}"
+                )
+            position_TND, type_N = checked(name, np.asarray(parts[0]), np.asarray(parts[1]), info.dimensions)
+            own = None
+            if len(parts) == 3:
+                own = np.broadcast_to(np.asarray(parts[2], np.float32), type_N.shape).copy()
+                floats(f"{name}: material_property", own, (len(type_N),))
+            yield Trajectory(name, position_TND, type_N, property_N=own)
+
+
+def _read_hdf5(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+    path = _file(folder, split, ".h5")
+    if path is None:
+        if info.format == "plain" and (archive := _file(folder, split, ".npz")):
+            yield from _read_plain_npz(archive, info)
+        return
+    with _opened(path) as file:
+        for key in sorted(file):
+            require(isinstance(file[key], h5py.Group), f"{path}: {key}", "a group with position", str(file[key]))
+            members = {name: _dataset(f"{path}: {key}", file[key], name) for name in file[key]}
+            yield _of_members(f"{path}: {key}", members, info)
+
+
+def _read_plain_npz(path: Path, info: SetInfo) -> Iterator[Trajectory]:
+    key, members = "", dict[str, np.ndarray]()
+    for member, array in read_npz(path):
+        trajectory, _, name = member.rpartition("/")
+        require(bool(trajectory), f"{path}: {member}", "named TRAJECTORY/FIELD", member)
+        require(not array.dtype.hasobject, f"{path}: {member}", "an array of numbers", str(array.dtype))
+        if members and trajectory != key:
+            yield _of_members(f"{path}: {key}", members, info)
+            members = {}
+        key, members[name] = trajectory, array
+    if members:
+        yield _of_members(f"{path}: {key}", members, info)
+
+
+def _of_members(name: str, members: Mapping[str, np.ndarray], info: SetInfo) -> Trajectory:
+    position = members.get("position", members.get("positions"))  # geoelements' HDF5 has the other
+    if position is None:
+        raise ConfigError(f"{name}: position is missing; it has {', '.join(members) or 'nothing'}")
+    types = members.get("particle_type")
+    if types is None:
+        require(info.format == "plain", f"{name}: particle_type", "there", None)
+        types = np.full((), FLUID)
+    position_TND, type_N = checked(name, position, types, info.dimensions)
+    kept_N = ~np.isin(type_N, list(info.ignored_types))
+    if not kept_N.all():
+        position_TND, type_N = position_TND[:, kept_N], type_N[kept_N]
+    boundary, cell, normal = (members.get(key) for key in ("boundary", "obstacle_cell", "obstacle_normal"))
+    if boundary is not None:
+        boundary = floats(f"{name}: boundary", boundary, (None, info.dimensions))
+    if cell is not None:
+        require(info.obstacle_cell_size is not None, "metadata.json: obstacle_cell_size", "given", None)
+        rule = "whole numbers [K, 3]"
+        fits = cell.dtype.kind in "iu" and cell.ndim == 2 and cell.shape[1] == 3
+        require(fits, f"{name}: obstacle_cell", rule, f"{cell.dtype} {list(cell.shape)}")
+        require(normal is not None, f"{name}: obstacle_normal", "there with obstacle_cell", None)
+        normal = floats(f"{name}: obstacle_normal", normal, cell.shape)
+    gravity = members.get("gravity")
+    if gravity is not None:
+        gravity = floats(f"{name}: gravity", gravity, (info.dimensions,))
+    own = members.get("material_property")
+    if own is not None:
+        own = np.broadcast_to(np.asarray(own, np.float32), kept_N.shape)[kept_N].copy()
+        floats(f"{name}: material_property", own, (len(type_N),))
+    return Trajectory(
+        name, position_TND, type_N, boundary, own, cell, normal,
+        None if gravity is None else tuple(float(value) for value in gravity),
+    )  # fmt: skip
+
+
+def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
+    there = [folder / name for name in SPLIT_NAMES[split] if (folder / name).is_dir()]
+    files = [path for place in there for path in place.glob("sim_*.h5")]
+    for path in sorted(files, key=lambda path: (len(path.stem), path.stem)):
+        with _opened(path) as file:
+            axes = info.dimensions
+            particles, boundary = (_wide(path, file, key, axes) for key in ("particles", "boundary"))
+            types = _dataset(str(path), file, "types") if "types" in file else np.full((), FLUID)
+        if types.ndim == 1 and len(types) == particles.shape[1] + boundary.shape[1]:  # the boundary's come first
+            types = types[boundary.shape[1] :]
+        position_TND, type_N = checked(str(path), particles, types, axes)
+        moved = np.abs(boundary - boundary[:1]).max(initial=0)
+        require(moved <= 1e-3 * info.radius, f"{path}: boundary", "at rest", f"a motion by {moved:.3g}")
+        yield Trajectory(str(path), position_TND, type_N, boundary[0] if boundary.size else None)
+
+
+def _wide(path: Path, file: h5py.File, key: str, axes: int) -> np.ndarray:
+    """The first columns of an array [frames, particles, columns]; there may be none of a boundary's particles."""
+    array = _dataset(str(path), file, key)
+    rule = f"[frames, particles, {axes} or more columns]"
+    require(array.ndim == 3 and array.shape[2] >= axes, f"{path}: {key}", rule, list(array.shape))
+    return floats(f"{path}: {key}", array[..., :axes], (*array.shape[:2], axes))
+
+
+_READERS: dict[str, Callable[[Path, str, SetInfo], Iterator[Trajectory]]] = {
+    "deepmind": _read_deepmind,
+    "geoelements": _read_geoelements,
+    "lagrangebench": _read_hdf5,
+    "neuralmpm": _read_neuralmpm,
+    "plain": _read_hdf5,
+}
+_EXAMPLES = {"bounds": "[[0.1,0.9],[0.1,0.9]]", "dt": "0.0025", "radius": "0.015"}
+
+
+def _opened(path: Path) -> h5py.File:
+    try:
+        file = h5py.File(path, "r")
+        require_own_data(file)
+    except OSError as error:
+        raise ConfigError(f"{path} must be a whole HDF5 file, got {error}; fetch it again") from None
+    return file
+
+
+def _dataset(name: str, group: h5py.Group, key: str) -> np.ndarray:
+    try:
+        found = group[key]
+        require(isinstance(found, h5py.Dataset), f"{name}: {key}", "a dataset", type(found).__name__)
+        return np.asarray(found[()])
+    except _DAMAGE as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{name}: {key} is missing or damaged; {' '.join(str(error).split())}") from None
+
+
+def _file(folder: Path, split: str, ending: str) -> Path | None:
+    paths = [folder / f"{name}{ending}" for name in SPLIT_NAMES[split]]
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    path = folder / "metadata.json"
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except ValueError as error:
+        raise ConfigError(f"{path} must be JSON, got {error}") from None
+    require(isinstance(found, dict), str(path), "a JSON object", type(found).__name__)
+    return dict(found)
+
+
+def _number(key: object, folder: Path) -> int:
+    try:
+        return int(str(key))
+    except ValueError:
+        rule = "names by the number of a particle type"
+        raise ConfigError(f"materials must be {rule}, got {key!r} of {folder}; as in materials={{7: goop}}") from None

@@ -1,0 +1,102 @@
+"""What every format is read into, checked once for all of them.
+
+Shape legend: T frames, N particles of all kinds, P particles of the boundary, D dimensions, 2 or 3.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hgn.schema import ConfigError, require
+
+FLUID = 1  # the type of particles in files that give none
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One simulation as a file has it, in the file's own units."""
+
+    name: str  # file and place in it, for messages
+    position_TND: np.ndarray  # float32 or float64
+    type_N: np.ndarray  # int64, the set's own numbers
+    boundary_PD: np.ndarray | None = None  # at rest, beside the particles; none: they are among them, by their types
+    property_N: np.ndarray | None = None  # float32, geoelements' material_property
+    obstacle_cell_K3: np.ndarray | None = None  # of the plain layout: cells and normals as this project has them
+    obstacle_normal_K3: np.ndarray | None = None
+    gravity: tuple[float, ...] | None = None  # of this trajectory, length per second squared
+
+
+@dataclass(frozen=True)
+class SetInfo:
+    """What is the same for all trajectories of a set: from its metadata, its format, or the command line."""
+
+    format: str
+    dimensions: int
+    frame_dt_s: float
+    bounds: tuple[tuple[float, float], ...]  # of the box on each axis, the set's units of length
+    radius: float  # of neighbours, in them
+    materials: Mapping[int, str]  # names by type
+    boundary_types: frozenset[int]
+    ignored_types: frozenset[int] = frozenset()  # padding
+    gravity: tuple[float, ...] | None = None  # length per second squared; none: to be estimated
+    gravity_size: float | None = None  # where only that is known
+    obstacle_cell_size: float | None = None
+    raw: Mapping[str, Any] = field(default_factory=dict)  # the metadata as they are
+
+    def __post_init__(self) -> None:
+        require(self.dimensions in (2, 3), "metadata.json: dim", "2 or 3", self.dimensions)
+        positive = {"dt": self.frame_dt_s, "default_connectivity_radius": self.radius}
+        for name, value in positive.items():
+            require(0 < value < math.inf, f"metadata.json: {name}", "a finite number > 0", value)
+        shape = np.shape(self.bounds)
+        rule = f"[low, high] for each of {self.dimensions} axes"
+        require(shape == (self.dimensions, 2), "metadata.json: bounds", rule, self.bounds)
+        require(all(low < high for low, high in self.bounds), "metadata.json: bounds", "low < high", self.bounds)
+        if self.gravity is not None:
+            rule = f"{self.dimensions} finite numbers, length per second squared"
+            there = len(self.gravity) == self.dimensions and bool(np.isfinite(self.gravity).all())
+            require(there, "gravity", rule, list(self.gravity))
+
+
+def checked(name: str, position: np.ndarray, types: np.ndarray, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [T, N, D] and types int64 [N] of a file, where `types` may be one number for all particles.
+
+    Raises: ConfigError naming the file and the field, for another type or shape, and for what is not finite.
+    """
+    position_TND = floats(f"{name}: position", position, (None, None, dimensions))
+    type_N = np.asarray(types)
+    if type_N.dtype.kind not in "iu":
+        whole = type_N.dtype.kind == "f" and bool((type_N == np.round(type_N)).all())
+        if not whole:  # geoelements' own writers keep some as float64
+            raise ConfigError(f"{name}: particle_type must be whole numbers, got {type_N.dtype}")
+    count = position_TND.shape[1]
+    if type_N.ndim == 0 or (type_N.shape == (1,) and count != 1):
+        type_N = np.full(count, type_N.reshape(())[()])
+    if type_N.shape != (count,):
+        raise ConfigError(f"{name}: particle_type must be one number for each of {count} particles, got {type_N.shape}")
+    return position_TND, type_N.astype(np.int64)
+
+
+def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """A finite array of float32 or float64 of this shape, where None stands for any length above 0.
+
+    Raises: ConfigError naming the file and the field.
+    """
+    array = np.asarray(array)
+    if array.dtype.kind != "f" or array.dtype.itemsize < 4:
+        raise ConfigError(f"{name} must be float32 or float64, got {array.dtype}")
+    fits = array.ndim == len(shape) and all(
+        n == m or (m is None and n) for n, m in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise ConfigError(f"{name} must have shape [{wanted}], got {list(array.shape)}")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        raise ConfigError(f"{name} must be finite, got {array[tuple(bad[0])]} at {bad[0].tolist()}")
+    return array.astype(array.dtype.newbyteorder("="), copy=False)

@@ -1,0 +1,44 @@
+"""Shards as files: the tar of an episode, the same bytes wherever it is made, and where members lie in one."""
+
+from __future__ import annotations
+
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from hgn.scene.episode import Episode, encode_episode
+from hgn.schema import ConfigError
+
+
+def episode_tar(episode: Episode) -> Iterator[bytes]:
+    """The parts of its tar: the same episode gives the same bytes, for there are no times, no owners, a fixed mode."""
+    written = 0
+    for name, data in encode_episode(episode).items():
+        info = tarfile.TarInfo(f"{episode.key}.{name}")
+        info.size, info.mtime, info.mode = len(data), 0, 0o644
+        header, rest = info.tobuf(tarfile.GNU_FORMAT), bytes(-len(data) % tarfile.BLOCKSIZE)
+        written += len(header) + len(data) + len(rest)
+        yield from (header, data, rest)
+    yield tar_end(written)
+
+
+def tar_end(written: int) -> bytes:
+    """What follows the last member: two empty blocks, and as many as fill a record."""
+    end = 2 * tarfile.BLOCKSIZE
+    return bytes(end + -(written + end) % tarfile.RECORDSIZE)
+
+
+def locate_members(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
+    """Where each member's data lies in a tar: key -> name after `<key>.` -> (offset, bytes).
+
+    Raises: ConfigError when the file is not a whole tar.
+    """
+    located: dict[str, dict[str, tuple[int, int]]] = {}
+    try:
+        with tarfile.open(path, mode="r:") as tar:
+            for info in tar:
+                key, _, name = info.name.partition(".")
+                located.setdefault(key, {})[name] = (info.offset_data, info.size)
+    except tarfile.TarError as error:
+        raise ConfigError(f"{path} must be a whole tar, got {error}; delete it and run the generator again") from None
+    return located

@@ -1,0 +1,40 @@
+"""python -m hgn.import_trajectories from=FOLDER out=data/mine: a data set from the trajectories of another program.
+
+Reads DeepMind's TFRecords, geoelements' npz, LagrangeBench's and NeuralMPM's HDF5, and plain npz or HDF5.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hgn.command import run_command
+from hgn.config import ImportConfig
+from hgn.data.foreign.dataset import import_set
+from hgn.schema import from_mapping, require
+from hgn.system.progress import bar
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Imports, and says what was found and how to train on it; returns the exit code."""
+    mapping = dict(mapping)
+    source = mapping.pop("from", None)
+    require(isinstance(source, str) and source != "", "from", "the folder with the trajectories", source)
+    materials = mapping.get("materials") or {}
+    mapping["materials"] = {str(key): value for key, value in materials.items()}
+    config = from_mapping(ImportConfig, mapping)
+    with bar("importing", total=None, unit="episode") as progress:
+        manifest = import_set(Path(str(source)), config, lambda _: progress.update())
+    found = manifest.config["imported"]
+    counts = ", ".join(f"{count} {split}" for split, count in manifest.requested.items())
+    gravity = ", ".join(f"{value:.4g}" for value in found["gravity"])
+    print(
+        f"{found['format']}, {found['dimensions']}D, {', '.join(found['materials'])}; {counts} episodes in {config.out}"
+    )
+    print(f"gravity ({gravity}), obstacles: {'yes' if found['obstacles'] else 'none'}, radius {found['radius']:g}")
+    print(f"to train: python -m hgn.train +experiment=imported dataset.folder={config.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main, "import_trajectories")
