@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from hgn.training.errors import (
     network_predictor,
     one_step_errors,
     rollout_errors,
+    set_convention,
 )
 
 
@@ -44,10 +46,17 @@ def main(mapping: dict[str, Any]) -> int:
     episodes = first_episodes(store, config.scenes)
     require_frame_rate(info, episodes[0].frame_rate_hz)
     rows = one_step_rows(simulator.backend, episodes, config)
+    trials: list[RolloutResult] = []
     if config.rollout_frames >= 2:
         print(simulator.backend.note, file=sys.stderr)
-        rows.append(rollout_row(simulator, episodes, config.rollout_frames))
+        trials = rollouts(simulator, episodes, config.rollout_frames)
+        rows.append(rollout_row(trials, episodes))
     print(table(rows, config, len(episodes)))
+    own = None
+    if episodes[0].imported:
+        paths = [trial.position_TN3 for trial in trials]
+        own = set_convention(rows[0]["one_step_mse"], paths, episodes[: len(paths)] or episodes)
+        print(convention_lines(own))
     if config.json is not None:
         report = {
             "meta": provenance(simulator.device)
@@ -55,6 +64,8 @@ def main(mapping: dict[str, Any]) -> int:
             | {"set": set_record(config.data, store.manifest.config["seed"], [find_weights(config.weights)])},
             "rows": rows,
         }
+        if own is not None:
+            report["set_convention"] = own
         write_json(config.json, report)
     return 0
 
@@ -78,15 +89,27 @@ def one_step_rows(backend: Backend, episodes: list[Episode], config: EvaluateCon
     ]
 
 
-def rollout_row(simulator: Simulator, episodes: list[Episode], frames: int) -> dict[str, Any]:
-    """{"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse", "by_material",
-    "ends"}; errors are means over the scenes that came so far.
-    """
+def rollouts(simulator: Simulator, episodes: list[Episode], frames: int) -> list[RolloutResult]:
+    """Simulates the episodes from their first frame, as far as the shortest of them goes."""
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     with bar("rollouts", total=frames - 1, unit="frame") as progress:
         initial = [InitialState.of_episode(episode) for episode in episodes]
-        trials = simulate_scenes(simulator, initial, frames, lambda _: progress.update())
+        return simulate_scenes(simulator, initial, frames, lambda _: progress.update())
+
+
+def convention_lines(errors: dict[str, dict[str, float]]) -> str:
+    """What `set_convention` found, for people."""
+    lines = ["in the set's own convention: mean over axes and frames; free particles, all particles"]
+    lines += [f"{name.replace('_', ' '):<20} {error['free']:.3e}, {error['all']:.3e}" for name, error in errors.items()]
+    return "\n".join(lines)
+
+
+def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode]) -> dict[str, Any]:
+    """{"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse", "by_material",
+    "ends"}; errors are means over the scenes that came so far.
+    """
     mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
+    frames = len(mse_T["all"])
     told = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
     reached = {str(n): sum(trial.frame_count > n for trial in trials) for n in told}
     return {

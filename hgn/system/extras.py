@@ -17,6 +17,7 @@ EXTRA_OF = {
     "h11": "service",
     "starlette": "service",
     "uvicorn": "service",
+    "google_crc32c": "import",
     "pxr": "files",
     "pysplashsurf": "files",
     "ray": "ray",

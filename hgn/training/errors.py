@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -149,6 +150,34 @@ def rollout_errors(predicted: Sequence[np.ndarray], episodes: Sequence[Episode])
             mse_T[: len(path_TN3)] = position_mse(path_TN3[:, chosen], reference_TN3[:, chosen])
             curves.setdefault(name, []).append(mse_T)
     return {name: mean_so_far(np.stack(mse)) for name, mse in curves.items()}
+
+
+def set_convention(one_step_mse: float, predicted: Sequence[np.ndarray], episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Errors as the papers of imported sets tell them: means over axes too, of free particles and of all.
+
+    Particles of the boundary are where they were, and so have no error; GNS counts them in its averages. Positions are
+    compared over the frames that were predicted, all or the first 20, scene by scene; as GNS does for its one-step and
+    rollout MSE (Sanchez-Gonzalez et al. 2020), and LagrangeBench for MSE20 (Toshev et al. 2023).
+    Units: squared, of the set's length.
+    """
+    dimensions = episodes[0].dimensions
+    still = [0 if episode.boundary_P3 is None else len(episode.boundary_P3) for episode in episodes]
+    share_S = np.array([e.particle_count / (e.particle_count + more) for e, more in zip(episodes, still, strict=True)])
+    steps_S = np.array([e.particle_count * (e.frame_count - 1) for e in episodes], np.float64)
+    result = {"one_step": _free_and_all(one_step_mse / dimensions, steps_S.sum() / (steps_S / share_S).sum())}
+    curves = [
+        position_mse(path_TN3[1:], episode.position_TN3[1 : len(path_TN3)]) / dimensions
+        for path_TN3, episode in zip(predicted, episodes, strict=True)
+    ]
+    for name, frames in (("rollout", None), ("rollout_20_frames", 20)):
+        free_S = np.array([mse_T[:frames].mean() for mse_T in curves])
+        if len(free_S):
+            result[name] = {"free": float(free_S.mean()), "all": float((free_S * share_S).mean())}
+    return result
+
+
+def _free_and_all(free: float, share: float) -> dict[str, float]:
+    return {"free": float(free), "all": float(free * share)}
 
 
 def mean_so_far(value_ST: np.ndarray) -> np.ndarray:

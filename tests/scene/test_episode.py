@@ -110,7 +110,7 @@ BROKEN_FIELDS: list[tuple[dict[str, Any], str]] = [
     ({"initial_velocity_N3": np.zeros((4, 3), np.float32)}, "velocity must have shape"),
     ({"initial_velocity_N3": np.full((5, 3), np.nan, np.float32)}, "velocity must be finite, got nan at"),
     ({"material_N": np.zeros(5, np.int64)}, "material must be of type uint8"),
-    ({"material_N": np.full(5, 3, np.uint8)}, "material must be below 3, got 3"),
+    ({"material_N": np.full(5, 4, np.uint8)}, "material must be below 4, got 4"),
     ({"frame_rate_hz": float("nan")}, "frame_rate_hz must be a finite number > 0"),
     ({"domain_size": (1.0, 0.0, 1.0)}, "domain_size must be finite and > 0"),
     ({"gravity": (0.0, float("inf"), 0.0)}, "gravity must be finite"),
