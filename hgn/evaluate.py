@@ -50,7 +50,7 @@ def main(mapping: dict[str, Any]) -> int:
     if config.rollout_frames >= 2:
         print(simulator.backend.note, file=sys.stderr)
         trials = rollouts(simulator, episodes, config.rollout_frames)
-        rows.append(rollout_row(trials, episodes))
+        rows.append(rollout_row(trials, episodes, config.rollout_frames))
     print(table(rows, config, len(episodes)))
     own = None
     if episodes[0].imported:
@@ -104,12 +104,12 @@ def convention_lines(errors: dict[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode]) -> dict[str, Any]:
+def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode], frames: int) -> dict[str, Any]:
     """{"system", "position_mse": {frame: value}, "scenes_reached": {frame: count}, "mean_position_mse", "by_material",
     "ends"}; errors are means over the scenes that came so far.
     """
     mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
-    frames = len(mse_T["all"])
+    frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
     told = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
     reached = {str(n): sum(trial.frame_count > n for trial in trials) for n in told}
     return {

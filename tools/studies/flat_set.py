@@ -51,7 +51,7 @@ def main(mapping: dict[str, Any]) -> int:
     generator = np.random.default_rng(config.seed)
     with bar("simulating", total=config.training + config.validation, unit="trajectory") as progress:
         for split, count in (("train", config.training), ("valid", config.validation)):
-            members = {}
+            members: dict[str, Any] = {}
             for number in range(count):
                 water_N2, slopes = drawn(generator)
                 still_P2 = np.concatenate([slope_particles(slope) for slope in slopes])
