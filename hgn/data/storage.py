@@ -3,7 +3,8 @@
 Shards of a URL are kept in a cache on this machine, under their sha256, so that no two data sets collide there; one
 process of the machine brings a shard, the others wait for it. `HGN_CACHE` names the cache's folder (default
 `~/.cache/hgn`), `HGN_CACHE_GB` how much may be in it (default: all that fits on its disk; the shard that was brought
-first makes room), `HGN_DATASET_TOKEN` the token that a dataset service asks for.
+first makes room), `HGN_DATASET_TOKEN` the token that a dataset service asks for,
+`HGN_DATASET_HOST` the only host (or host:port) that it is for.
 """
 
 from __future__ import annotations
@@ -24,11 +25,13 @@ import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
+from urllib.parse import urlsplit
 
 from hgn.schema import ConfigError, require
 from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
+TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
 CACHE_VARIABLE = "HGN_CACHE"
 LIMIT_VARIABLE = "HGN_CACHE_GB"
 PATIENCE_S = 300.0  # with a server that does not answer: time enough to start a service again
@@ -121,6 +124,11 @@ def dataset_token() -> str | None:
         plain and len(token) >= 16, TOKEN_VARIABLE, "16 or more printable ASCII characters", f"{len(token)} of them"
     )
     return token
+
+
+def _token_is_for(url: str) -> bool:
+    named, address = os.environ.get(TOKEN_HOST_VARIABLE), urlsplit(url)
+    return not named or named in (address.hostname, f"{address.hostname}:{address.port}")
 
 
 def _make_folder(folder: Path) -> None:
@@ -223,7 +231,7 @@ class _Remote:
 
             from hgn.data.bounded_http import BoundedResponse
 
-            token = dataset_token()
+            token = dataset_token() if _token_is_for(url) else None
             timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_S, sock_read=_SILENCE_S)
             # packed, a small answer could become a large one
             headers = {"Accept-Encoding": "identity"}
@@ -445,8 +453,8 @@ def _transient(error: Exception, url: str) -> str | None:
     status = getattr(error, "status", None)
     if status in (401, 403) or isinstance(error, PermissionError):
         raise ConfigError(
-            f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token (an object "
-            "store asks for its own credentials)"
+            f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token, which "
+            f"goes to {TOKEN_HOST_VARIABLE} alone where that is set (an object store asks for its own credentials)"
         ) from None
     if status == 410:
         raise ConfigError(f"{url} is damaged at its service; delete it there and run the generator again") from None
