@@ -48,6 +48,7 @@ _GRACE_S = 5  # for answers that are being sent when the service is stopped; rea
 _FRESH_S = 0.05  # for which a look at the manifest counts: a thousand readers may ask in a second
 _BACKLOG = 256  # connections that are accepted before any of them is looked at
 _OTHER_FILES = 64
+_ANSWERS = 64  # that are kept, of 128 lines at most
 OPEN_FILES = 1024  # of a process, where nothing else is said
 _REMEDY = "delete it and run the generator again"
 
@@ -166,6 +167,8 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
     """The service as an ASGI application."""
     published, counters = Published(folder), Counter[str]()
     hashing: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+    told: dict[tuple[int, int, int], str] = {}  # what came after so many shards, of so many
+    telling = asyncio.Lock()
 
     async def manifest(request: Request) -> Response:
         snapshot = await published.snapshot()
@@ -195,7 +198,15 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
                 json.dumps(to_mapping(shard)) + "\n" for shard in islice(index.since(int(asked)), SEGMENT_SHARDS)
             )
 
-        text = await to_thread.run_sync(lines)
+        # after a publication a thousand ask for the same
+        key = index.state.generation, len(index), int(asked)
+        if key not in told:
+            async with telling:
+                if key not in told:
+                    told[key] = await to_thread.run_sync(lines)
+        text = told[key]
+        while len(told) > _ANSWERS:
+            del told[next(iter(told))]
         return Response(text, headers={"cache-control": "no-cache"}, media_type="application/jsonl")
 
     async def shard(request: Request) -> Response:

@@ -20,6 +20,7 @@ from urllib.parse import unquote
 import pytest
 from processes import processes_of_session, wait_until
 
+import datagen.service.server
 import datagen.service.supervisor
 import hgn.data.storage
 from datagen.pool.progress import Progress
@@ -31,6 +32,7 @@ from hgn.command import run_command
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.storage import TOKEN_VARIABLE, file_sha256
+from hgn.schema import to_mapping
 
 MakeConfig = Callable[..., DatagenConfig]
 MakeDataset = Callable[[DatagenConfig], Path]
@@ -115,8 +117,8 @@ def test_index_and_what_is_new(ask: Ask, folder: Path) -> None:
 
 
 def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After a publication the manifest is read once and each line of the index once; a shard that many want is hashed
-    once; and who asks whether the service lives waits for none of these."""
+    """After a publication the manifest is read once, each line of the index once, and what is new is written once; a
+    shard that many want is hashed once; and who asks whether the service lives waits for none of these."""
     work: Counter[str] = Counter()
     hash_may_end = threading.Event()
 
@@ -130,10 +132,11 @@ def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(Manifest, "parse", staticmethod(counted("parse", Manifest.parse)))
     monkeypatch.setattr(ShardEntry, "__post_init__", counted("line", ShardEntry.__post_init__))
     monkeypatch.setattr(hgn.data.storage, "file_sha256", counted("hash", slow))
+    monkeypatch.setattr(datagen.service.server, "to_mapping", counted("told", to_mapping))
 
     async def crowd() -> list[Answer]:
         app = make_app(folder, None, PoolState)
-        await asyncio.gather(*(request(app, path) for path in 16 * ["/manifest.json", "/progress"]))
+        await asyncio.gather(*(request(app, path) for path in 16 * ["/manifest.json", "/progress", "/index?since=4"]))
         readers = [asyncio.create_task(request(app, SHARD)) for _ in range(60)]
         while not work["hash"]:
             await asyncio.sleep(0)
@@ -142,7 +145,7 @@ def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
         return await asyncio.gather(*readers)
 
     assert {answer[::2] for answer in asyncio.run(crowd())} == {(200, (folder / SHARD[1:]).read_bytes())}
-    assert work == {"parse": 1, "line": 7, "hash": 1}
+    assert work == {"parse": 1, "line": 7, "told": 3, "hash": 1}
 
 
 def test_shards_with_ranges(ask: Ask, folder: Path) -> None:
