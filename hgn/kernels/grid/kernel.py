@@ -584,7 +584,7 @@ def balance_cells(
     used = there[:, None] & (column < 3)
     change = -(1 - touched)[:, None] * inverse[:, None] * tl.load(sums + cell[:, None] * OUT + column, used, other=0.0)
     for slot in tl.static_range(6):
-        axis: tl.constexpr = slot // 2
+        axis = slot // 2
         stress = tl.where(column == axis, 3 + axis, 9 - column - axis)  # of xx, yy, zz, yz, xz, xy behind the three
         own = tl.load(sums + cell[:, None] * OUT + stress, mask=used, other=0.0) * inverse[:, None]
         other, share, beside = _across(neighbour, felt, motion, geometry, cell, there, mass, slot, capacity, LEVELS)
@@ -612,7 +612,7 @@ def balance_cells_backward(
     mean = there[:, None] & (column < 3)
     value = -(1 - touched)[:, None] * tl.load(sums + cell[:, None] * OUT + column, mask=mean, other=0.0)
     for slot in tl.static_range(6):
-        axis: tl.constexpr = slot // 2
+        axis = slot // 2
         # the component of the force that a column of stress makes across this face
         part = tl.where(column == 3 + axis, axis, 9 - axis - column)
         makes = (column == 3 + axis) | ((column >= 6) & (column < 9) & (part >= 0) & (part < 3) & (part != axis))
