@@ -1,5 +1,6 @@
 """What Triton makes of a small training's kernels for an H100, a line each: CANARY and what of Triton's interface held,
-PRODUCT, kernel, tiles copied ahead and products under way meanwhile, HAZARDS, kernel, precision and their number."""
+COMPILED and a kernel of a grid with relative inputs, PRODUCT, kernel, tiles copied ahead and products under way
+meanwhile, HAZARDS, kernel, precision and their number."""
 
 from __future__ import annotations
 
@@ -42,6 +43,13 @@ print("CANARY", function.__name__, flush=True)
 
 CUDABackend.make_cubin = lambda *_: b""  # ptxas takes a fifth of the time, and nobody looks at what it makes
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
+relative = NetworkConfig(inputs="relative", width=16, levels=2, message_passing_steps=1)
+job = PrecompileJob(relative, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,))
+for function, data in launches_of(job).values():
+    if function.fn.__module__ == "hgn.kernels.grid.kernel":
+        triton_compat.preload(function, data)
+        print("COMPILED", function.__name__, flush=True)
+
 network = NetworkConfig(levels=1, message_passing_steps=1)
 for precision in ("fp16", "tf32"):
     seen = set()

@@ -38,6 +38,14 @@ def test_the_interface_is_as_it_was(lines: list[list[str]]) -> None:
     assert ["CANARY", "_copy"] in lines
 
 
+def test_what_the_interpreter_forgives(lines: list[list[str]]) -> None:
+    """All kernels of grids and relative inputs compile, of an update and of a frame: the interpreter takes what Triton
+    does not, a constant that is defined twice say."""
+    compiled = [line[1] for line in lines if line[0] == "COMPILED"]
+    names = {"prepare_relative_features", "sum_coarsest", "balance_cells", "balance_cells_backward", "add_coarsest"}
+    assert set(compiled) > names and len(compiled) > len(set(compiled)), compiled
+
+
 def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines: list[list[str]]) -> None:
     """Of the weights' products tiles are copied to shared memory ahead, and each product is over before the next copy:
     the compiler keeps too few buffers for one that is under way meanwhile."""
