@@ -219,7 +219,8 @@ def reposes(base: MpmConfig) -> list[Row]:
     for angle in REPOSE_ANGLES_DEG:
         for start in (angle - REPOSE_WITHIN_DEG, angle + REPOSE_STEEPER_DEG):
             before, after, speed = repose(angle, start, base, REPOSE_CELLS)
-            beyond = f"{after - before:+.1f} degrees; at the end {speed:.2g} m/s root mean square"
+            shears = math.degrees(math.atan(shear_strength(_sand(base, base.sand_friction_law, angle))))
+            beyond = f"{after - before:+.1f} degrees; at the end {speed:.2g} m/s rms; shears at {shears:.3g}"
             if start < angle:
                 held = abs(after - before) <= STANDS_DEG
                 rows.append(Row(f"slope that stands, friction {angle:g} degrees", before, after, held, beyond))
