@@ -162,7 +162,7 @@ class MpmConfig:
     )
     time_step: Annotated[str, one_of("adaptive", "fixed")] = "adaptive"  # or fixed
     fixed_time_step_s: Positive[float] = 0.02 / 64
-    stability_fraction: Positive[float] = 0.5  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
+    stability_fraction: Positive[float] = 0.8  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
     speed_fraction: Positive[float] = 0.3  # of a cell that the fastest particle may cross between two transfers
     # particles and grid exchange velocities every cell_size / this: 32 times a frame of 1/60 s at 64 cells,
     # whatever the materials, with as many steps of stress between as they need; null: at every step. Fewer
@@ -174,7 +174,7 @@ class MpmConfig:
     collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient; 0 separates without friction
     collider_projection: bool = True  # stop particles that would still cross an obstacle's triangle; counted
     device: Processor = "auto"  # or cpu, gpu
-    scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 832 on a GPU
+    scenes_per_launch: OneOrMore | None = None  # null: 1 on a CPU, 208 on a GPU
     maximum_substeps_per_frame: Positive[int] = 20_000  # beyond it a scene is stopped and reported
 
     def __post_init__(self) -> None:

@@ -78,7 +78,8 @@ class SceneValue(NamedTuple):
     water_density: int = 15  # at rest, in masses of a particle a cell; 0 where it is not known
     wall_friction: int = 16  # 16, 17, 18: of the domain's walls across x, y, z
     frame: int = 19  # length of the present frame, s
-    length: int = 20
+    stiffness: int = 20  # largest in the step before, m²/s²
+    length: int = 21
 
 
 class Status(NamedTuple):

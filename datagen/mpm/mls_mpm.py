@@ -111,48 +111,59 @@ def choose_time_step(
     setting: ti.template(),
     maximum_substeps: ti.i32,
 ):
-    step = 0.0
-    dx = setting[SETTING.cell_size]
+    # all that is read, at once and before anything is written: else each would wait for a way to memory of its own
     remaining = scene_value[scene, VALUE.remaining]
-    if remaining > 0.0 and counter[scene, COUNT.status] == STATUS.running:
-        stiffness = ti.max(
-            _maximum(counter, scene, COUNT.stiffness_bits),
-            scene_value[scene, VALUE.least_stiffness],
-            1e-3,
-        )
-        speed_square = _maximum(counter, scene, COUNT.speed_square_bits)
-        scene_value[scene, VALUE.largest_speed_square] = ti.max(
-            scene_value[scene, VALUE.largest_speed_square], speed_square
-        )
-        gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
-        fixed = setting[SETTING.fixed_time_step]
-        limit = scene_value[scene, VALUE.stability_fraction] * dx / ti.sqrt(stiffness)
-        interval = scene_value[scene, VALUE.interval]
-        elapsed = scene_value[scene, VALUE.interval_elapsed]
-        left = scene_value[scene, VALUE.interval_remaining]
+    status = counter[scene, COUNT.status]
+    least = scene_value[scene, VALUE.least_stiffness]
+    stiffness = ti.max(_maximum(counter, scene, COUNT.stiffness_bits), least, 1e-3)
+    speed_square = _maximum(counter, scene, COUNT.speed_square_bits)
+    largest_speed_square = scene_value[scene, VALUE.largest_speed_square]
+    gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
+    fraction = scene_value[scene, VALUE.stability_fraction]
+    interval = scene_value[scene, VALUE.interval]
+    elapsed = scene_value[scene, VALUE.interval_elapsed]
+    left = scene_value[scene, VALUE.interval_remaining]
+    smallest = scene_value[scene, VALUE.smallest_time_step]
+    last_stiffness = scene_value[scene, VALUE.stiffness]
+    done = ti.cast(counter[scene, COUNT.frame_substeps], ti.i32)
+    substeps = counter[scene, COUNT.substeps]
+    transfers = counter[scene, COUNT.transfers]
+    dx = setting[SETTING.cell_size]
+    fixed = setting[SETTING.fixed_time_step]
+    fixed_substeps = setting[SETTING.fixed_substeps]
+    transfer_interval = setting[SETTING.transfer_interval]
+    speed_fraction = setting[SETTING.speed_fraction]
+    leapfrog = setting[SETTING.leapfrog]
+    step = 0.0
+    if remaining > 0.0 and status == STATUS.running:
+        # what stiffens as it is pressed together goes on to do so in the step
+        growth = ti.max(stiffness / ti.max(last_stiffness, 1e-3), 1.0) if last_stiffness > 0.0 else 1.0
+        limit = fraction * dx / ti.sqrt(stiffness * ti.min(growth, 2.0))
         begins = left == 0.0
         shift = 0.0  # from the middle of the last interval to that of the present one is not its length
         if begins:
             elapsed = 0.0
-            longest = ti.max(limit, setting[SETTING.transfer_interval])
+            longest = ti.max(limit, transfer_interval)
             # the fall within the interval counts too
             speed = ti.sqrt(speed_square) + gravity.norm() * ti.min(longest, remaining)
-            longest = ti.min(longest, setting[SETTING.speed_fraction] * dx / ti.max(speed, 1e-20))
+            longest = ti.min(longest, speed_fraction * dx / ti.max(speed, 1e-20))
             # equal intervals to the end of the frame: no sliver at its end
+            last = interval
             interval = remaining / _parts(remaining, longest)
             left = interval
             if fixed > 0.0:
                 interval = fixed
-            shift = 0.5 * setting[SETTING.leapfrog] * (scene_value[scene, VALUE.interval] - interval)
+            shift = 0.5 * leapfrog * (last - interval)
         # steps in this interval, and with those after it
         ahead = _parts(left, limit)
         total = ahead
         if remaining > left:
             total += _parts(remaining - left, interval) * _parts(interval, limit)
-        done = ti.cast(counter[scene, COUNT.frame_substeps], ti.i32)
         if fixed > 0.0:
             ahead = 1.0
-            total = setting[SETTING.fixed_substeps] - ti.cast(done, ti.f32)
+            total = fixed_substeps - ti.cast(done, ti.f32)
+        scene_value[scene, VALUE.stiffness] = stiffness
+        scene_value[scene, VALUE.largest_speed_square] = ti.max(largest_speed_square, speed_square)
         if not total <= ti.cast(maximum_substeps - done, ti.f32):
             counter[scene, COUNT.status] = ti.cast(STATUS.too_many_substeps, ti.i64)
             scene_value[scene, VALUE.remaining] = 0.0
@@ -164,7 +175,7 @@ def choose_time_step(
             left -= step
             elapsed += step
             # an interval also ends where material has become much faster in it
-            reach = SPEED_MARGIN * setting[SETTING.speed_fraction] * dx
+            reach = SPEED_MARGIN * speed_fraction * dx
             if ahead <= 1.0 or (not begins and elapsed * ti.sqrt(speed_square) > reach):
                 left = 0.0
             if total <= 1.0:
@@ -176,10 +187,10 @@ def choose_time_step(
             scene_value[scene, VALUE.begins] = ti.cast(begins, ti.f32)
             scene_value[scene, VALUE.gravity_time] = step + shift
             scene_value[scene, VALUE.substeps_ahead] = total - 1.0
-            counter[scene, COUNT.transfers] += ti.cast(begins, ti.i64)
-            scene_value[scene, VALUE.smallest_time_step] = ti.min(scene_value[scene, VALUE.smallest_time_step], step)
+            scene_value[scene, VALUE.smallest_time_step] = ti.min(smallest, step)
+            counter[scene, COUNT.transfers] = transfers + ti.cast(begins, ti.i64)
             counter[scene, COUNT.frame_substeps] = ti.cast(done + 1, ti.i64)
-            counter[scene, COUNT.substeps] += ti.cast(1, ti.i64)
+            counter[scene, COUNT.substeps] = substeps + ti.cast(1, ti.i64)
             # maxima are gathered anew while the step runs
             counter[scene, COUNT.stiffness_bits] = ti.cast(0, ti.i64)
             counter[scene, COUNT.speed_square_bits] = ti.cast(0, ti.i64)

@@ -26,8 +26,10 @@ from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
 GPU_THREADS = 512  # that run on a processor at once, whatever they do (see device)
-TEAM_THREADS = 256  # of a scene's only block
-SHARED_THREADS, SHARED_BLOCKS = 128, 2  # of each of several, and how many of them a processor has
+TEAM_THREADS, TEAM_BLOCKS = 256, 8  # of many scenes, which teams take one after another
+FEWEST_BLOCKS = 4  # of as many teams as there are scenes; with fewer the longest scene is waited for
+EVEN = 0.95  # of the time of a launch, that the mean scene takes at least where each has one block
+SHARED_THREADS = 128  # of a block, where each of a few scenes has TEAM_BLOCKS and more
 SHARED_PARTICLES = 8  # at least, of each of several
 LARGE_THREADS = 512  # where a scene has more particles for each processor than
 LARGE_PARTICLES = 4096
@@ -116,11 +118,11 @@ def simulate(
         if moving or any(scene.emits for scene in batch[0]):
             team = Team(0)  # contacts that move are placed between launches, and particles enter there
         elif team is None:
-            team = _team(device, len(occupied), max(scene.particle_count for scene in batch[0]))
-        _require_at_once(device, team, len(occupied))
+            team = _team(device, [scene.particle_count for scene in batch[0]])
+        teams = _teams_at_once(device, team) if team.blocks > 1 else len(occupied)
         with _arrays_freed_here():
             outcomes = _launched(
-                TeamLaunch(team, *batch) if team.threads else GridLaunch(device, *batch), frames, on_frame
+                TeamLaunch(team, teams, *batch) if team.threads else GridLaunch(device, *batch), frames, on_frame
             )
         for index, outcome in zip(occupied, outcomes, strict=True):
             results[index] = outcome
@@ -169,29 +171,39 @@ def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
         np.array([material_index(name) for name in scene.materials], np.uint8),
         obstacles, scene.domain_size, scene.cell_size, scene.gravity,
     )  # fmt: skip
-    simulate([one] * min(scenes, WARM_SCENES), config, 2, 60.0, team=_team(device, scenes, USUAL_PARTICLES))
+    simulate(
+        [one] * min(scenes, WARM_SCENES),
+        config,
+        2,
+        60.0,
+        team=_team(device, [*[USUAL_PARTICLES] * (scenes - 1), 2 * USUAL_PARTICLES]),
+    )
 
 
-def _team(device: Device, scenes: int, most: int) -> Team:
-    """Who runs so many scenes soonest, the largest of so many particles."""
+def _team(device: Device, counts: Sequence[int]) -> Team:
+    """Who runs scenes of so many particles soonest."""
+    scenes, most = len(counts), max(counts)
     if device.kind == "cpu" or most > MAXIMUM_PARTICLES:
         return Team(0)
     share = device.processors // scenes
     if share > 1 and most > LARGE_PARTICLES * share:
         return Team(LARGE_THREADS, share)
-    blocks = min(SHARED_BLOCKS * device.processors // scenes, -(-most // SHARED_PARTICLES))
-    if blocks <= 1:
-        return Team(TEAM_THREADS)
-    # where each thread has a particle at most, it is done sooner alone
-    return Team(SHARED_THREADS, blocks, 1) if most <= SHARED_THREADS * blocks else Team(SHARED_THREADS, blocks)
+    room = 2 * device.processors  # blocks
+    blocks = min(room // scenes, -(-most // SHARED_PARTICLES))
+    if blocks >= TEAM_BLOCKS:
+        # where each thread has a particle at most, it is done sooner alone
+        return Team(SHARED_THREADS, blocks, 1) if most <= SHARED_THREADS * blocks else Team(SHARED_THREADS, blocks)
+    rounds = -(-scenes // room)
+    if scenes > EVEN * rounds * room and sum(counts) > EVEN * scenes * most:
+        return Team(TEAM_THREADS)  # all are done at once
+    return Team(TEAM_THREADS, blocks if blocks >= FEWEST_BLOCKS else TEAM_BLOCKS)
 
 
-def _require_at_once(device: Device, team: Team, scenes: int) -> None:
-    """The blocks of a scene wait for each other."""
-    if team.blocks > 1:
-        # a CPU runs one scene after the other
-        room = device.threads if device.kind == "cpu" else device.processors * (GPU_THREADS // team.threads) // scenes
-        require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
+def _teams_at_once(device: Device, team: Team) -> int:
+    """How many teams are at work at once: the blocks of one wait for each other."""
+    room = device.threads if device.kind == "cpu" else device.processors * (GPU_THREADS // team.threads)
+    require(team.blocks <= room, "team.blocks", f"at most {room}, which run at once", team.blocks)
+    return room // team.blocks
 
 
 def _shared_grid(scenes: Sequence[Scene], config: MpmConfig) -> tuple[int, int, int]:

@@ -13,15 +13,26 @@ OFF_DIAGONAL_SQUARE = 1e-14
 
 
 @ti.func
+def _inverse_root(x: ti.f32) -> ti.f32:
+    """1 / sqrt(x) to rounding: a GPU's own is off by more."""
+    y = ti.rsqrt(x)
+    return y * (1.5 - 0.5 * x * y * y)
+
+
+@ti.func
 def _rotate(S: ti.template(), V: ti.template(), p: ti.template(), q: ti.template()):
     r = ti.static(3 - p - q)
     apq = S[p, q]
-    theta = (S[q, q] - S[p, p]) / (2.0 * apq)
-    t = 1.0 / (ti.abs(theta) + ti.sqrt(theta * theta + 1.0))
-    if theta < 0.0:
-        t = -t
-    c = 1.0 / ti.sqrt(t * t + 1.0)
-    s = t * c
+    # the half of the angle whose tangent is 2 a_pq / (a_qq - a_pp), at most 45 degrees
+    difference = S[q, q] - S[p, p]
+    inverse = _inverse_root(difference * difference + 4.0 * apq * apq)
+    square = 0.5 + 0.5 * ti.abs(difference) * inverse
+    inverse_c = _inverse_root(square)
+    c = square * inverse_c
+    s = apq * inverse * inverse_c
+    if difference < 0.0:
+        s = -s
+    t = s * inverse_c
     S[p, p] -= t * apq
     S[q, q] += t * apq
     S[p, q] = 0.0
@@ -103,14 +114,14 @@ def svd3(A: ti.template()):
         b0 = ti.Vector([B[0, 0], B[1, 0], B[2, 0]])
         b1 = ti.Vector([B[0, 1], B[1, 1], B[2, 1]])
         b2 = ti.Vector([B[0, 2], B[1, 2], B[2, 2]])
-        u0 = b0 / ti.sqrt(square[0])
+        u0 = b0 * _inverse_root(square[0])
         b1 -= u0 * u0.dot(b1)
-        length = b1.norm()
+        length_square = b1.dot(b1)
         u1 = _perpendicular(u0)
-        if length > 1e-7:  # of the largest entry: below it the direction is rounding
-            u1 = b1 / length
+        if length_square > 1e-14:  # of the largest entry's square: below it the direction is rounding
+            u1 = b1 * _inverse_root(length_square)
             u1 -= u0 * u0.dot(u1)
-            u1 = u1 / u1.norm()
+            u1 *= _inverse_root(u1.dot(u1))
         u2 = u0.cross(u1)
         for i in ti.static(range(3)):
             U[i, 0] = u0[i]

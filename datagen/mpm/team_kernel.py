@@ -19,6 +19,7 @@ With one thread a block it runs on a CPU too; the tests check it there against t
 import taichi as ti
 
 from datagen.mpm.layout import (
+    BLOCK,
     BLOCK_NODES,
     CONSTANT,
     COUNT,
@@ -60,7 +61,9 @@ LANES = 4  # threads that share a particle where it meets the nodes; each has on
 MASS = 3  # the component
 WARP = 32
 CPU_ITEMS = 512  # of a loop, that Taichi gives to a thread of a CPU at once: a block of one thread
-MEETING = 64  # integers of a team: how many blocks have come, and half way on how often all were let go
+MEETING = 96  # integers of a team, in thirds: how many blocks have come, how often all were let go, its next scene
+COPIED = 16  # fields at once
+CHUNK = 32  # particles that follow each other, of one block of a team
 
 
 @ti.func
@@ -152,9 +155,9 @@ def _meet_and_choose(
             _choose(scene, scene_value, counter, setting, shape, live)
             if ti.static(several):
                 _fence(threads)
-                ti.atomic_add(meeting[team * MEETING + MEETING // 2], 1)
+                ti.atomic_add(meeting[team * MEETING + MEETING // 3], 1)
         if ti.static(several):
-            _await(meeting, team * MEETING + MEETING // 2, choices, threads)
+            _await(meeting, team * MEETING + MEETING // 3, choices, threads)
     _wait(threads)
 
 
@@ -176,6 +179,14 @@ def _raise(
             ti.atomic_max(counter[scene, entry], ti.cast(bits, ti.i64))  # without a look, which would be waited for
     else:
         raise_maximum(counter, scene, entry, value)
+
+
+@ti.func
+def _dealt(own: ti.i32, part: ti.i32, chunk: ti.i32, blocks: ti.i32) -> ti.i32:
+    """Which of a scene's particles a block's own one is: they are dealt out in chunks, so that no block has all of
+    what takes long.
+    """
+    return (own // chunk * blocks + part) * chunk + own % chunk
 
 
 @ti.func
@@ -219,47 +230,110 @@ def _entry(place: ti.i32, component: ti.i32) -> ti.i32:
 
 
 @ti.func
-def _cell(x, scene: ti.i32, setting: ti.template(), shape: ti.template()):
-    """Where the cell of a particle lies in the arrays of nodes: at its base node."""
-    return node_place(base_node(x, setting[SETTING.inverse_cell_size]), scene, shape)
+def _cell(x, scene: ti.i32, setting: ti.template(), shape: ti.template()) -> ti.i32:
+    """The number of a particle's cell in the order: BLOCK of them above each other are a column. Material falls, so
+    what follows in a column stays beside each other for longest.
+    """
+    base = base_node(x, setting[SETTING.inverse_cell_size])
+    place = node_place(base, scene, shape)
+    column = (place // BLOCK_NODES * BLOCK + (base[0] & 3)) * BLOCK + (base[2] & 3)
+    return column * BLOCK + (base[1] & 3)
 
 
 @ti.func
-def _reorder(
-    low: ti.i32,
-    high: ti.i32,
+def _sort(
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
     scene: ti.i32,
     first: ti.i32,
     copy: ti.i32,
+    segment: ti.i32,
+    team: ti.i32,
     lane: ti.i32,
+    meetings: ti.template(),
     stride: ti.i32,
     state: ti.template(),
     tag: ti.template(),
     rank: ti.template(),
     cell_count: ti.template(),
+    column_count: ti.template(),
+    column_list: ti.template(),
+    columns: ti.template(),
+    live: ti.template(),
+    meeting: ti.template(),
     setting: ti.template(),
     shape: ti.template(),
     fields: ti.template(),
     threads: ti.template(),
+    several: ti.template(),
 ):
-    """Copies a block's particles to the other copy, each to its place in the order of the cells."""
-    p = low + lane
-    while p < high:
+    """Copies all particles to the other copy, in the order of their columns; a meeting at its end."""
+    own = lane
+    while own < owned:
+        p = _dealt(own, part, chunk, blocks)
+        at = _cell(_vector(state, copy * fields * stride + first + p, stride, FIELD.position), scene, setting, shape)
+        rank[first + p] = ti.atomic_add(cell_count[at], 1)
+        if ti.atomic_add(column_count[at // BLOCK], 1) == 0:
+            listed = ti.atomic_add(columns[segment], 1)
+            column_list[first + _dealt(listed, part, chunk, blocks)] = at // BLOCK
+        own += threads
+    _meet(team, lane, meetings, meeting, threads, several, blocks)
+    # the columns that a block came upon first stay together
+    c = lane
+    while c < columns[segment]:
+        ti.atomic_add(columns[segment + 1], column_count[column_list[first + _dealt(c, part, chunk, blocks)]])
+        c += threads
+    _wait(threads)
+    if lane == 0:
+        columns[segment + 1] = ti.atomic_add(live[scene * LIVE.length + LIVE.cursor], columns[segment + 1])
+    _wait(threads)
+    c = lane
+    while c < columns[segment]:
+        column = column_list[first + _dealt(c, part, chunk, blocks)]
+        begin = ti.atomic_add(columns[segment + 1], column_count[column])
+        for n in range(BLOCK):
+            count = cell_count[column * BLOCK + n]
+            cell_count[column * BLOCK + n] = begin
+            begin += count
+        c += threads
+    _meet(team, lane, meetings, meeting, threads, several, blocks)
+    own = lane
+    while own < owned:
+        p = _dealt(own, part, chunk, blocks)
         source = copy * fields * stride + first + p
-        cell = _cell(_vector(state, source, stride, FIELD.position), scene, setting, shape)
-        place = first + cell_count[cell] + rank[first + p]
+        at = _cell(_vector(state, source, stride, FIELD.position), scene, setting, shape)
+        place = first + cell_count[at] + rank[first + p]
         target = (1 - copy) * fields * stride + place
-        for field in range(fields):
-            state[target + field * stride] = state[source + field * stride]
+        for group in ti.static(range(0, fields, COPIED)):
+            values = ti.Vector([state[source + field * stride] for field in range(group, min(group + COPIED, fields))])
+            for i in ti.static(range(values.n)):
+                state[target + (group + i) * stride] = values[i]
         for i in ti.static(range(TAG.length)):
             tag[((1 - copy) * TAG.length + i) * stride + place] = tag[(copy * TAG.length + i) * stride + first + p]
-        p += threads
+        own += threads
+    _meet(team, lane, meetings, meeting, threads, several, blocks)
+    c = lane
+    while c < columns[segment]:
+        column = column_list[first + _dealt(c, part, chunk, blocks)]
+        column_count[column] = 0
+        for n in range(BLOCK):
+            cell_count[column * BLOCK + n] = 0
+        c += threads
+    _wait(threads)
+    if lane == 0:
+        columns[segment] = 0
+        columns[segment + 1] = 0
+        live[scene * LIVE.length + LIVE.cursor] = 0
 
 
 @ti.func
 def _gather(
-    low: ti.i32,
-    high: ti.i32,
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
     lane: ti.i32,
     scene: ti.i32,
     first: ti.i32,
@@ -281,9 +355,9 @@ def _gather(
     """
     inverse_dx = setting[SETTING.inverse_cell_size]
     first_entry = velocities + LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
-    task = LANES * low + lane
-    while task < LANES * high:
-        p = task // LANES
+    task = lane
+    while task < LANES * owned:
+        p = _dealt(task // LANES, part, chunk, blocks)
         component = task % LANES
         place = particles + p
         if component < MASS or ends:
@@ -338,8 +412,10 @@ def _gather(
 
 @ti.func
 def _strain(
-    low: ti.i32,
-    high: ti.i32,
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
     lane: ti.i32,
     scene: ti.i32,
     first: ti.i32,
@@ -368,8 +444,9 @@ def _strain(
     solid = ti.static(has_solid(variant))
     largest = 0.0
     fastest = 0.0
-    p = low + lane
-    while p < high:
+    own = lane
+    while own < owned:
+        p = _dealt(own, part, chunk, blocks)
         place = particles + p
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
         if begins == 1.0:
@@ -401,15 +478,17 @@ def _strain(
             _put_symmetric(state, place, stride, FIELD.stretch, new_stretch)
         state[place + FIELD.volume * stride] = volume
         largest = ti.max(largest, stiffness)
-        p += threads
+        own += threads
     _raise(lane, counter, scene, COUNT.stiffness_bits, largest, threads)
     _raise(lane, counter, scene, COUNT.speed_square_bits, fastest, threads)
 
 
 @ti.func
 def _scatter(
-    low: ti.i32,
-    high: ti.i32,
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
     lane: ti.i32,
     scene: ti.i32,
     first: ti.i32,
@@ -430,26 +509,30 @@ def _scatter(
     run: ti.template(),
 ):
     """Adds what each particle gives to its 27 nodes: momentum and mass, in later steps of an interval what forces
-    change in momentum. A thread adds up what particles of one cell give that follow each other, of `run` in all.
+    change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes up a
+    column with them; what it leaves goes to the nodes.
     """
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
     first_entry = LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
     task = lane
-    tasks = (high - low + run - 1) // run * LANES
+    tasks = (owned + run - 1) // run * LANES
     while task < tasks:
         component = task % LANES
-        p = low + task // LANES * run
-        end = ti.min(p + run, high)
+        own = task // LANES * run
+        p = _dealt(own, part, chunk, blocks)
+        end = p + ti.min(run, owned - own)
         if begins == 0.0 and component == MASS:
             p = end
         gain = ti.Vector([0.0 for _ in range(27)])
         base = ti.Vector([0, 0, 0])
+        x = ti.Vector([0.0, 0.0, 0.0])
         if p < end:
-            base = base_node(_vector(state, particles + p, stride, FIELD.position), inverse_dx)
+            x = _vector(state, particles + p, stride, FIELD.position)
+            base = base_node(x, inverse_dx)
         while p < end:
             place = particles + p
-            fx = _vector(state, place, stride, FIELD.position) * inverse_dx - ti.cast(base, ti.f32)
+            fx = x * inverse_dx - ti.cast(base, ti.f32)
             w0, w1, w2 = weights(fx)
             w = ti.static((w0, w1, w2))
             A = ti.Vector([0.0, 0.0, 0.0])
@@ -459,34 +542,70 @@ def _scatter(
                 v = -A.dot(fx)
                 if begins == 1.0:
                     v += state[place + (FIELD.velocity + component) * stride]
-            scale = 1.0
             if ti.static(bool(variant & VARIANT.several_laws)):
                 scale = law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
+                v *= scale
+                A *= scale
             bits = 0
             if ti.static(bool(variant & VARIANT.sheets)):
                 bits = hidden[first + p]
             for i, j in ti.static(ti.ndrange(3, 3)):
-                weight_xy = scale * w[i][0] * w[j][1]
+                weight_xy = w[i][0] * w[j][1]
                 v_xy = v + A[0] * i + A[1] * j
                 for k in ti.static(range(3)):
                     given = weight_xy * w[k][2] * (v_xy + A[2] * k)
-                    if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
-                        if (bits >> (9 * i + 3 * j + k)) & 1:
-                            ghost = ghost_place(base + ti.Vector([i, j, k]), scene, contact, shape)
-                            ti.atomic_add(node[_entry(ghost, component)], given)
-                            given = 0.0
+                    if ti.static(bool(variant & VARIANT.sheets)):
+                        given = 0.0 if (bits >> (9 * i + 3 * j + k)) & 1 else given
                     gain[9 * i + 3 * j + k] += given
+            if ti.static(bool(variant & VARIANT.sheets)):
+                n = 0
+                while bits != 0:
+                    if bits & 1:
+                        corner = ti.Vector([n // 9, n // 3 % 3, n % 3])
+                        away = ti.cast(corner, ti.f32)
+                        weight = spline(away[0] - fx[0]) * spline(away[1] - fx[1]) * spline(away[2] - fx[2])
+                        ghost = ghost_place(base + corner, scene, contact, shape)
+                        ti.atomic_add(node[_entry(ghost, component)], weight * (v + A.dot(away)))
+                    bits >>= 1
+                    n += 1
             p += 1
             following = base
             if p < end:
-                following = base_node(_vector(state, particles + p, stride, FIELD.position), inverse_dx)
+                x = _vector(state, particles + p, stride, FIELD.position)
+                following = base_node(x, inverse_dx)
             if p == end or (following != base).any():
+                climbs = p < end and (following == base + ti.Vector([0, 1, 0])).all()
                 index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
-                for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
-                    ti.atomic_add(node[index_x[i] + index_y[j] + index_z[k]], gain[9 * i + 3 * j + k])
-                    gain[9 * i + 3 * j + k] = 0.0
+                for i, k in ti.static(ti.ndrange(3, 3)):
+                    ti.atomic_add(node[index_x[i] + index_y[0] + index_z[k]], gain[9 * i + k])
+                    gain[9 * i + k] = gain[9 * i + 3 + k]
+                    gain[9 * i + 3 + k] = gain[9 * i + 6 + k]
+                    gain[9 * i + 6 + k] = 0.0
+                if not climbs:
+                    for i, j, k in ti.static(ti.ndrange(3, 2, 3)):
+                        ti.atomic_add(node[index_x[i] + index_y[j + 1] + index_z[k]], gain[9 * i + 3 * j + k])
+                        gain[9 * i + 3 * j + k] = 0.0
                 base = following
         task += threads
+
+
+@ti.func
+def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
+    """What came to its momentum, its mass, and its velocity before (none where an interval begins)."""
+    before = ti.Vector([0.0, 0.0, 0.0])
+    if begins == 0.0:
+        before = ti.Vector([node[velocities + place + c] for c in range(3)])
+    return ti.Vector([node[place + c] for c in range(3)]), node[place + MASS], before
+
+
+@ti.func
+def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, node: ti.template()):
+    for c in ti.static(range(3)):
+        node[place + c] = 0.0
+        node[velocities + place + c] = v[c]
+    if ends:
+        node[velocities + place + MASS] = mass
+        node[place + MASS] = 0.0
 
 
 @ti.func
@@ -513,42 +632,39 @@ def _update_nodes(
     n = member
     while n < count:
         touched = block[block_list + n // BLOCK_NODES]
+        corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
         local = n % BLOCK_NODES
-        if local == 0:
-            block[touched] = 0
+        # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
+        place = _entry(touched * BLOCK_NODES + local, 0)
         entry = -1
-        node_fields = 1
         if ti.static(bool(variant & VARIANT.contact)):
             entry = contact[touched * BLOCK_NODES + local]
-            if entry >= 0 and entry < shape[SHAPE.ghosts]:
-                node_fields = 2
-        for field in range(node_fields):
-            place = _entry(touched * BLOCK_NODES + local, 0)
-            if field == 1:
-                place = _entry(shape[SHAPE.ghost_begin] + entry, 0)
-            gain = ti.Vector([node[place + c] for c in range(3)])
-            mass = node[place + MASS]
-            before = ti.Vector([0.0, 0.0, 0.0])
-            if begins == 0.0:
-                before = ti.Vector([node[velocities + place + c] for c in range(3)])
+        gain, mass, before = _read_node(place, velocities, begins, node)
+        if local == 0:
+            block[touched] = 0
+        if mass > 0.0 or begins == 1.0:
             v = node_velocity(
-                before, gain, mass, local, 2 * entry + field,
-                block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES], fall, scene, scene_value, shape,
-                contact_normal, variant,
-            )  # fmt: skip
-            for c in ti.static(range(3)):
-                node[place + c] = 0.0
-                node[velocities + place + c] = v[c]
-            if ends:
-                node[velocities + place + MASS] = mass
-                node[place + MASS] = 0.0
+                before, gain, mass, local, 2 * entry, corner, fall, scene, scene_value, shape, contact_normal, variant
+            )
+            _write_node(place, velocities, v, mass, ends, node)
+        if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
+            if entry >= 0 and entry < shape[SHAPE.ghosts]:
+                ghost = _entry(shape[SHAPE.ghost_begin] + entry, 0)
+                gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
+                v = node_velocity(
+                    before_there, gain_there, mass_there, local, 2 * entry + 1, corner, fall, scene, scene_value,
+                    shape, contact_normal, variant,
+                )  # fmt: skip
+                _write_node(ghost, velocities, v, mass_there, ends, node)
         n += members
 
 
 @ti.func
 def _move(
-    low: ti.i32,
-    high: ti.i32,
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
     lane: ti.i32,
     scene: ti.i32,
     particles: ti.i32,
@@ -567,8 +683,9 @@ def _move(
 ):
     """New positions; velocities as obstacles leave them."""
     largest = 0.0
-    p = low + lane
-    while p < high:
+    own = lane
+    while own < owned:
+        p = _dealt(own, part, chunk, blocks)
         place = particles + p
         x = _vector(state, place, stride, FIELD.position)
         moved, speed, speed_square = move(
@@ -584,13 +701,14 @@ def _move(
         _put_vector(state, place, stride, FIELD.position, moved)
         _put_vector(state, place, stride, FIELD.velocity, speed)
         largest = ti.max(largest, speed_square)
-        p += threads
+        own += threads
     _raise(lane, counter, scene, COUNT.speed_square_bits, largest, threads)
 
 
 @ti.kernel
 def advance(
     frames: ti.i32,
+    teams: ti.i32,
     blocks: ti.i32,
     frame_s: ti.f32,
     state: Scalars,
@@ -598,10 +716,11 @@ def advance(
     rank: Integers,
     hidden: Integers,
     cell_count: Integers,
-    cell_list: Integers,
+    column_count: Integers,
+    column_list: Integers,
     block: Integers,
     live: Integers,
-    cells: Integers,
+    columns: Integers,
     meeting: Integers,
     node: Scalars,
     turn: Integers,
@@ -620,145 +739,129 @@ def advance(
 ):
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
-    Each scene has `blocks` blocks of `threads` threads; with `several` of them all blocks of the launch have to run at
-    once. Arrays, with P particles and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, hidden (see
-    grid_kernel.substep) and cell_list [P] are work space; node [2, G, 4] holds what comes to momentum in a step and to
-    mass in an interval, zero between them, and then velocities, with the mass for an interval's end; cell_count [G],
-    the flags in block [3 * G / 64], cells [2 * blocks * scenes] and meeting [MEETING * scenes] are zero at first;
-    turn [scenes] says which scene
-    comes when (long ones first). A scene that failed keeps still.
+    Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another; with `several` blocks
+    all of the launch have to run at once. Particles are sorted at the begin of each frame. Arrays, with P particles
+    and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, hidden (see grid_kernel.substep) and
+    column_list [P] are work space; node [2, G, 4] holds what comes to momentum in a step and to mass in an interval,
+    zero between them, and then velocities, with the mass for an interval's end; cell_count [G], column_count [G / 4],
+    the flags in block [3 * G / 64], columns [2 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at
+    first; turn [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
-    for item in range(turn.shape[0] * (blocks * ti.static(threads if threads > 1 else CPU_ITEMS))):
+    for item in range(teams * (blocks * ti.static(threads if threads > 1 else CPU_ITEMS))):
         fields = ti.static(FIELD.solid if has_solid(variant) else FIELD.fluid)
         items = ti.static(threads if threads > 1 else CPU_ITEMS)
         members = blocks * threads
         # a CPU's threads take a stretch of items each: blocks that wait for each other are not of the same
-        team = item // items % turn.shape[0]
-        part = item // items // turn.shape[0]
+        team = item // items % teams
+        part = item // items // teams
         lane = item % items
         member = part * threads + lane
-        scene = turn[team]
-        first = shape[SHAPE.part_begin + scene]
-        count = shape[SHAPE.part_begin + scene + 1] - first
-        share = (count + blocks - 1) // blocks
-        low = ti.min(part * share, count)
-        high = ti.min(low + share, count)
         stride = rank.shape[0]
         velocities = node.shape[0] // 2
-        own = scene * LIVE.length
-        copy = live[own + LIVE.copy]
         meetings = 0
         choices = 0
         segment = 2 * (team * blocks + part)
-        frame = 0 if lane < threads else frames
-        while frame < frames:
-            going = counter[scene, COUNT.status] == STATUS.running
-            if going:
-                p = low + lane
-                while p < high:
-                    x = _vector(state, copy * fields * stride + first + p, stride, FIELD.position)
-                    cell = _cell(x, scene, setting, shape)
-                    rank_here = ti.atomic_add(cell_count[cell], 1)
-                    rank[first + p] = rank_here
-                    if rank_here == 0:
-                        cell_list[first + low + ti.atomic_add(cells[segment], 1)] = cell
-                    p += threads
-                if member == 0:
-                    live[own + LIVE.cursor] = 0
-                    counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
-                    scene_value[scene, VALUE.remaining] = frame_s
-                _meet(team, lane, meetings, meeting, threads, several, blocks)
-                # the cells that a block came upon first stay together
-                c = lane
-                while c < cells[segment]:
-                    ti.atomic_add(cells[segment + 1], cell_count[cell_list[first + low + c]])
-                    c += threads
-                _wait(threads)
-                if lane == 0:
-                    cells[segment + 1] = ti.atomic_add(live[own + LIVE.cursor], cells[segment + 1])
-                _wait(threads)
-                c = lane
-                while c < cells[segment]:
-                    cell = cell_list[first + low + c]
-                    cell_count[cell] = ti.atomic_add(cells[segment + 1], cell_count[cell])
-                    c += threads
-                _meet(team, lane, meetings, meeting, threads, several, blocks)
-                _reorder(
-                    low, high, scene, first, copy, lane, stride, state, tag, rank, cell_count, setting, shape, fields,
-                    threads,
-                )  # fmt: skip
-                copy = 1 - copy
-                _meet_and_choose(
+        scenes = turn.shape[0] if lane < threads and frames > 0 else 0
+        place_in_turn = team
+        while place_in_turn < scenes:
+            scene = turn[place_in_turn]
+            first = shape[SHAPE.part_begin + scene]
+            count = shape[SHAPE.part_begin + scene + 1] - first
+            chunk = (count + blocks - 1) // blocks
+            if chunk > 4 * CHUNK:
+                chunk = CHUNK
+            round_of_all = chunk * blocks
+            owned = count // round_of_all * chunk + ti.min(ti.max(count % round_of_all - part * chunk, 0), chunk)
+            live_at = scene * LIVE.length
+            copy = live[live_at + LIVE.copy]
+            frame = 0
+            while frame < frames:
+                going = counter[scene, COUNT.status] == STATUS.running
+                sorted_already = False
+                if going:
+                    if member == 0:
+                        counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
+                        scene_value[scene, VALUE.remaining] = frame_s
+                    _meet_and_choose(
                         team, lane, scene, meetings, choices, meeting, scene_value, counter, setting, shape, live,
                         threads, several, blocks,
                     )  # fmt: skip
-                c = lane
-                while c < cells[segment]:
-                    cell_count[cell_list[first + low + c]] = 0
-                    c += threads
-                _wait(threads)
-                if lane == 0:
-                    cells[segment] = 0
-                    cells[segment + 1] = 0
-            particles = copy * fields * stride + first
-            tags = copy * TAG.length * stride + first
-            while going:
-                step = scene_value[scene, VALUE.time_step]
-                begins = scene_value[scene, VALUE.begins]
-                ends = scene_value[scene, VALUE.interval_remaining] == 0.0
-                fall = falls(scene, scene_value)
-                going = step > 0.0
-                if going:
-                    if begins == 0.0:
-                        _gather(
-                            low, high, lane, scene, first, particles, stride, velocities, state, hidden, node, setting,
-                            shape, contact, False, variant, threads,
+                particles = copy * fields * stride + first
+                tags = copy * TAG.length * stride + first
+                while going:
+                    step = scene_value[scene, VALUE.time_step]
+                    begins = scene_value[scene, VALUE.begins]
+                    ends = scene_value[scene, VALUE.interval_remaining] == 0.0
+                    fall = falls(scene, scene_value)
+                    going = step > 0.0
+                    if going:
+                        if begins == 1.0:
+                            if not sorted_already:
+                                _sort(
+                                    owned, part, chunk, blocks, scene, first, copy, segment, team, lane, meetings,
+                                    stride, state, tag, rank, cell_count, column_count, column_list, columns, live,
+                                    meeting, setting, shape, fields, threads, several,
+                                )  # fmt: skip
+                                copy = 1 - copy
+                                particles = copy * fields * stride + first
+                                tags = copy * TAG.length * stride + first
+                                sorted_already = True
+                        else:
+                            _gather(
+                                owned, part, chunk, blocks, lane, scene, first, particles, stride, velocities, state,
+                                hidden, node, setting, shape, contact, False, variant, threads,
+                            )  # fmt: skip
+                            _wait(threads)
+                        _strain(
+                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, step, begins,
+                            state, tag, hidden, block, live, counter, setting, law, shape, contact, contact_normal,
+                            variant, threads,
                         )  # fmt: skip
                         _wait(threads)
-                    _strain(
-                        low, high, lane, scene, first, particles, tags, stride, step, begins, state, tag, hidden, block,
-                        live, counter, setting, law, shape, contact, contact_normal, variant, threads,
-                    )  # fmt: skip
-                    _wait(threads)
-                    _scatter(
-                        low, high, lane, scene, first, particles, tags, stride, begins, state, tag, hidden, node,
-                        setting, law, shape, contact, variant, threads, run,
-                    )  # fmt: skip
-                    _meet(team, lane, meetings, meeting, threads, several, blocks)
-                    # a thread that hardly has nodes of its own, while the others are at theirs
-                    if not ends and member == members - 1:
-                        _choose(scene, scene_value, counter, setting, shape, live)
-                    _update_nodes(
-                        member, scene, velocities, begins, ends, block, live, node, fall, scene_value, shape,
-                        contact, contact_normal, variant, members,
-                    )  # fmt: skip
-                    _meet(team, lane, meetings, meeting, threads, several, blocks)
-                    if ends:
-                        _gather(
-                            low, high, lane, scene, first, particles, stride, velocities, state, hidden, node, setting,
-                            shape, contact, True, variant, threads,
+                        _scatter(
+                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, begins, state,
+                            tag, hidden, node, setting, law, shape, contact, variant, threads, run,
                         )  # fmt: skip
-                        _wait(threads)
-                        _move(
-                            low, high, lane, scene, particles, tags, stride, state, tag, scene_value, counter, setting,
-                            shape, contact, contact_normal, variant, threads,
+                        _meet(team, lane, meetings, meeting, threads, several, blocks)
+                        # a thread that hardly has nodes of its own, while the others are at theirs
+                        if not ends and member == members - 1:
+                            _choose(scene, scene_value, counter, setting, shape, live)
+                        _update_nodes(
+                            member, scene, velocities, begins, ends, block, live, node, fall, scene_value, shape,
+                            contact, contact_normal, variant, members,
                         )  # fmt: skip
-                        _meet_and_choose(
-                            team, lane, scene, meetings, choices, meeting, scene_value, counter, setting, shape, live,
-                            threads, several, blocks,
-                        )  # fmt: skip
-            p = low + lane
-            while p < high:
-                target = frame * stride + first + tag[tags + TAG.origin * stride + p]
-                for axis in ti.static(range(3)):
-                    output[3 * target + axis] = state[particles + p + (FIELD.position + axis) * stride]
-                p += threads
+                        _meet(team, lane, meetings, meeting, threads, several, blocks)
+                        if ends:
+                            _gather(
+                                owned, part, chunk, blocks, lane, scene, first, particles, stride, velocities, state,
+                                hidden, node, setting, shape, contact, True, variant, threads,
+                            )  # fmt: skip
+                            _wait(threads)
+                            _move(
+                                owned, part, chunk, blocks, lane, scene, particles, tags, stride, state, tag,
+                                scene_value, counter, setting, shape, contact, contact_normal, variant, threads,
+                            )  # fmt: skip
+                            _meet_and_choose(
+                                team, lane, scene, meetings, choices, meeting, scene_value, counter, setting, shape,
+                                live, threads, several, blocks,
+                            )  # fmt: skip
+                own = lane
+                while own < owned:
+                    p = _dealt(own, part, chunk, blocks)
+                    target = frame * stride + first + tag[tags + TAG.origin * stride + p]
+                    for axis in ti.static(range(3)):
+                        output[3 * target + axis] = state[particles + p + (FIELD.position + axis) * stride]
+                    own += threads
+                if member == 0 and counter[scene, COUNT.status] == STATUS.running:
+                    live[live_at + LIVE.frames] += 1
+                frame += 1
             if member == 0:
-                live[own + LIVE.copy] = copy
-                if counter[scene, COUNT.status] == STATUS.running:
-                    live[own + LIVE.frames] += 1
-            frame += 1
+                live[live_at + LIVE.copy] = copy
+                meeting[team * MEETING + 2 * MEETING // 3] = teams + ti.atomic_add(meeting[teams * MEETING], 1)
+            _meet(team, lane, meetings, meeting, threads, several, blocks)
+            place_in_turn = meeting[team * MEETING + 2 * MEETING // 3]
+            _meet(team, lane, meetings, meeting, threads, several, blocks)
 
 
 @ti.kernel

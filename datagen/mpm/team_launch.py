@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from datagen.mpm.launch import Launch, device_array
-from datagen.mpm.layout import BLOCK_NODES, COUNT, FIELD, LIVE, TAG, has_solid
+from datagen.mpm.layout import BLOCK, BLOCK_NODES, COUNT, FIELD, LIVE, TAG, has_solid
 from hgn.schema import ConfigError
 
 import taichi as ti  # isort: skip
@@ -37,9 +37,9 @@ class TeamLaunch(Launch):
 
     entries_a_node = 2 * team_kernel.LANES
 
-    def __init__(self, team: Team, *batch: Any) -> None:
+    def __init__(self, team: Team, teams: int, *batch: Any) -> None:
         super().__init__(*batch)
-        self.team = team
+        self.team, self.teams = team, min(teams, len(self.scenes))
         if self.particles > MAXIMUM_PARTICLES:
             raise ConfigError(
                 f"a batch must hold at most {MAXIMUM_PARTICLES} particles, got {self.particles} of {len(self.scenes)} "
@@ -51,13 +51,14 @@ class TeamLaunch(Launch):
         order = self._order()
         tag[0, TAG.origin] = order - np.repeat(self.particle_begin[:-1], np.diff(self.particle_begin))
         self.tag = device_array(tag.ravel())
-        self.rank, self.cell_list = (ti.ndarray(ti.i32, self.particles) for _ in range(2))
+        self.rank, self.column_list = (ti.ndarray(ti.i32, self.particles) for _ in range(2))
         self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
+        self.column_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES // BLOCK)
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
-        self.meeting = ti.ndarray(ti.i32, len(self.scenes) * team_kernel.MEETING)
-        self.cells = ti.ndarray(ti.i32, 2 * len(self.scenes) * team.blocks)
-        for array in (self.cell_count, self.block, self.cells, self.node):
+        self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * team_kernel.MEETING)
+        self.columns = ti.ndarray(ti.i32, 2 * self.teams * team.blocks)
+        for array in (self.cell_count, self.column_count, self.block, self.columns, self.node):
             array.fill(0)
         self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))
         team_kernel.start_team(
@@ -68,15 +69,14 @@ class TeamLaunch(Launch):
         )  # fmt: skip
 
     def _order(self) -> np.ndarray:
-        """Particles in the order of their cells, int32 [P]: neighbours in space are neighbours in memory then."""
-        cell = np.concatenate(
-            [
-                self._places(np.floor(scene.position_N3 / scene.cell_size - 0.5).astype(np.int32))
-                + np.int64(index * self.scene_nodes)
-                for index, scene in enumerate(self.scenes)
-            ]
-        )
-        return np.argsort(cell, kind="stable").astype(np.int32)
+        """Particles in the order that the kernel sorts them into, int32 [P]."""
+        keys = []
+        for index, scene in enumerate(self.scenes):
+            base = np.floor(scene.position_N3 / scene.cell_size - 0.5).astype(np.int32)
+            block = self._places(base) // BLOCK_NODES + np.int64(index * self.scene_nodes // BLOCK_NODES)
+            column = (block * BLOCK + base[:, 0] % BLOCK) * BLOCK + base[:, 2] % BLOCK
+            keys.append(column * BLOCK + base[:, 1] % BLOCK)
+        return np.argsort(np.concatenate(keys), kind="stable").astype(np.int32)
 
     def _node_array(self, nodes: int) -> ti.ScalarNdarray:
         return ti.ndarray(ti.f32, self.entries_a_node * nodes)
@@ -117,9 +117,9 @@ class TeamLaunch(Launch):
         self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
         self.meeting.fill(0)
         team_kernel.advance(
-            frames, self.team.blocks, self.frame_s, self.state, self.tag, self.rank, self.hidden, self.cell_count,
-            self.cell_list, self.block, self.live, self.cells, self.meeting, self.node,
-            self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact,
+            frames, self.teams, self.team.blocks, self.frame_s, self.state, self.tag, self.rank, self.hidden,
+            self.cell_count, self.column_count, self.column_list, self.block, self.live, self.columns, self.meeting,
+            self.node, self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact,
             self.contact_normal, output, self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
         )  # fmt: skip
         return output

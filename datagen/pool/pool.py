@@ -35,8 +35,8 @@ from hgn.schema import ConfigError
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
 _PACKING_SECONDS = 0.02  # at most until a packed shard is published
 _LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
-GPU_SCENES_PER_LAUNCH = 832  # all of the paper's data set: long scenes begin first, and short ones fill the gaps
-GPU_NODES_PER_LAUNCH = GPU_SCENES_PER_LAUNCH * 64**3  # of the grids of all scenes, about 30 bytes each
+GPU_SCENES_PER_LAUNCH = 208  # so that scenes are made, and episodes staged, while others are simulated
+GPU_NODES_PER_LAUNCH = 832 * 64**3  # of the grids of all scenes, about 60 bytes each
 GPU_EARLY_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
 _LAUNCH_GROWTH = 32  # from one launch to the next, up to the full size
 MAXIMUM_MAKERS = 32

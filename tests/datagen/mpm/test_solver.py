@@ -110,7 +110,7 @@ def test_adaptive_steps_fill_the_frame() -> None:
     fall = (outcome.position_TN3[-1] - outcome.position_TN3[0])[:, 1].mean()
     interval = time / outcome.counters["transfers"]
     assert -9.8 * time * (time / 2 + 0.55 * interval) < fall < -9.8 * time * (time / 2 + 0.45 * interval)
-    assert outcome.counters["substeps"] >= time / (0.5 * CELL * (1000 / 1_666_667) ** 0.5)
+    assert outcome.counters["substeps"] >= time / (config.stability_fraction * CELL * (1000 / 1_666_667) ** 0.5)
 
 
 @pytest.mark.parametrize("config", [ADAPTIVE, FIXED], ids=["adaptive", "fixed"])

@@ -8,7 +8,7 @@ import pytest
 
 from datagen.mpm import team_launch
 from datagen.mpm.device import Device
-from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, simulate
+from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, _teams_at_once, simulate
 from hgn.config import MpmConfig
 from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
@@ -68,11 +68,20 @@ def test_blocks_that_wait_for_each_other_agree_with_one() -> None:
 @pytest.mark.parametrize("scenes", [1, 2, 7, 32, 132, 133, 264, 800])
 @pytest.mark.parametrize("most", [1, 50, 4_000, 40_000, 1_000_000])
 def test_blocks_that_wait_for_each_other_all_run_at_once(scenes: int, most: int) -> None:
-    """The blocks of a scene, where there are several, find room on a GPU's processors with those of all scenes."""
-    team = _team(Device("gpu", 1, 132), scenes, most)
+    """The blocks of a scene, where there are several, find room on a GPU's processors."""
+    team = _team(Device("gpu", 1, 132), [most] * scenes)
     assert team.threads % 32 == 0
-    assert team.blocks == 1 or scenes * team.blocks <= 132 * (512 // team.threads)
-    assert _team(Device("cpu", 2), scenes, most) == _team(Device("gpu", 1, 132), 1, 50_000_000) == Team(0)
+    assert team.blocks * _teams_at_once(Device("gpu", 1, 132), team) <= 132 * (512 // team.threads)
+    assert _team(Device("cpu", 2), [most] * scenes) == _team(Device("gpu", 1, 132), [50_000_000]) == Team(0)
+
+
+def test_who_runs_many_scenes() -> None:
+    """One block a scene where all are done at once, else teams that take scenes one after another."""
+    gpu = Device("gpu", 1, 132)
+    assert _team(gpu, [4_000] * 256) == Team(256)
+    assert _team(gpu, [4_000, *[3_000] * 255]) == _team(gpu, [4_000] * 100) == _team(gpu, [4_000] * 300) == Team(256, 8)
+    assert _team(gpu, [4_000] * 50) == Team(256, 5)
+    assert _team(gpu, [4_000]) == Team(128, 264, 1)
 
 
 def test_more_blocks_than_run_at_once() -> None:
