@@ -6,6 +6,7 @@ Below this file nobody sees a DictConfig. Numbers that follow from others are pr
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -523,6 +524,25 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
+
+
+@dataclass(frozen=True)
+class CardConfig:
+    """`python -m hgn.card`: the README.md that the Hugging Face Hub shows of weights or of a data set."""
+
+    weights: str | None = None  # a file of python -m hgn.export, copied into out; or …
+    data: str | None = None  # … a data set's folder, where the card is written
+    out: str | None = None  # with weights: a folder
+    license: str = "mit"  # by the Hub's names
+    name: str | None = None  # the heading; null: the file's or the folder's name
+
+    def __post_init__(self) -> None:
+        one = (self.weights is None) != (self.data is None)
+        require(one, "weights", "given, or else data", [self.weights, self.data])
+        rule = "a folder, given together with weights"
+        require((self.weights is None) == (self.out is None), "out", rule, self.out)
+        plain = re.fullmatch(r"[a-z0-9.-]+", self.license) is not None
+        require(plain, "license", "a name as the Hub has them, for example mit or cc-by-4.0", self.license)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from urllib.parse import urlsplit
 
 from hgn.schema import ConfigError, require
 from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
+from hgn.system.hub import PREFIX, HubPlace, hub_token
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
@@ -224,14 +225,16 @@ class _Remote:
     def __init__(self, url: str) -> None:
         import fsspec  # loads for a while, and local data sets need none of it
 
-        self._url, self._http = url, url.startswith(("http://", "https://"))
+        self._url, hub = url, url.startswith(PREFIX)
+        address = HubPlace.parse(url, "dataset.folder").address if hub else url
+        self._http = address.startswith(("http://", "https://"))
         options: dict[str, Any] = {}
         if self._http:
             import aiohttp
 
             from hgn.data.bounded_http import BoundedResponse
 
-            token = dataset_token() if _token_is_for(url) else None
+            token = hub_token() if hub else dataset_token() if _token_is_for(url) else None
             timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_S, sock_read=_SILENCE_S)
             # packed, a small answer could become a large one
             headers = {"Accept-Encoding": "identity"}
@@ -245,7 +248,7 @@ class _Remote:
             }
             options = {"client_kwargs": client, "use_listings_cache": False}
         try:
-            self._files, self._root = fsspec.core.url_to_fs(url, **options)
+            self._files, self._root = fsspec.core.url_to_fs(address, **options)
         except (ValueError, ImportError) as error:
             raise ConfigError(
                 f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({error})"
@@ -454,7 +457,8 @@ def _transient(error: Exception, url: str) -> str | None:
     if status in (401, 403) or isinstance(error, PermissionError):
         raise ConfigError(
             f"{url} must be open to this program, got refused; set {TOKEN_VARIABLE} to the service's token, which "
-            f"goes to {TOKEN_HOST_VARIABLE} alone where that is set (an object store asks for its own credentials)"
+            f"goes to {TOKEN_HOST_VARIABLE} alone where that is set (an object store asks for its own credentials, the "
+            "Hugging Face Hub for HF_TOKEN)"
         ) from None
     if status == 410:
         raise ConfigError(f"{url} is damaged at its service; delete it there and run the generator again") from None

@@ -20,6 +20,7 @@ from hgn.network.build import build_network
 from hgn.renamed import current_names
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import write_atomically
+from hgn.system.hub import PREFIX, hub_weights
 
 FORMAT_VERSION = 1
 SUFFIX = ".safetensors"
@@ -58,13 +59,15 @@ def shipped_weights() -> dict[str, Path]:
 
 
 def find_weights(name: str, field: str = "weights") -> Path:
-    """The file that `name` means: shipped weights by their name, as in `obstacles`, else a path.
+    """The file that `name` means: shipped weights by their name, as in `obstacles`, a repository's at hf://, or a path.
 
     Raises: ConfigError for what is neither a name that is shipped nor looks like a path.
     """
     shipped = shipped_weights()
     if name in shipped:
         return shipped[name]
+    if name.startswith(PREFIX):
+        return hub_weights(name, field)
     path = Path(name)
     if path.suffix or len(path.parts) > 1 or path.exists():
         return path

@@ -18,6 +18,7 @@ EXTRA_OF = {
     "starlette": "service",
     "uvicorn": "service",
     "google_crc32c": "import",
+    "huggingface_hub": "hub",
     "pxr": "files",
     "pysplashsurf": "files",
     "ray": "ray",

@@ -1,0 +1,101 @@
+"""python -m hgn.card weights=net.safetensors out=FOLDER, or data=FOLDER: a card for the Hugging Face Hub.
+
+Writes README.md with the Hub's metadata at its head: what is in the file or the data set, as these say of themselves.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hgn.command import run_command
+from hgn.config import CardConfig
+from hgn.data.manifest import SPLITS, Manifest
+from hgn.data.storage import is_remote
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
+from hgn.schema import from_mapping, require
+from hgn.system.files import write_atomically
+
+CARD = "README.md"
+_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))  # the Hub's names, by episodes
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Writes the card, beside weights a copy of them; returns the exit code. A card that is there is kept."""
+    config = from_mapping(CardConfig, mapping)
+    if config.weights is not None:
+        assert config.out is not None  # CardConfig saw to it
+        path, folder = find_weights(config.weights), Path(config.out)
+        _, info = load_weights(path)
+        text = weights_card(info, config.name or path.stem, path.name, config.license)
+    else:
+        assert config.data is not None
+        require(not is_remote(config.data), "data", "a folder of this machine", config.data)
+        folder = Path(config.data)
+        text = data_card(Manifest.load(folder), config.name or folder.name, config.license)
+    target = folder / CARD
+    require(not target.exists(), "out" if config.weights else "data", f"a folder without {CARD}", str(folder))
+    folder.mkdir(parents=True, exist_ok=True)
+    if config.weights is not None and not (folder / path.name).exists():
+        shutil.copyfile(path, folder / path.name)
+    write_atomically(target, text.encode())
+    print(target)
+    return 0
+
+
+def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
+    """The card of a weights file: the Hub's metadata, then what it says of itself and how it is used."""
+    network = info.network
+    metadata = {"license": licence, "library_name": "hgn", "tags": ["physics", "particles", "simulation", network.kind]}
+    rows = {
+        "network": f"{network.kind}, {network.dimensions}D, width {network.width}, {network.levels} levels",
+        "materials": ", ".join(network.materials),
+        "cells": f"{network.cell_size:g}",
+        "obstacles": "seen" if network.sees_obstacles else "not seen",
+        "frames a second": f"{info.frame_rate_hz:g}",
+        "gravity": "any" if network.relative else str(list(info.gravity)),
+        "updates": str(info.updates),
+    }
+    use = f"python -m hgn.rollout weights=hf://USER/NAME/{file}"
+    return _page(metadata, name, "Weights of a particle simulator, for HGN.", rows, use)
+
+
+def data_card(manifest: Manifest, name: str, licence: str) -> str:
+    """The card of a data set: the Hub's metadata with its splits, then what the manifest says and how it is used."""
+    episodes = {split: manifest.published(split) for split in SPLITS if manifest.published(split)}
+    require(bool(episodes), "data", "a data set with episodes", name)
+    count = sum(episodes.values())
+    files = [{"split": split, "path": f"{split}-*.tar"} for split in episodes]
+    metadata = {
+        "license": licence,
+        "pretty_name": name,
+        "tags": ["physics", "particles", "simulation", "webdataset"],
+        "size_categories": [next((size for limit, size in _SIZES if count < limit), "100K<n<1M")],
+        "configs": [{"config_name": "default", "data_files": files}],
+    }
+    own = manifest.config.get("imported")
+    scene = own or manifest.config["scene"]
+    rows = {split: f"{number} episodes" for split, number in episodes.items()}
+    rows |= {
+        "frames a second": f"{manifest.config['frame_rate_hz']:g}",
+        "materials": ", ".join(scene["materials"]),
+        "gravity": str(list(scene["gravity"])),
+        "made by": f"an import of {own['format']} files" if own else "HGN's solver",
+        "configuration": manifest.config_hash[:12],
+    }
+    kind = "imported" if own else "EXPERIMENT"
+    use = f"python -m hgn.train +experiment={kind} dataset.folder=hf://datasets/USER/NAME"
+    return _page(metadata, name, "Trajectories of particles: WebDataset shards, a manifest and an index.", rows, use)
+
+
+def _page(metadata: dict[str, Any], name: str, what: str, rows: dict[str, str], use: str) -> str:
+    head = yaml.safe_dump(metadata, sort_keys=False)
+    table = "".join(f"| {key} | {value} |\n" for key, value in rows.items())
+    return f"---\n{head}---\n\n# {name}\n\n{what}\n\n| | |\n|---|---|\n{table}\n```sh\n{use}\n```\n"
+
+
+if __name__ == "__main__":
+    run_command(main, "card")

@@ -1,0 +1,126 @@
+"""The Hugging Face Hub: `hf://USER/NAME[@REVISION][/PATH]` is weights, `hf://datasets/USER/NAME` a data set.
+
+Data sets are read as from any web server, by ranges, through the Hub's addresses of files. Weights are brought by
+huggingface_hub into its cache. $HF_ENDPOINT names another server, $HF_TOKEN is what private repositories ask for.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import random
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+from hgn.schema import ConfigError
+
+PREFIX = "hf://"
+_NAME = r"[\w.-]+"
+_PATTERN = re.compile(rf"hf://(datasets/)?({_NAME}/{_NAME})(?:@([^/]+))?(?:/(.*))?")
+_PATIENCE_S, _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 60.0, 0.25, 10.0
+_PACKAGES = ("httpx", "httpx2", "httpcore", "httpcore2")
+_PASSING = (408, 425, 429)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class HubPlace:
+    """A place in a repository."""
+
+    repository: str  # USER/NAME
+    revision: str
+    path: str  # in it; empty: its root
+    is_dataset: bool
+
+    @staticmethod
+    def parse(url: str, field: str) -> HubPlace:
+        """Raises: ConfigError in the name of `field` for what is no such address."""
+        match = _PATTERN.fullmatch(url)
+        if match is None:
+            rule = "an address as hf://USER/NAME or hf://datasets/USER/NAME, @REVISION and /PATH may follow"
+            raise ConfigError(f"{field} must be {rule}, got {url!r}")
+        return HubPlace(match[2], match[3] or "main", (match[4] or "").strip("/"), match[1] is not None)
+
+    @property
+    def address(self) -> str:
+        """Where its files are served."""
+        kind = "datasets/" if self.is_dataset else ""
+        return f"{endpoint()}/{kind}{self.repository}/resolve/{quote(self.revision, safe='')}/{self.path}".rstrip("/")
+
+
+def endpoint() -> str:
+    """The Hub's server."""
+    return os.environ.get("HF_ENDPOINT", "https://huggingface.co").rstrip("/")
+
+
+def hub_token() -> str | None:
+    """The token of $HF_TOKEN."""
+    return os.environ.get("HF_TOKEN") or None
+
+
+@functools.lru_cache(maxsize=64)
+def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_S) -> Path:
+    """A weights file of a repository, in huggingface_hub's cache: the one that is named, or its only one.
+
+    Raises: ConfigError where there is none, or several, or access is refused, or the server stays away.
+    """
+    import huggingface_hub  # loads for a while, and is an extra
+
+    place = HubPlace.parse(url, field)
+    if place.is_dataset:
+        raise ConfigError(f"{field} must be of a repository of weights, hf://USER/NAME, got {url!r}")
+    api = huggingface_hub.HfApi(endpoint=endpoint(), token=hub_token())
+    name = place.path
+    if not name.endswith(".safetensors"):
+        ask = functools.partial(api.list_repo_files, place.repository, revision=place.revision)
+        folder = f"{name}/" if name else ""
+        files = _patiently(ask, url, field, patience_s)
+        inside = [file for file in files if file.endswith(".safetensors") and file.startswith(folder)]
+        if len(inside) != 1:
+            several = f"one of {', '.join(inside)}" if inside else "a repository with a .safetensors file"
+            raise ConfigError(f"{field} must name {several}, got {url!r}")
+        name = inside[0]
+    bring = functools.partial(api.hf_hub_download, place.repository, name, revision=place.revision)
+    return Path(_patiently(bring, url, field, patience_s))
+
+
+def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) -> T:
+    """Asks again while the server is away: huggingface_hub's and httpx' errors are none of OSError's kinds."""
+    begin, pause = time.monotonic(), _FIRST_PAUSE_S
+    while True:
+        try:
+            return ask()
+        except Exception as error:
+            cause = _passing(error, url, field)
+            if cause is None:
+                raise
+            if time.monotonic() - begin + pause > patience_s:
+                raise ConfigError(
+                    f"{field} must be within reach, got no answer from {endpoint()} for {url} in {patience_s:.0f} s "
+                    f"(at last: {cause})"
+                ) from error
+            time.sleep(pause * random.uniform(0.5, 1.0))
+            pause = min(2 * pause, _LONGEST_PAUSE_S)
+
+
+def _passing(error: Exception, url: str, field: str) -> str | None:
+    """What to say of an error that may pass; none of another program's. Raises: ConfigError for one that stays."""
+    from huggingface_hub import errors
+
+    status = getattr(getattr(error, "response", None), "status_code", None)
+    refused = isinstance(error, errors.RepositoryNotFoundError) or status in (401, 403)
+    if refused:
+        remedy = "check the name; a private one asks for a token in HF_TOKEN"
+        raise ConfigError(f"{field} must be open to this program, got {url} refused or not there; {remedy}") from None
+    missing = isinstance(error, errors.EntryNotFoundError) and not isinstance(error, errors.LocalEntryNotFoundError)
+    if missing or (isinstance(status, int) and 400 <= status < 500 and status not in _PASSING):
+        raise ConfigError(f"{field} must be a file of the repository, got {url}, which has no such file") from None
+    packages: set[Any] = {kind.__module__.partition(".")[0] for kind in type(error).__mro__}
+    known = isinstance(error, (errors.LocalEntryNotFoundError, OSError)) or packages & set(_PACKAGES)
+    return (" ".join(str(error).split())[:200] or type(error).__name__) if known else None

@@ -1,0 +1,139 @@
+"""Weights and data sets of the Hugging Face Hub, from a stand-in that speaks its protocol."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from data.hub_server import TOKEN, Hub, served
+from network.states import network_of
+
+from hgn import card
+from hgn.config import DatagenConfig
+from hgn.data.reader import EpisodeStore
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
+from hgn.schema import ConfigError
+from hgn.system import hub as hub_module
+from hgn.system.hub import HubPlace, hub_weights
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    network = network_of(torch.float32)
+    info = WeightsInfo(network.config, 60.0, 1 / 64)
+    for place in (
+        "one/net/net.safetensors",
+        "one/two/a.safetensors",
+        "one/two/b.safetensors",
+        "one/private/x.safetensors",
+    ):
+        (tmp_path / "hub" / "models" / place).parent.mkdir(parents=True, exist_ok=True)
+        save_weights(tmp_path / "hub" / "models" / place, network, info)
+    (tmp_path / "hub" / "models" / "one" / "none").mkdir()
+    (tmp_path / "hub" / "models" / "one" / "none" / "README.md").write_text("nothing")
+    monkeypatch.setenv("HGN_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub_cache"))
+    monkeypatch.delenv("HF_TOKEN", raising=False)
+    monkeypatch.setattr(hub_module, "_FIRST_PAUSE_S", 0.01)
+    hub_weights.cache_clear()
+    with served(tmp_path / "hub") as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        yield server
+
+
+@pytest.mark.parametrize(
+    "url", ["hf://one/net", "hf://one/net/net.safetensors", "hf://one/net@main", "hf://one/two/b.safetensors"]
+)
+def test_weights_come_from_a_repository(url, hub):
+    """By the file's name, or where there is one alone; they are the file's, and a second asking brings nothing."""
+    path = find_weights(url)
+    place = HubPlace.parse(url, "weights")
+    stored = hub.folder / "models" / place.repository / path.name
+    assert path.read_bytes() == stored.read_bytes() and load_weights(path)[1].frame_rate_hz == 60.0
+    asked = len(hub.asked)
+    assert find_weights(url) == path and len(hub.asked) == asked
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("hf://one", r"weights must be an address as hf://USER/NAME .* got 'hf://one'"),
+        ("hf://datasets/one/data", r"weights must be of a repository of weights, hf://USER/NAME"),
+        ("hf://one/two", r"weights must name one of a.safetensors, b.safetensors, got 'hf://one/two'"),
+        ("hf://one/none", r"weights must name a repository with a .safetensors file"),
+        (
+            "hf://one/absent",
+            r"weights must be open to this program, got hf://one/absent refused or .*HF_TOKEN",
+        ),
+        ("hf://one/net/other.safetensors", r"weights must be a file of the repository, got .*has no such file"),
+        ("hf://one/private/x.safetensors", r"weights must be open to this program"),
+    ],
+)
+def test_what_cannot_be_had_is_told(url, message, hub):
+    with pytest.raises(ConfigError, match=message):
+        find_weights(url)
+
+
+def test_a_token_opens_private_repositories(hub, monkeypatch):
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
+    assert find_weights("hf://one/private/x.safetensors").is_file()
+
+
+def test_a_server_that_fails_is_asked_again(hub, monkeypatch):
+    """Its errors are huggingface_hub's own and no OSError of a socket; one that stays away ends in a message."""
+    monkeypatch.setattr("time.sleep", lambda _: None)  # huggingface_hub's own pauses too
+    hub.failures = 2
+    assert find_weights("hf://one/net/net.safetensors").is_file()
+    hub.failures = 1_000_000
+    with pytest.raises(ConfigError, match=r"weights must be within reach, got no answer from .* for hf://one/two/a"):
+        hub_weights("hf://one/two/a.safetensors", patience_s=0.05)
+
+
+def test_a_data_set_is_read_from_a_repository(
+    hub: Hub,
+    make_config: Callable[..., DatagenConfig],
+    make_dataset: Callable[[DatagenConfig], Path],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """dataset.folder=hf://datasets/…: the episodes are the folder's, with errors on the way, in a folder of it too."""
+    config = make_config()
+    folder = make_dataset(config)
+    monkeypatch.setattr("hgn.data.storage._FIRST_PAUSE_S", 0.01)
+    for place in ("one/data", "one/several/part", "one/private"):
+        shutil.copytree(folder, hub.folder / "datasets" / place)
+    hub.failures = 2
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
+    for url in ("hf://datasets/one/data", "hf://datasets/one/several@main/part", "hf://datasets/one/private"):
+        remote, local = EpisodeStore(url, "train"), EpisodeStore(folder, "train")
+        assert len(remote) == len(local) == 5
+        for left, right in zip(remote.episodes, local.episodes, strict=True):
+            assert np.array_equal(left.position_TN3, right.position_TN3)
+    assert not EpisodeStore.available("hf://datasets/one/nothing")
+    with pytest.raises(ConfigError, match=r"dataset.folder must be an address as hf://USER"):
+        EpisodeStore("hf://data", "train")
+
+
+def test_cards_are_the_hubs(hub, make_config, make_dataset, tmp_path):
+    """Metadata that huggingface_hub itself reads and finds valid, figures of the file and the manifest, no second
+    card; and what lies in such a folder is read back by its hf:// address."""
+    from huggingface_hub import DatasetCard, ModelCard
+
+    folder = make_dataset(make_config())
+    assert card.main({"data": str(folder), "license": "cc-by-4.0"}) == 0
+    found = DatasetCard.load(folder / "README.md")
+    assert found.data.license == "cc-by-4.0" and found.data.size_categories == ["n<1K"]
+    files = found.data.to_dict()["configs"][0]["data_files"]
+    assert {entry["split"] for entry in files} == {"train", "validation", "test"}
+    assert all(list(folder.glob(entry["path"])) for entry in files) and "5 episodes" in found.text
+    weights = hub.folder / "models" / "one" / "net" / "net.safetensors"
+    target = hub.folder / "models" / "one" / "carded"
+    assert card.main({"weights": str(weights), "out": str(target)}) == 0
+    model = ModelCard.load(target / "README.md")
+    assert model.data.library_name == "hgn" and "width 16" in model.text
+    assert load_weights(find_weights("hf://one/carded"))[1].frame_rate_hz == 60.0
+    with pytest.raises(ConfigError, match=r"data must be a folder without README.md"):
+        card.main({"data": str(folder)})
