@@ -518,12 +518,27 @@ class TrainConfig:
 class ExportConfig:
     """`python -m hgn.export`."""
 
-    checkpoint: str
-    out: str
+    checkpoint: str | None = None  # whose network is written to `out` as weights
+    out: str | None = None
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
+    weights: str | None = None  # what onnx, package and arrays are of: a file or shipped weights; null: `out`
+    onnx: str | None = None  # file of a step's graph, for ONNX Runtime
+    package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
+    device: str = "cpu"  # or cuda, cuda:1
+    arrays: str | None = None  # folder of what a step is first given for `scene`, as .npy files
+    scene: str | None = None  # a scene file, or the name of an example
 
     def __post_init__(self) -> None:
         require_bounds(self)
+        both = (self.checkpoint is None) == (self.out is None)
+        require(both, "out", "given with checkpoint, and only then", self.out, "give both or weights")
+        require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
+        steps = any(name is not None for name in (self.onnx, self.package, self.arrays))
+        require(steps or self.weights is None, "onnx", "given with weights, or package or arrays", self.onnx)
+        rule = "given, or weights with onnx, package or arrays"
+        require(self.checkpoint is not None or self.weights is not None, "checkpoint", rule, self.checkpoint)
+        if self.package is not None:
+            require(self.package.endswith(".pt2"), "package", "a name that ends in .pt2", self.package)
 
 
 @dataclass(frozen=True)

@@ -1,28 +1,65 @@
-"""python -m hgn.export checkpoint=… out=…: a checkpoint's network as inference weights."""
+"""python -m hgn.export: a checkpoint's network as weights; a network's step as ONNX or as a compiled package."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hgn.command import run_command
 from hgn.config import ExportConfig
-from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
+from hgn.runtime.simulator import Simulator
+from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
+from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import from_mapping
+from hgn.system.device import choose_device
+from hgn.system.extras import require_installed
 from hgn.system.provenance import provenance
-from hgn.training.checkpoint import data_of_checkpoint, network_of_checkpoint, read_checkpoint, updates_of_checkpoint
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Writes the weights file; returns the exit code."""
+    """Writes what is asked for; returns the exit code."""
     config = from_mapping(ExportConfig, mapping)
-    export(Path(config.checkpoint), Path(config.out), config.stored_precision)
-    print(config.out)
+    if config.onnx is not None:
+        require_installed("onnxscript")
+    if config.checkpoint is not None:
+        assert config.out is not None
+        export(Path(config.checkpoint), Path(config.out), config.stored_precision)
+        print(config.out)
+    if config.onnx is None and config.package is None and config.arrays is None:
+        return 0
+    device = choose_device(config.device)
+    weights = config.weights or config.out
+    assert weights is not None
+    network, info = load_weights(find_weights(weights), device)
+    if config.arrays is not None:
+        assert config.scene is not None
+        simulator = Simulator(network, info.frame_rate_hz, "torch", info=info)
+        write_arrays(Path(config.arrays), simulator, config.scene)
+        print(config.arrays)
+    if config.onnx is not None or config.package is not None:
+        program = traced_step(network, info)
+    if config.onnx is not None:
+        write_onnx(Path(config.onnx), program, info)
+        print(config.onnx)
+    if config.package is not None:
+        write_package(Path(config.package), program, info)
+        print(config.package)
     return 0
 
 
 def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32") -> None:
     """Checkpoint to weights. Raises: ConfigError when the checkpoint is missing or not ours."""
+    # Lightning, which the other exports do without, is loaded here
+    from hgn.training.checkpoint import (
+        data_of_checkpoint,
+        network_of_checkpoint,
+        read_checkpoint,
+        updates_of_checkpoint,
+    )
+
     checkpoint = read_checkpoint(checkpoint_path)
     network = network_of_checkpoint(checkpoint)
     data = data_of_checkpoint(checkpoint)
@@ -36,6 +73,13 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32") -> 
         provenance=provenance() | {"checkpoint": checkpoint_path.name, "data_config_hash": data.config_hash},
     )
     save_weights(out, network, info, stored_precision)
+
+
+def write_arrays(folder: Path, simulator: Simulator, scene: str) -> None:
+    """What a step is first given for a scene, an .npy file each. Raises: ConfigError as Simulator.start."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, array in initial_arrays(simulator.start([load_scene(find_scene(scene))])).items():
+        np.save(folder / f"{name}.npy", array)
 
 
 if __name__ == "__main__":

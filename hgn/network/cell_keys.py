@@ -7,11 +7,13 @@ other structure than one sorted list. Shape legend: … any leading shape.
 from __future__ import annotations
 
 import torch
+from torch.compiler import is_exporting
 
 COORDINATE_BITS = 17
 COORDINATE_LIMIT = 1 << (COORDINATE_BITS - 1)  # cells run from -limit to limit - 1 on each axis
 SCENE_LIMIT = 1 << (63 - 3 * COORDINATE_BITS)
 HASH_PRIMES = (73856093, 19349663, 83492791)  # of x, y, z (Teschner et al. 2003); products stay far below 2^63
+LARGEST_EXPORTED = 1 << 24  # particles or cells of an exported graph: bounds that compilers need
 AXIS_STRIDE = (1 << (2 * COORDINATE_BITS), 1 << COORDINATE_BITS, 1)  # key difference of neighbours in x, y, z
 
 
@@ -40,10 +42,30 @@ def unpack(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return key >> (3 * COORDINATE_BITS), cell_3
 
 
+def unique(key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The keys that occur, sorted, int64 [K], and where each of `key` is among them."""
+    key_K, index = torch.unique(key, return_inverse=True)
+    if is_exporting():
+        torch._check(key_K.shape[0] <= LARGEST_EXPORTED)
+    return key_K, index
+
+
 def find(sorted_key_K: torch.Tensor, key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Looks keys up in a sorted list: index int64 […] (0 where absent) and whether each is there, bool […]."""
+    if is_exporting():
+        return _find_by_unique(sorted_key_K, key)
     if len(sorted_key_K) == 0:
         return torch.zeros_like(key), torch.zeros_like(key, dtype=torch.bool)
     index = torch.searchsorted(sorted_key_K, key).clamp_(max=len(sorted_key_K) - 1)
     found = sorted_key_K[index] == key
     return index * found, found
+
+
+def _find_by_unique(sorted_key_K: torch.Tensor, key: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same without a search, which ONNX lacks."""
+    count = sorted_key_K.shape[0]
+    key_U, place = unique(torch.cat([sorted_key_K, key.flatten()]))
+    absent_U = torch.full_like(key_U, -1)
+    index_U = absent_U.scatter(0, place[:count], torch.arange(count, device=key.device))
+    index = index_U[place[count:]].view(key.shape)
+    return index.clamp(min=0), index >= 0

@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from torch.compiler import is_exporting
 
-from hgn.network.cell_keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, unpack
+from hgn.network.cell_keys import AXIS_STRIDE, COORDINATE_LIMIT, find, pack, unique, unpack
 
 # The 8 corners of a unit cube, z fastest: the offsets of a particle's cells, and of children in a parent.
 CORNER_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])
@@ -37,7 +38,7 @@ class Level:
 
     @property
     def cell_count(self) -> int:
-        return len(self.key_C)
+        return self.key_C.shape[0]  # len() would fix the size of an exported graph
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,8 @@ def build_hierarchy(
     Raises: GridRangeError when a particle is not finite or lies beyond ±65,536 cells.
     """
     grid_N3 = (position_N3 - origin_S3[scene_N]) / cell_size - 0.5
-    if len(grid_N3) and not bool((grid_N3.abs() < COORDINATE_LIMIT - 2).all()):
+    # an exported graph cannot raise
+    if not is_exporting() and len(grid_N3) and not bool((grid_N3.abs() < COORDINATE_LIMIT - 2).all()):
         raise GridRangeError(
             f"positions must be finite and within {(COORDINATE_LIMIT - 2) * cell_size:.0f} domain units, "
             f"got {position_N3[(grid_N3.abs() < COORDINATE_LIMIT - 2).logical_not().any(1)][0].tolist()}"
@@ -76,7 +78,7 @@ def build_hierarchy(
     # their pairs point at the near corner instead, with weight zero.
     reached_N83 = corner_83 * (fraction_N3 > 0)[:, None].long()
     key_N8 = pack(scene_N[:, None], base_N3.long()[:, None] + reached_N83)
-    key_C, cell_N8 = torch.unique(key_N8, return_inverse=True)
+    key_C, cell_N8 = unique(key_N8)
 
     built = []
     for level in range(levels):
@@ -85,7 +87,7 @@ def build_hierarchy(
             built.append(Level(key_C, sender_E, receiver_E, direction_E))
             break
         scene_C, coordinate_C3 = unpack(key_C)
-        parent_key, parent_C = torch.unique(pack(scene_C, coordinate_C3 >> 1), return_inverse=True)
+        parent_key, parent_C = unique(pack(scene_C, coordinate_C3 >> 1))
         octant_C = ((coordinate_C3 & 1) * torch.tensor([4, 2, 1], device=key_C.device)).sum(-1)
         built.append(Level(key_C, sender_E, receiver_E, direction_E, parent_C, octant_C))
         key_C = parent_key

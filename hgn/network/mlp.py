@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import nn
+from torch.compiler import is_exporting
 from torch.nn import functional
 
 LEAKY_SLOPE = 0.01
@@ -21,11 +22,16 @@ MINIMUM_ROWS = 16
 
 def linear(value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
     """The affine map of rows [R, in] (or [..., in]) to [R, out], each row computed alike however few there are."""
-    rows = value.shape[:-1].numel()
-    if rows >= MINIMUM_ROWS or value.device.type != "cpu":
+    if not _few(value):
         return functional.linear(value, weight, bias)
+    rows = value.shape[:-1].numel()
     flat = functional.pad(value.reshape(rows, value.shape[-1]), (0, 0, 0, MINIMUM_ROWS - rows))
     return functional.linear(flat, weight, bias)[:rows].reshape(*value.shape[:-1], len(weight))
+
+
+def _few(value: torch.Tensor) -> bool:
+    """Whether its rows are padded. An exported graph is one for all sizes, and pads none."""
+    return value.device.type == "cpu" and not is_exporting() and value.shape[:-1].numel() < MINIMUM_ROWS
 
 
 class MLP(nn.Module):
@@ -47,7 +53,7 @@ class MLP(nn.Module):
 
     def add_projection(self, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
         """Adds that product with rows [R, parts[part]] to `hidden` [R, hidden], in place and in one pass."""
-        if len(value) >= MINIMUM_ROWS or value.device.type != "cpu":
+        if not _few(value):
             return hidden.addmm_(value, self.columns(part).T)
         return hidden.add_(self.project(part, value))
 

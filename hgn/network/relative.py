@@ -95,7 +95,7 @@ def wall_nearness(
     """
     distance_N6 = torch.cat([position_N3, domain_N3 - position_N3], dim=-1)
     away_N6 = torch.cat([velocity_N3, -velocity_N3], dim=-1)
-    return (1 - (distance_N6 + away_N6.clamp(max=0)) / reach).clamp(0, WALL_LIMIT)
+    return (1 - (distance_N6 + away_N6.clamp(max=0)) / reach).clamp(0.0, WALL_LIMIT)
 
 
 def obstacle_normals(
@@ -164,7 +164,7 @@ def balanced(
     value_N10 = torch.cat([output_N9, torch.ones_like(output_N9[:, :1])], dim=-1)
     value_N8K = weight_N8[..., None] * value_N10[:, None]
     sum_CK = value_N8K.new_zeros(level.cell_count, OUTPUTS + 1).index_add(0, cell_N8.flatten(), value_N8K.flatten(0, 1))
-    mass_C = sum_CK[:, -1].detach().clamp(min=SMALLEST_MASS)
+    mass_C = sum_CK[:, -1].clamp(min=SMALLEST_MASS)
     mean_C9 = sum_CK[:, :OUTPUTS] / mass_C[:, None]
     stress_C33 = mean_C9[:, torch.tensor(STRESS_33, device=mean_C9.device)]
     sender_E, receiver_E = level.sender_E, level.receiver_E

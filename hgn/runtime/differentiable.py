@@ -6,13 +6,12 @@ Shape legend: T frames, N particles, H velocities, P surface particles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch.func import functional_call
-from torch.utils.checkpoint import checkpoint
 
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
@@ -52,7 +51,7 @@ def simulate(
 ) -> torch.Tensor:
     """Positions [T, N, 3]; `start` is the scene's state at frame 0, as the simulator has it.
 
-    The backward pass computes each frame again (torch.utils.checkpoint), so that it holds what one frame needs and the
+    The backward pass computes each frame again, so that it holds what one frame needs and the
     states between. The network's own weights have no gradients. Raises: ConfigError, DivergedError.
     """
     require(frames >= 1, "frames", "at least 1", frames)
@@ -60,31 +59,78 @@ def simulate(
     state = _started(network, start, scene, frame_rate_hz, inputs)
     weights = {name: tensor.detach() for name, tensor in network.state_dict(keep_vars=True).items()}
 
-    def step(state: ParticleState) -> tuple[torch.Tensor, torch.Tensor]:
-        after = advanced(state, functional_call(network, weights, (state,)))
+    def step(*variables: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        before = _with_variables(state, variables)
+        after = advanced(before, functional_call(network, weights, (before,)))
         return after.position_N3, after.velocity_NM3
 
+    variables = _variables(state)
     positions = [state.position_N3]
     for frame in range(1, frames):
         try:
-            position_N3, velocity_NM3 = _checkpointed(step, state)
+            variables[:2] = _Frame.apply(step, *variables)
         except GridRangeError as error:
             raise DivergedError(frame, str(error)) from None
-        state = replace(state, position_N3=position_N3, velocity_NM3=velocity_NM3)
-        lost = int(diverged(position_N3.detach(), state.domain_S3.detach()[state.scene_N]).sum())
+        lost = int(diverged(variables[0].detach(), state.domain_S3.detach()[state.scene_N]).sum())
         if lost:
-            raise DivergedError(frame, describe_diverged(lost, len(position_N3)))
-        positions.append(position_N3)
+            raise DivergedError(frame, describe_diverged(lost, len(variables[0])))
+        positions.append(variables[0])
     return torch.stack(positions)
 
 
-def _checkpointed(
-    step: Callable[[ParticleState], tuple[torch.Tensor, torch.Tensor]], state: ParticleState
-) -> tuple[torch.Tensor, torch.Tensor]:
-    if not torch.is_grad_enabled():
-        return step(state)
-    result: tuple[torch.Tensor, torch.Tensor] = checkpoint(step, state, use_reentrant=False, preserve_rng_state=False)
-    return result
+class _Frame(torch.autograd.Function):
+    """A frame without its intermediate results, which the backward pass computes again.
+
+    torch.utils.checkpoint does it too, with a call into Python for each of them: on a GPU that costs as much as they.
+    """
+
+    @staticmethod
+    def forward(context, step, *variables):  # type: ignore[no-untyped-def]
+        context.step = step
+        context.save_for_backward(*variables)
+        return step(*variables)
+
+    @staticmethod
+    def backward(context, *gradients):  # type: ignore[no-untyped-def]
+        asked = context.needs_input_grad[1:]
+        variables = [
+            tensor.detach().requires_grad_(wanted) for tensor, wanted in zip(context.saved_tensors, asked, strict=True)
+        ]
+        with torch.enable_grad():
+            outputs = context.step(*variables)
+        wanted = [tensor for tensor in variables if tensor.requires_grad]
+        found = iter(torch.autograd.grad(outputs, wanted, gradients, allow_unused=True))
+        return None, *(next(found) if tensor.requires_grad else None for tensor in variables)
+
+
+def _variables(state: ParticleState) -> list[torch.Tensor]:
+    """All of a state that may have gradients, positions and velocities first."""
+    tensors = [state.position_N3, state.velocity_NM3, state.domain_S3, state.gravity_S3]
+    if isinstance(state.obstacles, PosedObstacleCells):
+        for _, placement in state.obstacles.placed:
+            tensors += [placement.rotation_33, placement.translation_3]
+    return tensors if state.surface is None else [*tensors, state.surface.position_P3]
+
+
+def _with_variables(state: ParticleState, variables: Sequence[torch.Tensor]) -> ParticleState:
+    """The inverse: the state with those tensors."""
+    position_N3, velocity_NM3, domain_S3, gravity_S3, *others = variables
+    rest, obstacles = iter(others), state.obstacles
+    if isinstance(obstacles, PosedObstacleCells):
+        placed = tuple(
+            (cells, replace(placement, rotation_33=next(rest), translation_3=next(rest)))
+            for cells, placement in obstacles.placed
+        )
+        obstacles = replace(obstacles, placed=placed)
+    return replace(
+        state,
+        position_N3=position_N3,
+        velocity_NM3=velocity_NM3,
+        domain_S3=domain_S3,
+        gravity_S3=gravity_S3,
+        obstacles=obstacles,
+        surface=state.surface and replace(state.surface, position_P3=next(rest)),
+    )
 
 
 def _started(

@@ -21,6 +21,8 @@ EXTRA_OF = {
     "huggingface_hub": "hub",
     "pxr": "files",
     "pysplashsurf": "files",
+    "onnx": "onnx",
+    "onnxscript": "onnx",
     "ray": "ray",
     "s3fs": "s3",
 }

@@ -1,0 +1,146 @@
+"""One frame of a network as a graph that runs without this package: ONNX, or a compiled package (AOTInductor).
+
+The graph is traced from the reference, hgn.network, and holds all of it: features, grid, network, integration. Numbers
+of particles and of obstacle cells are free, up to LARGEST_EXPORTED. It raises nothing: who runs it checks that
+positions are finite. INPUTS and OUTPUTS name its tensors; `initial_arrays` gives those of a scene.
+Shape legend: N particles, H velocities, K obstacle cells.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from hgn.network.base import ParticleNetwork
+from hgn.network.cell_keys import COORDINATE_LIMIT, LARGEST_EXPORTED, pack, unpack
+from hgn.network.features import ParticleState
+from hgn.network.hgn import HierarchicalGraphNetwork
+from hgn.network.obstacles import ObstacleCells
+from hgn.runtime.stepped_rollout import advanced
+from hgn.runtime.weights import WeightsInfo
+from hgn.schema import require, to_mapping
+from hgn.system.files import write_atomically
+
+INPUTS = ("position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal")
+OUTPUTS = ("next_position", "next_velocity")
+EXAMPLE_PARTICLES, EXAMPLE_CELLS = 64, 32  # of the trace; any others would do
+
+
+class Step(nn.Module):
+    """One frame of one scene."""
+
+    def __init__(self, network: HierarchicalGraphNetwork, obstacle_cell_size: float) -> None:
+        super().__init__()
+        self.network, self.obstacle_cell_size = network, obstacle_cell_size
+
+    def forward(
+        self,
+        position: torch.Tensor,
+        velocity: torch.Tensor,
+        material: torch.Tensor,
+        domain_size: torch.Tensor,
+        gravity: torch.Tensor,
+        obstacle_cell: torch.Tensor,
+        obstacle_normal: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Positions [N, 3] and velocities [N, H, 3], newest first, a frame later; units: domain units, frames.
+
+        material int64 [N] indexes the network's materials; domain_size and gravity [3]; obstacle_cell int64 [K, 3],
+        each once, sorted by x, then y, then z, and obstacle_normal [K, 3]. Absolute inputs take no heed of gravity.
+        """
+        # a cell that no particle reaches, so that there always is one
+        far_13 = torch.full_like(domain_size[None], COORDINATE_LIMIT - 1).to(torch.int64)
+        cell_K3 = torch.cat([obstacle_cell, far_13])
+        normal_K3 = torch.cat([obstacle_normal, torch.zeros_like(domain_size[None])])
+        key_K = pack(torch.zeros_like(cell_K3[:, 0]), cell_K3)
+        state = ParticleState(
+            position_N3=position,
+            velocity_NM3=velocity,
+            material_N=material,
+            scene_N=torch.zeros_like(material),
+            domain_S3=domain_size[None],
+            gravity_S3=gravity[None],
+            obstacles=ObstacleCells(key_K, normal_K3, self.obstacle_cell_size),
+        )
+        after = advanced(state, self.network(state))
+        return after.position_N3, after.velocity_NM3
+
+
+def initial_arrays(state: ParticleState) -> dict[str, np.ndarray]:
+    """What the graph of a step is first given, by the names of INPUTS: a simulator's state of one scene."""
+    require(state.scene_count == 1, "scenes", "one", state.scene_count)
+    cells, normals = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
+    if state.obstacles is not None:
+        cells = unpack(state.obstacles.key_K)[1].cpu().numpy()
+        normals = state.obstacles.normal_K3.cpu().numpy()
+    tensors = (state.position_N3, state.velocity_NM3, state.material_N, state.domain_S3[0], state.gravity_S3[0])
+    arrays = [*(tensor.cpu().numpy() for tensor in tensors), cells, normals]
+    return dict(zip(INPUTS, arrays, strict=True))
+
+
+def traced_step(network: ParticleNetwork, info: WeightsInfo) -> torch.export.ExportedProgram:
+    """The graph. Raises: ConfigError for a GNS, whose neighbour list has no such graph yet."""
+    require(isinstance(network, HierarchicalGraphNetwork), "weights", "an hgn network", network.config.kind)
+    assert isinstance(network, HierarchicalGraphNetwork)
+    device, config = next(network.parameters()).device, network.config
+    generator = torch.Generator().manual_seed(0)
+    example = (
+        torch.rand(EXAMPLE_PARTICLES, 3, generator=generator) * 0.1 + 0.3,
+        torch.randn(EXAMPLE_PARTICLES, config.velocity_history, 3, generator=generator) * 1e-3,
+        torch.zeros(EXAMPLE_PARTICLES, dtype=torch.int64),
+        torch.ones(3),
+        torch.zeros(3),
+        torch.arange(EXAMPLE_CELLS)[:, None] * torch.tensor([0, 0, 1]),
+        torch.ones(EXAMPLE_CELLS, 3),
+    )
+    particles = {0: torch.export.Dim("particles", min=1, max=LARGEST_EXPORTED)}
+    cells = {0: torch.export.Dim("obstacle_cells", min=0, max=LARGEST_EXPORTED)}
+    step = Step(network, info.obstacle_cell_size).eval()
+    # one graph for 0, 1 and more of both
+    with (
+        torch.no_grad(),
+        torch.fx.experimental._config.patch(  # type: ignore[attr-defined]
+            backed_size_oblivious=True
+        ),
+    ):
+        return torch.export.export(
+            step,
+            tuple(tensor.to(device) for tensor in example),
+            dynamic_shapes=(particles, particles, particles, None, None, cells, cells),
+            strict=False,
+        )
+
+
+def write_onnx(path: Path, program: torch.export.ExportedProgram, info: WeightsInfo) -> None:
+    """The graph as ONNX, weights inside; what the weights say of themselves is its metadata `hgn`."""
+    import onnxscript  # noqa: F401 - torch says no more than that something is missing
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's own, of its dependencies
+        exported = torch.onnx.export(program, (), dynamo=True, input_names=INPUTS, output_names=OUTPUTS, verbose=False)
+    assert exported is not None
+    exported.model.metadata_props["hgn"] = _description(info)
+    write_atomically(path, exported.model_proto.SerializeToString())
+
+
+def write_package(path: Path, program: torch.export.ExportedProgram, info: WeightsInfo) -> None:
+    """The graph compiled for the device it was traced on, as PyTorch's C++ loads it; minutes, with a C++ compiler."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.pt2")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch._inductor.aoti_compile_and_package(
+            program,
+            package_path=str(temporary.resolve()),
+            inductor_configs={"aot_inductor.metadata": {"hgn": _description(info)}},
+        )
+    temporary.replace(path)
+
+
+def _description(info: WeightsInfo) -> str:
+    return json.dumps(to_mapping(info), sort_keys=True)

@@ -1,0 +1,63 @@
+// NumPy's .npy files of version 1, little-endian, in C order: what a scene's arrays and the positions are kept in.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+#include <fstream>
+#include <sstream>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+struct Array {
+    std::vector<int64_t> shape;
+    std::string type;  // "<f4" or "<i8"
+    std::vector<char> bytes;
+};
+
+inline Array read_array(const std::string& path) {
+    std::ifstream file(path, std::ios::binary);
+    char start[10];
+    if (!file.read(start, sizeof start) || std::memcmp(start, "\x93NUMPY\x01", 7) != 0)
+        throw std::runtime_error(path + " must be a .npy file of version 1; write it with python -m hgn.export arrays=");
+    std::string header(static_cast<unsigned char>(start[8]) + 256 * static_cast<unsigned char>(start[9]), ' ');
+    file.read(header.data(), header.size());
+    Array array;
+    array.type = header.substr(header.find("'descr': '") + 10, 3);
+    if ((array.type != "<f4" && array.type != "<i8") || header.find("'fortran_order': False") == std::string::npos)
+        throw std::runtime_error(path + " must hold float32 or int64 in C order, got " + header);
+    size_t first = header.find('(') + 1;
+    std::istringstream sizes(header.substr(first, header.find(')') - first));
+    int64_t count = 1;
+    for (std::string size; std::getline(sizes, size, ',');)
+        if (size.find_first_not_of(' ') != std::string::npos) {
+            array.shape.push_back(std::stoll(size));
+            count *= array.shape.back();
+        }
+    array.bytes.resize(count * (array.type == "<f4" ? 4 : 8));
+    if (!file.read(array.bytes.data(), array.bytes.size()) && !array.bytes.empty())
+        throw std::runtime_error(path + " ends too early");
+    return array;
+}
+
+inline void write_positions(const std::string& path, const std::vector<float>& values, int64_t frames, int64_t particles) {
+    std::ostringstream text;
+    text << "{'descr': '<f4', 'fortran_order': False, 'shape': (" << frames << ", " << particles << ", 3), }";
+    std::string header = text.str();
+    header.append(63 - (header.size() + 10) % 64, ' ').push_back('\n');
+    std::ofstream file(path, std::ios::binary);
+    file.write("\x93NUMPY\x01\x00", 8);
+    file.put(header.size() % 256).put(header.size() / 256) << header;
+    file.write(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(float));
+    if (!file.flush()) throw std::runtime_error(path + " could not be written");
+}
+
+// Order and names of a step's inputs; the first two are replaced by its two outputs.
+inline const std::vector<std::string> INPUTS = {
+    "position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal"};
+
+inline std::vector<Array> read_arrays(const std::string& folder) {
+    std::vector<Array> arrays;
+    for (const auto& name : INPUTS) arrays.push_back(read_array(folder + "/" + name + ".npy"));
+    return arrays;
+}
