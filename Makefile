@@ -10,7 +10,7 @@ TEST_PROCESSES ?= 2
 # the tests start a hundred processes, each of which would compile the package anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test check format lint types layers docs clean
+.PHONY: setup demo test check format lint types layers docs film clean
 
 setup: $(VENV)/.installed
 
@@ -69,6 +69,11 @@ layers:
 
 docs: setup
 	$(RUN) -m sphinx -W --keep-going -n -q -b html docs docs/_build
+
+# a simulation as a page that plays by itself, which the docs show where it is
+film: setup
+	$(RUN) -m hgn.rollout scene=play frames=150 render=false out=runs/film/film.vtkhdf
+	$(RUN) -m hgn.play rollout=runs/film/film.vtkhdf html=docs/_static/film.html
 
 clean:
 	rm -rf $(VENV) build dist docs/_build docs/_generated

@@ -23,6 +23,7 @@ EXTRA_OF = {
     "pysplashsurf": "files",
     "onnx": "onnx",
     "onnxscript": "onnx",
+    "viser": "play",
     "ray": "ray",
     "s3fs": "s3",
 }

@@ -26,7 +26,6 @@ from hgn.scene.scene_file import ObstacleEntry
 from hgn.scene.shapes import shape_obstacle
 
 Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 _numbers = itertools.count()
 
 
@@ -61,12 +60,6 @@ class PlacedObstacle:
     @cached_property
     def rotation_33(self) -> np.ndarray:
         return euler_rotation(self.rotation)
-
-    @property
-    def wxyz(self) -> Quaternion:
-        """The rotation as a quaternion."""
-        x, y, z, w = Rotation.from_matrix(self.rotation_33).as_quat()
-        return float(w), float(x), float(y), float(z)
 
     @property
     def entry(self) -> ObstacleEntry:

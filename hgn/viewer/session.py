@@ -22,6 +22,7 @@ from hgn.runtime.simulator import InitialState, Simulator
 from hgn.scene.distance import contains
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count
 from hgn.scene.material import MATERIALS, material_index
+from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry, SceneFile
@@ -229,6 +230,13 @@ class PlaySession:
         placed = placed_by(entry, folder, self.cell_size)
         self._set_obstacles((*self.obstacles, placed))
         return placed
+
+    def add_mesh(self, path: Path, size: float, middle: Vector) -> PlacedObstacle:
+        """A mesh file, scaled so that the longest side of its bounding box is `size`, with its middle at a place."""
+        low, high = (bound(load_mesh(path).vertex_V3, axis=0) for bound in (np.min, np.max))
+        scale = size / float((high - low).max())
+        x, y, z = (np.array(middle) - scale * 0.5 * (low + high)).tolist()
+        return self.add_obstacle(ObstacleEntry(mesh=path.name, scale=scale, position=(x, y, z)), path.parent)
 
     def move_obstacle(self, moved: PlacedObstacle) -> None:
         """The obstacle of the same body is there from now on; nothing happens where it was removed."""

@@ -1,0 +1,82 @@
+"""python -m hgn.play: a scene in the browser, live: pour, drag obstacles, go back, save; or a rollout file.
+
+Prints the page's address, which has a token; Ctrl-C ends it.
+"""
+
+from __future__ import annotations
+
+import hgn.system.threads  # noqa: F401  # isort: skip  # before torch is loaded
+
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+from hgn.command import run_command
+from hgn.config import PlayConfig
+from hgn.runtime.simulator import Simulator
+from hgn.runtime.weights import shipped_weights
+from hgn.scene.rollout_file import read_rollout
+from hgn.scene.scene_file import find_scene, load_scene
+from hgn.schema import from_mapping
+from hgn.system.device import choose_device
+from hgn.system.extras import require_installed
+from hgn.system.files import write_atomically
+
+
+def main(mapping: dict[str, Any]) -> int:
+    """Serves the page until Ctrl-C, or writes the static one; returns the exit code."""
+    config = from_mapping(PlayConfig, mapping)
+    require_installed("viser")
+    if config.html is not None:
+        return _write_page(config)
+    page = film_page(config) if config.rollout is not None else play_page(config)
+    print(page.address, flush=True)
+    if config.browser:
+        webbrowser.open(page.address)
+    try:
+        page.run()
+    finally:
+        page.close()
+    return 0
+
+
+def play_page(config: PlayConfig) -> Any:
+    """A `hgn.viewer.page.PlayPage` of a scene. Raises: ConfigError, as loading and simulating the scene do."""
+    from hgn.viewer.page import PlayPage
+    from hgn.viewer.session import PlaySession
+
+    place = choose_device(config.device)
+    name = config.weights or ("obstacles_small" if place.type == "cpu" else "obstacles")
+
+    def load(weights: str) -> Simulator:
+        return Simulator.load(weights, config.device, config.backend, config.precision)
+
+    simulator, path = load(name), find_scene(config.scene)
+    print(simulator.backend.note, file=sys.stderr)
+    session = PlaySession(simulator, load_scene(path), path.parent, config.particles, config.keep_mb << 20, name)
+    names = [name, *(shipped for shipped in shipped_weights() if shipped != name)]
+    return PlayPage(session, names, load, config.host, config.port)
+
+
+def film_page(config: PlayConfig) -> Any:
+    """A `hgn.viewer.film.FilmPage` of a rollout file. Raises: ConfigError for what is no such file."""
+    from hgn.viewer.film import FilmPage
+
+    assert config.rollout is not None
+    return FilmPage(read_rollout(config.rollout), config.host, config.port, Path(config.rollout).name)
+
+
+def _write_page(config: PlayConfig) -> int:
+    from hgn.viewer.film import film_html
+
+    assert config.rollout is not None and config.html is not None
+    path = Path(config.html)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, film_html(read_rollout(config.rollout), config.every).encode())
+    print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main, "play")

@@ -1,0 +1,125 @@
+"""Rollout files in the browser: a page with a slider, a notebook's cell, or one static file.
+
+Shape legend: T frames.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import viser
+
+from hgn.render.pictures import rollout_spacing
+from hgn.scene.rollout_file import Rollout
+from hgn.schema import require
+from hgn.viewer.stage import Quaternion, StageView, Vector, quaternion
+from hgn.viewer.viser_compat import start_server
+
+REST = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+class _Film:
+    """A rollout's frames on a server's stage."""
+
+    def __init__(self, server: viser.ViserServer, rollout: Rollout) -> None:
+        self.rollout = rollout
+        self.stage = StageView(server, rollout.domain_size, rollout_spacing(rollout), "float16")
+        self.moving = []
+        for index, obstacle in enumerate(rollout.obstacles):
+            mesh = self.stage.add_obstacle(f"{index}_{obstacle.name}", replace(obstacle, motion=None), *REST)
+            if obstacle.motion is not None:
+                self.moving.append((mesh, obstacle.motion))
+
+    def show(self, frame: int) -> None:
+        present = self.rollout.present(frame)
+        self.stage.show(self.rollout.position_TN3[frame, :present], self.rollout.material_N[:present])
+        for mesh, motion in self.moving:
+            mesh.position, mesh.wxyz = self._place(motion, frame / self.rollout.frame_rate_hz)
+
+    @staticmethod
+    def _place(motion: Any, time_s: float) -> tuple[Vector, Quaternion]:
+        rotation_33, _ = motion.pose(time_s)
+        x, y, z = motion.place(np.zeros((1, 3)), time_s)[0].tolist()
+        return (x, y, z), quaternion(rotation_33)
+
+
+def _record(rollout: Rollout, every: int) -> tuple[viser.ViserServer, Any]:
+    require(every >= 1, "every", "at least 1", every)
+    server, _ = start_server("127.0.0.1", 0, "HGN")
+    film = _Film(server, rollout)
+    film.show(0)
+    serializer = server.get_scene_serializer()
+    for frame in range(0, rollout.frame_count, every):
+        film.show(frame)
+        serializer.insert_sleep(every / rollout.frame_rate_hz)
+    return server, serializer
+
+
+def film_html(rollout: Rollout, every: int = 2) -> str:
+    """A page that plays every `every`-th frame by itself, without a server or a network: 3 MB, and the positions.
+
+    Raises: ConfigError for `every` below 1; ModuleNotFoundError without the extra `play`.
+    """
+    server, serializer = _record(rollout, every)
+    try:
+        return str(serializer.as_html())
+    finally:
+        server.stop()
+
+
+def show_film(rollout: Rollout, every: int = 2, height: int = 480) -> None:
+    """The same in a notebook's cell, `height` pixels high; outside notebooks it opens in the browser.
+
+    Raises: as `film_html`.
+    """
+    server, serializer = _record(rollout, every)
+    try:
+        serializer.show(height=height)
+    finally:
+        server.stop()
+
+
+class FilmPage:
+    """A page with a rollout, a slider over its frames, and a button that plays them."""
+
+    def __init__(self, rollout: Rollout, host: str = "127.0.0.1", port: int = 8080, label: str = "HGN") -> None:
+        """Raises: ConfigError for a host that is not an address of this machine."""
+        self.server, self.address = start_server(host, port, label)
+        self.film, self.rollout = _Film(self.server, rollout), rollout
+        gui = self.server.gui
+        gui.configure_theme(show_share_button=False, show_logo=False)
+        gui.set_panel_label("HGN")
+        self.playing = gui.add_checkbox("Play", True)
+        self.speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
+        self.slider: Any = gui.add_slider("Frame", 0, max(1, rollout.frame_count - 1), 1, 0)
+        self.ended = threading.Event()
+        self.film.show(0)
+
+        @self.slider.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:
+                self.film.show(min(self.slider.value, rollout.frame_count - 1))
+
+    def run(self) -> None:
+        """Plays until `close`."""
+        shown = time.monotonic()
+        frame = 0.0
+        while not self.ended.wait(1 / 60):
+            now = time.monotonic()
+            passed, shown = now - shown, now
+            if not self.playing.value:
+                frame = self.slider.value
+                continue
+            if abs(self.slider.value - int(frame)) > 1:  # someone moved it
+                frame = self.slider.value
+            frame = (frame + passed * self.speed.value * self.rollout.frame_rate_hz) % self.rollout.frame_count
+            self.film.show(int(frame))
+            self.slider.value = int(frame)
+
+    def close(self) -> None:
+        self.ended.set()
+        self.server.stop()

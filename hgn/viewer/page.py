@@ -1,0 +1,333 @@
+"""The page of `hgn.play`: a session on screen, with its buttons; any number of viewers share it.
+
+What viewers do is queued and done between two frames, so that nobody waits for a frame on the server's event loop; the
+places that an obstacle is dragged to only the last is worth anything. All state is here: a viewer whose connection is
+lost comes back to it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import queue
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+
+from hgn.config import MESH_SUFFIXES, OBSTACLE_SHAPES
+from hgn.runtime.divergence import DivergedError
+from hgn.runtime.simulator import Simulator
+from hgn.scene.rollout_file import write_rollout
+from hgn.scene.scene_file import ObstacleEntry
+from hgn.schema import ConfigError, require
+from hgn.viewer.placed import PlacedObstacle, Vector
+from hgn.viewer.session import PlaySession, Spout
+from hgn.viewer.stage import StageView, quaternion
+from hgn.viewer.viser_compat import start_server
+
+TOLD_S = 0.25  # between two tellings of frame and speed
+BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
+TURN_DEGREES = 360.0  # by a drag across the whole window
+HELP = """
+**Shift + drag** on the floor pours, **Shift + click** drops a ball.
+**Drag** an obstacle to move it, **Ctrl/⌘ + drag** to turn it, **click** to choose it.
+Elsewhere the mouse moves the camera.
+"""
+
+
+class PlayPage:
+    """A session's page. `run` simulates, in the thread that calls it; `close` ends it."""
+
+    def __init__(
+        self,
+        session: PlaySession,
+        weights: Sequence[str] = (),
+        load: Callable[[str], Simulator] | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> None:
+        """`weights` are the names to choose from, which `load` makes simulators of.
+
+        Raises: ConfigError for a host that is not an address of this machine.
+        """
+        self.server, self.address = start_server(host, port, "HGN")
+        self.session, self.load = session, load
+        self.rate = session.simulator.frame_rate_hz
+        spacing = session.cell_size / session.particles_per_cell ** (1 / 3)
+        self.stage = StageView(self.server, session.domain_size, spacing)
+        self.ended, self.playing, self.steps = threading.Event(), True, 0
+        self.wanted: queue.SimpleQueue[tuple[object, Callable[[], Any], Any]] = queue.SimpleQueue()
+        self.meshes: dict[int, viser.MeshHandle] = {}
+        self.shown: dict[int, PlacedObstacle] = {}
+        self.chosen: int | None = None
+        self._numbers = itertools.count()
+        self.frames_a_second = 0.0
+        self._add_buttons(list(weights))
+        self._add_mouse()
+        self._show()
+        self._tell()
+
+    # between the viewers and the session
+
+    def do(self, action: Callable[[], Any], client: viser.ClientHandle | None = None, key: object = None) -> None:
+        """Queues what is to be done before the next frame; of actions with one key only the last is done."""
+        self.wanted.put((next(self._numbers) if key is None else key, action, client))
+
+    def _do_all(self) -> bool:
+        latest: dict[object, tuple[Callable[[], Any], Any]] = {}
+        while not self.wanted.empty():
+            key, action, client = self.wanted.get()
+            latest.pop(key, None)
+            latest[key] = action, client
+        for action, client in latest.values():
+            try:
+                action()
+            except (ConfigError, DivergedError) as error:
+                self._say(str(error), client)
+        return bool(latest)
+
+    def _say(self, message: str, client: viser.ClientHandle | None = None) -> None:
+        for one in [client] if client is not None else list(self.server.get_clients().values()):
+            one.add_notification("HGN", message, auto_close_seconds=10)
+
+    def run(self) -> None:
+        """Simulates until `close`, at most as fast as time passes."""
+        due = told = time.monotonic()
+        frames = 0
+        while not self.ended.is_set():
+            changed = self._do_all()
+            if self.playing or self.steps:
+                self.steps = max(0, self.steps - 1)
+                try:
+                    self.session.step()
+                except DivergedError as error:
+                    self.playing = False
+                    self._say(f"{error}; paused a frame before")
+                frames, changed = frames + 1, True
+            if changed:
+                self._show()
+            now = time.monotonic()
+            if now - told >= TOLD_S:
+                self.frames_a_second = frames / (now - told)
+                told, frames = now, 0
+                self._tell()
+            due = max(due + 1 / self.rate, now)
+            self.ended.wait(max(0.0, due - now) if due > now else 0)
+
+    def close(self) -> None:
+        """Ends the server, once `run` is over: `ended.set()` ends it from another thread."""
+        self.ended.set()
+        self.server.stop()
+
+    # what is on screen
+
+    def _show(self) -> None:
+        session = self.session
+        self.stage.show(session.newest.position_N3, session.materials())
+        obstacles = {obstacle.body.number: obstacle for obstacle in session.obstacles}
+        for number in self.meshes.keys() - obstacles.keys():
+            self.meshes.pop(number).remove()
+            del self.shown[number]
+        for number, obstacle in obstacles.items():
+            if number not in self.meshes:
+                self._add_mesh(obstacle)
+            elif self.shown[number] is not obstacle:
+                self.meshes[number].position = obstacle.position
+                self.meshes[number].wxyz = quaternion(obstacle.rotation_33)
+            self.shown[number] = obstacle
+        if self.chosen not in obstacles:
+            self.chosen = next(reversed(obstacles), None)
+
+    def _tell(self) -> None:
+        session = self.session
+        told = f"**{self.frames_a_second:.0f}** frames a second · **{len(session.newest.position_N3):,}** particles"
+        backend = f"{session.weights} on {session.simulator.device.type}"
+        self.status.content = f"{told}\n\nframe {session.frame} · {backend}"
+        self.play_button.label = "Pause" if self.playing else "Play"
+        self.gravity.value = session.gravity
+        name = self.shown[self.chosen].body.name if self.chosen is not None else "none"
+        self.chosen_text.content = f"chosen: {name}"
+
+    # what the viewers do
+
+    def _add_buttons(self, weights: list[str]) -> None:
+        gui, session = self.server.gui, self.session
+        gui.configure_theme(show_share_button=False, show_logo=False)
+        gui.set_panel_label("HGN")
+        self.status = gui.add_markdown("")
+        self.play_button = gui.add_button("Pause")
+        step = gui.add_button("Step")
+        back = gui.add_button_group("Back by", tuple(BACK_S))
+        restart = gui.add_button("Restart")
+        with gui.add_folder("Pour"):
+            known = session.simulator.network.config.materials
+            self.material = gui.add_dropdown("Material", tuple(known), initial_value=known[0])
+            self.diameter = gui.add_slider("Diameter", 0.02, 0.3, 0.01, 0.08)
+            self.speed = gui.add_slider("Speed", 0.0, 3.0, 0.1, 1.0)
+            self.height = gui.add_slider("Height", 0.1, 1.0, 0.05, 0.75)
+            gui.add_markdown(HELP)
+        with gui.add_folder("Obstacles"):
+            self.shape = gui.add_dropdown("Shape", OBSTACLE_SHAPES)
+            self.size = gui.add_slider("Size", 0.05, 0.6, 0.01, 0.3)
+            add = gui.add_button("Add")
+            upload = gui.add_upload_button("Own mesh", mime_type=",".join(MESH_SUFFIXES))
+            self.chosen_text = gui.add_markdown("")
+            remove = gui.add_button("Remove the chosen")
+        with gui.add_folder("World"):
+            self.gravity: Any = gui.add_vector3("Gravity", session.gravity, step=0.1)
+            self.weights: Any = gui.add_dropdown("Weights", tuple(weights) or (session.weights or "own",))
+        with gui.add_folder("Save"):
+            save_scene = gui.add_button("Scene (YAML, zip)")
+            save_rollout = gui.add_button("Rollout (VTKHDF)")
+
+        def playing(value: bool) -> None:
+            self.playing = value
+
+        def one_step() -> None:
+            self.playing, self.steps = False, 1
+
+        def go_back(seconds: float) -> None:
+            self.playing = False
+            frames = max(1, round(seconds * self.rate))
+            session.rewind(max(session.recording.earliest, session.frame - frames))
+
+        self.play_button.on_click(lambda event: self.do(lambda: playing(not self.playing), event.client))
+        step.on_click(lambda event: self.do(one_step, event.client))
+        restart.on_click(lambda event: self.do(session.restart, event.client))
+        add.on_click(lambda event: self.do(self._add_shape, event.client))
+        remove.on_click(lambda event: self.do(self._remove_chosen, event.client))
+        save_scene.on_click(lambda event: self.do(lambda: self._send_scene(event), event.client))
+        save_rollout.on_click(lambda event: self.do(lambda: self._send_rollout(event), event.client))
+
+        @back.on_click
+        def _(event: Any) -> None:
+            seconds = BACK_S[event.target.value]
+            self.do(lambda: go_back(seconds), event.client)
+
+        @self.gravity.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:
+                x, y, z = (float(value) for value in event.target.value)
+                self.do(lambda: session.set_gravity((x, y, z)), event.client, "gravity")
+
+        @self.weights.on_update
+        def _(event: Any) -> None:
+            if event.client is not None and self.load is not None:
+                name = event.target.value
+                self.do(lambda: self._use(name), event.client, "weights")
+
+        @upload.on_upload
+        def _(event: Any) -> None:
+            file = event.target.value
+            self.do(lambda: self._add_file(file.name, file.content), event.client)
+
+    def _use(self, name: str) -> None:
+        assert self.load is not None
+        try:
+            self.session.use_weights(self.load(name), name)
+        except ConfigError:
+            self.weights.value = self.session.weights
+            raise
+        known = self.session.simulator.network.config.materials
+        self.material.options = tuple(known)
+
+    def _middle(self) -> Vector:
+        x, y, z = self.session.domain_size
+        return 0.5 * x, 0.3 * y, 0.5 * z
+
+    def _add_shape(self) -> None:
+        entry = ObstacleEntry(shape=self.shape.value, size=float(self.size.value), position=self._middle())
+        self.chosen = self.session.add_obstacle(entry).body.number
+
+    def _add_file(self, name: str, content: bytes) -> None:
+        """A mesh as large as the slider says, in the middle."""
+        file = Path(name).name
+        require(Path(file).suffix.lower() in MESH_SUFFIXES, "mesh", f"one of {', '.join(MESH_SUFFIXES)}", file)
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / file).write_bytes(content)
+            self.chosen = self.session.add_mesh(Path(folder) / file, float(self.size.value), self._middle()).body.number
+
+    def _remove_chosen(self) -> None:
+        if self.chosen is not None:
+            self.session.remove_obstacle(self.chosen)
+
+    def _send_scene(self, event: Any) -> None:
+        event.client.send_file_download("scene.zip", self.session.scene_archive(), save_immediately=True)
+
+    def _send_rollout(self, event: Any) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "rollout.vtkhdf"
+            write_rollout(path, self.session.rollout())
+            event.client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
+
+    # the mouse
+
+    def _add_mouse(self) -> None:
+        room = self.stage.room
+
+        @room.on_drag("left", modifier="shift")
+        async def _(event: viser.SceneNodeDragEvent) -> None:
+            eye_3 = np.array(event.client.camera.position)
+            spout = None if event.phase == "end" else self._spout(eye_3, np.array(event.end_position) - eye_3)
+            self.do(lambda: self._pour(spout), event.client, "pour")
+
+        @self.server.scene.on_click(modifier="shift")
+        def _(event: viser.SceneClickEvent) -> None:
+            spout = self._spout(np.array(event.ray_origin), np.array(event.ray_direction))
+            self.do(lambda: self._drop(spout), event.client)
+
+    def _pour(self, spout: Spout | None) -> None:
+        self.session.spout = spout
+
+    def _drop(self, spout: Spout) -> None:
+        if not self.session.drop(spout.material, spout.position, spout.diameter, spout.speed):
+            self._say("there is no room for a ball here")
+
+    def _spout(self, origin_3: np.ndarray, direction_3: np.ndarray) -> Spout:
+        """Above what a ray hits in the room: the floor, or else the wall it leaves through."""
+        high_3 = np.array(self.session.domain_size)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far_3 = np.where(direction_3 > 0, (high_3 - origin_3) / direction_3, -origin_3 / direction_3)
+        hit_3 = origin_3 + np.nanmin(far_3) * direction_3
+        x, _, z = np.clip(hit_3, 0, high_3).tolist()
+        height = float(self.height.value) * self.session.domain_size[1]
+        return Spout((x, height, z), self.material.value, float(self.diameter.value), float(self.speed.value))
+
+    def _add_mesh(self, obstacle: PlacedObstacle) -> None:
+        number = obstacle.body.number
+        rotation = quaternion(obstacle.rotation_33)
+        mesh = self.stage.add_obstacle(obstacle.body.name, obstacle.body.mesh, obstacle.position, rotation)
+        self.meshes[number] = mesh
+        begin: list[PlacedObstacle] = []  # where a drag began
+
+        @mesh.on_click
+        async def _(event: Any) -> None:
+            self.chosen = number
+
+        @mesh.on_drag("left")
+        async def _(event: viser.SceneNodeDragEvent) -> None:
+            if event.phase == "start":
+                begin[:] = [self.shown[number]]
+                self.grabbed_3 = np.array(event.start_position)
+                self.chosen = number
+            if begin and number in self.shown:
+                x, y, z = (np.array(begin[0].position) + np.array(event.end_position) - self.grabbed_3).tolist()
+                moved = replace(self.shown[number], position=(x, y, z))
+                self.do(lambda: self.session.move_obstacle(moved), event.client, number)
+
+        @mesh.on_drag("left", modifier="cmd/ctrl")
+        async def _(event: viser.SceneNodeDragEvent) -> None:
+            if event.phase == "start":
+                begin[:] = [self.shown[number]]
+                self.grabbed_x = event.end_screen_pos[0]
+                self.chosen = number
+            if begin and number in self.shown:
+                degrees = TURN_DEGREES * (event.end_screen_pos[0] - self.grabbed_x)
+                turned = replace(begin[0].turned(degrees), position=self.shown[number].position)
+                self.do(lambda: self.session.move_obstacle(turned), event.client, number)

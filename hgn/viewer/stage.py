@@ -1,0 +1,100 @@
+"""What all pages draw: the domain, particles as a cloud of each material, obstacles as meshes.
+
+Shape legend: N particles.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+import viser
+from scipy.spatial.transform import Rotation
+
+from hgn.render.renderer import BOX_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, box_corners, to_bytes
+from hgn.scene.material import MATERIALS
+from hgn.scene.scene import Obstacle
+
+DIAMETER_IN_SPACINGS = 1.2  # points that overlap a little look like a body
+ROOM_COLOR = (236, 238, 242)
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+def quaternion(rotation_33: np.ndarray) -> Quaternion:
+    """(w, x, y, z)."""
+    x, y, z, w = Rotation.from_matrix(rotation_33).as_quat()
+    return float(w), float(x), float(y), float(z)
+
+
+class StageView:
+    """The scene of a server of Viser's."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        domain_size: Vector,
+        spacing: float,
+        precision: Literal["float16", "float32"] = "float32",
+    ) -> None:
+        """`spacing` of particles at rest, domain units. With float16 positions are 2^-12 of the domain apart."""
+        self.scene, self.domain_size = server.scene, domain_size
+        self.scene.set_up_direction("+y")
+        self.middle_3 = 0.5 * np.array(domain_size)
+        size = max(domain_size)
+        server.initial_camera.position = tuple(self.middle_3 + size * np.array([0.55, 0.45, 1.55]))
+        server.initial_camera.look_at = tuple(self.middle_3 - size * np.array([0.0, 0.08, 0.0]))
+        # seen from inside: its near walls are not there
+        self.room = self.scene.add_mesh_simple(
+            "/room", *_box(domain_size), color=ROOM_COLOR, side="back", flat_shading=True, cast_shadow=False
+        )
+        edges = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
+        corner_83 = box_corners(domain_size)
+        self.scene.add_line_segments("/edges", np.array([corner_83[list(edge)] for edge in edges]), BOX_COLOR)
+        self.clouds = [
+            self.scene.add_point_cloud(
+                f"/particles/{name}",
+                np.zeros((0, 3), np.float32),
+                to_bytes(colour),
+                point_size=DIAMETER_IN_SPACINGS * spacing,
+                point_shape="circle",
+                precision=precision,
+                position=tuple(self.middle_3),
+            )
+            for name, colour in zip(MATERIALS, MATERIAL_COLORS, strict=True)
+        ]
+
+    def show(self, position_N3: np.ndarray, material_N: np.ndarray) -> None:
+        """The particles of a frame, domain units; those that are not finite are left out."""
+        there_N = np.isfinite(position_N3).all(axis=1)
+        local_N3 = (position_N3 - self.middle_3).astype(np.float32)
+        for index, cloud in enumerate(self.clouds):
+            mine_N = there_N & (material_N == index)
+            if mine_N.any() or len(cloud.points):
+                cloud.points = local_N3[mine_N]
+
+    def add_obstacle(self, name: str, mesh: Obstacle, position: Vector, rotation: Quaternion) -> viser.MeshHandle:
+        """A mesh about its own origin, at a place."""
+        return self.scene.add_mesh_simple(
+            f"/obstacles/{name}",
+            mesh.vertex_V3.astype(np.float32),
+            mesh.triangle_F3,
+            color=to_bytes(OBSTACLE_COLOR),
+            opacity=0.65,
+            side="double",
+            flat_shading=True,
+            position=position,
+            wxyz=rotation,
+        )
+
+
+def _box(domain_size: Vector) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles, oriented outwards."""
+    corner_83 = box_corners(domain_size)
+    sides: list[Any] = []
+    for axis in range(3):
+        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
+        for high in (0, 1 << axis):
+            a, b, c, d = high, high | u, high | u | v, high | v
+            sides += [(a, b, c), (a, c, d)] if high else [(a, c, b), (a, d, c)]
+    return corner_83, np.array(sides, np.int32)

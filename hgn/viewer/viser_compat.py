@@ -1,0 +1,73 @@
+"""What of Viser is changed from within; pyproject.toml bounds its version.
+
+Viser serves its page and its websocket to whoever reaches the port. Here both ask for a token: the page's address has
+it (`/?token=…`) and leaves it as a cookie, which the browser sends with the websocket. `tests/viewer/test_page.py`
+fails when a new version has changed where.
+"""
+
+from __future__ import annotations
+
+import hmac
+import http
+import http.cookies
+import secrets
+import socket
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+from urllib.parse import parse_qs, urlsplit
+
+import viser
+import websockets.asyncio.server
+from websockets import Headers
+from websockets.http11 import Request, Response
+
+from hgn.schema import require
+
+COOKIE = "hgn_play"
+REFUSAL = b"open the address that hgn.play printed, with its token\n"
+Process = Callable[[Any, Request], Response | None]
+
+
+def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, str]:
+    """A server of Viser's, and the address that opens it, token included. A port that is taken: the next that is not.
+
+    Raises: ConfigError for a host that is not an address of this machine.
+    """
+    try:
+        socket.create_server((host, 0)).close()
+    except OSError as error:  # Viser would wait for ever
+        require(False, "host", "an address of this machine", host, str(error))
+    token = secrets.token_urlsafe(16)
+    serve = websockets.asyncio.server.serve
+
+    def guarded_serve(*args: Any, process_request: Process, **options: Any) -> Any:
+        return serve(*args, process_request=guarded(process_request, token), **options)
+
+    with mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
+        server = viser.ViserServer(host, port, label, verbose=False)
+    shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
+    return server, f"http://{shown}:{server.get_port()}/?token={token}"
+
+
+def guarded(process: Process, token: str) -> Process:
+    """Answers requests that have the token, in the address or a cookie of it, as `process`, and refuses all others."""
+
+    def answer(connection: Any, request: Request) -> Response | None:
+        port = connection.local_address[1]
+        name = f"{COOKIE}_{port}"  # cookies know no ports
+        cookies: http.cookies.SimpleCookie = http.cookies.SimpleCookie()
+        for header in request.headers.get_all("Cookie"):
+            cookies.load(header)
+        given = [*parse_qs(urlsplit(request.path).query).get("token", [])]
+        given += [cookies[name].value] if name in cookies else []
+        if not any(hmac.compare_digest(value.encode(), token.encode()) for value in given):
+            headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(REFUSAL))})
+            return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, REFUSAL)
+        response = process(connection, request)
+        if response is not None:
+            response.headers["Set-Cookie"] = f"{name}={token}; Path=/; HttpOnly; SameSite=Strict"
+            response.headers["Referrer-Policy"] = "no-referrer"
+        return response
+
+    return answer

@@ -1,0 +1,278 @@
+"""The page in a real browser, headless, one session of it for all tests; skipped where there is none."""
+
+from __future__ import annotations
+
+import io
+import re
+import shutil
+import threading
+import time
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from network.states import network_of
+from PIL import Image
+
+from hgn.runtime.simulator import Simulator
+from hgn.scene.rollout_file import read_rollout
+from hgn.scene.scene import Scene
+from hgn.scene.scene_file import load_scene
+from hgn.scene.shapes import shape_obstacle
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'hgn[play]'")
+from hgn.schema import ConfigError
+from hgn.viewer.film import film_html
+from hgn.viewer.page import PlayPage
+from hgn.viewer.session import PlaySession
+from hgn.viewer.viser_compat import start_server
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+SIZE = (900, 600)
+CONF = Path(__file__).parents[2] / "conf"
+# viser keeps its event loop's threads and sockets until the garbage collector comes
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+def floating() -> Simulator:
+    """Relative inputs and an output of zero: particles without gravity stay where they are."""
+    network = network_of(torch.float32, width=16, levels=2, inputs="relative")
+    with torch.no_grad():
+        for parameter in network.decode.parameters():
+            parameter.zero_()
+    return Simulator(network, 60.0, "cpu")
+
+
+@pytest.fixture(scope="module")
+def play() -> Iterator[PlayPage]:
+    block_N3 = 0.4 + 0.2 * np.random.default_rng(0).random((600, 3)).astype(np.float32)
+    cone = shape_obstacle("cone", 0.3, (0.5, 0.5, 0.5))
+    still = (0.0, 0.0, 0.0)
+    scene = Scene(block_N3, 0 * block_N3, np.zeros(600, np.uint8), (cone,), cell_size=1 / 32, gravity=still)
+    session = PlaySession(floating(), scene, weights="floating")
+    page = PlayPage(session, ("floating", "other"), lambda name: floating(), port=0)
+    thread = threading.Thread(target=page.run)
+    thread.start()
+    yield page
+    page.ended.set()
+    thread.join()
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        pytest.skip(f"no browser is installed: one of {', '.join(BROWSERS)}")
+    options = ["--headless=new", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=options, headless=True)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def viewer(browser: Any, play: PlayPage) -> Any:
+    return opened(browser, play.address)
+
+
+def opened(browser: Any, address: str) -> Any:
+    """A viewer's page, once its canvas shows more than one colour."""
+    page = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]}).new_page()
+    page.set_default_timeout(120_000)
+    page.goto(address)
+    page.wait_for_selector("canvas")
+    until(lambda: len(np.unique(pixels(page).reshape(-1, 3), axis=0)) > 50)
+    return page
+
+
+def pixels(page: Any) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+
+
+def until(condition: Callable[[], Any], seconds: float = 120.0) -> Any:
+    """Waits for a condition, patiently: the browser draws on a shared core."""
+    end = time.monotonic() + seconds
+    while not (met := condition()):
+        assert time.monotonic() < end, "it did not come"
+        time.sleep(0.05)
+    return met
+
+
+def blue(page: Any) -> int:
+    """Pixels of water."""
+    red, green, blue = np.moveaxis(pixels(page), -1, 0)
+    return int(((blue > red + 60) & (blue > green + 25)).sum())
+
+
+def on_screen(play: PlayPage, point: tuple[float, float, float]) -> tuple[float, float]:
+    """Where the first viewer's camera sees a point, in pixels."""
+    camera = next(iter(play.server.get_clients().values())).camera
+    forward = np.asarray(camera.look_at) - camera.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, camera.up_direction)
+    right /= np.linalg.norm(right)
+    offset = np.asarray(point) - camera.position
+    depth = offset @ forward
+    scale = SIZE[1] / 2 / np.tan(camera.fov / 2) / depth
+    return SIZE[0] / 2 + scale * (offset @ right), SIZE[1] / 2 - scale * (offset @ np.cross(right, forward))
+
+
+def drag(page: Any, begin: tuple[float, float], end: tuple[float, float], key: str | None = None) -> None:
+    """A mouse's way in steps that the page cannot miss, with the button held."""
+    if key:
+        page.keyboard.down(key)
+    page.mouse.move(*begin)
+    page.mouse.down()
+    for share in np.linspace(0, 1, 12):
+        page.mouse.move(*(a + share * (b - a) for a, b in zip(begin, end, strict=True)))
+        page.wait_for_timeout(50)
+    page.mouse.up()
+    if key:
+        page.keyboard.up(key)
+
+
+def press(page: Any, name: str) -> None:
+    page.get_by_role("button", name=name, exact=True).first.click()
+
+
+def test_points_are_drawn(viewer: Any, play: PlayPage) -> None:
+    """The page shows the water where the camera sees it, the numbers of particles and frames a second."""
+    assert blue(viewer) > 300
+    x, y = (int(value) for value in on_screen(play, (0.5, 0.56, 0.5)))
+    around = pixels(viewer)[y - 60 : y + 60, x - 60 : x + 60]
+    assert ((around[..., 2] > around[..., 0] + 60).mean()) > 0.02
+    text = viewer.inner_text("body")
+    assert re.search(r"600 particles", text) and re.search(r"[1-9]\d* frames a second", text)
+
+
+def test_a_drag_with_shift_pours(viewer: Any, play: PlayPage) -> None:
+    """Particles of the chosen material enter while the mouse is held, above what it points at, and none thereafter."""
+    begin, end = on_screen(play, (0.25, 0.0, 0.3)), on_screen(play, (0.35, 0.0, 0.3))
+    drag(viewer, begin, end, "Shift")
+    until(lambda: play.session.spout is None and len(play.session.newest.position_N3) > 610)
+    count = len(play.session.newest.position_N3)
+    poured_A3 = play.session.recording.frames[-1].position_N3[600:]
+    assert (np.abs(poured_A3[:, [0, 2]] - (0.3, 0.3)) < 0.15).all()
+    viewer.wait_for_timeout(300)
+    assert len(play.session.newest.position_N3) == count
+    until(lambda: f"{count:,} particles" in viewer.inner_text("body"))
+    press(viewer, "Restart")  # what pours here falls for ever
+    until(lambda: play.session.frame > 3 and len(play.session.materials()) == 600)
+
+
+def test_an_obstacle_that_is_dragged_moves(viewer: Any, play: PlayPage) -> None:
+    """On screen by as much as the mouse, for the network as for the eye; with Ctrl it turns about the vertical."""
+    (before,) = play.session.obstacles
+    begin = on_screen(play, (0.5, 0.5, 0.5))
+    drag(viewer, begin, (begin[0] + 80, begin[1]))
+    until(lambda: play.session.obstacles[0].position != before.position and not play.wanted.qsize())
+    viewer.wait_for_timeout(200)
+    (after,) = play.session.obstacles
+    moved_3 = np.subtract(after.position, before.position)
+    shown = on_screen(play, tuple(np.add((0.5, 0.5, 0.5), moved_3)))
+    assert shown == pytest.approx((begin[0] + 80, begin[1]), abs=8)
+    grid = play.session.live.scene.obstacle_grid
+    middle_3 = (grid.cell_K3 + 0.5).mean(axis=0) * grid.cell_size - np.subtract(after.position, (0, 0.03, 0))
+    assert np.abs(middle_3).max() < 0.06
+    drag(viewer, shown, (shown[0] - 90, shown[1]), "Control")
+    until(lambda: play.session.obstacles[0].rotation != after.rotation)
+    assert play.session.obstacles[0].rotation[1] == pytest.approx(-36, abs=4)
+
+
+def test_pause_step_and_back(viewer: Any, play: PlayPage) -> None:
+    """Pause holds the scene, Step makes one frame, Back takes frames away and holds it, Play goes on."""
+    press(viewer, "Pause")
+    until(lambda: not play.playing)
+    frame = play.session.frame
+    press(viewer, "Step")
+    until(lambda: play.session.frame == frame + 1)
+    viewer.wait_for_timeout(300)
+    assert play.session.frame == frame + 1
+    press(viewer, "a frame")
+    until(lambda: play.session.frame == frame)
+    press(viewer, "Play")
+    until(lambda: play.session.frame > frame + 3)
+    press(viewer, "1 s")
+    until(lambda: play.session.frame <= max(0, frame - 30) and not play.playing)
+    press(viewer, "Play")
+    until(lambda: play.playing)
+
+
+def test_scene_and_rollout_are_taken_away(viewer: Any, play: PlayPage, tmp_path: Path) -> None:
+    """Both come as downloads; the scene opens as it is now, the rollout has its frames."""
+    with viewer.expect_download() as download:
+        press(viewer, "Scene (YAML, zip)")
+    zipfile.ZipFile(download.value.path()).extractall(tmp_path)
+    assert yaml.safe_load((tmp_path / "scene.yaml").read_text())["cell_size"] == 1 / 32
+    assert load_scene(tmp_path / "scene.yaml").particle_count == len(play.session.newest.position_N3)
+    with viewer.expect_download() as download:
+        press(viewer, "Rollout (VTKHDF)")
+    download.value.save_as(tmp_path / "a.vtkhdf")
+    rollout = read_rollout(tmp_path / "a.vtkhdf")
+    assert rollout.particle_count == 600 and rollout.frame_count > 3
+
+
+def test_own_meshes(viewer: Any, play: PlayPage) -> None:
+    """An uploaded mesh stands in the middle, as large as the slider says; what is none is told and changes nothing."""
+    count = len(play.session.obstacles)
+    field = viewer.locator("input[type=file]")
+    field.set_input_files(files=[{"name": "a.obj", "mimeType": "", "buffer": b"no mesh"}])
+    viewer.get_by_text("must contain triangles").wait_for()
+    field.set_input_files(str(CONF / "example" / "ramp.obj"))
+    until(lambda: len(play.session.obstacles) == count + 1)
+    vertex_V3 = play.session.obstacles[-1].mesh().vertex_V3
+    low, high = vertex_V3.min(axis=0), vertex_V3.max(axis=0)
+    np.testing.assert_allclose(0.5 * (low + high), (0.5, 0.3, 0.5), atol=1e-6)
+    assert (high - low).max() == pytest.approx(0.3)
+    press(viewer, "Remove the chosen")
+    until(lambda: len(play.session.obstacles) == count)
+
+
+def test_two_viewers_and_a_lost_connection(browser: Any, viewer: Any, play: PlayPage) -> None:
+    """A second viewer sees the same scene; when all connections break the scene goes on, and both come back to it."""
+    second = opened(browser, play.address)
+    assert len(play.server.get_clients()) == 2 and blue(second) > 300
+    frame = play.session.frame
+    play.server._websock_server.disconnect_all_clients()
+    until(lambda: not play.server.get_clients())
+    until(lambda: len(play.server.get_clients()) == 2)
+    assert play.session.frame > frame
+    press(second, "Pause")
+    until(lambda: not play.playing)
+    until(lambda: "Play" in viewer.inner_text("body").splitlines())
+    assert blue(viewer) > 300 and blue(second) > 300
+    second.context.close()
+
+
+def test_without_the_token_there_is_nothing(browser: Any, play: PlayPage) -> None:
+    """Neither the page nor the websocket answers without it, nor with another; the host is loopback's."""
+    bare = play.address.split("?")[0]
+    assert bare.startswith("http://127.0.0.1:")
+    for address in (bare, f"{bare}?token=wrong"):
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(address)
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(bare.replace("http", "ws"))
+    with pytest.raises(ConfigError, match=r"host must be an address of this machine, got '192.0.2.1'"):
+        start_server("192.0.2.1", 0, "HGN")
+
+
+def test_a_film_plays_by_itself(browser: Any, play: PlayPage, tmp_path: Path) -> None:
+    """The static page draws the rollout's particles without any server."""
+    path = tmp_path / "film.html"
+    path.write_text(film_html(play.session.rollout(), every=10))
+    page = opened(browser, path.as_uri())
+    until(lambda: blue(page) > 300)
+    page.context.close()
