@@ -53,7 +53,7 @@ GRID_WITHIN = 0.05
 # quarters of round columns on a rough floor: run-out beside Lube et al. 2004, height beside the mean of what they and
 # Lajeunesse et al. 2004 found
 COLUMN_RADIUS = 0.5  # m; the tallest column's own weight presses it by 2 %
-COLUMN_CELLS = 24  # in radius
+COLUMN_CELLS = 24  # in radius, and at least in height: a front lacks its last two to two and a half cells
 COLUMN_DEPTH = 1 / 64  # of the radius: where sand is as deep, there is its edge
 COLUMN_WITHIN = 0.1
 COLUMN_ASPECTS = (0.5, 1.0, 1.5, 2.5, 4.0)
@@ -159,7 +159,9 @@ def columns(base: MpmConfig) -> list[Row]:
     """Run-out and height of collapsed columns by the config's own law, and by others that are there for comparison."""
     cases = [(aspect, base.sand_friction_law, base.sand_friction_angle_deg) for aspect in COLUMN_ASPECTS]
     cases += [(aspect, law, angle) for law, angle in SAND_LAWS for aspect in OTHER_ASPECTS]
-    return [row for case in cases for row in column_rows(*case, base, COLUMN_CELLS)]
+    return [
+        row for case in cases for row in column_rows(*case, base, max(COLUMN_CELLS, math.ceil(COLUMN_CELLS / case[0])))
+    ]
 
 
 def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cells: int) -> list[Row]:
