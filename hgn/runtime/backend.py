@@ -210,7 +210,7 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
     """What keeps simulations from the backend triton, in words; none if nothing does."""
     if device.type != "cuda":
         return f"it needs a CUDA device, not {device.type}"
-    if reason := host_unsupported_reason():
+    if reason := _too_little_shared_memory(device, config.width) or host_unsupported_reason():
         return reason
     if config.kind != "hgn" and precision != "fp16":
         return f"it computes {config.kind} with precision fp16, not {precision}"
@@ -220,6 +220,17 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
         return "it computes in tf32 or fp16, not fp32"
     if config.levels > TRITON_LEVELS:
         return f"network.levels must be at most {TRITON_LEVELS} for it, not {config.levels}"
+    return None
+
+
+def _too_little_shared_memory(device: torch.device, width: int) -> str | None:
+    """Kernels keep their weights there: five of the cells' MLP in float16, or as much of others in TF32."""
+    needed = room = 10 * width**2
+    if torch.cuda.is_available():
+        # a name that torch's own annotations leave out
+        room = getattr(torch.cuda.get_device_properties(device), "shared_memory_per_block_optin", needed)
+    if room < needed:
+        return f"its kernels need {needed >> 10} KB of shared memory at width {width}, and this GPU has {room >> 10}"
     return None
 
 

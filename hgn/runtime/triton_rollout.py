@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ from hgn.kernels.forward import FusedNetwork, feature_columns
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
 from hgn.kernels.rollout.kernel import DIVERGED, advance, integrate
+from hgn.kernels.tuning import Tuning
+from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
@@ -31,6 +33,7 @@ from hgn.runtime.parity import OUTPUT_BOUND, relative_error
 from hgn.schema import ConfigError
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4
+CROWDED = 140  # particles in a cell of the finest level, half again as many as in the data's bodies
 PATH_BYTES = 1 << 27  # of positions on their way to the host: fewer frames where there are many particles
 GROWTH = 2.0  # room for so many times the cells
 # The same where there are more than ROOMY_CELLS of them: at first, and for what was needed when there was too little.
@@ -50,6 +53,15 @@ def first_capacities(cells: Sequence[int], particles: int) -> tuple[int, ...]:
         roomy = min(HEADROOM * count, spread, ROOMY_CELLS >> 2 * level)
         capacities.append(max(256 >> level, _room(count, level, TIGHT_START), int(roomy)))
     return tuple(capacities)
+
+
+def crowded(position_N3: torch.Tensor, scene_N: torch.Tensor, cell_size: float) -> bool:
+    """Whether more than a twentieth of the particles lie where sums of them in float16 would lose small summands."""
+    cell_N3 = torch.floor(position_N3 / cell_size).long()
+    inside_N = (cell_N3.abs() < COORDINATE_LIMIT).all(-1)
+    key_N = pack(scene_N[inside_N].long(), cell_N3[inside_N])
+    _, count_C = torch.unique(key_N, return_counts=True)
+    return 20 * int(count_C[count_C > CROWDED].sum()) > len(position_N3)
 
 
 def _room(count: int, level: int, tight: float) -> int:
@@ -118,12 +130,17 @@ class TritonRollout:
         self.mean, self.std = normaliser.acceleration_mean.float(), normaliser.acceleration_std.float()
         self.frames_done = 0
         self.growths = 0
+        self._careful = self._crowded(state)
         self._fill(state)
         self._build(capacities or self._first_capacities())
 
     def fits(self, state: ParticleState) -> bool:
-        """Whether `begin` can go on with a state: as many scenes, in such domains, and not too many particles."""
+        """Whether `begin` can go on with a state: as many scenes, in such domains, and not too many particles, nor too
+        many in one place.
+        """
         if state.scene_count != self.scenes or len(state.position_N3) > self.particles:
+            return False
+        if not self._careful and self._crowded(state):
             return False
         new, old = state.obstacles, self.obstacles
         same = new is old is None or (new is not None and old is not None and new.cell_size == old.cell_size)
@@ -166,6 +183,10 @@ class TritonRollout:
         if self.config.relative:
             self.gravity_S3.copy_(state.gravity_S3)
 
+    def _crowded(self, state: ParticleState) -> bool:
+        nowhere = state.position_N3.device.type == "meta"  # kernels are compiled ahead, for no particles
+        return not nowhere and crowded(state.position_N3, state.scene_N, self.config.cell_size)
+
     def use_values(self, values: torch.Tensor) -> None:
         """Takes over parameters in the packed layout."""
         self.values.copy_(values)
@@ -195,7 +216,11 @@ class TritonRollout:
             window, self.scenes, rounded, self.particles, feature_columns(config), config.cell_size,
             self.device, config.relative,
         )  # fmt: skip
-        self.fused = FusedNetwork(config, self.packed, self.values, self.grid, self.count, self.precision)
+        tuning = Tuning.of(self.precision)
+        tuning = replace(tuning, half_sums=tuning.half_sums and not self._careful)
+        self.fused = FusedNetwork(
+            config, self.packed, self.values, self.grid, self.count, self.precision, tuning=tuning
+        )
         if self.device.type == "cuda":
             self.graph = self._capture()
 

@@ -1,6 +1,6 @@
 """What Triton makes of a small training's kernels for an H100, a line each: CANARY and what of Triton's interface held,
 COMPILED and a kernel of a grid with relative inputs, PRODUCT, kernel, tiles copied ahead and products under way
-meanwhile, HAZARDS, kernel, precision and their number."""
+meanwhile, HAZARDS, kernel, precision and their number, SHARED, kernel and its bytes of shared memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ptx import hazards, overwritten_tiles
 from hgn.config import NetworkConfig
 from hgn.kernels import triton_compat
 from hgn.kernels.update.op import UpdateSettings
-from hgn.runtime.precompile_program import PrecompileJob, launches_of
+from hgn.runtime.precompile_program import FrameJob, PrecompileJob, launches_of
 
 
 @triton.jit
@@ -65,3 +65,9 @@ for precision in ("fp16", "tf32"):
             if name.endswith("weight_gradient") and precision == "fp16":
                 print("PRODUCT", name, *overwritten_tiles(asm["ttgir"]))
             print("HAZARDS", name, precision, len(hazards(asm["ptx"])), flush=True)
+
+# where a block has 99 KB of shared memory
+triton_compat.use_target(89)
+narrow = NetworkConfig(width=64, levels=2, message_passing_steps=2)
+for function, data in launches_of(FrameJob(((narrow, "fp16"),), ((40_000, 10_000),), 89)).values():
+    print("SHARED", function.__name__, triton_compat.preload(function, data).metadata.shared, flush=True)

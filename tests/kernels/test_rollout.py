@@ -11,7 +11,7 @@ import pytest
 import torch
 from kernels.engines import device
 from kernels.memory import living_tensors
-from network.states import network_of, random_grid
+from network.states import network_of, random_grid, random_state
 
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import DeviceGrid, Window
@@ -20,8 +20,10 @@ from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime import triton_rollout
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.live import LiveSimulation
+from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
+from hgn.runtime.weights import find_weights, load_weights
 from hgn.scene.symmetry import Vector
 from hgn.schema import ConfigError
 
@@ -254,3 +256,57 @@ def test_wrong_kernels_are_refused() -> None:
         next(other.decode.parameters()).mul_(1.5)
     with pytest.raises(ConfigError, match="backend must be torch on this machine"):
         rollout.require_parity(other, state)
+
+
+def block(density: float, cell_size: float, cells: int) -> ParticleState:
+    """Water at rest in a cube of so many cells, so many times as dense as the data's: 90 particles in a cell."""
+    count = round(90 * density * cells**3)
+    state = random_state((count,), obstacles=False, dtype=torch.float32)
+    unit_N3 = torch.rand(count, 3, generator=torch.Generator().manual_seed(1))
+    position_N3 = cell_size * (8 + 0.01 + (cells - 0.02) * unit_N3)
+    material_N = torch.zeros_like(state.material_N)
+    return replace(state, position_N3=position_N3, velocity_NM3=0 * state.velocity_NM3, material_N=material_N)
+
+
+@pytest.mark.skipif(device().type != "cpu", reason="the interpreter's; the next one is a GPU's")
+def test_crowds_are_added_in_float32(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where particles lie twice as densely as in the data, sums of them in float16 would be further off."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.0625).float()
+    with torch.no_grad():
+        network.particle_to_cell.norm.bias.fill_(3.0)  # sums are large beside what is added
+
+    def error(density: float, careful: bool) -> float:
+        state = block(density, 0.0625, 1)
+        rollout = TritonRollout(network, state, "fp16", (64,))
+        assert rollout._careful is careful
+        rollout._network_pass()
+        expected = network.normalised_acceleration(state).detach()
+        return relative_error(rollout.fused.output[: len(expected), :3], expected)
+
+    assert error(1, False) < 1e-2
+    crowded = error(2, True)
+    roomy = TritonRollout(network, block(1, 0.0625, 1), "fp16", (64,), room=200)
+    assert roomy.fits(block(1, 0.0625, 1)) and not roomy.fits(block(2, 0.0625, 1))
+    monkeypatch.setattr(triton_rollout, "CROWDED", 10**9)
+    assert crowded < 1e-2 and crowded < 0.8 * error(2, False)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
+@pytest.mark.parametrize("density", [1, 2, 4, 10])
+def test_density(density: float) -> None:
+    """Accelerations of the shipped network in half precision are within 1 % of TF32's, up to ten times the data's
+    density."""
+    network, _ = load_weights(find_weights("obstacles"))
+    network = network.to(device())
+    assert isinstance(network, HierarchicalGraphNetwork)
+    state = block(density, network.config.cell_size, 4)
+    state = replace(state, **{name: value.to(device()) for name, value in vars(state).items() if value is not None})
+    output = []
+    for precision in ("fp16", "tf32"):
+        rollout = TritonRollout(network, state, precision)
+        rollout._network_pass()
+        output.append(rollout.fused.output[: len(state.position_N3), :3].clone())
+    error = relative_error(*output)
+    print(f"density {density}: {error:.2e}")
+    assert error < 1e-2

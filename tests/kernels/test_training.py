@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -262,3 +263,16 @@ def test_why_backend_triton_does_not_run() -> None:
     assert "not 48" in str(triton_unsupported_reason(gpu, NetworkConfig(width=48)))
     assert "in tf32 or fp16, not fp32" in str(triton_unsupported_reason(gpu, hgn, "fp32"))
     assert "at most 8" in str(triton_unsupported_reason(gpu, NetworkConfig(levels=9)))
+
+
+def test_little_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU with 99 KB of shared memory takes backend torch, which says why; triton where the network is narrower."""
+    small = SimpleNamespace(shared_memory_per_block_optin=101_376)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: small)
+    monkeypatch.setattr("hgn.runtime.backend.host_unsupported_reason", lambda: None)
+    gpu, reason = torch.device("cuda"), "its kernels need 160 KB of shared memory at width 128, and this GPU has 99"
+    assert triton_unsupported_reason(gpu, NetworkConfig()) == reason
+    reasons = {"triton": reason, "torch": None}
+    assert reason in pick(reasons, "auto", "tf32", "backend")[1]
+    assert triton_unsupported_reason(gpu, NetworkConfig(width=64)) is None

@@ -68,6 +68,13 @@ def test_no_group_overwrites_what_another_still_multiplies(lines: list[list[str]
     assert {(kernel, precision) for kernel, precision, count in scanned if int(count)} <= SAFE, scanned
 
 
+def test_narrow_networks_fit_into_less_shared_memory(lines: list[list[str]]) -> None:
+    """Compiled for a GPU with 99 KB of it, as those for graphics have, the kernels of width 64 take no more."""
+    shared = {kernel: int(size) for what, kernel, size in (line[:3] for line in lines if line[0] == "SHARED")}
+    assert shared.keys() >= {"mlp_forward", "edge_forward", "cell_mlp_forward", "particle_cell_forward"}
+    assert max(shared.values()) <= 101_376, shared
+
+
 @pytest.mark.parametrize(("between", "count"), [("bar.sync 0;", 0), ("add.s32 %r1, %r1, 1;", 1)])
 def test_a_missing_barrier_is_seen(between: str, count: int) -> None:
     """Also behind a branch back, where the write stands before the wait."""
