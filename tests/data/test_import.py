@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,19 +14,24 @@ import torch
 from data.foreign_writers import Hostile, metadata, pickled_npz, sequence_example, write
 from training.runs import metrics, train_mapping
 
-from hgn import import_trajectories, train
-from hgn.config import DatagenConfig, NetworkConfig
+from hgn import evaluate, import_trajectories, train
+from hgn.config import DatagenConfig, NetworkConfig, RolloutConfig
 from hgn.data.batch import make_batch
 from hgn.data.foreign.boundary import boundary_grid
 from hgn.data.foreign.episodes import flat_plane
 from hgn.data.foreign.gravity import estimate_gravity
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
+from hgn.export import export
 from hgn.network.build import build_network
 from hgn.network.grid import build_hierarchy
+from hgn.render.pictures import compare_picture
+from hgn.rollout import rollout
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.weights import load_weights
 from hgn.scene.episode import decode_episode, encode_episode
 from hgn.scene.history import frames_before, window
+from hgn.scene.rollout_file import read_rollout
 from hgn.schema import ConfigError
 from hgn.training.noise import jittered_origin, perturbed_window
 
@@ -402,3 +408,31 @@ def test_an_own_layout_may_bring_obstacle_cells(tmp_path):
     assert grid.cell_K3.tolist() == [[1, 5, 3], [9, 2, 2]] and grid.cell_size == 1 / 64
     assert grid.normal_K3.tolist() == [[1, 0, 0], [0, 1, 0]]
     assert [episode.materials[i] for i in episode.material_N] == ["fluid"] * 3
+
+
+def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
+    """Training with noise, mirrors and pushforward, evaluation in both conventions, a rollout file with the set's
+    names, and a picture of it."""
+    symmetric = {"symmetry": "gravity", "noise_correlated_fraction": 0.3, "pushforward_fraction": 0.5}
+    mapping = train_mapping(make_config(folder=str(flat)), tmp_path / "run", **symmetric, pushforward_frames=4)
+    assert train.main(mapping | {"imported": True}) == 0
+    weights = tmp_path / "flat.safetensors"
+    export(tmp_path / "run" / "checkpoints" / "last.ckpt", weights)
+    network, _ = load_weights(weights)
+    assert network.config.dimensions == 2 and network.config.materials == ("water", "goop")
+    assert network.normaliser.acceleration_std[2] == np.float32(1e-30)
+    figures = tmp_path / "figures.json"
+    options = {"weights": str(weights), "data": str(flat), "split": "train", "rollout_frames": 24, "backend": "torch"}
+    assert evaluate.main(options | {"device": "cpu", "json": str(figures)}) == 0
+    report = json.loads(figures.read_text())
+    own, (ours, *_, simulated) = report["set_convention"], report["rows"]
+    assert own["one_step"]["free"] == pytest.approx(ours["one_step_mse"] / 2)
+    assert own["rollout"]["free"] == pytest.approx(simulated["mean_position_mse"] * 24 / 23 / 2)
+    for errors in own.values():
+        assert errors["all"] == pytest.approx(errors["free"] * 24 / (24 + 160))
+    config = RolloutConfig(str(weights), str(tmp_path / "out.vtkhdf"), data=str(flat), episode="train-000001", frames=9)
+    path, _ = rollout(dataclasses.replace(config, device="cpu", backend="cpu"))
+    result = read_rollout(path)
+    assert [result.materials[i] for i in np.unique(result.material_N)] == ["water", "goop"]
+    assert len(np.unique(result.position_TN3[..., 2])) == 1
+    assert compare_picture(result, [0, 8]).width > 100

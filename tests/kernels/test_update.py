@@ -182,6 +182,22 @@ def test_noise_and_jitter() -> None:
     torch.testing.assert_close(updates.share_N[:700].cpu(), torch.tensor([4 / 800] * 400 + [1 / 600] * 300))
 
 
+def test_a_flat_network_is_shown_no_noise_across() -> None:
+    """With two dimensions z and its velocities are the data's bit by bit, and the grid does not move along it."""
+    network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, dimensions=2)
+    made, _ = episode(1, 64, False, spread=0.3)
+    updates = updates_of(network, 1, (512,), noise_std=1e-3, grid_jitter=True, noise_correlated_fraction=0.3)
+    updates._upload([[(made, 1, 5)]], [1e-3])
+    updates.particles, updates._reach = 64, (torch.zeros(3), torch.ones(3))
+    updates._build()
+    updates._assemble()
+    window = made.position_TN3[1 : 1 + HISTORY + 1]
+    step_N3 = updates.velocity_NV[:64].view(64, HISTORY, 3)[:, 0] - (window[-1] - window[-2])
+    assert not step_N3[:, 2].any() and step_N3[:, :2].all()
+    assert torch.equal(updates.position_N3[:64, 2], window[-1, :, 2])
+    assert updates.origin_S3[0, 2] == 0 and (updates.origin_S3[0, :2] < 0).all()
+
+
 def test_smooth_noise() -> None:
     """With noise_correlated_fraction=1 a scene gets the sum of its waves for noise, as in backend torch, of the asked
     spread; other scenes have other waves; half of the variance leaves the other half to each particle."""
