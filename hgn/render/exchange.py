@@ -110,6 +110,8 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
     stage.SetEndTimeCode(rollout.frame_count - 1)
     world = UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())
+    for name in ("obstacles", "particles"):  # prims without a type would lose the up axis in Blender
+        UsdGeom.Xform.Define(stage, f"/World/{name}")
     world.GetPrim().SetCustomDataByKey("gravity", Gf.Vec3d(*rollout.gravity))
 
     def colour(shape: Any, rgb_3: np.ndarray) -> None:

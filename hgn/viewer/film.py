@@ -17,7 +17,7 @@ from hgn.render.pictures import rollout_spacing
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import require
 from hgn.viewer.stage import Quaternion, StageView, Vector, quaternion
-from hgn.viewer.viser_compat import start_server
+from hgn.viewer.viser_compat import start_server, stop_server
 
 REST = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
@@ -68,7 +68,7 @@ def film_html(rollout: Rollout, every: int = 2) -> str:
     try:
         return str(serializer.as_html())
     finally:
-        server.stop()
+        stop_server(server)
 
 
 def show_film(rollout: Rollout, every: int = 2, height: int = 480) -> None:
@@ -80,7 +80,7 @@ def show_film(rollout: Rollout, every: int = 2, height: int = 480) -> None:
     try:
         serializer.show(height=height)
     finally:
-        server.stop()
+        stop_server(server)
 
 
 class FilmPage:
@@ -122,4 +122,4 @@ class FilmPage:
 
     def close(self) -> None:
         self.ended.set()
-        self.server.stop()
+        stop_server(self.server)

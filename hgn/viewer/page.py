@@ -29,7 +29,7 @@ from hgn.schema import ConfigError, require
 from hgn.viewer.placed import PlacedObstacle, Vector
 from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
-from hgn.viewer.viser_compat import start_server
+from hgn.viewer.viser_compat import start_server, stop_server
 
 TOLD_S = 0.25  # between two tellings of frame and speed
 BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
@@ -123,7 +123,7 @@ class PlayPage:
     def close(self) -> None:
         """Ends the server, once `run` is over: `ended.set()` ends it from another thread."""
         self.ended.set()
-        self.server.stop()
+        stop_server(self.server)
 
     # what is on screen
 

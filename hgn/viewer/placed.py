@@ -46,7 +46,7 @@ class Body:
 
     @property
     def name(self) -> str:
-        return f"{self.number}_{Path(self.entry.mesh).stem if self.entry.mesh else self.entry.shape}"
+        return f"{Path(self.entry.mesh).stem if self.entry.mesh else self.entry.shape}_{self.number}"
 
 
 @dataclass(frozen=True, eq=False)

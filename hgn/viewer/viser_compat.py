@@ -7,9 +7,11 @@ fails when a new version has changed where.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import http
 import http.cookies
+import io
 import secrets
 import socket
 from collections.abc import Callable
@@ -44,10 +46,17 @@ def start_server(host: str, port: int, label: str) -> tuple[viser.ViserServer, s
     def guarded_serve(*args: Any, process_request: Process, **options: Any) -> Any:
         return serve(*args, process_request=guarded(process_request, token), **options)
 
-    with mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
+    unsaid = contextlib.redirect_stdout(io.StringIO())  # Viser's own lines have an address without the token
+    with unsaid, mock.patch.object(websockets.asyncio.server, "serve", guarded_serve):
         server = viser.ViserServer(host, port, label, verbose=False)
     shown = "127.0.0.1" if host in ("0.0.0.0", "localhost") else host
     return server, f"http://{shown}:{server.get_port()}/?token={token}"
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """Ends a server and its thread."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
 
 
 def guarded(process: Process, token: str) -> Process:

@@ -52,6 +52,7 @@ def test_usd_is_read_back(tmp_path: Path, rollout: Rollout) -> None:
     stage = Usd.Stage.Open(str(path))
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 2, 60)
     assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert all(prim.GetTypeName() for prim in stage.Traverse())  # Blender loses the up axis below one without a type
     velocity_TN3 = frame_velocity(rollout.position_TN3, 60.0)
     for index, name in enumerate(MATERIALS[:2]):
         points = UsdGeom.Points(stage.GetPrimAtPath(f"/World/particles/{name}"))
