@@ -27,6 +27,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.shard import locate_members
 from hgn.data.statistics import Moments
 from hgn.schema import ConfigError
+from tools.studies.kills import verified_shards
 
 
 def test_dataset_is_complete_and_in_order(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
@@ -301,3 +302,34 @@ def test_full_disk_while_several_are_packed(
     assert not list(writer.folder.rglob("*.partial"))
     make_dataset(make_config())
     assert Manifest.load(writer.folder).complete
+
+
+def test_a_disk_that_fails(
+    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever the disk cannot keep what was written (EIO), the generation ends with that error, what is published is
+    whole, and the next one goes on; at the end the data set is the one of a sound disk, bitwise."""
+    expected = hashes(make_dataset(make_config(training_scenes=3, folder=str(tmp_path / "sound"))))
+    config = make_config(training_scenes=3, folder=str(tmp_path / "failing"))
+    real, failures, published = os.fsync, 0, []
+    while True:
+        left = [failures % 7]
+
+        def fsync(descriptor: int, left: list[int] = left) -> None:
+            left[0] -= 1
+            if left[0] == -1:
+                raise OSError(errno.EIO, "Input/output error")
+            real(descriptor)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        try:
+            folder = make_dataset(config)
+            break
+        except OSError as error:
+            assert error.errno == errno.EIO
+            failures += 1
+        monkeypatch.setattr(os, "fsync", real)
+        published = verified_shards(tmp_path / "failing", published)
+    monkeypatch.setattr(os, "fsync", real)
+    assert failures > 10
+    assert hashes(make_dataset(config)) == expected and folder == tmp_path / "failing"
