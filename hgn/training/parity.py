@@ -17,7 +17,7 @@ from hgn.kernels.update.op import Updates
 from hgn.network.cell_keys import pack
 from hgn.network.features import ParticleState
 from hgn.network.obstacles import ObstacleCells
-from hgn.runtime.parity import GRADIENT_BOUND, OUTPUT_BOUND, relative_error
+from hgn.runtime.parity import GRADIENT_BOUND, LEAST_OUTPUT, OUTPUT_BOUND, relative_error
 from hgn.scene.symmetry import Symmetry
 from hgn.schema import ConfigError
 from hgn.training.symmetry import obstacles_under
@@ -39,7 +39,7 @@ def require_parity(
     parameters = list(network.parameters())
     output_N3 = updates.reference_output(state, origin_S3)
     expected = torch.autograd.grad((output_N3 * weight_N3).sum(), parameters, allow_unused=True)
-    output_error = relative_error(fused.output[:count, :3], output_N3.detach())
+    output_error = relative_error(fused.output[:count, :3], output_N3.detach(), LEAST_OUTPUT)
     fused.output_gradient[:count].zero_()
     fused.output_gradient[:count, :3] = weight_N3 / fused.unscale
     fused.backward()

@@ -61,6 +61,29 @@ def test_frames_are_those_of_the_plain_loop(inputs: str) -> None:
         np.testing.assert_allclose(path_TN3, expected_TN3, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("precision", ["fp32", "fp16"])
+def test_free_flight_is_not_refused(precision: str) -> None:
+    """What relative inputs put out in free flight is rounding alone, which differs as a whole; both loops fall with
+    gravity to 1e-3 of it. A network whose weights differ is still refused where something happens."""
+    thrown = replace(scene(40, gravity=(0.0, -5.0, 0.0)), domain_size=(1.0, 1.0, 1.0))
+    thrown = replace(thrown, position_N3=thrown.position_N3 + 0.4, velocity_N3=np.full((40, 3), 1.7, np.float32))
+    paths = [
+        Simulator(network(2, inputs="relative"), 60.0, name, precision).rollout([thrown], 4)[0].astype(np.float64)
+        for name in ("torch", "triton")
+    ]
+    for path_TN3 in paths:
+        falls_T3 = np.diff(path_TN3, 2, axis=0).mean(axis=1) * 3600
+        np.testing.assert_allclose(falls_T3, np.broadcast_to(thrown.gravity, falls_T3.shape), rtol=0, atol=5e-3)
+    stirred = Simulator(network(2, inputs="relative"), 60.0, "torch").start([scene(40)])
+    rollout = TritonRollout(network(2, inputs="relative"), stirred, precision, (512, 64))
+    rollout.require_parity(network(2, inputs="relative"), stirred)
+    other = network(2, inputs="relative")
+    with torch.no_grad():
+        other.decode.second.weight.mul_(1.5)
+    with pytest.raises(ConfigError, match="its output differs by"):
+        rollout.require_parity(other, stirred)
+
+
 def test_overflow_loses_nothing() -> None:
     """A rollout whose cells outgrow its buffers grows them, and its frames equal those of one that had room."""
     spreading = network()
