@@ -40,6 +40,7 @@ from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 
 LONGEST_FILES = (  # ten seconds and more of one core; begun last, one of them would run alone
+    *("viewer/test_page",),
     *("datagen/mpm/test_solver", "jobs/test_jobs", "docs/test_tutorials", "kernels/test_triton_compat"),
     *("tools/test_error_vs_time", "tools/test_scaling", "training/test_ddp", "kernels/test_kernels_alone"),
     *("datagen/test_pool", "datagen/test_service", "datagen/test_command", "training/test_precompile"),

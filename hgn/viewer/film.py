@@ -60,7 +60,7 @@ def _record(rollout: Rollout, every: int) -> tuple[viser.ViserServer, Any]:
 
 
 def film_html(rollout: Rollout, every: int = 2) -> str:
-    """A page that plays every `every`-th frame by itself, without a server or a network: 3 MB, and the positions.
+    """A page that plays every `every`-th frame by itself, without a server or a network: a megabyte and the positions.
 
     Raises: ConfigError for `every` below 1; ModuleNotFoundError without the extra `play`.
     """
