@@ -186,3 +186,12 @@ def test_how_to(here: Path) -> None:
     (example,) = [block for block in blocks_of(ROOT / "docs/how_to/scene_files.md") if block.language == "yaml"]
     Path("funnel.yaml").write_text(example.content)
     assert len(load_scene("funnel.yaml").obstacles) == 5
+
+
+def test_gradients() -> None:
+    """Gradients: of velocities and of a turned obstacle; the first steps towards a target come nearer."""
+    runner = Runner(SETTINGS, {"range(10)": "range(2)"})
+    runner.run(ROOT / "docs/how_to/gradients.md")
+    assert bool(runner.names["turn_3"].grad.any()) and bool(runner.names["velocity_N3"].grad.any())
+    first, second = (abs(path_T3[-1] - runner.names["target_3"].numpy()).max() for path_T3 in runner.names["tries"])
+    assert second < 0.8 * first
