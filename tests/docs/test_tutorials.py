@@ -150,7 +150,10 @@ def test_serve(here: Path, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
         "datagen.service": [*SCENES[:-1], "out=data/mine", "host=127.0.0.1", f"port={port}", "progress=json"],
         "hgn.train": [*SETTINGS["hgn.train"], f"dataset.folder=http://127.0.0.1:{port}", "run=runs/served"],
     }
-    runner = Runner(settings, setenv=monkeypatch.setenv)
+    proxy = "tests/jobs/test_nginx.py runs nginx with jobs/nginx.conf"
+    lines = (TUTORIALS / "serve.md").read_text().splitlines()
+    elsewhere = {line: proxy for line in lines if line.startswith(("export SERVER_NAME", "envsubst", "nginx"))}
+    runner = Runner(settings, elsewhere=elsewhere, setenv=monkeypatch.setenv)
     try:
         runner.run(TUTORIALS / "serve.md")
     finally:
