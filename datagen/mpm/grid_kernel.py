@@ -14,8 +14,6 @@ from datagen.mpm.mls_mpm import (
     Nodes,
     Scalars,
     Vectors,
-    choose_time_step,
-    falls,
     find_hidden,
     ghost_place,
     initial_stiffness,
@@ -26,12 +24,12 @@ from datagen.mpm.mls_mpm import (
     move,
     node_places,
     node_velocity,
-    raise_maximum,
     respond,
     settle,
     settles,
     weights,
 )
+from datagen.mpm.time_step import choose_time_step, falls, raise_maximum
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
 

@@ -16,6 +16,8 @@ from hgn.schema import ConfigError
 import taichi as ti  # isort: skip
 
 from datagen.mpm import team_kernel  # isort: skip
+from datagen.mpm.team_meeting import MEETING  # isort: skip
+from datagen.mpm.team_transfers import LANES  # isort: skip
 
 LAUNCH_SECONDS = 3.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
 MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
@@ -35,7 +37,7 @@ class Team(NamedTuple):
 class TeamLaunch(Launch):
     """Particles in one array, field by field, in two copies."""
 
-    entries_a_node = 2 * team_kernel.LANES
+    entries_a_node = 2 * LANES
 
     def __init__(self, team: Team, teams: int, *batch: Any) -> None:
         super().__init__(*batch)
@@ -56,7 +58,7 @@ class TeamLaunch(Launch):
         self.column_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES // BLOCK)
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
-        self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * team_kernel.MEETING)
+        self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING)
         self.columns = ti.ndarray(ti.i32, 2 * self.teams * team.blocks)
         for array in (self.cell_count, self.column_count, self.block, self.columns, self.node):
             array.fill(0)

@@ -17,12 +17,11 @@ import torch
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds
 from hgn.command import _with_json_as_override
-from hgn.config import MpmConfig, NetworkConfig, SceneConfig
+from hgn.config import MpmConfig, NetworkConfig
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.grid import build_hierarchy
 from hgn.network.neighbours import neighbour_list
 from hgn.runtime.simulator import Simulator
-from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.schema import ConfigError, from_mapping
 from tools.bench import contenders, triton_contenders
 from tools.bench.__main__ import main, workloads
@@ -69,17 +68,6 @@ def test_rows_of_every_case(
         assert cases == ["frame", "gns_frame", "gns_train", "mpm_frame", "torch_frame", "train"]
     printed = capsys.readouterr().out
     assert all(row["case"] in printed for row in rows)
-
-
-def test_random_scenes_of_the_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With random_scenes the solver simulates scenes of a data set; a row tells their particles, and steps a frame."""
-    monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate(False))
-    path = tmp_path / "bench.json"
-    changes = {"scenes": [1, 2], "cases": ["mpm_frame"], "random_scenes": True, "json": str(path)}
-    assert main(SMALL | changes | {"particles": [60, 70]}) == 0
-    rows = json.loads(path.read_text())["rows"]
-    assert [row["scenes"] for row in rows] == [1, 2] and all(row["substeps"] == 2 for row in rows)
-    assert rows[0]["particles"] == generate_scene(SceneConfig(), REPORT_SEED).particle_count
 
 
 def test_no_time_where_a_check_is_red(

@@ -74,8 +74,6 @@ def workloads(config: BenchConfig, device: torch.device) -> list[Workload]:
     gpu = device.type == "cuda"
     particles = config.particles or (GPU_PARTICLES if gpu else CPU_PARTICLES)
     scenes = config.scenes or (GPU_SCENES if gpu else CPU_SCENES)
-    if config.random_scenes:  # which have particles of their own
-        particles = particles[:1]
     single = [Workload(count, 1) for count in particles] if 1 in scenes else []
     return single + [Workload(min(particles), count) for count in scenes if count != 1]
 

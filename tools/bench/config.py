@@ -33,8 +33,6 @@ class BenchConfig:
     rounds: Positive[int] = 50  # samples of each contender
     seconds: Positive[float] = 20.0  # at most for contenders that take turns, once five rounds are done
     mpm_frames: int = 20  # of the solver in one sample
-    # the solver simulates random scenes of a data set, as in mpm_frames=60 'cases=[mpm_frame]' 'scenes=[1,64,256]'
-    random_scenes: bool = False
     device: str = "auto"  # or cpu, cuda, cuda:1
     json: str | None = None  # also write the rows to this file; --json FILE does the same
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from hgn.config import MpmConfig, NetworkConfig, SceneConfig, TrainingConfig
+from hgn.config import MpmConfig, NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
@@ -22,7 +22,6 @@ from hgn.network.gns import GraphNetworkSimulator
 from hgn.runtime.backend import build, fastest_stepped, with_gradients
 from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import Simulator
-from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
 from tools.bench.config import BenchConfig
@@ -129,16 +128,12 @@ class Train(TimedRun):
 
 
 class MpmFrame:
-    """One frame of the solver that makes the data, at its converged step: of the same particles at rest, or of random
-    scenes with obstacles, of which the second half of the frames counts, when most particles have landed.
+    """One frame of the solver that makes the data, at its converged step: of the same particles at rest. What it takes
+    with landed and random scenes is measured by tools.studies.solver_targets.
     """
 
     def __init__(self, work: Workload, config: BenchConfig, device: torch.device) -> None:
-        self.random = config.random_scenes
-        if self.random:
-            self.scenes = [generate_scene(SceneConfig(), REPORT_SEED + i) for i in range(work.scenes)]
-        else:
-            self.scenes = [scene_of(work, seed, config.network.cell_size) for seed in range(work.scenes)]
+        self.scenes = [scene_of(work, seed, config.network.cell_size) for seed in range(work.scenes)]
         self.config = MpmConfig(device="gpu" if device.type == "cuda" else "cpu", scenes_per_launch=work.scenes)
         self.frames = config.mpm_frames
         self.particles = sum(scene.particle_count for scene in self.scenes) // work.scenes
@@ -167,13 +162,10 @@ class MpmFrame:
                 steps += result.counters["substeps"] * scene.particle_count
         particles = sum(scene.particle_count for scene in self.scenes)
         self.substeps = steps / particles / (self.frames - 1)
-        first = 0
-        if self.random:  # frames of one launch end together: from the end of the launch that the middle frame is in
-            first = max(t for t in range(self.frames - 1) if ends[t] <= ends[(self.frames - 1) // 2] + 1e-3)
-        return [(ends[-1] - ends[first]) * 1e3 / (self.frames - 1 - first)]
+        return [(ends[-1] - ends[0]) * 1e3 / (self.frames - 1)]
 
     def timed(self) -> Timed:
-        return Timed(self.sample, 1 if self.random else MPM_ROUNDS)
+        return Timed(self.sample, MPM_ROUNDS)
 
 
 def _data_info() -> DataInfo:

@@ -1,0 +1,277 @@
+"""What passes between the particles of a team's scene and its nodes.
+
+Four threads share a particle, one for each component of a node (x, y and z of momentum or velocity, and mass): together
+they read and add up whole sectors of memory.
+"""
+
+import taichi as ti
+
+from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
+from datagen.mpm.mls_mpm import base_node, ghost_place, node_place, node_places, node_velocity, spline, weights
+from datagen.mpm.team_particles import dealt, get_vector
+
+LANES = 4  # threads that share a particle where it meets the nodes; each has one component of theirs
+MASS = 3  # the component
+
+
+@ti.func
+def _entry(place: ti.i32, component: ti.i32) -> ti.i32:
+    return LANES * place + component
+
+
+@ti.func
+def gather(
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
+    lane: ti.i32,
+    scene: ti.i32,
+    first: ti.i32,
+    particles: ti.i32,
+    stride: ti.i32,
+    velocities: ti.i32,
+    state: ti.template(),
+    hidden: ti.template(),
+    node: ti.template(),
+    setting: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+    ends: ti.i32,
+    variant: ti.template(),
+    threads: ti.template(),
+):
+    """Velocity and its gradient at each particle from the nodes around, at an interval's end their mass too, left in
+    the state.
+    """
+    inverse_dx = setting[SETTING.inverse_cell_size]
+    first_entry = velocities + LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
+    task = lane
+    while task < LANES * owned:
+        p = dealt(task // LANES, part, chunk, blocks)
+        component = task % LANES
+        place = particles + p
+        if component < MASS or ends:
+            scaled = get_vector(state, place, stride, FIELD.position) * inverse_dx
+            base = ti.floor(scaled - 0.5, ti.i32)
+            fx = scaled - ti.cast(base, ti.f32)
+            w0, w1, w2 = weights(fx)
+            w = ti.static((w0, w1, w2))
+            index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
+            total = 0.0
+            gradient = ti.Vector([0.0, 0.0, 0.0])
+            for i in ti.static(range(3)):
+                plane = 0.0
+                plane_y = 0.0
+                plane_z = 0.0
+                for j in ti.static(range(3)):
+                    line = 0.0
+                    line_z = 0.0
+                    for k in ti.static(range(3)):
+                        share = w[k][2] * node[index_x[i] + index_y[j] + index_z[k]]
+                        line += share
+                        line_z += (k - fx[2]) * share
+                    plane += w[j][1] * line
+                    plane_y += w[j][1] * (j - fx[1]) * line
+                    plane_z += w[j][1] * line_z
+                total += w[i][0] * plane
+                gradient += w[i][0] * ti.Vector([(i - fx[0]) * plane, plane_y, plane_z])
+            if ti.static(bool(variant & VARIANT.sheets)):
+                bits = hidden[first + p]
+                if component == MASS:
+                    bits = 0
+                n = 0
+                while bits != 0:
+                    if bits & 1:
+                        index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
+                        offset = ti.cast(index, ti.f32) - scaled
+                        seen = node[velocities + _entry(node_place(index, scene, shape), component)]
+                        change = node[velocities + _entry(ghost_place(index, scene, contact, shape), component)] - seen
+                        change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
+                        total += change
+                        gradient += change * offset
+                    bits >>= 1
+                    n += 1
+            if component == MASS:
+                state[place + FIELD.mass * stride] = total
+            else:
+                state[place + (FIELD.velocity + component) * stride] = total
+                for j in ti.static(range(3)):
+                    state[place + (FIELD.affine + 3 * component + j) * stride] = 4.0 * inverse_dx * gradient[j]
+        task += threads
+
+
+@ti.func
+def scatter(
+    owned: ti.i32,
+    part: ti.i32,
+    chunk: ti.i32,
+    blocks: ti.i32,
+    lane: ti.i32,
+    scene: ti.i32,
+    first: ti.i32,
+    particles: ti.i32,
+    tags: ti.i32,
+    stride: ti.i32,
+    begins: ti.f32,
+    state: ti.template(),
+    tag: ti.template(),
+    hidden: ti.template(),
+    node: ti.template(),
+    setting: ti.template(),
+    law: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+    variant: ti.template(),
+    threads: ti.template(),
+    run: ti.template(),
+):
+    """Adds what each particle gives to its 27 nodes: momentum and mass, in later steps of an interval what forces
+    change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes up a
+    column with them; what it leaves goes to the nodes.
+    """
+    dx = setting[SETTING.cell_size]
+    inverse_dx = setting[SETTING.inverse_cell_size]
+    first_entry = LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
+    task = lane
+    tasks = (owned + run - 1) // run * LANES
+    while task < tasks:
+        component = task % LANES
+        own = task // LANES * run
+        p = dealt(own, part, chunk, blocks)
+        end = p + ti.min(run, owned - own)
+        if begins == 0.0 and component == MASS:
+            p = end
+        gain = ti.Vector([0.0 for _ in range(27)])
+        base = ti.Vector([0, 0, 0])
+        x = ti.Vector([0.0, 0.0, 0.0])
+        if p < end:
+            x = get_vector(state, particles + p, stride, FIELD.position)
+            base = base_node(x, inverse_dx)
+        while p < end:
+            place = particles + p
+            fx = x * inverse_dx - ti.cast(base, ti.f32)
+            w0, w1, w2 = weights(fx)
+            w = ti.static((w0, w1, w2))
+            A = ti.Vector([0.0, 0.0, 0.0])
+            v = 1.0
+            if component < MASS:
+                A = dx * ti.Vector([state[place + (FIELD.affine + 3 * component + j) * stride] for j in range(3)])
+                v = -A.dot(fx)
+                if begins == 1.0:
+                    v += state[place + (FIELD.velocity + component) * stride]
+            if ti.static(bool(variant & VARIANT.several_laws)):
+                scale = law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
+                v *= scale
+                A *= scale
+            bits = 0
+            if ti.static(bool(variant & VARIANT.sheets)):
+                bits = hidden[first + p]
+            for i, j in ti.static(ti.ndrange(3, 3)):
+                weight_xy = w[i][0] * w[j][1]
+                v_xy = v + A[0] * i + A[1] * j
+                for k in ti.static(range(3)):
+                    given = weight_xy * w[k][2] * (v_xy + A[2] * k)
+                    if ti.static(bool(variant & VARIANT.sheets)):
+                        given = 0.0 if (bits >> (9 * i + 3 * j + k)) & 1 else given
+                    gain[9 * i + 3 * j + k] += given
+            if ti.static(bool(variant & VARIANT.sheets)):
+                n = 0
+                while bits != 0:
+                    if bits & 1:
+                        corner = ti.Vector([n // 9, n // 3 % 3, n % 3])
+                        away = ti.cast(corner, ti.f32)
+                        weight = spline(away[0] - fx[0]) * spline(away[1] - fx[1]) * spline(away[2] - fx[2])
+                        ghost = ghost_place(base + corner, scene, contact, shape)
+                        ti.atomic_add(node[_entry(ghost, component)], weight * (v + A.dot(away)))
+                    bits >>= 1
+                    n += 1
+            p += 1
+            following = base
+            if p < end:
+                x = get_vector(state, particles + p, stride, FIELD.position)
+                following = base_node(x, inverse_dx)
+            if p == end or (following != base).any():
+                climbs = p < end and (following == base + ti.Vector([0, 1, 0])).all()
+                index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
+                for i, k in ti.static(ti.ndrange(3, 3)):
+                    ti.atomic_add(node[index_x[i] + index_y[0] + index_z[k]], gain[9 * i + k])
+                    gain[9 * i + k] = gain[9 * i + 3 + k]
+                    gain[9 * i + 3 + k] = gain[9 * i + 6 + k]
+                    gain[9 * i + 6 + k] = 0.0
+                if not climbs:
+                    for i, j, k in ti.static(ti.ndrange(3, 2, 3)):
+                        ti.atomic_add(node[index_x[i] + index_y[j + 1] + index_z[k]], gain[9 * i + 3 * j + k])
+                        gain[9 * i + 3 * j + k] = 0.0
+                base = following
+        task += threads
+
+
+@ti.func
+def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
+    """What came to its momentum, its mass, and its velocity before (none where an interval begins)."""
+    before = ti.Vector([0.0, 0.0, 0.0])
+    if begins == 0.0:
+        before = ti.Vector([node[velocities + place + c] for c in range(3)])
+    return ti.Vector([node[place + c] for c in range(3)]), node[place + MASS], before
+
+
+@ti.func
+def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, node: ti.template()):
+    for c in ti.static(range(3)):
+        node[place + c] = 0.0
+        node[velocities + place + c] = v[c]
+    if ends:
+        node[velocities + place + MASS] = mass
+        node[place + MASS] = 0.0
+
+
+@ti.func
+def update_nodes(
+    member: ti.i32,
+    scene: ti.i32,
+    velocities: ti.i32,
+    begins: ti.f32,
+    ends: ti.i32,
+    block: ti.template(),
+    live: ti.template(),
+    node: ti.template(),
+    fall,
+    scene_value: ti.template(),
+    shape: ti.template(),
+    contact: ti.template(),
+    contact_normal: ti.template(),
+    variant: ti.template(),
+    members: ti.i32,
+):
+    """New velocities of the nodes of all blocks that particles touch."""
+    block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
+    count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
+    n = member
+    while n < count:
+        touched = block[block_list + n // BLOCK_NODES]
+        corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
+        local = n % BLOCK_NODES
+        # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
+        place = _entry(touched * BLOCK_NODES + local, 0)
+        entry = -1
+        if ti.static(bool(variant & VARIANT.contact)):
+            entry = contact[touched * BLOCK_NODES + local]
+        gain, mass, before = _read_node(place, velocities, begins, node)
+        if local == 0:
+            block[touched] = 0
+        if mass > 0.0 or begins == 1.0:
+            v = node_velocity(
+                before, gain, mass, local, 2 * entry, corner, fall, scene, scene_value, shape, contact_normal, variant
+            )
+            _write_node(place, velocities, v, mass, ends, node)
+        if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
+            if entry >= 0 and entry < shape[SHAPE.ghosts]:
+                ghost = _entry(shape[SHAPE.ghost_begin] + entry, 0)
+                gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
+                v = node_velocity(
+                    before_there, gain_there, mass_there, local, 2 * entry + 1, corner, fall, scene, scene_value,
+                    shape, contact_normal, variant,
+                )  # fmt: skip
+                _write_node(ghost, velocities, v, mass_there, ends, node)
+        n += members

@@ -1,0 +1,128 @@
+"""How long a scene's next substep is, for Taichi kernels; see mls_mpm for intervals and gravity."""
+
+import taichi as ti
+
+from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
+
+SPEED_MARGIN = 1.25  # times the way planned for an interval, which a particle that gains speed may go
+
+
+@ti.func
+def raise_maximum(counter: ti.template(), scene: ti.i32, entry: ti.template(), value: ti.f32):
+    """The maximum of a value > 0 and what is there, both by their bits (see layout.Count); NaN is left out."""
+    if value > 0.0:
+        bits = ti.cast(ti.bit_cast(value, ti.i32), ti.i64)
+        if counter[scene, entry] < bits:
+            ti.atomic_max(counter[scene, entry], bits)
+
+
+@ti.func
+def _maximum(counter: ti.template(), scene: ti.i32, entry: ti.template()) -> ti.f32:
+    return ti.bit_cast(ti.cast(counter[scene, entry], ti.i32), ti.f32)
+
+
+@ti.func
+def _parts(whole: ti.f32, longest: ti.f32) -> ti.f32:
+    """Into how many equal parts, none longer than `longest`, a time is cut."""
+    return ti.max(ti.ceil(ti.min(whole / longest, 1e9) - 1e-4), 1.0)
+
+
+@ti.func
+def choose_time_step(
+    scene: ti.i32,
+    scene_value: ti.template(),
+    counter: ti.template(),
+    setting: ti.template(),
+    maximum_substeps: ti.i32,
+):
+    # all that is read, at once and before anything is written: else each would wait for a way to memory of its own
+    remaining = scene_value[scene, VALUE.remaining]
+    status = counter[scene, COUNT.status]
+    least = scene_value[scene, VALUE.least_stiffness]
+    stiffness = ti.max(_maximum(counter, scene, COUNT.stiffness_bits), least, 1e-3)
+    speed_square = _maximum(counter, scene, COUNT.speed_square_bits)
+    largest_speed_square = scene_value[scene, VALUE.largest_speed_square]
+    gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
+    fraction = scene_value[scene, VALUE.stability_fraction]
+    interval = scene_value[scene, VALUE.interval]
+    elapsed = scene_value[scene, VALUE.interval_elapsed]
+    left = scene_value[scene, VALUE.interval_remaining]
+    smallest = scene_value[scene, VALUE.smallest_time_step]
+    last_stiffness = scene_value[scene, VALUE.stiffness]
+    done = ti.cast(counter[scene, COUNT.frame_substeps], ti.i32)
+    substeps = counter[scene, COUNT.substeps]
+    transfers = counter[scene, COUNT.transfers]
+    dx = setting[SETTING.cell_size]
+    fixed = setting[SETTING.fixed_time_step]
+    fixed_substeps = setting[SETTING.fixed_substeps]
+    transfer_interval = setting[SETTING.transfer_interval]
+    speed_fraction = setting[SETTING.speed_fraction]
+    leapfrog = setting[SETTING.leapfrog]
+    step = 0.0
+    if remaining > 0.0 and status == STATUS.running:
+        # what stiffens as it is pressed together goes on to do so in the step
+        growth = ti.max(stiffness / ti.max(last_stiffness, 1e-3), 1.0) if last_stiffness > 0.0 else 1.0
+        limit = fraction * dx / ti.sqrt(stiffness * ti.min(growth, 2.0))
+        begins = left == 0.0
+        shift = 0.0  # from the middle of the last interval to that of the present one is not its length
+        if begins:
+            elapsed = 0.0
+            longest = ti.max(limit, transfer_interval)
+            # the fall within the interval counts too
+            speed = ti.sqrt(speed_square) + gravity.norm() * ti.min(longest, remaining)
+            longest = ti.min(longest, speed_fraction * dx / ti.max(speed, 1e-20))
+            # equal intervals to the end of the frame: no sliver at its end
+            last = interval
+            interval = remaining / _parts(remaining, longest)
+            left = interval
+            if fixed > 0.0:
+                interval = fixed
+            shift = 0.5 * leapfrog * (last - interval)
+        # steps in this interval, and with those after it
+        ahead = _parts(left, limit)
+        total = ahead
+        if remaining > left:
+            total += _parts(remaining - left, interval) * _parts(interval, limit)
+        if fixed > 0.0:
+            ahead = 1.0
+            total = fixed_substeps - ti.cast(done, ti.f32)
+        scene_value[scene, VALUE.stiffness] = stiffness
+        scene_value[scene, VALUE.largest_speed_square] = ti.max(largest_speed_square, speed_square)
+        if not total <= ti.cast(maximum_substeps - done, ti.f32):
+            counter[scene, COUNT.status] = ti.cast(STATUS.too_many_substeps, ti.i64)
+            scene_value[scene, VALUE.remaining] = 0.0
+        else:
+            step = left / ahead
+            if fixed > 0.0:
+                step = fixed
+            remaining -= step
+            left -= step
+            elapsed += step
+            # an interval also ends where material has become much faster in it
+            reach = SPEED_MARGIN * speed_fraction * dx
+            if ahead <= 1.0 or (not begins and elapsed * ti.sqrt(speed_square) > reach):
+                left = 0.0
+            if total <= 1.0:
+                remaining = 0.0
+            scene_value[scene, VALUE.remaining] = remaining
+            scene_value[scene, VALUE.interval] = interval
+            scene_value[scene, VALUE.interval_elapsed] = elapsed
+            scene_value[scene, VALUE.interval_remaining] = left
+            scene_value[scene, VALUE.begins] = ti.cast(begins, ti.f32)
+            scene_value[scene, VALUE.gravity_time] = step + shift
+            scene_value[scene, VALUE.substeps_ahead] = total - 1.0
+            scene_value[scene, VALUE.smallest_time_step] = ti.min(smallest, step)
+            counter[scene, COUNT.transfers] = transfers + ti.cast(begins, ti.i64)
+            counter[scene, COUNT.frame_substeps] = ti.cast(done + 1, ti.i64)
+            counter[scene, COUNT.substeps] = substeps + ti.cast(1, ti.i64)
+            # maxima are gathered anew while the step runs
+            counter[scene, COUNT.stiffness_bits] = ti.cast(0, ti.i64)
+            counter[scene, COUNT.speed_square_bits] = ti.cast(0, ti.i64)
+    scene_value[scene, VALUE.time_step] = step
+
+
+@ti.func
+def falls(scene: ti.i32, scene_value: ti.template()):
+    """What gravity adds to velocities in the present substep."""
+    gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
+    return scene_value[scene, VALUE.gravity_time] * gravity
