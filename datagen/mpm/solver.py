@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -17,7 +18,7 @@ from datagen.mpm.collider import Collider, build_collider
 from datagen.mpm.device import Device, initialise
 from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.launch import Launch, SceneFailure, Simulated, fixed_substeps, no_counters, particle_bounds
-from datagen.mpm.team_launch import MAXIMUM_PARTICLES, Team, TeamLaunch
+from datagen.mpm.team_launch import MAXIMUM_PARTICLES, BlocksApartError, Team, TeamLaunch
 from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.emission import at_entry, require_free_entries
 from hgn.scene.material import material_index
@@ -121,9 +122,17 @@ def simulate(
             team = _team(device, [scene.particle_count for scene in batch[0]])
         teams = _teams_at_once(device, team) if team.blocks > 1 else len(occupied)
         with _arrays_freed_here():
-            outcomes = _launched(
-                TeamLaunch(team, teams, *batch) if team.threads else GridLaunch(device, *batch), frames, on_frame
-            )
+            try:
+                outcomes = _launched(
+                    TeamLaunch(team, teams, *batch) if team.threads else GridLaunch(device, *batch), frames, on_frame
+                )
+            except BlocksApartError:
+                warnings.warn(
+                    f"the {device.kind} does not run {team.blocks} blocks of {team.threads} threads at once, which "
+                    "share a scene: scenes take one launch a substep, which is slower; leave the device to this "
+                    "process alone", RuntimeWarning, stacklevel=2,
+                )  # fmt: skip
+                outcomes = _launched(GridLaunch(device, *batch), frames, on_frame)
         for index, outcome in zip(occupied, outcomes, strict=True):
             results[index] = outcome
     elif on_frame is not None:

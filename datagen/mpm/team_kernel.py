@@ -29,7 +29,17 @@ from datagen.mpm.mls_mpm import (
     settle,
     settles,
 )
-from datagen.mpm.team_meeting import MEETING, choose, meet_and_choose, meet_team, raise_by_warps, wait
+from datagen.mpm.team_meeting import (
+    LEAVES,
+    MEETING,
+    QUEUE,
+    SEGMENT,
+    choose,
+    meet_and_choose,
+    meet_team,
+    raise_by_warps,
+    wait,
+)
 from datagen.mpm.team_particles import (
     dealt,
     get_matrix,
@@ -172,6 +182,7 @@ def advance(
     frames: ti.i32,
     teams: ti.i32,
     blocks: ti.i32,
+    patience: ti.i32,
     frame_s: ti.f32,
     state: Scalars,
     tag: Integers,
@@ -206,7 +217,7 @@ def advance(
     and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, hidden (see grid_kernel.substep) and
     column_list [P] are work space; node [2, G, 4] holds what comes to momentum in a step and to mass in an interval,
     zero between them, and then velocities, with the mass for an interval's end; cell_count [G], column_count [G / 4],
-    the flags in block [3 * G / 64], columns [2 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at
+    the flags in block [3 * G / 64], columns [3 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at
     first; turn [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
@@ -223,8 +234,14 @@ def advance(
         velocities = node.shape[0] // 2
         meetings = 0
         choices = 0
-        segment = 2 * (team * blocks + part)
-        scenes = turn.shape[0] if lane < threads and frames > 0 else 0
+        at = (team + 1) * MEETING
+        segment = SEGMENT * (team * blocks + part)
+        scenes = 0
+        if lane < threads:
+            # whether all blocks are at work at once shows before anything is simulated
+            meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+            if frames > 0 and columns[segment + LEAVES] == 0:
+                scenes = turn.shape[0]
         place_in_turn = team
         while place_in_turn < scenes:
             scene = turn[place_in_turn]
@@ -246,8 +263,8 @@ def advance(
                         counter[scene, COUNT.frame_substeps] = ti.cast(0, ti.i64)
                         scene_value[scene, VALUE.remaining] = frame_s
                     meet_and_choose(
-                        team, lane, scene, meetings, choices, meeting, scene_value, counter, setting, shape, live,
-                        threads, several, blocks,
+                        at, lane, scene, meetings, choices, meeting, columns, segment, patience, scene_value, counter,
+                        setting, shape, live, threads, several, blocks,
                     )  # fmt: skip
                 particles = copy * fields * stride + first
                 tags = copy * TAG.length * stride + first
@@ -256,14 +273,14 @@ def advance(
                     begins = scene_value[scene, VALUE.begins]
                     ends = scene_value[scene, VALUE.interval_remaining] == 0.0
                     fall = falls(scene, scene_value)
-                    going = step > 0.0
+                    going = step > 0.0 and columns[segment + LEAVES] == 0
                     if going:
                         if begins == 1.0:
                             if not sorted_already:
                                 sort(
-                                    owned, part, chunk, blocks, scene, first, copy, segment, team, lane, meetings,
+                                    owned, part, chunk, blocks, scene, first, copy, segment, at, lane, meetings,
                                     stride, state, tag, rank, cell_count, column_count, column_list, columns, live,
-                                    meeting, setting, shape, fields, threads, several,
+                                    meeting, patience, setting, shape, fields, threads, several,
                                 )  # fmt: skip
                                 copy = 1 - copy
                                 particles = copy * fields * stride + first
@@ -285,7 +302,7 @@ def advance(
                             owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, begins, state,
                             tag, hidden, node, setting, law, shape, contact, variant, threads, run,
                         )  # fmt: skip
-                        meet_team(team, lane, meetings, meeting, threads, several, blocks)
+                        meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         # a thread that hardly has nodes of its own, while the others are at theirs
                         if not ends and member == members - 1:
                             choose(scene, scene_value, counter, setting, shape, live)
@@ -293,7 +310,7 @@ def advance(
                             member, scene, velocities, begins, ends, block, live, node, fall, scene_value, shape,
                             contact, contact_normal, variant, members,
                         )  # fmt: skip
-                        meet_team(team, lane, meetings, meeting, threads, several, blocks)
+                        meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         if ends:
                             gather(
                                 owned, part, chunk, blocks, lane, scene, first, particles, stride, velocities, state,
@@ -305,8 +322,8 @@ def advance(
                                 scene_value, counter, setting, shape, contact, contact_normal, variant, threads,
                             )  # fmt: skip
                             meet_and_choose(
-                                team, lane, scene, meetings, choices, meeting, scene_value, counter, setting, shape,
-                                live, threads, several, blocks,
+                                at, lane, scene, meetings, choices, meeting, columns, segment, patience, scene_value,
+                                counter, setting, shape, live, threads, several, blocks,
                             )  # fmt: skip
                 own = lane
                 while own < owned:
@@ -318,12 +335,15 @@ def advance(
                 if member == 0 and counter[scene, COUNT.status] == STATUS.running:
                     live[live_at + LIVE.frames] += 1
                 frame += 1
+                if columns[segment + LEAVES] != 0:
+                    frame = frames
+                    scenes = 0
             if member == 0:
                 live[live_at + LIVE.copy] = copy
-                meeting[team * MEETING + 2 * MEETING // 3] = teams + ti.atomic_add(meeting[teams * MEETING], 1)
-            meet_team(team, lane, meetings, meeting, threads, several, blocks)
-            place_in_turn = meeting[team * MEETING + 2 * MEETING // 3]
-            meet_team(team, lane, meetings, meeting, threads, several, blocks)
+                meeting[at + 2 * MEETING // 3] = teams + ti.atomic_add(meeting[QUEUE], 1)
+            meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
+            place_in_turn = meeting[at + 2 * MEETING // 3]
+            meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
 
 
 @ti.kernel

@@ -16,7 +16,7 @@ from hgn.schema import ConfigError
 import taichi as ti  # isort: skip
 
 from datagen.mpm import team_kernel  # isort: skip
-from datagen.mpm.team_meeting import MEETING  # isort: skip
+from datagen.mpm.team_meeting import APART, MEETING, SEGMENT  # isort: skip
 from datagen.mpm.team_transfers import LANES  # isort: skip
 
 LAUNCH_SECONDS = 3.0  # aimed at: one launch runs as many frames as fit in; scenes wait for each other at its end
@@ -24,6 +24,7 @@ MAXIMUM_OUTPUT_BYTES = 2**30  # of positions, a launch
 MAXIMUM_PARTICLES = (2**31 - 1) // (2 * FIELD.solid)  # whose fields kernels count in int32
 PAUSE = 0.8  # of the time that a launch is expected to take
 SHORT_SECONDS = 0.1  # of a launch that nobody sleeps for
+PATIENCE = (2**31 - 1, 2**22)  # looks at a counter, of a CPU's and a GPU's block: seconds
 
 
 class Team(NamedTuple):
@@ -32,6 +33,10 @@ class Team(NamedTuple):
     threads: int  # of a block: of a GPU a multiple of 32, of a CPU 1; 0: nobody, but one launch a substep
     blocks: int = 1
     run: int = 8  # particles in the order of their cells, that a thread adds up before it adds to nodes
+
+
+class BlocksApartError(Exception):
+    """Blocks that wait for each other were not all at work at once."""
 
 
 class TeamLaunch(Launch):
@@ -59,7 +64,7 @@ class TeamLaunch(Launch):
         self.block = ti.ndarray(ti.i32, 3 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING)
-        self.columns = ti.ndarray(ti.i32, 2 * self.teams * team.blocks)
+        self.columns = ti.ndarray(ti.i32, SEGMENT * self.teams * team.blocks)
         for array in (self.cell_count, self.column_count, self.block, self.columns, self.node):
             array.fill(0)
         self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))
@@ -88,6 +93,7 @@ class TeamLaunch(Launch):
         done, size, substeps, expected = 0, min(1, frames), np.zeros(len(self.scenes), np.int64), 0.0
         work = np.array([scene.particle_count for scene in self.scenes])
         self._launch(0, work)  # compiles
+        self._require_together()
         begin, output = time.perf_counter(), self._launch(size, work)
         while size:
             # Taichi holds the interpreter's lock while it waits for the device: other threads run before that
@@ -99,6 +105,7 @@ class TeamLaunch(Launch):
             taken = time.perf_counter() - begin
             if pause > SHORT_SECONDS and taken < 1.05 * (woken - begin):  # it was done before, nobody knows when
                 taken *= 0.5
+            self._require_together()
             total = self.counter.to_numpy()[:, COUNT.substeps]
             completed = self.live.to_numpy().reshape(-1, LIVE.length)[:, LIVE.frames].astype(np.int64)
             work, substeps = (total - substeps) * np.diff(self.particle_begin), total
@@ -111,6 +118,10 @@ class TeamLaunch(Launch):
             begin, output = time.perf_counter(), self._launch(size, work)
             yield position, completed
 
+    def _require_together(self) -> None:
+        if self.team.blocks > 1 and self.meeting.to_numpy()[APART]:
+            raise BlocksApartError
+
     def _launch(self, frames: int, work: np.ndarray) -> ti.ScalarNdarray:
         """Starts that many frames of the scenes, long ones first so that none is left alone at the end; the positions
         once the device is done.
@@ -119,9 +130,10 @@ class TeamLaunch(Launch):
         self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
         self.meeting.fill(0)
         team_kernel.advance(
-            frames, self.teams, self.team.blocks, self.frame_s, self.state, self.tag, self.rank, self.hidden,
-            self.cell_count, self.column_count, self.column_list, self.block, self.live, self.columns, self.meeting,
-            self.node, self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact,
-            self.contact_normal, output, self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
+            frames, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s, self.state, self.tag,
+            self.rank, self.hidden, self.cell_count, self.column_count, self.column_list, self.block, self.live,
+            self.columns, self.meeting, self.node, self.turn, self.scene_value, self.counter, self.setting, self.law,
+            self.shape, self.contact, self.contact_normal, output, self.variant, self.team.threads, self.team.blocks >
+            1, self.team.run,
         )  # fmt: skip
         return output

@@ -1,6 +1,9 @@
 """How the thread blocks of a team wait for each other: at a counter in global memory, where several share a scene.
 
-`threads` of a block are 1 on a CPU, where nothing has to be waited for within it.
+`threads` of a block are 1 on a CPU, where nothing has to be waited for within it. A block looks at the counter so often
+at most, the `patience`: where blocks that it waits for are not at work at the same time, it would wait for ever. Then
+it says so in meeting[APART] and in columns[segment + LEAVES], and all leave the launch, whose results are worth
+nothing.
 """
 
 import taichi as ti
@@ -10,6 +13,9 @@ from datagen.mpm.time_step import choose_time_step, raise_maximum
 
 WARP = 32
 MEETING = 96  # integers of a team, in thirds: how many blocks have come, how often all were let go, its next scene
+QUEUE, APART = 0, 1  # before the teams' own: scenes that were taken, and whether blocks are not at work at once
+SEGMENT, LEAVES = 3, 2  # integers of a block, and which of them says that it leaves
+LOOKS = 64  # at a counter, between two at whether all leave
 
 
 @ti.func
@@ -27,18 +33,39 @@ def fence(threads: ti.template()):
 
 
 @ti.func
-def await_count(meeting: ti.template(), entry: ti.i32, target: ti.i32, threads: ti.template()):
-    while ti.atomic_max(meeting[entry], 0) < target:  # Taichi has no load that passes by the caches
-        pass
+def await_count(
+    meeting: ti.template(),
+    entry: ti.i32,
+    target: ti.i32,
+    columns: ti.template(),
+    segment: ti.i32,
+    patience: ti.i32,
+    threads: ti.template(),
+):
+    looks = 0
+    while looks >= 0:
+        if ti.atomic_max(meeting[entry], 0) >= target:  # Taichi has no load that passes by the caches
+            looks = -1
+        else:
+            looks += 1
+            if looks % LOOKS == 0:
+                apart = ti.atomic_max(meeting[APART], 0)
+                if apart > 0 or looks >= patience:
+                    ti.atomic_max(meeting[APART], 1)
+                    columns[segment + LEAVES] = 1
+                    looks = -1
     fence(threads)
 
 
 @ti.func
 def meet_team(
-    team: ti.i32,
+    at: ti.i32,
     lane: ti.i32,
     meetings: ti.template(),
     meeting: ti.template(),
+    columns: ti.template(),
+    segment: ti.i32,
+    patience: ti.i32,
     threads: ti.template(),
     several: ti.template(),
     blocks: ti.i32,
@@ -49,8 +76,8 @@ def meet_team(
         if lane == 0:
             meetings += 1
             fence(threads)
-            ti.atomic_add(meeting[team * MEETING], 1)
-            await_count(meeting, team * MEETING, meetings * blocks, threads)
+            ti.atomic_add(meeting[at], 1)
+            await_count(meeting, at, meetings * blocks, columns, segment, patience, threads)
         wait(threads)
 
 
@@ -70,12 +97,15 @@ def choose(
 
 @ti.func
 def meet_and_choose(
-    team: ti.i32,
+    at: ti.i32,
     lane: ti.i32,
     scene: ti.i32,
     meetings: ti.template(),
     choices: ti.template(),
     meeting: ti.template(),
+    columns: ti.template(),
+    segment: ti.i32,
+    patience: ti.i32,
     scene_value: ti.template(),
     counter: ti.template(),
     setting: ti.template(),
@@ -93,7 +123,7 @@ def meet_and_choose(
             meetings += 1
             choices += 1
             fence(threads)
-            if ti.atomic_add(meeting[team * MEETING], 1) != meetings * blocks - 1:
+            if ti.atomic_add(meeting[at], 1) != meetings * blocks - 1:
                 last = 0
         if last == 1:
             if ti.static(several):
@@ -101,9 +131,9 @@ def meet_and_choose(
             choose(scene, scene_value, counter, setting, shape, live)
             if ti.static(several):
                 fence(threads)
-                ti.atomic_add(meeting[team * MEETING + MEETING // 3], 1)
+                ti.atomic_add(meeting[at + MEETING // 3], 1)
         if ti.static(several):
-            await_count(meeting, team * MEETING + MEETING // 3, choices, threads)
+            await_count(meeting, at + MEETING // 3, choices, columns, segment, patience, threads)
     wait(threads)
 
 

@@ -76,7 +76,7 @@ def sort(
     first: ti.i32,
     copy: ti.i32,
     segment: ti.i32,
-    team: ti.i32,
+    at: ti.i32,
     lane: ti.i32,
     meetings: ti.template(),
     stride: ti.i32,
@@ -89,6 +89,7 @@ def sort(
     columns: ti.template(),
     live: ti.template(),
     meeting: ti.template(),
+    patience: ti.i32,
     setting: ti.template(),
     shape: ti.template(),
     fields: ti.template(),
@@ -99,13 +100,15 @@ def sort(
     own = lane
     while own < owned:
         p = dealt(own, part, chunk, blocks)
-        at = _cell(get_vector(state, copy * fields * stride + first + p, stride, FIELD.position), scene, setting, shape)
-        rank[first + p] = ti.atomic_add(cell_count[at], 1)
-        if ti.atomic_add(column_count[at // BLOCK], 1) == 0:
+        cell = _cell(
+            get_vector(state, copy * fields * stride + first + p, stride, FIELD.position), scene, setting, shape
+        )
+        rank[first + p] = ti.atomic_add(cell_count[cell], 1)
+        if ti.atomic_add(column_count[cell // BLOCK], 1) == 0:
             listed = ti.atomic_add(columns[segment], 1)
-            column_list[first + dealt(listed, part, chunk, blocks)] = at // BLOCK
+            column_list[first + dealt(listed, part, chunk, blocks)] = cell // BLOCK
         own += threads
-    meet_team(team, lane, meetings, meeting, threads, several, blocks)
+    meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
     # the columns that a block came upon first stay together
     c = lane
     while c < columns[segment]:
@@ -124,13 +127,14 @@ def sort(
             cell_count[column * BLOCK + n] = begin
             begin += count
         c += threads
-    meet_team(team, lane, meetings, meeting, threads, several, blocks)
+    meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
     own = lane
     while own < owned:
         p = dealt(own, part, chunk, blocks)
         source = copy * fields * stride + first + p
-        at = _cell(get_vector(state, source, stride, FIELD.position), scene, setting, shape)
-        place = first + cell_count[at] + rank[first + p]
+        cell = _cell(get_vector(state, source, stride, FIELD.position), scene, setting, shape)
+        # within memory also where blocks leave, and counts are not whole
+        place = ti.min(first + cell_count[cell] + rank[first + p], stride - 1)
         target = (1 - copy) * fields * stride + place
         for group in ti.static(range(0, fields, COPIED)):
             values = ti.Vector([state[source + field * stride] for field in range(group, min(group + COPIED, fields))])
@@ -139,7 +143,7 @@ def sort(
         for i in ti.static(range(TAG.length)):
             tag[((1 - copy) * TAG.length + i) * stride + place] = tag[(copy * TAG.length + i) * stride + first + p]
         own += threads
-    meet_team(team, lane, meetings, meeting, threads, several, blocks)
+    meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
     c = lane
     while c < columns[segment]:
         column = column_list[first + dealt(c, part, chunk, blocks)]

@@ -6,7 +6,7 @@ A GPU runs it with hundreds of threads a block; here a block has one, and two bl
 import numpy as np
 import pytest
 
-from datagen.mpm import team_launch
+from datagen.mpm import solver, team_launch
 from datagen.mpm.device import Device
 from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, _teams_at_once, simulate
 from hgn.config import MpmConfig
@@ -82,6 +82,20 @@ def test_who_runs_many_scenes() -> None:
     assert _team(gpu, [4_000, *[3_000] * 255]) == _team(gpu, [4_000] * 100) == _team(gpu, [4_000] * 300) == Team(256, 8)
     assert _team(gpu, [4_000] * 50) == Team(256, 5)
     assert _team(gpu, [4_000]) == Team(128, 264, 1)
+
+
+def test_blocks_that_are_not_at_work_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three blocks on two threads, that would wait for ever: all leave, a warning says so, and each substep is a launch
+    of its own, with the same result.
+    """
+    monkeypatch.setattr(solver, "_teams_at_once", lambda device, team: 1)
+    monkeypatch.setattr(team_launch, "PATIENCE", (10_000, 10_000))
+    scene = mixed(120, 0, (0, -3, 0))
+    (expected,) = simulate([scene], CONFIG, 4, 60.0)
+    with pytest.warns(RuntimeWarning, match="does not run 3 blocks of 1 threads at once"):
+        (found,) = simulate([scene], CONFIG, 4, 60.0, team=Team(1, 3, 1))
+    assert isinstance(expected, Simulated) and isinstance(found, Simulated)
+    assert np.array_equal(found.position_TN3, expected.position_TN3)
 
 
 def test_more_blocks_than_run_at_once() -> None:
