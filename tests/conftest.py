@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,19 +36,21 @@ sys.path.insert(0, str(Path(__file__).parent / "datagen"))  # spawned workers fi
 
 import ballistic_dataset
 import ballistic_solver
+from ballistic_dataset import MakeConfig, MakeDataset, Stage
 
 from datagen.pool.worker import Backend
-from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig
 
-LONGEST_FILES = (  # ten seconds and more of one core; begun last, one of them would run alone
-    *("viewer/test_page",),
-    *("datagen/mpm/test_solver", "jobs/test_jobs", "docs/test_tutorials", "kernels/test_triton_compat"),
-    *("tools/test_error_vs_time", "tools/test_scaling", "training/test_ddp", "kernels/test_kernels_alone"),
-    *("datagen/test_pool", "datagen/test_service", "datagen/test_command", "training/test_precompile"),
-    *("end_to_end/test_datagen", "end_to_end/test_bad_input", "kernels/test_rollout", "kernels/test_update"),
-    *("network/test_network", "kernels/test_network", "training/test_train", "training/test_resume"),
-    *("tools/test_bench", "scene/test_random_scene", "training/test_live_service", "end_to_end/test_wheel"),
+LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
+    *("viewer/test_page", "datagen/mpm/test_solver", "datagen/mpm/test_validation"),
+    *("training/test_ddp", "jobs/test_jobs"),
+    *("kernels/test_triton_compat", "network/test_network", "datagen/test_command", "datagen/test_pool"),
+    *("tools/test_bench", "kernels/test_rollout", "docs/test_tutorials", "end_to_end/test_bad_input"),
+    *("tools/test_stability_network", "end_to_end/test_datagen", "kernels/test_kernels_alone", "datagen/test_kills"),
+    *("training/test_generator", "training/test_train", "scene/test_random_scene", "end_to_end/test_wheel"),
+    *("tools/test_error_vs_time", "kernels/test_relative", "kernels/test_update", "jobs/test_queue"),
+    *("datagen/test_service", "training/test_resume", "training/test_live_service", "kernels/test_memory"),
+    *("test_command", "kernels/test_symmetry", "kernels/test_network", "training/test_precompile"),
 )
 
 
@@ -89,32 +93,48 @@ def control(backend: Backend, tmp_path: Path) -> Path:
     return tmp_path / "control"
 
 
-@pytest.fixture
-def make_config(tmp_path: Path) -> Callable[..., DatagenConfig]:
-    def make(**changes: Any) -> DatagenConfig:
-        values = {
-            "folder": str(tmp_path / "data"),
-            "training_scenes": 5,
-            "validation_scenes": 2,
-            "test_scenes": 1,
-            "frames": 6,
-            "workers": 1,
-        }
-        return DatagenConfig(dataset=DatasetConfig(**(values | changes)))
-
-    return make
+def small_config(folder: Path, **changes: Any) -> DatagenConfig:
+    values = {"training_scenes": 5, "validation_scenes": 2, "test_scenes": 1, "frames": 6, "workers": 1}
+    return DatagenConfig(dataset=DatasetConfig(**({"folder": str(folder)} | values | changes)))
 
 
 @pytest.fixture
-def stage(backend: Backend) -> Callable[[DatasetWriter, str, int], None]:
+def make_config(tmp_path: Path) -> MakeConfig:
+    return partial(small_config, folder=tmp_path / "data")
+
+
+@pytest.fixture
+def stage(backend: Backend) -> Stage:
     """Simulates one episode in this process and stages it; the writer claims what comes before it too."""
     return ballistic_dataset.stage
 
 
 @pytest.fixture
-def make_dataset(backend: Backend) -> Callable[[DatagenConfig], Path]:
+def make_dataset(backend: Backend) -> MakeDataset:
     """Makes a whole data set without any worker process."""
     return ballistic_dataset.make_dataset
+
+
+@pytest.fixture(scope="session")
+def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What tests that do not make one themselves get a copy of."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(ballistic_solver.FOLDER_VARIABLE, str(tmp_path_factory.mktemp("control")))
+        return ballistic_dataset.make_dataset(small_config(tmp_path_factory.mktemp("small") / "data"))
+
+
+@pytest.fixture
+def data(make_config: MakeConfig, small_dataset: Path) -> DatagenConfig:
+    """The configuration of a small data set, which is there."""
+    config = make_config()
+    shutil.copytree(small_dataset, config.dataset.folder)
+    return config
+
+
+@pytest.fixture
+def folder(data: DatagenConfig) -> Path:
+    """Its folder."""
+    return Path(data.dataset.folder)
 
 
 @pytest.fixture(scope="session")

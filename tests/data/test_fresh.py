@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from datagen.generate import datagen_config
-from hgn.config import DatagenConfig
 from hgn.data.fresh import draw_fresh, read_fresh, set_record
 from hgn.data.manifest import Manifest
 from hgn.data.storage import file_sha256
@@ -56,11 +54,8 @@ def test_what_reports_say_of_a_set(weights: Path, tmp_path: Path) -> None:
         read_fresh(folder)
 
 
-def test_what_is_no_fresh_set_is_refused(
-    weights: Path, tmp_path: Path, make_config: Callable[..., DatagenConfig], make_dataset: Callable[..., Path]
-) -> None:
+def test_what_is_no_fresh_set_is_refused(weights: Path, tmp_path: Path, folder: Path) -> None:
     """A data set that is there, weights that changed since, files that are not there, a seed that is given, a URL."""
-    folder = make_dataset(make_config())
     assert Manifest.load(folder).complete
     with pytest.raises(ConfigError, match=r"frozen must be left out: .* holds a data set whose seed was chosen before"):
         draw_fresh(folder, [str(weights)])

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from written_files import MakeConfig, MakeDataset, Stage, first_release, hashes
+from ballistic_dataset import MakeConfig, MakeDataset, Stage
+from written_files import first_release, hashes
 
 import hgn.data.index
 import hgn.data.reader

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from ballistic_dataset import MakeConfig
 from written_files import first_release
 
-from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_differences, identity_hash
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import EpisodeEntry, Manifest, QuarantinedScene, ShardEntry
@@ -82,7 +81,7 @@ def test_wrong_manifest(tmp_path: Path) -> None:
             Manifest.load(tmp_path)
 
 
-def test_identity_survives_json(make_config: Callable[..., DatagenConfig]) -> None:
+def test_identity_survives_json(make_config: MakeConfig) -> None:
     """The identity in a manifest hashes to the manifest's hash, in any key order."""
     identity = dataset_identity(make_config())
     reread = json.loads(json.dumps(dict(reversed(identity.items()))))

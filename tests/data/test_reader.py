@@ -6,29 +6,21 @@ import dataclasses
 import json
 import os
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from ballistic_dataset import MakeConfig, MakeDataset
 from written_files import first_release
 
 import hgn.data.storage
 from datagen.pool.writer import DatasetWriter
-from hgn.config import DatagenConfig, SceneConfig
+from hgn.config import SceneConfig
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.shard import locate_members
 from hgn.schema import ConfigError
-
-MakeConfig = Callable[..., DatagenConfig]
-MakeDataset = Callable[[DatagenConfig], Path]
-
-
-@pytest.fixture
-def folder(make_config: MakeConfig, make_dataset: MakeDataset) -> Path:
-    return make_dataset(make_config())
 
 
 def test_positions_are_read_only_memory_maps(folder: Path) -> None:

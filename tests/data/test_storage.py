@@ -24,13 +24,13 @@ import fsspec
 import numpy as np
 import pytest
 import uvicorn
+from ballistic_dataset import MakeConfig, MakeDataset
 from written_files import first_release
 
 import hgn.data.storage
 from datagen.service.server import make_app, make_server
 from datagen.service.supervisor import PoolState
 from hgn.command import run_command
-from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import (
@@ -46,8 +46,6 @@ from hgn.data.storage import (
 )
 from hgn.schema import ConfigError
 
-MakeConfig = Callable[..., DatagenConfig]
-MakeDataset = Callable[[DatagenConfig], Path]
 TOKEN = "correct-horse-battery"
 
 
@@ -57,11 +55,6 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
     monkeypatch.setattr(hgn.data.storage, "_FIRST_PAUSE_S", 0.01)
     return tmp_path / "cache" / "shards"
-
-
-@pytest.fixture
-def folder(make_config: MakeConfig, make_dataset: MakeDataset) -> Path:
-    return make_dataset(make_config())
 
 
 def in_memory(folder: Path, name: str) -> str:

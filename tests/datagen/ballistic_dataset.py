@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import ballistic_solver
@@ -10,6 +11,10 @@ from datagen.pool.shard import stage_episode
 from datagen.pool.worker import MadeScene, make_episode
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig
+
+MakeConfig = Callable[..., DatagenConfig]
+MakeDataset = Callable[[DatagenConfig], Path]
+Stage = Callable[[DatasetWriter, str, int], None]
 
 
 def stage(writer: DatasetWriter, split: str, index: int) -> None:

@@ -9,11 +9,12 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
+from ballistic_dataset import MakeConfig, MakeDataset
+from docs.pages import run_module
 from processes import processes_of_session, wait_until
 
 from datagen.__main__ import main
@@ -27,11 +28,10 @@ ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["scenes=3", "dataset.validation_scenes=1", "dataset.test_scenes=0", "dataset.frames=5", "dataset.workers=1"]
 
 
-def start(*arguments: str, ballistic: bool = True, **options: object) -> subprocess.Popen[str]:
-    module = "ballistic_command" if ballistic else "datagen"
+def start(*arguments: str, **options: object) -> subprocess.Popen[str]:
     path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
     return subprocess.Popen(
-        [sys.executable, "-m", module, *arguments],
+        [sys.executable, "-m", "ballistic_command", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -41,8 +41,8 @@ def start(*arguments: str, ballistic: bool = True, **options: object) -> subproc
     )
 
 
-def run(*arguments: str, ballistic: bool = True, **options: object) -> tuple[int, str, str]:
-    process = start(*arguments, ballistic=ballistic, **options)
+def run(*arguments: str, **options: object) -> tuple[int, str, str]:
+    process = start(*arguments, **options)
     output, errors = process.communicate(timeout=60)
     return process.returncode, output, errors
 
@@ -133,14 +133,21 @@ def test_faults_of_ours_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) ->
         run_command(fail, "datagen")
 
 
-def test_help_and_config_print(tmp_path: Path) -> None:
+def test_help_and_config_print(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Hydra's own options work and start nothing."""
-    code, output, _ = run("--help", cwd=tmp_path, ballistic=False)
-    assert code == 0 and "makes a data set, or completes one" in output
-    code, output, _ = run("--cfg", "job", *SMALL, cwd=tmp_path, ballistic=False)
-    assert code == 0 and "training_scenes: 800" in output and yaml.safe_load(output)["scenes"] == 3
-    code, experiment, _ = run("--cfg", "job", "experiment=demo", cwd=tmp_path, ballistic=False)
-    assert code == 0 and run("--cfg", "job", "+experiment=demo", cwd=tmp_path, ballistic=False)[1] == experiment
+    monkeypatch.chdir(tmp_path)
+
+    def printed(*arguments: str) -> str:
+        assert run_module("datagen", arguments) == 0
+        return capfd.readouterr().out
+
+    assert "makes a data set, or completes one" in printed("--help")
+    output = printed("--cfg", "job", *SMALL)
+    assert "training_scenes: 800" in output and yaml.safe_load(output)["scenes"] == 3
+    experiment = printed("--cfg", "job", "experiment=demo")
+    assert printed("--cfg", "job", "+experiment=demo") == experiment
     assert yaml.safe_load(experiment)["name"] == "demo"
     assert list(tmp_path.iterdir()) == []
 
@@ -215,8 +222,8 @@ def test_two_generators_at_once(
     backend: object,
     control: Path,
     tmp_path: Path,
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
+    make_config: MakeConfig,
+    make_dataset: MakeDataset,
 ) -> None:
     """The same command twice on one folder, at once: each scene is simulated and each shard published once, both end
     with the whole data set, and it is bitwise the one that a single generator makes."""

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from ballistic_dataset import MakeConfig, MakeDataset
 
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
@@ -17,8 +18,6 @@ from hgn.schema import ConfigError
 from tools.studies.kills import TARGETS, KillsConfig, differences, equal_shards, generate_with_kills
 
 ROOT = Path(__file__).resolve().parents[2]
-MakeConfig = Callable[..., DatagenConfig]
-MakeDataset = Callable[[DatagenConfig], Path]
 
 
 @pytest.fixture

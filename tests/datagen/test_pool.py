@@ -5,12 +5,12 @@ from __future__ import annotations
 import multiprocessing
 import shutil
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from ballistic_dataset import MakeConfig, MakeDataset
 
 from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import LocalWorkerFactory, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
@@ -22,7 +22,6 @@ from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.schema import ConfigError
 
-MakeConfig = Callable[..., DatagenConfig]
 ONE = WorkerPlan(solvers=1, threads=1, makers=1, scenes_per_launch=1, first_launch=1)
 
 
@@ -61,9 +60,7 @@ def simulated(control: Path) -> list[int]:
     return [int(line) for line in (control / "simulated.log").read_text().split()]
 
 
-def test_whole_dataset(
-    make_config: MakeConfig, make_dataset: Callable[[DatagenConfig], Path], backend: Backend, tmp_path: Path
-) -> None:
+def test_whole_dataset(make_config: MakeConfig, make_dataset: MakeDataset, backend: Backend, tmp_path: Path) -> None:
     """Two solvers in processes of their own make the same shards, bitwise, as one loop in this process; they end in
     order, for only then Taichi writes what it compiled to its cache."""
     config = make_config()

@@ -6,10 +6,10 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from ballistic_dataset import MakeConfig
 
 from datagen.pool.pool import WorkerPlan
 from datagen.pool.ray_workers import RayWorkerFactory, plan_cluster
@@ -44,7 +44,7 @@ def test_lost_node(
     assert report["differences"] == [] and report["shards_bitwise_equal"] == report["shards"] == 7
 
 
-def test_no_cluster(make_config: Callable[..., DatagenConfig], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_cluster(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without Ray, or without a cluster, the message says what to do."""
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"needs Ray, which is not installed; pip install 'hgn\[ray\]'"):

@@ -18,6 +18,7 @@ from typing import Any
 from urllib.parse import unquote
 
 import pytest
+from ballistic_dataset import MakeConfig
 from processes import processes_of_session, wait_until
 
 import datagen.service.server
@@ -29,13 +30,10 @@ from datagen.service.__main__ import main
 from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState, Supervisor
 from hgn.command import run_command
-from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.storage import TOKEN_VARIABLE, file_sha256
 from hgn.schema import to_mapping
 
-MakeConfig = Callable[..., DatagenConfig]
-MakeDataset = Callable[[DatagenConfig], Path]
 Ask = Callable[..., tuple[int, dict[str, str], bytes]]
 ROOT = Path(__file__).resolve().parents[2]
 TOKEN = "correct-horse-battery"
@@ -45,11 +43,6 @@ SHARD = "/train-000002-000004.tar"
 @pytest.fixture(autouse=True)
 def no_long_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(datagen.service.supervisor, "_FIRST_PAUSE_S", 0.1)
-
-
-@pytest.fixture
-def folder(make_config: MakeConfig, make_dataset: MakeDataset) -> Path:
-    return make_dataset(make_config())
 
 
 Answer = tuple[int, dict[str, str], bytes]
@@ -373,10 +366,9 @@ def test_bad_input_is_one_line(
 
 
 def test_another_data_set_is_not_served(
-    make_config: MakeConfig, make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
 ) -> None:
     """A folder with another data set, or one of another version, ends the service with exit code 2."""
-    folder = make_dataset(make_config())
     assert run_service([f"out={folder}", "port=0", "dataset.seed=7"], monkeypatch) == 2
     assert "holds another data set: frames is 6 there" in capsys.readouterr().err
     mapping = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from written_files import MakeConfig, MakeDataset, Stage, claim_all, hashes, snapshot
+from ballistic_dataset import MakeConfig, MakeDataset, Stage
+from written_files import claim_all, hashes, snapshot
 
 import datagen.pool.shard
 import datagen.pool.writer
@@ -100,9 +101,8 @@ def test_growth_keeps_what_is_there(
 
 
 @pytest.mark.parametrize("count", [5, 3])
-def test_complete_folder_stays_untouched(make_config: MakeConfig, make_dataset: MakeDataset, count: int) -> None:
+def test_complete_folder_stays_untouched(make_config: MakeConfig, folder: Path, count: int) -> None:
     """Asking again for what is there, or for less of it, changes no file."""
-    folder = make_dataset(make_config())
     before = snapshot(folder)
     with DatasetWriter(make_config(training_scenes=count)) as writer:
         assert writer.complete and writer.claim_next() is None

@@ -7,24 +7,20 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import fsspec
 import pytest
+from ballistic_dataset import MakeConfig, MakeDataset
 
 import hgn.data.storage
 from datagen.upload import main
 from hgn.command import run_command
-from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import CACHE_VARIABLE
 from hgn.schema import ConfigError
-
-MakeConfig = Callable[..., DatagenConfig]
-MakeDataset = Callable[[DatagenConfig], Path]
 
 
 @pytest.fixture(autouse=True)
@@ -60,11 +56,8 @@ def test_copy_is_the_data_set(make_config: MakeConfig, make_dataset: MakeDataset
     }
 
 
-def test_copying_that_is_cut_off(
-    make_config: MakeConfig, make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch, store: Any
-) -> None:
+def test_copying_that_is_cut_off(folder: Path, monkeypatch: pytest.MonkeyPatch, store: Any) -> None:
     """Whatever copying ends at, nothing is listed that is not there; and the same command completes it."""
-    folder = make_dataset(make_config())
     real = type(store).put_file
     sent = 0
 

@@ -17,7 +17,8 @@ import ballistic_solver
 import numpy as np
 import pytest
 import webdataset
-from written_files import MakeConfig, MakeDataset, Stage, claim_all, hashes
+from ballistic_dataset import MakeConfig, MakeDataset, Stage
+from written_files import claim_all, hashes
 
 from datagen.pool.plan import ShardRange
 from datagen.pool.writer import DatasetWriter
@@ -30,9 +31,8 @@ from hgn.schema import ConfigError
 from tools.studies.kills import verified_shards
 
 
-def test_dataset_is_complete_and_in_order(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_dataset_is_complete_and_in_order(folder: Path) -> None:
     """Every episode is published in shards of growing size; the manifest's last revision lists them all."""
-    folder = make_dataset(make_config())
     manifest = Manifest.load(folder)
     assert manifest.complete and manifest.revision == len(manifest.shards)
     assert [shard.name for shard in manifest.shards] == [
@@ -54,9 +54,8 @@ def test_same_input_gives_same_bytes(make_config: MakeConfig, make_dataset: Make
     assert (folders[0] / "manifest.json").read_bytes() == (folders[1] / "manifest.json").read_bytes()
 
 
-def test_headers_tell_nothing_of_the_machine(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_headers_tell_nothing_of_the_machine(folder: Path) -> None:
     """Tar headers hold no time, owner or umask."""
-    folder = make_dataset(make_config())
     with tarfile.open(folder / "train-000002-000004.tar") as tar:
         for info in tar:
             assert (info.mtime, info.uid, info.gid, info.uname, info.gname, info.mode) == (0, 0, 0, "", "", 0o644)
@@ -64,9 +63,8 @@ def test_headers_tell_nothing_of_the_machine(make_config: MakeConfig, make_datas
 
 # WebDataset leaves the file it iterated over to the garbage collector
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
-def test_plain_tar_and_webdataset_read_shards(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_plain_tar_and_webdataset_read_shards(folder: Path) -> None:
     """Any tar program and a plain WebDataset pipeline read a shard without this project."""
-    folder = make_dataset(make_config())
     shard = folder / "train-000002-000004.tar"
     names = subprocess.run(["tar", "-tf", shard], capture_output=True, text=True, check=True).stdout.split()
     assert names[:6] == [
@@ -89,9 +87,8 @@ def test_plain_tar_and_webdataset_read_shards(make_config: MakeConfig, make_data
         assert sample["json"]["seed"] == episode.seed
 
 
-def test_offsets_lead_to_the_data(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_offsets_lead_to_the_data(folder: Path) -> None:
     """The manifest's offsets hold a whole .npy file each, so a window of frames can be read alone."""
-    folder = make_dataset(make_config())
     for shard in Manifest.load(folder).shards:
         content = (folder / shard.name).read_bytes()
         for entry in shard.episodes:
@@ -100,9 +97,8 @@ def test_offsets_lead_to_the_data(make_config: MakeConfig, make_dataset: MakeDat
             assert position.shape == (entry.frames, entry.particles, 3)
 
 
-def test_manifest_statistics_equal_direct_ones(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_manifest_statistics_equal_direct_ones(folder: Path) -> None:
     """Statistics over all shards of a split equal those computed from all its episodes at once."""
-    folder = make_dataset(make_config())
     statistics = Manifest.load(folder).statistics("train")
     positions = [np.asarray(episode.position_TN3, np.float64) for episode in EpisodeStore(folder, "train").episodes]
     for moments, order in ((statistics.velocity, 1), (statistics.acceleration, 2)):
@@ -113,9 +109,8 @@ def test_manifest_statistics_equal_direct_ones(make_config: MakeConfig, make_dat
     assert Manifest.load(folder).statistics("test").velocity != Moments()
 
 
-def test_manifest_is_rebuilt_from_the_shards(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_manifest_is_rebuilt_from_the_shards(make_config: MakeConfig, folder: Path) -> None:
     """A lost manifest costs nothing: published shards are verified and listed again."""
-    folder = make_dataset(make_config())
     before = {shard.name: shard for shard in Manifest.load(folder).shards}
     (folder / "manifest.json").unlink()
     with DatasetWriter(make_config()) as writer:
@@ -123,9 +118,8 @@ def test_manifest_is_rebuilt_from_the_shards(make_config: MakeConfig, make_datas
     assert {shard.name: shard for shard in Manifest.load(folder).shards} == before
 
 
-def test_shards_of_another_dataset_are_not_adopted(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_shards_of_another_dataset_are_not_adopted(make_config: MakeConfig, folder: Path) -> None:
     """Without a manifest a shard of other settings is still recognised and refused."""
-    folder = make_dataset(make_config())
     (folder / "manifest.json").unlink()
     config = dataclasses.replace(make_config(), scene=SceneConfig(obstacle_count=3))
     with pytest.raises(ConfigError, match="belongs to another data set; move the file out"), DatasetWriter(config):
@@ -145,9 +139,8 @@ def test_missing_shard_is_made_again(make_config: MakeConfig, make_dataset: Make
     assert hashes(folder) == before
 
 
-def test_unlisted_shard_that_was_cut_is_refused(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_unlisted_shard_that_was_cut_is_refused(make_config: MakeConfig, folder: Path) -> None:
     """A shard is adopted only when it holds its whole range; a cut at a member boundary does not pass."""
-    folder = make_dataset(make_config())
     shard = folder / "train-000002-000004.tar"
     located = locate_members(shard)
     start = located["train-000003"]["position.npy"][0] - 512

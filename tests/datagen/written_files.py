@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from datagen.pool.writer import DatasetWriter
-from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.schema import to_mapping
-
-MakeConfig = Callable[..., DatagenConfig]
-MakeDataset = Callable[[DatagenConfig], Path]
-Stage = Callable[[DatasetWriter, str, int], None]
 
 
 def hashes(folder: Path) -> dict[str, str]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from ballistic_dataset import MakeConfig, MakeDataset
 from network.states import network_of
 from training.runs import train_arguments, train_mapping
 
@@ -80,8 +81,8 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def place(
     original: Path,
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
+    make_config: MakeConfig,
+    make_dataset: MakeDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Place]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,28 +25,20 @@ GNS = {"levels": 1, "message_passing_steps": 2, "width": 8, "material_embedding"
 
 
 @pytest.mark.parametrize("kind", ["gns", "gns_particles"])
-def test_every_command_takes_a_baseline(
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
-    tmp_path: Path,
-    kind: str,
-) -> None:
+def test_every_command_takes_a_baseline(data: DatagenConfig, tmp_path: Path, kind: str) -> None:
     """A baseline is trained, resumed, exported, simulated and evaluated, in fp16, by the HGN's commands."""
-    config = make_config()
-    make_dataset(config)
     network = GNS | {"kind": kind, "obstacle_features": kind == "gns"}
     run = tmp_path / "run"
     for updates in (2, 4):
-        mapping = train_mapping(config, run, maximum_updates=updates, precision="fp16")
+        mapping = train_mapping(data, run, maximum_updates=updates, precision="fp16")
         assert train.main(mapping | {"network": network}) == 0
     with pytest.raises(ConfigError, match=r"network\.kind must be '.*' to go on with"):
-        train.main(train_mapping(config, run))
+        train.main(train_mapping(data, run))
     weights = tmp_path / "weights.safetensors"
     export(run / "checkpoints" / "last.ckpt", weights)
     loaded, info = load_weights(weights)
     assert type(loaded).__name__ == "GraphNetworkSimulator" and info.network.kind == kind and info.updates == 4
-    data = config.dataset.folder
-    place = {"weights": str(weights), "data": data, "precision": "fp16"}
+    place = {"weights": str(weights), "data": data.dataset.folder, "precision": "fp16"}
     out = tmp_path / "rollout.vtkhdf"
     assert rollout.main(place | {"episode": "validation-000000", "frames": 4, "out": str(out)}) == 0
     report = tmp_path / "errors.json"
@@ -56,14 +47,10 @@ def test_every_command_takes_a_baseline(
 
 
 @pytest.mark.parametrize("spacing_cells", [0.25, 0.5])
-def test_training_and_rollout_see_the_same_surface(
-    spacing_cells: float, make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]
-) -> None:
+def test_training_and_rollout_see_the_same_surface(spacing_cells: float, data: DatagenConfig) -> None:
     """A batch and a simulation's start hold the same surface points, as far apart as asked, in the obstacles'
     cells; without obstacles there are none."""
-    config = make_config()
-    make_dataset(config)
-    plain = EpisodeStore(config.dataset.folder, "train").episodes[0]
+    plain = EpisodeStore(data.dataset.folder, "train").episodes[0]
     grid = random_grid(3, 40)
     episode = replace(plain, obstacle_grid=grid, position_TN3=np.array(plain.position_TN3))
     network = NetworkConfig(kind="gns_particles", obstacle_features=False, static_spacing_cells=spacing_cells, **GNS)

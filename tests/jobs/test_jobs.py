@@ -10,7 +10,6 @@ import subprocess
 import sys
 import sysconfig
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -151,16 +150,9 @@ def test_options_of_slurm_come_first(script: Path) -> None:
     assert values.get("ntasks-per-node", "1") == tasks
 
 
-def test_torchrun_trains(
-    warm: dict[str, str],
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
-    tmp_path: Path,
-) -> None:
+def test_torchrun_trains(warm: dict[str, str], data: DatagenConfig, tmp_path: Path) -> None:
     """jobs/torchrun.sh starts one training on two processes, which writes one run folder."""
-    config = make_config()
-    make_dataset(config)
-    done = run("torchrun.sh", *train_arguments(config, tmp_path / "run", **SHORT), cwd=tmp_path, GPUS="2", **warm)
+    done = run("torchrun.sh", *train_arguments(data, tmp_path / "run", **SHORT), cwd=tmp_path, GPUS="2", **warm)
     assert done.returncode == 0, done.stderr[-4000:]
     assert done.stdout.count("trained 4 of 4 updates") == 1
     stored = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
@@ -200,17 +192,9 @@ def test_torchrun_on_several_machines(tmp_path: Path) -> None:
     ]
 
 
-def test_slurm_trains(
-    slurm: dict[str, str],
-    warm: dict[str, str],
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
-    tmp_path: Path,
-) -> None:
+def test_slurm_trains(slurm: dict[str, str], warm: dict[str, str], data: DatagenConfig, tmp_path: Path) -> None:
     """jobs/slurm/train.sbatch starts one training of two tasks that know their ranks from Slurm's variables."""
-    config = make_config()
-    make_dataset(config)
-    arguments = train_arguments(config, tmp_path / "run", **SHORT)
+    arguments = train_arguments(data, tmp_path / "run", **SHORT)
     done = run("slurm/train.sbatch", *arguments, cwd=tmp_path, **slurm, **warm)
     assert done.returncode == 0, done.stderr[-4000:]
     assert done.stdout.count("trained 4 of 4 updates") == 1
@@ -221,18 +205,12 @@ def test_slurm_trains(
 
 
 def test_slurm_trains_with_torchrun(
-    slurm: dict[str, str],
-    warm: dict[str, str],
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
-    tmp_path: Path,
+    slurm: dict[str, str], warm: dict[str, str], data: DatagenConfig, tmp_path: Path
 ) -> None:
     """jobs/slurm/train_torchrun.sbatch starts one torchrun a node. At the time limit the training ends with a
     checkpoint and the job is queued again; started again, it goes on in the same folder, named after the job."""
-    config = make_config()
-    make_dataset(config)
     (tmp_path / "jobs").symlink_to(JOBS)
-    arguments = [a for a in train_arguments(config, tmp_path, **SHORT) if not a.startswith("run=")]
+    arguments = [a for a in train_arguments(data, tmp_path, **SHORT) if not a.startswith("run=")]
     slurm |= {"SLURM_NTASKS": "1", "EXPERIMENT": "small"} | warm
     started = start(
         "slurm/train_torchrun.sbatch", *arguments, "training.maximum_updates=1000000", cwd=tmp_path, **slurm

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from ballistic_dataset import MakeConfig, MakeDataset
 from kernels.engines import device
 from training.runs import metrics, train_mapping
 
@@ -28,7 +28,7 @@ NETWORK = {"width": 16, "levels": 1, "message_passing_steps": 1, "material_embed
 
 
 @pytest.fixture
-def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
+def data(make_config: MakeConfig, make_dataset: MakeDataset) -> DatagenConfig:
     config = make_config(training_scenes=2, validation_scenes=1, test_scenes=0)
     make_dataset(config)
     return config
@@ -87,8 +87,8 @@ def test_fast_training_is_the_plain_one(
 
 @pytest.mark.skipif(device().type != "cpu", reason="on a GPU sums are taken in another order each time")
 def test_a_quarter_of_the_data_is_enough(
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
+    make_config: MakeConfig,
+    make_dataset: MakeDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

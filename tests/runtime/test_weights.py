@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 import torch
+from ballistic_dataset import MakeConfig, MakeDataset
 from network.states import network_of, random_state
 from safetensors import safe_open
 from safetensors.torch import save_file
 from training.runs import train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig
 from hgn.export import export
 from hgn.runtime.weights import WeightsInfo, load_weights, require_frame_rate, save_weights
 from hgn.schema import ConfigError
@@ -50,7 +50,7 @@ def rewrite(
 
 
 def test_exported_checkpoint_is_the_trained_network(
-    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path], tmp_path: Path
+    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path
 ) -> None:
     """A checkpoint of the trainer, exported and loaded, predicts what the checkpoint's network does (to 1e-6) and
     remembers what it was trained on."""

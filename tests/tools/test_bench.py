@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from docs.pages import run_module
 
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds
@@ -203,15 +202,11 @@ def test_workloads() -> None:
     assert workloads(BenchConfig(), CPU) == [Workload(TILE_PARTICLES, 1)]
 
 
-def test_json_option(warm_python: Path, tmp_path: Path) -> None:
+def test_json_option(tmp_path: Path) -> None:
     """The command takes --json FILE as other tools do, beside overrides; without a name it says so."""
     path = tmp_path / "bench.json"
     small = ["cases=[frame]", "particles=[30]", "rounds=5", "network.width=8", "network.levels=1", "device=cpu"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    command = [str(warm_python), "-m", "tools.bench"]
-    subprocess.run(
-        [*command, "--json", str(path), *small], env=environment, check=True, capture_output=True, timeout=120
-    )
+    assert run_module("tools.bench", ["--json", str(path), *small]) == 0
     assert json.loads(path.read_text())["rows"][0]["case"] == "frame"
     assert _with_json_as_override(["a=1", "--json=b.json", "c=2"]) == ["a=1", "json=b.json", "c=2"]
     with pytest.raises(ConfigError, match="--json must be followed by a file name"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ballistic_dataset import MakeConfig, MakeDataset
 from network.states import gns_of, network_of, random_grid
 from PIL import Image
 
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated
-from hgn.config import DatagenConfig, MpmConfig
+from hgn.config import MpmConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
@@ -66,7 +66,7 @@ def weights_file(path: Path, kind: str) -> Path:
 
 
 @pytest.fixture
-def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> str:
+def data(make_config: MakeConfig, make_dataset: MakeDataset) -> str:
     return str(make_dataset(make_config(frames=FRAMES)))
 
 

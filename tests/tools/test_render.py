@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from ballistic_dataset import MakeConfig, MakeDataset
 from PIL import Image
 
-from hgn.config import DatagenConfig
 from hgn.data.lookup import find_episode
 from hgn.render.pictures import rollout_of_episode
 from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
@@ -68,9 +67,7 @@ def test_no_gif(tmp_path: Path) -> None:
     assert [entry.name for entry in (tmp_path / "p").iterdir()] == ["fall.png"]
 
 
-def test_episode_of_a_data_set(
-    tmp_path: Path, make_dataset: Callable[[DatagenConfig], Path], make_config: Callable[..., DatagenConfig]
-) -> None:
+def test_episode_of_a_data_set(tmp_path: Path, make_dataset: MakeDataset, make_config: MakeConfig) -> None:
     """An episode is drawn without a rollout; a key that is not there is answered with those that are."""
     folder = make_dataset(make_config(training_scenes=1, validation_scenes=2, test_scenes=1))
     mapping = {"data": str(folder), "out": str(tmp_path / "out"), "size": 80}
@@ -83,9 +80,7 @@ def test_episode_of_a_data_set(
         main(mapping | {"episode": "validation-000009"})
 
 
-def test_rollouts_beside_an_episode(
-    tmp_path: Path, make_dataset: Callable[[DatagenConfig], Path], make_config: Callable[..., DatagenConfig]
-) -> None:
+def test_rollouts_beside_an_episode(tmp_path: Path, make_dataset: MakeDataset, make_config: MakeConfig) -> None:
     """The episode is the truth and comes first; each rollout has a column, and a line in the plot of errors."""
     data = str(make_dataset(make_config(training_scenes=1, validation_scenes=1, test_scenes=1)))
     truth = rollout_of_episode(find_episode(data, "validation-000000"))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from docs.pages import run_module
 from network.states import network_of
 from PIL import Image
 
@@ -351,13 +351,13 @@ def test_bad_options(change: dict[str, Any], message: str) -> None:
         from_mapping(StabilityNetworkConfig, {"weights": "w"} | change)
 
 
-def test_the_command_names_its_parts(warm_python: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_names_its_parts(capfd: pytest.CaptureFixture[str]) -> None:
     """Help says what parts there are; an unknown one is refused with them; a known one takes the options of its own."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
-    command = [str(warm_python), "-m", "tools.stability"]
-    told = subprocess.run([*command, "--help"], capture_output=True, text=True, timeout=120)
-    assert told.returncode == 0 and "python -m tools.stability network" in told.stdout and not told.stderr
-    refused = subprocess.run([*command, "bridge"], capture_output=True, text=True, timeout=120)
-    assert refused.returncode == 2 and "must be one of" in refused.stderr and "network" in refused.stderr
-    missing = subprocess.run([*command, "network", "weights=none.pt"], capture_output=True, text=True, timeout=120)
-    assert missing.returncode == 2 and "weights must be an existing file" in missing.stderr
+    assert run_module("tools.stability", ["--help"]) == 0
+    told = capfd.readouterr()
+    assert "python -m tools.stability network" in told.out and not told.err
+    assert run_module("tools.stability", ["bridge"]) == 2
+    refused = capfd.readouterr().err
+    assert "must be one of" in refused and "network" in refused
+    assert run_module("tools.stability", ["network", "weights=none.pt"]) == 2
+    assert "weights must be an existing file" in capfd.readouterr().err

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ import torch
 from training.runs import train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig
 from hgn.system.files import write_atomically
 from hgn.training import checkpoint_writer
 from hgn.training.checkpoint import read_checkpoint
@@ -46,13 +45,6 @@ def writer() -> Iterator[CheckpointWriter]:
     made = CheckpointWriter()
     yield made
     made.teardown()
-
-
-@pytest.fixture
-def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
-    config = make_config()
-    make_dataset(config)
-    return config
 
 
 class Gate:

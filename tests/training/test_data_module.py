@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -12,9 +11,10 @@ import fsspec
 import numpy as np
 import pytest
 import torch
+from ballistic_dataset import MakeConfig, MakeDataset
 from training.runs import NETWORK, TRAINING
 
-from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
+from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.data.reader import EpisodeStore
@@ -24,11 +24,6 @@ from hgn.training.data_module import EpisodeDataModule, agreed_count
 
 UPDATES = 40  # of 2 samples, where an epoch has 25
 SETTINGS = (NetworkConfig(**NETWORK), TrainingConfig(**TRAINING))
-
-
-@pytest.fixture
-def folder(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> Path:
-    return make_dataset(make_config())
 
 
 def streamed(folder: Path | str, training: TrainingConfig = SETTINGS[1]) -> list[Batch]:
@@ -81,9 +76,7 @@ def test_feeding_from_a_url_equals_feeding_from_a_folder(
         assert (here.seeds_S, here.sampler_state) == (there.seeds_S, there.sampler_state)
 
 
-def test_shard_made_again_is_not_mixed_up(
-    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path], folder: Path
-) -> None:
+def test_shard_made_again_is_not_mixed_up(make_config: MakeConfig, make_dataset: MakeDataset, folder: Path) -> None:
     """A damaged shard that was deleted and made again is published last: an epoch that began before does not go on,
     for some samples would come twice."""
     feed = EpisodeDataModule(EpisodeStore(folder, "train"), *SETTINGS)
@@ -113,8 +106,8 @@ def test_ranks_with_other_data_are_refused(folder: Path, here: bool) -> None:
 
 
 def test_data_larger_than_the_cache(
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
+    make_config: MakeConfig,
+    make_dataset: MakeDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -146,9 +139,7 @@ def test_data_larger_than_the_cache(
     assert len([name for name in fetched if name.endswith(".tar")]) > 2 * len(sizes)
 
 
-def test_data_larger_than_the_device(
-    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]
-) -> None:
+def test_data_larger_than_the_device(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
     """Backend triton holds two windows of the order, here a quarter of the data, through two epochs: every sample's
     episode is held when it is trained on, and is the one that a trainer of all of the data has."""
     folder = make_dataset(make_config(training_scenes=64, validation_scenes=0, test_scenes=0, frames=4))

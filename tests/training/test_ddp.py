@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import torch
+from ballistic_dataset import MakeConfig
 from training.runs import metrics, train_mapping
 
 from hgn import train
@@ -117,14 +118,10 @@ class Reference:
 
 
 @pytest.fixture
-def reference(
-    make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path], tmp_path: Path
-) -> Reference:
-    config = make_config()
-    make_dataset(config)
+def reference(data: DatagenConfig, tmp_path: Path) -> Reference:
     changes: dict[str, Any] = {"monitor_rollout_frames": 0, "monitor_every": 1000}
     run = tmp_path / "one"
-    assert train.main(train_mapping(config, run, **changes, maximum_updates=1, batch_scenes=2)) == 0
+    assert train.main(train_mapping(data, run, **changes, maximum_updates=1, batch_scenes=2)) == 0
     alone = read_checkpoint(run / "checkpoints" / "last.ckpt")
     # Adam's first moment after one update is (1 - beta_1) times the gradient
     moments = alone["optimizer_states"][0]["state"]
@@ -133,7 +130,7 @@ def reference(
     gradients = {name: moments[index]["exp_avg"] / (1 - ADAM_BETA_1) for index, name in enumerate(names)}
     assert max(float(gradient.abs().max()) for gradient in gradients.values()) > 0.1
     two = changes | {"maximum_updates": 40, "batch_scenes": 1}
-    return Reference(lambda folder: train_mapping(config, folder / "run", **two), gradients)
+    return Reference(lambda folder: train_mapping(data, folder / "run", **two), gradients)
 
 
 def test_two_ranks_train_as_one(reference: Reference, warm_python: Path, tmp_path: Path) -> None:
@@ -375,8 +372,7 @@ GPUS = (pytest.mark.multigpu, pytest.mark.skipif(torch.cuda.device_count() < 2, 
     ],
 )
 def test_no_rank_waits_for_one_that_fails(
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
+    data: DatagenConfig,
     no_launcher: pytest.MonkeyPatch,
     warm_python: Path,
     tmp_path: Path,
@@ -386,10 +382,8 @@ def test_no_rank_waits_for_one_that_fails(
 ) -> None:
     """Two ranks of Lightning's own launcher end where one of them meets an error of its own, and where one has other
     weights, which the next log line finds."""
-    config = make_config()
-    make_dataset(config)
     options: dict[str, Any] = {"accelerator": accelerator, "backend": "torch", "devices": 2, "maximum_updates": 10**6}
-    (tmp_path / "mapping.json").write_text(json.dumps(train_mapping(config, tmp_path / "run", **options)))
+    (tmp_path / "mapping.json").write_text(json.dumps(train_mapping(data, tmp_path / "run", **options)))
     python = str(warm_python) if accelerator == "cpu" else sys.executable
     process = subprocess.Popen(
         [python, str(PROGRAM.with_name("failing_rank.py")), str(tmp_path), fault, failing],
@@ -406,7 +400,7 @@ def test_no_rank_waits_for_one_that_fails(
 @pytest.mark.parametrize(("local_rank", "expected"), [("0", []), ("1", [signal.SIGKILL])])
 def test_ranks_end_with_the_one_that_started_them(
     monkeypatch: pytest.MonkeyPatch,
-    make_config: Callable[..., DatagenConfig],
+    make_config: MakeConfig,
     tmp_path: Path,
     local_rank: str,
     expected: Any,

@@ -8,11 +8,12 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import fsspec
 import pytest
+from ballistic_dataset import MakeConfig, MakeDataset
 from processes import wait_until
 from training.runs import metrics, train_mapping
 
@@ -20,7 +21,6 @@ import hgn.data.storage
 import hgn.training.data_module
 from datagen.pool.plan import scene_seed
 from hgn import train
-from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import CACHE_VARIABLE, TOKEN_VARIABLE
@@ -71,9 +71,7 @@ def service(control: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     service.kill()
 
 
-def test_service_restarted_midway(
-    make_config: Callable[..., DatagenConfig], service: Service, control: Path, tmp_path: Path
-) -> None:
+def test_service_restarted_midway(make_config: MakeConfig, service: Service, control: Path, tmp_path: Path) -> None:
     """A trainer reads over HTTP what a service makes meanwhile. The service is killed with all its processes and
     started again: training goes on through it, with the scenes it has and then with those that come."""
     config = make_config(folder=service.url, training_scenes=SCENES, validation_scenes=1, test_scenes=0)
@@ -122,8 +120,8 @@ def test_service_restarted_midway(
 
 
 def test_stopped_while_its_service_is_away(
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
+    make_config: MakeConfig,
+    make_dataset: MakeDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

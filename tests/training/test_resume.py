@@ -111,13 +111,6 @@ def test_an_epoch_keeps_the_revision_it_began_with(
     seen.require_each_once(sampler_state, lambda epoch: published[: begun[epoch]])
 
 
-@pytest.fixture
-def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
-    config = make_config()
-    make_dataset(config)
-    return config
-
-
 def test_reading_ahead_changes_nothing(data: DatagenConfig) -> None:
     """With 0 to 3 batches read ahead the batches are the same, bit by bit, and each carries the sampler's state after
     it, from which a feed goes on with the next one."""

@@ -6,7 +6,7 @@ import math
 import os
 import signal
 import zipfile
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from itertools import permutations
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from training.runs import metrics, train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig, TrainConfig
+from hgn.config import TrainConfig
 from hgn.data.manifest import Manifest
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
@@ -29,16 +29,6 @@ from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
 from hgn.training.dataset import PublishedEpisodes
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
-
-MakeConfig = Callable[..., DatagenConfig]
-MakeDataset = Callable[[DatagenConfig], Path]
-
-
-@pytest.fixture
-def data(make_config: MakeConfig, make_dataset: MakeDataset) -> DatagenConfig:
-    config = make_config()
-    make_dataset(config)
-    return config
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:

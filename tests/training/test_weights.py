@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from ballistic_dataset import MakeConfig, MakeDataset
 from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
@@ -25,7 +25,7 @@ from hgn.training.module import TrainingModule
 
 
 @pytest.fixture
-def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
+def data(make_config: MakeConfig, make_dataset: MakeDataset) -> DatagenConfig:
     config = make_config(training_scenes=2, validation_scenes=1, test_scenes=0)
     make_dataset(config)
     return config
