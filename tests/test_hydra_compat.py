@@ -15,15 +15,17 @@ def test_canary(tmp_path: Path) -> None:
     not find is added; its own entry point composes the same; a key that must be given is named."""
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "wide.yaml").write_text("defaults:\n  - hgn.config.SceneConfig\ngroup_size: 0.5\n")
-    (tmp_path / "made.yaml").write_text("defaults:\n  - hgn.config.ExportConfig\n  - scene: wide\n  - _self_\nout: x\n")
-    arguments = ["made", "checkpoint=my data (1)/ü", "scene.group_count=3", "invented.key=1"]
+    (tmp_path / "made.yaml").write_text(
+        "defaults:\n  - hgn.config.AverageConfig\n  - scene: wide\n  - _self_\nout: x\n"
+    )
+    arguments = ["made", "weights=my data (1)/ü", "scene.group_count=3", "invented.key=1"]
     (composed,) = compose(tmp_path, "made", arguments)
-    assert (composed["checkpoint"], composed["out"], composed["stored_precision"]) == ("my data (1)/ü", "x", "fp32")
+    assert (composed["weights"], composed["out"], composed["stored_precision"]) == ("my data (1)/ü", "x", "fp32")
     assert composed["scene"]["group_size"] == 0.5 and composed["scene"]["group_count"] == 3
     assert composed["scene"]["materials"] == ["water", "sand", "snow"] and composed["invented"] == {"key": 1}
     assert compose(tmp_path, "made", [*arguments, "hydra.job.name=x"]) == [composed]
     twice = compose(tmp_path, "made", ["made", "--multirun", *arguments[1:], "out=a,b"])
     assert [each["out"] for each in twice] == ["a", "b"]
-    with pytest.raises(ConfigError, match="checkpoint is missing; it must be given, as in checkpoint=…"):
+    with pytest.raises(ConfigError, match="weights is missing; it must be given, as in weights=…"):
         compose(tmp_path, "made", ["made"])
-    assert compose(tmp_path, "made", ["made"], complete=False)[0]["checkpoint"] == "???"
+    assert compose(tmp_path, "made", ["made"], complete=False)[0]["weights"] == "???"
