@@ -45,10 +45,7 @@ CUDABackend.make_cubin = lambda *_: b""  # ptxas takes a fifth of the time, and 
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 relative = NetworkConfig(inputs="relative", width=16, levels=2, message_passing_steps=1)
 job = PrecompileJob(relative, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,))
-for function, data in launches_of(job).values():
-    if function.fn.__module__ == "hgn.kernels.grid.kernel":
-        triton_compat.preload(function, data)
-        print("COMPILED", function.__name__, flush=True)
+of_relative = launches_of(job)  # before any is compiled: what is would be launched
 
 network = NetworkConfig(levels=1, message_passing_steps=1)
 for precision in ("fp16", "tf32"):
@@ -71,3 +68,9 @@ triton_compat.use_target(89)
 narrow = NetworkConfig(width=64, levels=2, message_passing_steps=2)
 for function, data in launches_of(FrameJob(((narrow, "fp16"),), ((40_000, 10_000),), 89)).values():
     print("SHARED", function.__name__, triton_compat.preload(function, data).metadata.shared, flush=True)
+
+triton_compat.use_target(90)
+for function, data in of_relative.values():
+    if function.fn.__module__ == "hgn.kernels.grid.kernel":
+        triton_compat.preload(function, data)
+        print("COMPILED", function.__name__, flush=True)
