@@ -169,7 +169,7 @@ def test_manifest_that_contradicts_itself(
 @pytest.mark.parametrize(
     ("pattern", "text", "message"),
     [
-        (r'"sha256":"..', '"sha256":"00', "must hold the .* shards that were published, got others"),
+        (r'"sha256":"....', '"sha256":"0000', "must hold the .* shards that were published, got others"),
         (r"^.*\n", "", "must have [0-9]+ bytes, got"),
         (r"\Z", "{}\n", ""),
         (r"}\n", " \n", "must be JSON"),
