@@ -100,7 +100,7 @@ class _Unplaced(TritonRollout):
 
 def _nowhere(config: NetworkConfig, particles: int, scenes: int, device: str) -> ParticleState:
     return ParticleState(
-        torch.zeros(particles, 3, device=device),
+        config.cell_size * torch.arange(particles, device=device)[:, None].expand(-1, 3),  # apart: none is crowded
         torch.zeros(particles, config.velocity_history, 3, device=device),
         torch.zeros(particles, dtype=torch.int32, device=device),
         torch.zeros(particles, dtype=torch.int64, device=device),
