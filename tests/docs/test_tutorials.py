@@ -192,9 +192,8 @@ def test_how_to(here: Path) -> None:
 
 
 def test_gradients() -> None:
-    """Gradients: of velocities and of a turned obstacle; the first steps towards a target come nearer."""
-    runner = Runner(SETTINGS, {"range(10)": "range(2)"})
+    """Gradients: of velocities and of a turned obstacle; the launch that hits a target is the closed form's."""
+    runner = Runner(SETTINGS)
     runner.run(ROOT / "docs/how_to/gradients.md")
     assert bool(runner.names["turn_3"].grad.any()) and bool(runner.names["velocity_N3"].grad.any())
-    first, second = (abs(path_T3[-1] - runner.names["target_3"].numpy()).max() for path_T3 in runner.names["tries"])
-    assert second < 0.8 * first
+    assert (runner.names["velocity_3"] - runner.names["launch_3"]).abs().max() < 1e-4
