@@ -16,6 +16,9 @@ from hgn.scene.material import ELASTIC, SAND, SNOW
 # Jp beyond these is rounding: hardening is capped, or nothing is left of it
 SMALLEST_PLASTIC_VOLUME, LARGEST_PLASTIC_VOLUME = 1e-3, 1e3
 LARGEST_VOLUME = 1e12  # of an elastic solid, whose stress goes with its square
+# of an elastic solid's stiffness, for the step: a single particle that hits the floor at 10 m/s gains energy with steps
+# of 0.8 of the limit, and none with 0.65
+ELASTIC_MARGIN = 1.6
 
 
 @ti.func
@@ -197,6 +200,7 @@ def solid(
             widest = sigma.max()
             stiffness = 3.0 * bulk * ti.max(1.0, J * (2.0 * J - 1.0))
             stiffness += 2.0 * shear * ti.max(1.0, widest * (2.0 * widest - 1.0))
+            stiffness *= ELASTIC_MARGIN
     new_F = F
     if plastic > 0:  # recomposed only then: each decomposition costs a rounding of det F
         new_F = _compose(U, new_sigma, V)

@@ -210,7 +210,7 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
     """What keeps simulations from the backend triton, in words; none if nothing does."""
     if device.type != "cuda":
         return f"it needs a CUDA device, not {device.type}"
-    if reason := _too_little_shared_memory(device, config.width) or host_unsupported_reason():
+    if reason := host_unsupported_reason() or _too_little_shared_memory(device, config.width):
         return reason
     if config.kind != "hgn" and precision != "fp16":
         return f"it computes {config.kind} with precision fp16, not {precision}"

@@ -88,7 +88,11 @@ def _one_scene(network, state, members, scene, origin_S3):
     change = [torch.zeros_like(value) for value in latent]
     for row, cell, weight, offset in pairs:
         change[row] = change[row] + weight * network.cell_to_particle(values[cell], latent[row], -offset)
-    return [network.decode(value + delta) for value, delta in zip(latent, change, strict=True)]
+    output = [network.decode(value + delta) for value, delta in zip(latent, change, strict=True)]
+    if not config.relative:
+        return output
+    columns = [_relative(network, state, i, scene, row, members, pairs)[0].tolist() for row, i in enumerate(members)]
+    return _balanced(config, columns, pairs, output)
 
 
 def _relative(network, state, i, scene, row, members, pairs):
@@ -130,6 +134,42 @@ def _relative(network, state, i, scene, row, members, pairs):
     gate = 1.0 if any(normals) else min(2 * max(walls), 1.0)
     contact = [gate * f(v[0][a]) for a in range(3)]
     return [torch.tensor([*history, *surroundings, *contact, *walls, *normals], dtype=state.position_N3.dtype)]
+
+
+def _balanced(config, columns, pairs, output):
+    """Of accelerations and stresses what keeps momentum, one coarsest cell after the other (relative.balanced)."""
+    motion = 3 * (config.velocity_history - 1 + config.levels)
+    top = [(row, tuple(k >> config.levels - 1 for k in cell), weight) for row, cell, weight, _ in pairs]
+    disturbed, touched, mass, mean = {}, {}, {}, {}
+    for row, cell, weight in top:
+        walls, normals = columns[row][motion + 3 : motion + 9], columns[row][motion + 9 :]
+        touch = 1.0 if any(normals) else min(1.0, 2 * max(walls))
+        moved = sum((value / 0.01) ** 2 for value in columns[row][:motion])
+        touched[cell] = max(touched.get(cell, 0.0), touch)
+        disturbed[cell] = max(disturbed.get(cell, 0.0), min(1.0, touch + moved))
+        mass[cell] = mass.get(cell, 0.0) + weight
+        mean[cell] = mean.get(cell, 0.0) + weight * output[row]
+
+    def around(values, cell):
+        sides = [tuple(k + sign * (a == b) for b, k in enumerate(cell)) for a in range(3) for sign in (1, -1)]
+        return max([values[cell], *(values[side] for side in sides if side in values)])
+
+    change = {}
+    for cell in mass:
+        rest = -(1 - around(touched, cell)) * mean[cell][:3] / mass[cell]
+        for axis, sign in itertools.product(range(3), (1, -1)):
+            other = tuple(k + sign * (a == axis) for a, k in enumerate(cell))
+            if other not in mass:
+                continue
+            stress = mean[cell] / mass[cell] + mean[other] / mass[other]  # after the acceleration: xx yy zz yz xz xy
+            column = {0: (3, 8, 7), 1: (8, 4, 6), 2: (7, 6, 5)}[axis]
+            share = around(disturbed, other) * mass[other] / (mass[cell] + mass[other]) / 2
+            rest = rest + share * sign * stress[list(column)]
+        change[cell] = rest
+    result = [torch.zeros(3, dtype=value.dtype) for value in output]
+    for row, cell, weight in top:
+        result[row] = result[row] + weight * around(disturbed, cell) * (output[row][:3] + change[cell])
+    return result
 
 
 def _messages(passing, values):

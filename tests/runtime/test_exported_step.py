@@ -7,7 +7,7 @@ import os
 import runpy
 import shutil
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,15 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "tools/deploy"
 TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
 FRAMES = 4
 SIZES = [(1, True), (1, False), (216, True), (216, False), (4_096, True)]
+
+
+@pytest.fixture(autouse=True)
+def whole_precision() -> Iterator[None]:
+    """PyTorch multiplies in float32, whatever a backend has chosen for the process."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    yield
+    torch.set_float32_matmul_precision(before)
 
 
 @pytest.mark.parametrize("inputs", ["absolute", pytest.param("relative", marks=pytest.mark.slow)])

@@ -181,7 +181,7 @@ def test_one_huge_triangle_and_many_small_ones() -> None:
 def test_sheets_do_not_leak(speed: float, offset: float) -> None:
     """Nothing passes an axis-aligned sheet at 3 and 10 m/s, wherever it lies between the nodes."""
     y = (5 + offset) * CELL
-    scenes = [dropped(material, y + 2.5 * CELL, speed, sheet(y)) for material in range(3)]
+    scenes = [dropped(material, y + 2.5 * CELL, speed, sheet(y)) for material in range(len(MATERIALS))]
     for name, outcome in zip(MATERIALS, simulate(scenes, CONFIG, 11, 60.0), strict=True):
         assert isinstance(outcome, Simulated), (name, outcome)
         assert outcome.position_TN3[:, :, 1].min() > y, name

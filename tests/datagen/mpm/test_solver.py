@@ -291,7 +291,8 @@ def test_bounds_themselves_are_inside() -> None:
         low, high = particle_bounds(block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=1), config)
         position = np.array([low, high, [low[0], high[1], low[2]]], np.float32)
         scene = Scene(position, np.full((3, 3), 2, np.float32), np.zeros(3, np.uint8), cell_size=CELL)
-        outcome = run(scene, config, 5)
+        outcome = simulate([scene], config, 5, 60.0)[0]
+        assert isinstance(outcome, Simulated), outcome
         assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
 
 
