@@ -70,6 +70,14 @@ def network_of(dtype: torch.dtype = torch.float64, **changes: object) -> Hierarc
     return network
 
 
+def silent(network: HierarchicalGraphNetwork) -> HierarchicalGraphNetwork:
+    """The network with an output of zero: with relative inputs, free flight."""
+    with torch.no_grad():
+        for parameter in network.decode.parameters():
+            parameter.zero_()
+    return network
+
+
 def gns_of(dtype: torch.dtype = torch.float64, **changes: object) -> GraphNetworkSimulator:
     """The same of GNS; `kind` may be gns_particles."""
     values = {"kind": "gns", "width": 16, "levels": 1, "message_passing_steps": 3} | changes

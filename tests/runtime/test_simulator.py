@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from network.states import network_of, random_grid
+from network.states import network_of, random_grid, silent
 
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.relative import history
@@ -43,10 +43,7 @@ def constant(acceleration: tuple[float, float, float], **changes: object) -> Hie
     """A network that predicts the same acceleration everywhere, in frame units."""
     network = network_of(torch.float32, **changes)
     network.normaliser.set("acceleration", torch.tensor(acceleration), torch.ones(3), 0.0)
-    with torch.no_grad():
-        for parameter in network.decode.parameters():
-            parameter.zero_()
-    return network
+    return silent(network)
 
 
 @pytest.mark.parametrize("obstacles", [(True, True, True), (True, False, True), (False, False, False)])
@@ -217,10 +214,7 @@ def test_what_loaded_weights_cannot_take(tmp_path: Path) -> None:
 def test_relative_inputs_take_any_gravity(tmp_path: Path, gravity: tuple[float, float, float]) -> None:
     """Weights of relative inputs that add nothing to gravity fly a scene along the closed form, whatever its own is, in
     a batch with another's; the history that they begin with shows none of it."""
-    network = network_of(torch.float32, inputs="relative")
-    with torch.no_grad():
-        for parameter in network.decode.parameters():
-            parameter.zero_()
+    network = silent(network_of(torch.float32, inputs="relative"))
     save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
     simulator = Simulator.load(tmp_path / "w.safetensors", device="cpu")
     scenes = [initial(9), replace(initial(25), gravity=gravity)]

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from network.states import network_of
+from network.states import network_of, silent
 from PIL import Image
 
 from hgn.runtime.simulator import Simulator
@@ -43,11 +43,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pyte
 
 def floating() -> Simulator:
     """Relative inputs and an output of zero: particles without gravity stay where they are."""
-    network = network_of(torch.float32, width=16, levels=2, inputs="relative")
-    with torch.no_grad():
-        for parameter in network.decode.parameters():
-            parameter.zero_()
-    return Simulator(network, 60.0, "cpu")
+    return Simulator(silent(network_of(torch.float32, width=16, levels=2, inputs="relative")), 60.0, "cpu")
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from network.states import network_of
+from network.states import network_of, silent
 
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import Simulator
@@ -33,11 +33,7 @@ groups:
 
 def free_flight() -> Simulator:
     """A network of relative inputs whose output is zero."""
-    network = network_of(torch.float32, width=16, levels=2, inputs="relative")
-    with torch.no_grad():
-        for parameter in network.decode.parameters():
-            parameter.zero_()
-    return Simulator(network, 60.0, "cpu")
+    return Simulator(silent(network_of(torch.float32, width=16, levels=2, inputs="relative")), 60.0, "cpu")
 
 
 def simulator(factor: float = 1.0) -> Simulator:
