@@ -71,6 +71,6 @@ for function, data in launches_of(FrameJob(((narrow, "fp16"),), ((40_000, 10_000
 
 triton_compat.use_target(90)
 for function, data in of_relative.values():
-    if function.fn.__module__ == "hgn.kernels.grid.kernel":
+    if function.fn.__module__ in ("hgn.kernels.grid.kernel", "hgn.kernels.coarsest.kernel"):
         triton_compat.preload(function, data)
         print("COMPILED", function.__name__, flush=True)

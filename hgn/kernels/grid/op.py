@@ -14,6 +14,7 @@ import torch
 import triton
 
 from hgn.config import NetworkConfig
+from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES, SCENE_LIMIT, pack, unpack
@@ -261,12 +262,12 @@ class DeviceGrid:
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
         """From what the decoder puts out [N, OUT] to accelerations less gravity in columns 0 to 2, in place."""
-        self._through_coarsest(output, count, kernel.balance_cells, OUTPUTS, 3)
+        self._through_coarsest(output, count, coarsest_kernel.balance_cells, OUTPUTS, 3)
 
     def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
         """From the gradient of what `balance` leaves to that of what it was given, in place."""
         self.sum_C.zero_()
-        self._through_coarsest(gradient, count, kernel.balance_cells_backward, 3, OUTPUTS)
+        self._through_coarsest(gradient, count, coarsest_kernel.balance_cells_backward, 3, OUTPUTS)
 
     def _through_coarsest(self, x: torch.Tensor, count: torch.Tensor, between: Any, taken: int, left: int) -> None:
         """Sums of the first columns on the coarsest cells, what these make of them, and that back to particles."""
@@ -274,14 +275,14 @@ class DeviceGrid:
         cells = {"neighbour": coarsest, "geometry": self.geometry, "counts": self.counts_L, "capacity": capacity}
         pairs = {"cell_of": self.cell_N8, "weight_of": self.weight_N8, "parent": self._parent, "particle_count": count}
         sizes = {"LEVELS": self.levels, "OUT": x.shape[1], "BLOCK": PARTICLE_BLOCK}
-        kernel.sum_coarsest[(triton.cdiv(max(particles, capacity), PARTICLE_BLOCK),)](
+        coarsest_kernel.sum_coarsest[(triton.cdiv(max(particles, capacity), PARTICLE_BLOCK),)](
             x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=self.sum_C, USED=taken,
             FEEL=taken == OUTPUTS, **sizes,
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
             sums=self.sum_C, felt=self.felt_C2, motion=self.motion_C4, **cells, table=self.table_C, **sizes
         )
-        kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
+        coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
             x=x, table=self.table_C, **pairs, geometry=self.geometry, USED=left,
             COLUMNS=triton.next_power_of_2(left + 1), **sizes,
         )  # fmt: skip
