@@ -51,7 +51,7 @@ demo: $(VENV)/.demo
 	@echo "picture: $(DEMO)/pictures/rollout.png, moving: $(DEMO)/pictures/rollout.gif"
 
 test: setup
-	$(RUN) -m pytest -n $(TEST_PROCESSES) --dist loadgroup --no-loadscope-reorder
+	$(RUN) -m pytest -n $(TEST_PROCESSES)
 
 check: setup format lint types layers docs test
 

@@ -23,6 +23,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+import file_scheduling
 import interpreter
 import torch
 import warm_server
@@ -41,18 +42,6 @@ from ballistic_dataset import MakeConfig, MakeDataset, Stage
 from datagen.pool.worker import Backend
 from hgn.config import DatagenConfig, DatasetConfig
 
-LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
-    *("viewer/test_page", "datagen/mpm/test_solver", "datagen/mpm/test_validation"),
-    *("training/test_ddp", "jobs/test_jobs"),
-    *("kernels/test_triton_compat", "network/test_network", "datagen/test_command", "datagen/test_pool"),
-    *("tools/test_bench", "kernels/test_rollout", "docs/test_tutorials", "end_to_end/test_bad_input"),
-    *("tools/test_stability_network", "end_to_end/test_datagen", "kernels/test_kernels_alone", "datagen/test_kills"),
-    *("training/test_generator", "training/test_train", "scene/test_random_scene", "end_to_end/test_wheel"),
-    *("tools/test_error_vs_time", "kernels/test_relative", "kernels/test_update", "jobs/test_queue"),
-    *("datagen/test_service", "training/test_resume", "training/test_live_service", "kernels/test_memory"),
-    *("test_command", "kernels/test_symmetry", "kernels/test_network", "training/test_precompile"),
-)
-
 
 def pytest_configure(config: pytest.Config) -> None:
     """All processes of these tests share a warm interpreter; the first that asks for it has it started."""
@@ -60,14 +49,15 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(warm_server.WarmServer().stop)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Asked for where several processes run the tests (pytest-xdist)."""
+    return file_scheduling.FileScheduling(config, log)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first; a file's tests in one process, and all that simulate in one, which compiles kernels once."""
-    tests = Path(__file__).parent
-    place = {tests / f"{name}.py": number for number, name in enumerate(LONGEST_FILES)}
-    items.sort(key=lambda item: place.get(item.path, len(place)))
-    for item in items:
-        solver = item.path.parent == tests / "datagen" / "mpm" or item.path.stem.startswith("test_stability")
-        item.add_marker(pytest.mark.xdist_group("solver" if solver else str(item.path.relative_to(tests))))
+    """Long files first, for begun last, one of them would run alone."""
+    items.sort(key=lambda item: file_scheduling.place_of(item.nodeid))
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,46 @@
+"""Which process of pytest-xdist runs which tests: a file's all in one, and all that simulate, long files first.
+
+A file's fixtures are made once then, and the solver's kernels compiled once.
+"""
+
+from __future__ import annotations
+
+from xdist.scheduler import LoadScopeScheduling
+
+LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
+    *("solver", "viewer/test_page"),
+    *("training/test_ddp", "jobs/test_jobs"),
+    *("kernels/test_triton_compat", "network/test_network", "datagen/test_command", "datagen/test_pool"),
+    *("tools/test_bench", "kernels/test_rollout", "docs/test_tutorials", "end_to_end/test_bad_input"),
+    *("end_to_end/test_datagen", "kernels/test_kernels_alone", "datagen/test_kills"),
+    *("training/test_generator", "training/test_train", "scene/test_random_scene", "end_to_end/test_wheel"),
+    *("tools/test_error_vs_time", "kernels/test_relative", "kernels/test_update", "jobs/test_queue"),
+    *("datagen/test_service", "training/test_resume", "training/test_live_service", "kernels/test_memory"),
+    *("test_command", "kernels/test_symmetry", "kernels/test_network", "training/test_precompile"),
+)
+
+
+PLACES = {name: number for number, name in enumerate(LONGEST_FILES)}
+
+
+def group_of(nodeid: str) -> str:
+    """What runs in one process: a file, or all that simulate."""
+    path = nodeid.split("::", 1)[0].removeprefix("tests/").removesuffix(".py")
+    return "solver" if path.startswith(("datagen/mpm/", "tools/test_stability")) else path
+
+
+def place_of(nodeid: str) -> int:
+    """Where its group stands in the order of the run."""
+    return PLACES.get(group_of(nodeid), len(PLACES))
+
+
+class FileScheduling(LoadScopeScheduling):
+    """Hands out groups as the tests are ordered; `--dist loadgroup` hands out single tests with pytest 9.2."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return group_of(nodeid)
+
+    def schedule(self) -> None:
+        """Groups stay in the tests' order, which xdist sorts by their number otherwise."""
+        self.config.option.loadscopereorder = False
+        super().schedule()
