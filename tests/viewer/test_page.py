@@ -83,7 +83,7 @@ def viewer(browser: Any, play: PlayPage) -> Any:
 def opened(browser: Any, address: str) -> Any:
     """A viewer's page, once its canvas shows more than one colour."""
     page = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]}).new_page()
-    page.set_default_timeout(120_000)
+    page.set_default_timeout(300_000)
     page.goto(address)
     page.wait_for_selector("canvas")
     until(lambda: len(np.unique(pixels(page).reshape(-1, 3), axis=0)) > 50)
@@ -94,7 +94,7 @@ def pixels(page: Any) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
-def until(condition: Callable[[], Any], seconds: float = 120.0) -> Any:
+def until(condition: Callable[[], Any], seconds: float = 300.0) -> Any:
     """Waits for a condition, patiently: the browser draws on a shared core."""
     end = time.monotonic() + seconds
     while not (met := condition()):
@@ -142,27 +142,31 @@ def press(page: Any, name: str) -> None:
 
 def test_points_are_drawn(viewer: Any, play: PlayPage) -> None:
     """The page shows the water where the camera sees it, the numbers of particles and frames a second."""
-    assert blue(viewer) > 300
+    until(lambda: blue(viewer) > 300)
     x, y = (int(value) for value in on_screen(play, (0.5, 0.56, 0.5)))
     around = pixels(viewer)[y - 60 : y + 60, x - 60 : x + 60]
     assert ((around[..., 2] > around[..., 0] + 60).mean()) > 0.02
-    text = viewer.inner_text("body")
-    assert re.search(r"600 particles", text) and re.search(r"[1-9]\d* frames a second", text)
+    until(lambda: re.search(r"[1-9]\d* frames a second · 600 particles", viewer.inner_text("body")))
 
 
 def test_a_drag_with_shift_pours(viewer: Any, play: PlayPage) -> None:
     """Particles of the chosen material enter while the mouse is held, above what it points at, and none thereafter."""
-    begin, end = on_screen(play, (0.25, 0.0, 0.3)), on_screen(play, (0.35, 0.0, 0.3))
+    play.speed.value, play.diameter.value = 0.2, 0.2  # slow: nothing stops it before it is out of the domain
+    begin, end = on_screen(play, (0.28, 0.0, 0.3)), on_screen(play, (0.32, 0.0, 0.3))
     drag(viewer, begin, end, "Shift")
     until(lambda: play.session.spout is None and len(play.session.newest.position_N3) > 610)
-    count = len(play.session.newest.position_N3)
-    poured_A3 = play.session.recording.frames[-1].position_N3[600:]
-    assert (np.abs(poured_A3[:, [0, 2]] - (0.3, 0.3)) < 0.15).all()
-    viewer.wait_for_timeout(300)
+    count, frame = len(play.session.newest.position_N3), play.session.frame
+    until(lambda: play.session.frame > frame + 10)
+    play.do(lambda: setattr(play, "playing", False))
+    until(lambda: not play.playing)
     assert len(play.session.newest.position_N3) == count
+    poured_A3 = play.session.newest.position_N3[600:]
+    assert (np.abs(poured_A3[:, [0, 2]] - (0.3, 0.3)) < 0.15).all()
     until(lambda: f"{count:,} particles" in viewer.inner_text("body"))
-    press(viewer, "Restart")  # what pours here falls for ever
-    until(lambda: play.session.frame > 3 and len(play.session.materials()) == 600)
+    press(viewer, "Restart")
+    until(lambda: len(play.session.materials()) == 600)
+    press(viewer, "Play")
+    until(lambda: play.session.frame > 3)
 
 
 def test_an_obstacle_that_is_dragged_moves(viewer: Any, play: PlayPage) -> None:
@@ -170,18 +174,18 @@ def test_an_obstacle_that_is_dragged_moves(viewer: Any, play: PlayPage) -> None:
     (before,) = play.session.obstacles
     begin = on_screen(play, (0.5, 0.5, 0.5))
     drag(viewer, begin, (begin[0] + 80, begin[1]))
-    until(lambda: play.session.obstacles[0].position != before.position and not play.wanted.qsize())
-    viewer.wait_for_timeout(200)
-    (after,) = play.session.obstacles
-    moved_3 = np.subtract(after.position, before.position)
-    shown = on_screen(play, tuple(np.add((0.5, 0.5, 0.5), moved_3)))
-    assert shown == pytest.approx((begin[0] + 80, begin[1]), abs=8)
+
+    def shown() -> tuple[float, float]:
+        moved_3 = np.subtract(play.session.obstacles[0].position, before.position)
+        return on_screen(play, tuple(np.add((0.5, 0.5, 0.5), moved_3)))
+
+    until(lambda: shown() == pytest.approx((begin[0] + 80, begin[1]), abs=8))
+    (after,), there = play.session.obstacles, shown()
     grid = play.session.live.scene.obstacle_grid
     middle_3 = (grid.cell_K3 + 0.5).mean(axis=0) * grid.cell_size - np.subtract(after.position, (0, 0.03, 0))
     assert np.abs(middle_3).max() < 0.06
-    drag(viewer, shown, (shown[0] - 90, shown[1]), "Control")
-    until(lambda: play.session.obstacles[0].rotation != after.rotation)
-    assert play.session.obstacles[0].rotation[1] == pytest.approx(-36, abs=4)
+    drag(viewer, there, (there[0] - 90, there[1]), "Control")
+    until(lambda: play.session.obstacles[0].rotation[1] == pytest.approx(-36, abs=4))
 
 
 def test_pause_step_and_back(viewer: Any, play: PlayPage) -> None:
@@ -192,7 +196,7 @@ def test_pause_step_and_back(viewer: Any, play: PlayPage) -> None:
     press(viewer, "Step")
     until(lambda: play.session.frame == frame + 1)
     viewer.wait_for_timeout(300)
-    assert play.session.frame == frame + 1
+    assert play.session.frame == frame + 1  # and no more
     press(viewer, "a frame")
     until(lambda: play.session.frame == frame)
     press(viewer, "Play")
@@ -236,16 +240,15 @@ def test_own_meshes(viewer: Any, play: PlayPage) -> None:
 def test_two_viewers_and_a_lost_connection(browser: Any, viewer: Any, play: PlayPage) -> None:
     """A second viewer sees the same scene; when all connections break the scene goes on, and both come back to it."""
     second = opened(browser, play.address)
-    assert len(play.server.get_clients()) == 2 and blue(second) > 300
-    frame = play.session.frame
+    until(lambda: len(play.server.get_clients()) == 2 and blue(second) > 300)
+    frame, lost = play.session.frame, set(play.server.get_clients())
     play.server._websock_server.disconnect_all_clients()
-    until(lambda: not play.server.get_clients())
-    until(lambda: len(play.server.get_clients()) == 2)
-    assert play.session.frame > frame
+    until(lambda: len(play.server.get_clients()) == 2 and not lost & set(play.server.get_clients()))
+    until(lambda: play.session.frame > frame)
     press(second, "Pause")
     until(lambda: not play.playing)
     until(lambda: "Play" in viewer.inner_text("body").splitlines())
-    assert blue(viewer) > 300 and blue(second) > 300
+    until(lambda: blue(viewer) > 300 and blue(second) > 300)
     second.context.close()
 
 
@@ -267,6 +270,8 @@ def test_without_the_token_there_is_nothing(browser: Any, play: PlayPage) -> Non
 
 def test_a_film_plays_by_itself(browser: Any, play: PlayPage, tmp_path: Path) -> None:
     """The static page draws the rollout's particles without any server."""
+    play.do(lambda: setattr(play, "playing", False))
+    until(lambda: not play.playing)
     path = tmp_path / "film.html"
     path.write_text(film_html(play.session.rollout(), every=10))
     page = opened(browser, path.as_uri())
