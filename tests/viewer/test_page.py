@@ -151,7 +151,8 @@ def test_points_are_drawn(viewer: Any, play: PlayPage) -> None:
 
 def test_a_drag_with_shift_pours(viewer: Any, play: PlayPage) -> None:
     """Particles of the chosen material enter while the mouse is held, above what it points at, and none thereafter."""
-    play.speed.value, play.diameter.value = 0.2, 0.2  # slow: nothing stops it before it is out of the domain
+    sliders: Any = play
+    sliders.speed.value, sliders.diameter.value = 0.2, 0.2  # slow: nothing stops it before it is out of the domain
     begin, end = on_screen(play, (0.28, 0.0, 0.3)), on_screen(play, (0.32, 0.0, 0.3))
     drag(viewer, begin, end, "Shift")
     until(lambda: play.session.spout is None and len(play.session.newest.position_N3) > 610)
