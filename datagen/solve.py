@@ -6,16 +6,32 @@ What networks learn from, for a scene of one's own. Beside a network's rollout o
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import SolveConfig
+from hgn.config import MpmConfig, require_rollout_name
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.schema import ConfigError, FrameCount, Positive, from_mapping, require_bounds, to_mapping
 from hgn.system.progress import bar
+
+
+@dataclass(frozen=True)
+class SolveConfig:
+    """`python -m datagen.solve`: a scene file, simulated by the solver."""
+
+    scene: str  # a scene file, or the name of one in conf/example, for example funnel
+    out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
+    frames: FrameCount = 300
+    frame_rate_hz: Positive[float] = 60.0
+    mpm: MpmConfig = field(default_factory=MpmConfig)
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        require_rollout_name("out", self.out)
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -9,18 +9,31 @@ from __future__ import annotations
 
 import contextlib
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from datagen.generate import StopSignal
 from hgn.command import run_command
-from hgn.config import UploadConfig
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.storage import is_remote, open_storage, verify_file, write_remote
-from hgn.schema import ConfigError, from_mapping, require
+from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds
 from hgn.system.progress import bar
 
 _LOOK_S = 0.2  # between looks for a signal
+
+
+@dataclass(frozen=True)
+class UploadConfig:
+    """`python -m datagen.upload`: what is copied where."""
+
+    data: str  # folder of a data set
+    to: str  # URL; training reads it with dataset.folder=URL
+    follow: bool = False  # go on while the data set grows, until it is complete
+    poll_s: Positive[float] = 5.0  # between looks at it then
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -6,21 +6,40 @@ no larger, and what each has learned is there in part (model soups, Wortsman et 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from hgn.command import run_command
-from hgn.config import AverageConfig
+from hgn.config import StoredPrecision
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
-from hgn.schema import ConfigError, from_mapping
+from hgn.schema import ConfigError, from_mapping, require, require_bounds
 from hgn.system.provenance import provenance
 
 Loaded = tuple[ParticleNetwork, WeightsInfo]
 SHARED = ("network", "frame_rate_hz", "obstacle_cell_size", "gravity")  # of weights that can be averaged
+
+
+@dataclass(frozen=True)
+class AverageConfig:
+    """`python -m hgn.average`."""
+
+    # files of python -m hgn.export or names of shipped weights, as in [a.safetensors,b.safetensors]
+    weights: tuple[str, ...]
+    out: str
+    coefficients: tuple[float, ...] | None = None  # of each, together 1, as in [0.7,0.3]; null: equal ones
+    stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        require(len(self.weights) >= 2, "weights", "at least two files", len(self.weights))
+        if self.coefficients is not None:
+            count = f"one for each of the {len(self.weights)} files"
+            require(len(self.coefficients) == len(self.weights), "coefficients", count, len(self.coefficients))
+            require(abs(sum(self.coefficients) - 1) < 1e-6, "coefficients", "1 together", sum(self.coefficients))
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -5,14 +5,15 @@ Writes README.md with the Hub's metadata at its head: what is in the file or the
 
 from __future__ import annotations
 
+import re
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from hgn.command import run_command
-from hgn.config import CardConfig
 from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.storage import is_remote
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
@@ -21,6 +22,25 @@ from hgn.system.files import write_atomically
 
 CARD = "README.md"
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))  # the Hub's names, by episodes
+
+
+@dataclass(frozen=True)
+class CardConfig:
+    """`python -m hgn.card`: the README.md that the Hugging Face Hub shows of weights or of a data set."""
+
+    weights: str | None = None  # a file of python -m hgn.export, copied into out; or …
+    data: str | None = None  # … a data set's folder, where the card is written
+    out: str | None = None  # with weights: a folder
+    license: str = "mit"  # by the Hub's names
+    name: str | None = None  # the heading; null: the file's or the folder's name
+
+    def __post_init__(self) -> None:
+        one = (self.weights is None) != (self.data is None)
+        require(one, "weights", "given, or else data", [self.weights, self.data])
+        rule = "a folder, given together with weights"
+        require((self.weights is None) == (self.out is None), "out", rule, self.out)
+        plain = re.fullmatch(r"[a-z0-9.-]+", self.license) is not None
+        require(plain, "license", "a name as the Hub has them, for example mit or cc-by-4.0", self.license)
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -1,4 +1,5 @@
-"""The dataclasses behind every command: Hydra composes YAML, these validate it, once per command.
+"""The dataclasses behind the commands: Hydra composes YAML, these validate it, once per command. A command's own
+options are at the top of its file.
 
 Below this file nobody sees a DictConfig. Numbers that follow from others are properties, never keys.
 """
@@ -6,7 +7,6 @@ Below this file nobody sees a DictConfig. Numbers that follow from others are pr
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -280,34 +280,6 @@ class ServiceConfig:
 
 
 @dataclass(frozen=True)
-class SolveConfig:
-    """`python -m datagen.solve`: a scene file, simulated by the solver."""
-
-    scene: str  # a scene file, or the name of one in conf/example, for example funnel
-    out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
-    frames: FrameCount = 300
-    frame_rate_hz: Positive[float] = 60.0
-    mpm: MpmConfig = field(default_factory=MpmConfig)
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-        require_rollout_name("out", self.out)
-
-
-@dataclass(frozen=True)
-class UploadConfig:
-    """`python -m datagen.upload`: what is copied where."""
-
-    data: str  # folder of a data set
-    to: str  # URL; training reads it with dataset.folder=URL
-    follow: bool = False  # go on while the data set grows, until it is complete
-    poll_s: Positive[float] = 5.0  # between looks at it then
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-
-
-@dataclass(frozen=True)
 class ImportConfig:
     """`python -m hgn.import_trajectories`, beside `from`: the folder to read."""
 
@@ -512,144 +484,3 @@ class TrainConfig:
     @property
     def datagen(self) -> DatagenConfig:
         return DatagenConfig(self.scene, self.mpm, self.dataset)
-
-
-@dataclass(frozen=True)
-class ExportConfig:
-    """`python -m hgn.export`."""
-
-    checkpoint: str | None = None  # whose network is written to `out` as weights
-    out: str | None = None
-    stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
-    weights: str | None = None  # what onnx, package and arrays are of: a file or shipped weights; null: `out`
-    onnx: str | None = None  # file of a step's graph, for ONNX Runtime
-    package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
-    device: str = "cpu"  # or cuda, cuda:1
-    arrays: str | None = None  # folder of what a step is first given for `scene`, as .npy files
-    scene: str | None = None  # a scene file, or the name of an example
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-        both = (self.checkpoint is None) == (self.out is None)
-        require(both, "out", "given with checkpoint, and only then", self.out, "give both or weights")
-        require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
-        steps = any(name is not None for name in (self.onnx, self.package, self.arrays))
-        require(steps or self.weights is None, "onnx", "given with weights, or package or arrays", self.onnx)
-        rule = "given, or weights with onnx, package or arrays"
-        require(self.checkpoint is not None or self.weights is not None, "checkpoint", rule, self.checkpoint)
-        if self.package is not None:
-            require(self.package.endswith(".pt2"), "package", "a name that ends in .pt2", self.package)
-
-
-@dataclass(frozen=True)
-class CardConfig:
-    """`python -m hgn.card`: the README.md that the Hugging Face Hub shows of weights or of a data set."""
-
-    weights: str | None = None  # a file of python -m hgn.export, copied into out; or …
-    data: str | None = None  # … a data set's folder, where the card is written
-    out: str | None = None  # with weights: a folder
-    license: str = "mit"  # by the Hub's names
-    name: str | None = None  # the heading; null: the file's or the folder's name
-
-    def __post_init__(self) -> None:
-        one = (self.weights is None) != (self.data is None)
-        require(one, "weights", "given, or else data", [self.weights, self.data])
-        rule = "a folder, given together with weights"
-        require((self.weights is None) == (self.out is None), "out", rule, self.out)
-        plain = re.fullmatch(r"[a-z0-9.-]+", self.license) is not None
-        require(plain, "license", "a name as the Hub has them, for example mit or cc-by-4.0", self.license)
-
-
-@dataclass(frozen=True)
-class AverageConfig:
-    """`python -m hgn.average`."""
-
-    # files of python -m hgn.export or names of shipped weights, as in [a.safetensors,b.safetensors]
-    weights: tuple[str, ...]
-    out: str
-    coefficients: tuple[float, ...] | None = None  # of each, together 1, as in [0.7,0.3]; null: equal ones
-    stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-        require(len(self.weights) >= 2, "weights", "at least two files", len(self.weights))
-        if self.coefficients is not None:
-            count = f"one for each of the {len(self.weights)} files"
-            require(len(self.coefficients) == len(self.weights), "coefficients", count, len(self.coefficients))
-            require(abs(sum(self.coefficients) - 1) < 1e-6, "coefficients", "1 together", sum(self.coefficients))
-
-
-@dataclass(frozen=True)
-class RolloutConfig:
-    """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
-
-    weights: str = "obstacles"  # a file of python -m hgn.export, or the name of shipped weights
-    # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
-    out: str | None = None
-    surface: bool = False  # water also as a closed surface, in USD and PLY
-    render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
-    # a scene file, or the name of one in conf/example, for example funnel; null: a random scene …
-    scene: str | None = None
-    seed: NonNegative[int] = 0  # … drawn with this number, as the training's scenes are
-    data: str | None = None  # or a data set …
-    episode: str | None = None  # … and an episode of it, for example validation-000000
-    frames: FrameCount = 300
-    device: str = "auto"  # or cpu, cuda, cuda:1, …
-    backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-        require(
-            (self.data is None) == (self.episode is None),
-            "data",
-            "given together with episode",
-            self.data,
-            "for example data=data/obstacles episode=validation-000000",
-        )
-        require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
-        require_rollout_name("out", self.out)
-
-
-@dataclass(frozen=True)
-class PlayConfig:
-    """`python -m hgn.play`: a scene in the browser, live, or a rollout file."""
-
-    weights: str | None = None  # a file or the name of shipped ones; null: obstacles on a GPU, else obstacles_small
-    scene: str = "play"  # a scene file, or the name of one in conf/example
-    rollout: str | None = None  # a file of hgn.rollout to look at instead
-    html: str | None = None  # with rollout: write a page that plays it by itself to this file, and end
-    every: Positive[int] = 2  # with html: of its frames
-    host: str = "127.0.0.1"  # to listen on; 0.0.0.0: whoever reaches this machine and has the token
-    port: int = 8080  # or the next that is free; 0: any
-    browser: bool = True  # open the page in this machine's browser
-    particles: Positive[int] = 40_000  # at most
-    keep_mb: Positive[int] = 1024  # of past frames, to go back to and to save
-    device: str = "auto"  # or cpu, cuda, cuda:1, …
-    backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
-
-    def __post_init__(self) -> None:
-        require_bounds(self)
-        require(0 <= self.port < 65536, "port", "0 to 65535", self.port)
-        require(self.html is None or self.rollout is not None, "html", "left out without rollout", self.html)
-
-
-@dataclass(frozen=True)
-class EvaluateConfig:
-    """`python -m hgn.evaluate`: one-step and rollout errors on a split of a data set."""
-
-    weights: str  # a file of python -m hgn.export, or the name of shipped weights
-    data: str
-    split: Split = "validation"  # or train, test
-    scenes: Positive[int] = 5
-    frame_stride: Positive[int] = 1
-    rollout_frames: NonNegative[int] = 300  # 0: none
-    particles_per_batch: Positive[int] = 32_768
-    device: str = "auto"  # or cpu, cuda, cuda:1
-    backend: BackendName = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
-    precision: Precision = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
-    json: str | None = None  # also write the figures to this file
-
-    def __post_init__(self) -> None:
-        require_bounds(self)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import EvaluateConfig
+from hgn.config import BackendName, Precision, Split
 from hgn.data.fresh import set_record
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
@@ -21,7 +22,7 @@ from hgn.runtime.weights import find_weights, require_frame_rate
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
-from hgn.schema import from_mapping
+from hgn.schema import NonNegative, Positive, from_mapping, require_bounds
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance
@@ -35,6 +36,26 @@ from hgn.training.errors import (
     rollout_errors,
     set_convention,
 )
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """`python -m hgn.evaluate`: one-step and rollout errors on a split of a data set."""
+
+    weights: str  # a file of python -m hgn.export, or the name of shipped weights
+    data: str
+    split: Split = "validation"  # or train, test
+    scenes: Positive[int] = 5
+    frame_stride: Positive[int] = 1
+    rollout_frames: NonNegative[int] = 300  # 0: none
+    particles_per_batch: Positive[int] = 32_768
+    device: str = "auto"  # or cpu, cuda, cuda:1
+    backend: BackendName = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
+    json: str | None = None  # also write the figures to this file
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
 
 
 def main(mapping: dict[str, Any]) -> int:

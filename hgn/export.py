@@ -2,21 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import ExportConfig
+from hgn.config import StoredPrecision
 from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import from_mapping
+from hgn.schema import from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.provenance import provenance
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """`python -m hgn.export`."""
+
+    checkpoint: str | None = None  # whose network is written to `out` as weights
+    out: str | None = None
+    stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
+    weights: str | None = None  # what onnx, package and arrays are of: a file or shipped weights; null: `out`
+    onnx: str | None = None  # file of a step's graph, for ONNX Runtime
+    package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
+    device: str = "cpu"  # or cuda, cuda:1
+    arrays: str | None = None  # folder of what a step is first given for `scene`, as .npy files
+    scene: str | None = None  # a scene file, or the name of an example
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        both = (self.checkpoint is None) == (self.out is None)
+        require(both, "out", "given with checkpoint, and only then", self.out, "give both or weights")
+        require((self.arrays is None) == (self.scene is None), "scene", "given with arrays, and only then", self.scene)
+        steps = any(name is not None for name in (self.onnx, self.package, self.arrays))
+        require(steps or self.weights is None, "onnx", "given with weights, or package or arrays", self.onnx)
+        rule = "given, or weights with onnx, package or arrays"
+        require(self.checkpoint is not None or self.weights is not None, "checkpoint", rule, self.checkpoint)
+        if self.package is not None:
+            require(self.package.endswith(".pt2"), "package", "a name that ends in .pt2", self.package)
 
 
 def main(mapping: dict[str, Any]) -> int:

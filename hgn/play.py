@@ -9,19 +9,44 @@ import hgn.system.threads  # noqa: F401  # isort: skip  # before torch is loaded
 
 import sys
 import webbrowser
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import PlayConfig
+from hgn.config import BackendName, Precision
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import shipped_weights
 from hgn.scene.rollout_file import read_rollout
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import from_mapping
+from hgn.schema import Positive, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
+
+
+@dataclass(frozen=True)
+class PlayConfig:
+    """`python -m hgn.play`: a scene in the browser, live, or a rollout file."""
+
+    weights: str | None = None  # a file or the name of shipped ones; null: obstacles on a GPU, else obstacles_small
+    scene: str = "play"  # a scene file, or the name of one in conf/example
+    rollout: str | None = None  # a file of hgn.rollout to look at instead
+    html: str | None = None  # with rollout: write a page that plays it by itself to this file, and end
+    every: Positive[int] = 2  # with html: of its frames
+    host: str = "127.0.0.1"  # to listen on; 0.0.0.0: whoever reaches this machine and has the token
+    port: int = 8080  # or the next that is free; 0: any
+    browser: bool = True  # open the page in this machine's browser
+    particles: Positive[int] = 40_000  # at most
+    keep_mb: Positive[int] = 1024  # of past frames, to go back to and to save
+    device: str = "auto"  # or cpu, cuda, cuda:1, …
+    backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        require(0 <= self.port < 65536, "port", "0 to 65535", self.port)
+        require(self.html is None or self.rollout is not None, "html", "left out without rollout", self.html)
 
 
 def main(mapping: dict[str, Any]) -> int:

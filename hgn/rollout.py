@@ -9,14 +9,14 @@ import hgn.system.threads  # noqa: F401  # isort: skip  # before torch is loaded
 
 import hashlib
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import RolloutConfig, SceneConfig
+from hgn.config import BackendName, Precision, SceneConfig, require_rollout_name
 from hgn.data.lookup import find_episode
 from hgn.render.exchange import require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
@@ -29,11 +29,43 @@ from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import find_scene, load_scene, sheets_of_meshes
-from hgn.schema import ConfigError, from_mapping
+from hgn.schema import ConfigError, FrameCount, NonNegative, from_mapping, require, require_bounds
 from hgn.system.progress import bar
 
 PICTURES = 4  # in the PNG
 EVERY = 3  # frames of the rollout for one picture of the GIF
+
+
+@dataclass(frozen=True)
+class RolloutConfig:
+    """`python -m hgn.rollout`: simulates a random scene, a scene file, or an episode of a data set beside its truth."""
+
+    weights: str = "obstacles"  # a file of python -m hgn.export, or the name of shipped weights
+    # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
+    out: str | None = None
+    surface: bool = False  # water also as a closed surface, in USD and PLY
+    render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
+    # a scene file, or the name of one in conf/example, for example funnel; null: a random scene …
+    scene: str | None = None
+    seed: NonNegative[int] = 0  # … drawn with this number, as the training's scenes are
+    data: str | None = None  # or a data set …
+    episode: str | None = None  # … and an episode of it, for example validation-000000
+    frames: FrameCount = 300
+    device: str = "auto"  # or cpu, cuda, cuda:1, …
+    backend: BackendName = "auto"  # torch, triton (kernels in CUDA graphs), cpu (compiled C); auto: the fastest
+    precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        require(
+            (self.data is None) == (self.episode is None),
+            "data",
+            "given together with episode",
+            self.data,
+            "for example data=data/obstacles episode=validation-000000",
+        )
+        require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
+        require_rollout_name("out", self.out)
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -16,7 +16,7 @@ def test_canary(tmp_path: Path) -> None:
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "wide.yaml").write_text("defaults:\n  - hgn.config.SceneConfig\ngroup_size: 0.5\n")
     (tmp_path / "made.yaml").write_text(
-        "defaults:\n  - hgn.config.AverageConfig\n  - scene: wide\n  - _self_\nout: x\n"
+        "defaults:\n  - hgn.average.AverageConfig\n  - scene: wide\n  - _self_\nout: x\n"
     )
     arguments = ["made", "weights=my data (1)/ü", "scene.group_count=3", "invented.key=1"]
     (composed,) = compose(tmp_path, "made", arguments)

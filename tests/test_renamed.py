@@ -8,18 +8,13 @@ from typing import Any
 
 import pytest
 
-from hgn.config import (
-    DatagenConfig,
-    EvaluateConfig,
-    ExportConfig,
-    NetworkConfig,
-    RolloutConfig,
-    SceneConfig,
-    TrainConfig,
-)
+from hgn.config import DatagenConfig, NetworkConfig, SceneConfig, TrainConfig
 from hgn.data.identity import dataset_identity
+from hgn.evaluate import EvaluateConfig
+from hgn.export import ExportConfig
 from hgn.network.build import build_network
 from hgn.renamed import KEYS, VALUES, current_names, stored_names
+from hgn.rollout import RolloutConfig
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping, from_stored, to_mapping
 

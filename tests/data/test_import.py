@@ -15,7 +15,7 @@ from data.foreign_writers import Hostile, metadata, pickled_npz, sequence_exampl
 from training.runs import metrics, train_mapping
 
 from hgn import evaluate, import_trajectories, train
-from hgn.config import DatagenConfig, NetworkConfig, RolloutConfig
+from hgn.config import DatagenConfig, NetworkConfig
 from hgn.data.batch import make_batch
 from hgn.data.foreign.boundary import boundary_grid
 from hgn.data.foreign.episodes import flat_plane
@@ -26,7 +26,7 @@ from hgn.export import export
 from hgn.network.build import build_network
 from hgn.network.grid import build_hierarchy
 from hgn.render.pictures import compare_picture
-from hgn.rollout import rollout
+from hgn.rollout import RolloutConfig, rollout
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights
 from hgn.scene.episode import decode_episode, encode_episode

@@ -189,7 +189,7 @@ def test_every_command_is_listed() -> None:
     assert listed == parents
 
     text = reference_pages.configuration_page()
-    for cls in (config.SceneConfig, config.MpmConfig, config.TrainingConfig, config.EvaluateConfig):
+    for cls in (config.SceneConfig, config.MpmConfig, config.TrainingConfig, config.NetworkConfig):
         section = text.split(f"## {cls.__name__}\n")[1].split("\n## ")[0]
         assert re.findall(r"^\| `(\w+)`", section, re.MULTILINE) == [field.name for field in dataclasses.fields(cls)]
     assert "| `seed` | `NonNegative[int]` | `0` |" in text and "domain units per frame |" in text

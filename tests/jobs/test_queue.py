@@ -14,9 +14,12 @@ import pytest
 from processes import processes_of_session, wait_until
 
 from datagen.generate import datagen_config
+from hgn.average import AverageConfig
 from hgn.command import _compose
-from hgn.config import AverageConfig, DatagenConfig, EvaluateConfig, ExportConfig, TrainConfig
+from hgn.config import DatagenConfig, TrainConfig
 from hgn.data.identity import dataset_identity
+from hgn.evaluate import EvaluateConfig
+from hgn.export import ExportConfig
 from hgn.runtime.weights import load_weights, shipped_weights
 from hgn.schema import from_mapping
 from tools.error_vs_time.settings import ErrorVsTimeConfig

@@ -10,8 +10,7 @@ import pytest
 import torch
 from training.test_weights import weights_file
 
-from hgn.average import average, main
-from hgn.config import AverageConfig
+from hgn.average import AverageConfig, average, main
 from hgn.runtime.weights import load_weights, save_weights
 from hgn.schema import ConfigError
 

@@ -19,7 +19,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scene.test_rollout_file import make_rollout
 
-from hgn.config import NetworkConfig, SolveConfig
+from datagen.solve import SolveConfig
+from hgn.config import NetworkConfig
 from hgn.data.index import parse_json
 from hgn.data.shard import locate_members
 from hgn.scene.mesh import load_mesh

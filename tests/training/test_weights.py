@@ -11,10 +11,10 @@ from ballistic_dataset import MakeConfig, MakeDataset
 from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig, EvaluateConfig, NetworkConfig, TrainingConfig
+from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
-from hgn.evaluate import one_step_rows
+from hgn.evaluate import EvaluateConfig, one_step_rows
 from hgn.export import export
 from hgn.network.build import build_network
 from hgn.runtime.backend import Backend
