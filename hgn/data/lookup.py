@@ -18,14 +18,14 @@ def first_indices(store: EpisodeStore, count: int, published: int | None = None)
     return [place for _, place in nsmallest(count, places)]
 
 
-def first_episodes(store: EpisodeStore, count: int, published: int | None = None) -> list[Episode]:
+def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
     """These episodes.
 
     Raises: ConfigError when there are none.
     """
     if not len(store):
         raise ConfigError(f"data must hold episodes of the split {store.split}, got none in {store.folder}")
-    return [store.episodes[i] for i in first_indices(store, count, published)]
+    return [store.episodes[i] for i in first_indices(store, count)]
 
 
 def find_episode(folder: Path | str, key: str) -> Episode:

@@ -21,7 +21,6 @@ from hgn.render.renderer import BACKGROUND_COLOR, MATERIAL_COLORS, OBSTACLE_COLO
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
-from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 from hgn.system.files import write_atomically
 
@@ -31,29 +30,6 @@ PALETTE_SAMPLES = 40_000
 WEBP_QUALITY = 70  # at 50 small particles smear, and at 90 the file is as large as a GIF
 Color = tuple[int, int, int]
 NO_OTHERS: Mapping[str, np.ndarray] = MappingProxyType({})
-
-
-def draw_frame(
-    position_N3: np.ndarray,
-    material_N: np.ndarray,
-    obstacles: Sequence[Obstacle],
-    domain_size: tuple[float, float, float],
-    title: str = "",
-    size: int = 640,
-    particle_radius: float | None = None,
-) -> Image.Image:
-    """One frame as an RGB picture, `size` pixels wide; lengths in domain units.
-
-    particle_radius: none takes it from the particles' spacing. Particles that are not finite are left out.
-    """
-    radius = particle_spacing(position_N3) * RADIUS_IN_SPACINGS if particle_radius is None else particle_radius
-    panel = Stage(domain_size, obstacles, radius, size).draw(position_N3, material_N)
-    header = _header_height(size) if title else 0
-    picture = Image.new("RGB", (panel.width, panel.height + header), _background())
-    picture.paste(panel, (0, header))
-    if title:
-        _write(picture, (panel.width / 2, header / 2), title, _text_size(size))
-    return picture
 
 
 def compare_picture(

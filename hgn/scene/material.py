@@ -34,13 +34,13 @@ MATERIAL_PARAMETERS: tuple[str, ...] = (
 )
 
 
-def material_index(name: str, field: str = "material") -> int:
+def material_index(name: str) -> int:
     """The index of a material name in `MATERIALS`.
 
     Raises: ConfigError when the name is unknown.
     """
     if name not in MATERIALS:
-        raise ConfigError(f"{field} must be one of {', '.join(MATERIALS)}, got {name!r}")
+        raise ConfigError(f"material must be one of {', '.join(MATERIALS)}, got {name!r}")
     return MATERIALS.index(name)
 
 

@@ -18,9 +18,9 @@ BY_WEIGHT = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 class StopRequest:
     """Whether, and why, this process should stop training."""
 
-    def __init__(self, maximum_minutes: float | None = None) -> None:
+    def __init__(self) -> None:
         self.signal: int | None = None
-        self._deadline = None if maximum_minutes is None else time.monotonic() + 60 * maximum_minutes
+        self._deadline: float | None = None
 
     def listen(self) -> None:
         """Takes over SIGINT, SIGTERM and SIGUSR1; only the main thread may call this."""

@@ -14,13 +14,13 @@ from PIL import Image, ImageSequence
 from hgn.render.pictures import (
     animate,
     compare_picture,
-    draw_frame,
     error_curve,
     particle_spacing,
     position_error,
     rollout_of_episode,
     write_picture,
 )
+from hgn.render.renderer import Stage
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
@@ -73,10 +73,10 @@ def test_each_material_is_seen_in_its_colour(material: int) -> None:
     """A frame shows a material's hue when that material is there, and not when it is not."""
     rollout = falling_blobs()
 
+    stage = Stage(rollout.domain_size, (), 0.01, 300)
+
     def frame(kept: np.ndarray) -> Image.Image:
-        return draw_frame(
-            rollout.position_TN3[0, kept], rollout.material_N[kept], (), rollout.domain_size, "t = 0.00 s", 300
-        )
+        return stage.draw(rollout.position_TN3[0, kept], rollout.material_N[kept])
 
     assert has_hue(frame(rollout.material_N == material), material)
     assert not has_hue(frame(np.zeros(len(rollout.material_N), bool)), material)

@@ -34,7 +34,7 @@ from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
 from tools.error_vs_time.paired import paired_difference, paired_lines, paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.settings import ErrorVsTimeConfig
-from tools.error_vs_time.sinkhorn import sinkhorn_divergence, sinkhorn_divergences
+from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
 from tools.solver_rollouts import FrameClock, other_grid
 
@@ -338,6 +338,10 @@ def test_a_diverging_scene_ends_alone(data: str) -> None:
 
 def test_sinkhorn_against_closed_forms() -> None:
     """Zero for a permuted cloud, the square of the shift for a shifted one, NaN where a position is not finite."""
+
+    def sinkhorn_divergence(first: torch.Tensor, second: torch.Tensor, blur: float) -> float:
+        return sinkhorn_divergences([(first, second)], blur)[0]
+
     generator = torch.Generator().manual_seed(0)
     cloud = torch.rand(120, 3, generator=generator)
     shift = torch.tensor([0.1, -0.05, 0.2])

@@ -17,17 +17,12 @@ FINAL_STEPS = 20  # at the last blur
 ENTRIES_AT_ONCE = 1 << 26  # of costs
 
 
-def sinkhorn_divergence(first_N3: torch.Tensor, second_M3: torch.Tensor, blur: float) -> float:
-    """In units of length squared: the mean squared distance that mass has to move. NaN where positions are not finite.
+def sinkhorn_divergences(pairs: Sequence[tuple[torch.Tensor, torch.Tensor]], blur: float) -> list[float]:
+    """Of each pair the mean squared distance that mass has to move. NaN where positions are not finite.
 
     Zero for equal clouds, the square of the shift for a shifted one. `blur` is the length below which matter may be
-    mixed up. Costs memory and time of N x M.
+    mixed up. Costs memory and time of N x M; pairs of equal numbers of particles are taken at once.
     """
-    return sinkhorn_divergences([(first_N3, second_M3)], blur)[0]
-
-
-def sinkhorn_divergences(pairs: Sequence[tuple[torch.Tensor, torch.Tensor]], blur: float) -> list[float]:
-    """Those of many pairs of clouds, pairs of equal numbers of particles at once: each as if it were alone."""
     divergences = [math.nan] * len(pairs)
     of_size: dict[tuple[int, int], list[int]] = {}
     for i, (first_N3, second_M3) in enumerate(pairs):

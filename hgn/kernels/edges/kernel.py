@@ -94,7 +94,7 @@ def edge_forward(
 
     FIRST: edges have no features yet, their unit offset takes the place. The last iteration stores no edges. SAVE keeps
     what edge_backward reads: the hidden layer and the normalised output [C, 6, W], and `rstd` [C, 6], one over its
-    rstd.
+    standard deviation.
 
     Reference: hgn.kernels.edges.reference; test: tests/kernels/test_kernels_alone.py.
     """

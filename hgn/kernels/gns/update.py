@@ -14,6 +14,7 @@ from functools import cached_property
 import torch
 import triton
 from torch.nn import functional
+from torch.nn.utils import vector_to_parameters
 
 from hgn.kernels.forward import feature_columns
 from hgn.kernels.gns.op import FusedEdges
@@ -52,9 +53,7 @@ class FlatLayout:
 def views_of(network: GraphNetworkSimulator, values: torch.Tensor) -> GraphNetworkSimulator:
     """A network whose parameters are pieces of `values`, laid out one after the other."""
     result = copy.deepcopy(network)
-    parameters = list(result.parameters())
-    for parameter, part in zip(parameters, values.split([p.numel() for p in parameters]), strict=True):
-        parameter.data = part.view(parameter.shape)
+    vector_to_parameters(values, result.parameters())
     return result
 
 

@@ -91,8 +91,8 @@ def particle_cell_forward(
     particle + sum over the corners of weight * MLP(by_cell_c + by_particle_n - offset). The by_… are products with
     first-layer weights, by_particle with the particle's part of the offset: what is left of it are the corner's bits.
 
-    SAVE keeps what particle_cell_backward reads: the normalised output [8 N, W], `rstd` [8 N], one over its rstd,
-    and the hidden layer unless BY_PRODUCT: then it is cheaper to compute again.
+    SAVE keeps what particle_cell_backward reads: the normalised output [8 N, W], `rstd` [8 N], one over its standard
+    deviation, and the hidden layer unless BY_PRODUCT: then it is cheaper to compute again.
 
     Reference: hgn.kernels.particle_cell.reference; test: tests/kernels/test_kernels_alone.py.
     """
