@@ -71,15 +71,35 @@ def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver_validation, "COLUMN_ASPECTS", (1.0,))
     monkeypatch.setattr(solver_validation, "OTHER_ASPECTS", (1.0,))
     monkeypatch.setattr(solver_validation, "SAND_LAWS", (("compression", 45.0),))
-    monkeypatch.setattr(solver_validation, "REPOSE_ANGLES_DEG", ())
     monkeypatch.setattr(solver_validation, "REST_S", 3.0)
-    rows = solver_validation.validation(MpmConfig(device="cpu"))
+    cpu = MpmConfig(device="cpu")
+    rows = [row for part in ("rest", "dam_breaks", "columns") for row in getattr(solver_validation, part)(cpu)]
     assert [row.case.split(",")[0] for row in rows] == [
         "level of water at rest", *["dam break"] * 3, *["sand column"] * 4
     ]  # fmt: skip
     assert rows[1].held and rows[2].held
     assert [row.predicted for row in rows[4:6]] == pytest.approx([1.24, 0.74])
     assert rows[5].measured < rows[7].measured  # so few cells tell heights apart, not run-outs
+
+
+def test_grids() -> None:
+    """Fronts, run-outs and heights on each grid, with what they lead to."""
+    rows = solver_validation.grids(MpmConfig(device="cpu"), (4, 5, 6))
+    quantities = ["front of the dam", "run-out of a sand", "height of a sand", *["height of a block"] * 3]
+    assert all(what in row.case for what, row in zip(quantities, rows, strict=True))
+    snow = rows[-1].more["values"]
+    assert all(0.95 < height < 1.1 for height in snow)  # of a side: it hardly yields; water lies spread out by then
+    assert max(rows[3].more["values"]) < 0.3
+
+
+@pytest.mark.parametrize("order", [0.5, 1.0, 2.0])
+def test_order_of_convergence(order: float) -> None:
+    """Values that approach a limit by a power of the cells' size have both told; from what turns round nothing is."""
+    cells = (8, 12, 16, 32)
+    found, limit = solver_validation.convergence_order(cells, [3 - 2 / count**order for count in cells])
+    assert (found, limit) == pytest.approx((order, 3.0), rel=0.02)
+    assert solver_validation.convergence_order(cells, [1.0, 1.2, 1.1, 1.0]) == (None, None)
+    assert solver_validation.convergence_order(cells, [1.0, 1.1, 1.3, 2.3]) == (None, None)
 
 
 def test_height_is_taken_while_there_is_a_block() -> None:
@@ -105,3 +125,5 @@ def test_bad_options_are_refused() -> None:
         main({"cases": ["stesp"]})
     with pytest.raises(ConfigError, match="picture"):
         main({"cases": ["leak"], "picture": "steps.png"})
+    with pytest.raises(ConfigError, match="grid_cells"):
+        main({"cases": ["grid"], "grid_cells": [16, 8, 12]})

@@ -1,8 +1,9 @@
 """python -m tools.stability solver [--json FILE] [picture=FILE]: what the solver bears, up to where, and beyond.
 
 Rows: the largest stable step against the formula, stiffness, speed of impact, convergence of the default step, flight
-from obstacles and friction on them, leaks through them, a long run, and what published experiments found. On two CPU
-cores each case takes minutes, the table of leaks with leak_seconds=0.1 leak_block_cells=3.
+from obstacles and friction on them, leaks through them, a long run, what published experiments found (water at rest,
+dams, columns and slopes of sand), and convergence on the grid. On two CPU cores each case takes minutes, the table of
+leaks with leak_seconds=0.1 leak_block_cells=3; columns want a GPU.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,22 +25,27 @@ from tools.stability.solver_contact import contacts
 from tools.stability.solver_leak import OFFSETS, leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
 from tools.stability.solver_steps import Point, draw, largest_steps
-from tools.stability.solver_validation import grids, validation
+from tools.stability.solver_validation import columns, dam_breaks, grids, reposes, rest
 
 PART = "solver"
-CASES = ("steps", "stiffness", "impact", "convergence", "contact", "leak", "long", "validation", "grid")
+CASES = (
+    "steps", "stiffness", "impact", "convergence", "contact", "leak", "long", "rest", "dam", "column", "repose", "grid"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class StabilitySolverConfig:
     """`python -m tools.stability solver`: what is tried."""
 
-    # steps, stiffness, impact, convergence, contact, leak, long, validation, grid; null: all
+    # steps, stiffness, impact, convergence, contact, leak, long, rest, dam, column, repose, grid; null: all
     cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     device: Processor = "auto"  # or cpu, gpu
     leak_seconds: Positive[float] = 5.0  # simulated, for each row of the table of leaks
     leak_block_cells: Positive[float] = 4.0  # side of the blocks that hit the obstacles, eight particles a cell
     leak_offsets: int = len(OFFSETS)  # of an obstacle within a cell, at most 8; 54 scenes each
+    # of the case grid, in widths of dams, radii of columns and sides of blocks; four such fit into a domain, so 8 to 32
+    # are what 32 to 128 cells a side give; 32 want a GPU
+    grid_cells: tuple[int, ...] = (8, 12, 16)
     leak_band_cells: float | None = None  # mpm.collider_band_cells for the table of leaks; null: the solver's own
     picture: str | None = None  # also draw stable and unstable steps against the formula, as PNG
     json: str | None = None  # also write the rows to this file; --json FILE does the same
@@ -46,6 +53,9 @@ class StabilitySolverConfig:
     def __post_init__(self) -> None:
         require_bounds(self)
         require(1 <= self.leak_offsets <= len(OFFSETS), "leak_offsets", f"1 to {len(OFFSETS)}", self.leak_offsets)
+        cells = self.grid_cells
+        rising = len(cells) > 2 and cells[0] > 3 and all(a < b for a, b in pairwise(cells))
+        require(rising, "grid_cells", "three numbers or more that rise, from 4 on", list(cells))
         band = self.leak_band_cells
         require(band is None or band > 0, "leak_band_cells", "> 0", band)
         drawn = self.picture is None or self.cases is None or "steps" in self.cases
@@ -67,8 +77,11 @@ def main(mapping: dict[str, Any]) -> int:
             _leak_settings(mpm, config), config.leak_seconds, config.leak_block_cells, config.leak_offsets
         ),
         "long": lambda: long_run(mpm),
-        "validation": lambda: validation(mpm),
-        "grid": lambda: grids(mpm),
+        "rest": lambda: rest(mpm),
+        "dam": lambda: dam_breaks(mpm),
+        "column": lambda: columns(mpm),
+        "repose": lambda: reposes(mpm),
+        "grid": lambda: grids(mpm, config.grid_cells),
     }
     rows: list[Row] = []
     wanted = [name for name in CASES if name in (config.cases or CASES)]

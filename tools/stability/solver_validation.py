@@ -12,13 +12,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from datagen.mpm.layout import sand_alpha, sand_sine
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from hgn.config import MpmConfig
-from hgn.scene.material import SAND, WATER
+from hgn.scene.material import PAPER_MATERIALS, SAND, WATER
 from hgn.scene.scene import Obstacle, Scene
 from tools.stability.row import Row
 from tools.stability.solver_scenes import PARTICLES_PER_CELL
@@ -44,11 +45,12 @@ REST_CELLS, REST_DEPTH = 6, 0.375  # m
 REST_S, REST_RATE_HZ, REST_WITHIN = 20.0, 4.0, 0.005
 SETTLED_S = 2.5  # until its first waves are gone
 
-# one scene on three grids
-GRID_CELLS = (8, 16, 32)  # in the width of the dam and the radius of the column
-GRID_ASPECT = 1.5
-GRID_DAM_S = 0.25
+# one scene on several grids
+GRID_ASPECT = 1.0
+GRID_DAM_S, GRID_IMPACT_S = 0.25, 1 / 30
 GRID_WITHIN = 0.05
+ORDERS = (0.1, 4.0, 391)
+IMPACT_SIDE, IMPACT_DROP, IMPACT_SPEED = 0.125, 0.125, 4.5  # m; sides above the floor; m/s
 
 # quarters of round columns on a rough floor: run-out beside Lube et al. 2004, height beside the mean of what they and
 # Lajeunesse et al. 2004 found
@@ -77,11 +79,6 @@ REPOSE_CELLS = 24  # along it
 REPOSE_TIMES = 12.0  # of sqrt(length / g)
 PIT = 0.4  # of the platform's length, below it
 AT_REST = 1e-2  # m/s, root mean square
-
-
-def validation(base: MpmConfig) -> list[Row]:
-    """Rows of water at rest, of the dam break, of columns by each friction law, and of angles of repose."""
-    return [*rest(base), *dam_breaks(base), *columns(base), *reposes(base)]
 
 
 def dam_breaks(base: MpmConfig) -> list[Row]:
@@ -127,32 +124,59 @@ def rest(base: MpmConfig) -> list[Row]:
     return [Row("level of water at rest, random filling", REST_WITHIN, worst, abs(worst) <= REST_WITHIN, beyond)]
 
 
-def grids(base: MpmConfig) -> list[Row]:
-    """What a grid twice and four times as fine changes in fronts, run-outs and heights, and the order of it."""
-    rows = []
+def grids(base: MpmConfig, cells: Sequence[int]) -> list[Row]:
+    """How fronts, run-outs and heights change with the grid, with the order of it: `cells`, three or more, are those of
+    the width of a dam, the radius of a column, and the side of blocks that hit the floor.
+    """
     sand = base.sand_friction_law, base.sand_friction_angle_deg
-    measured: dict[str, list[float]] = {
-        "front of the dam break, in widths": [], "run-out of a sand column": [], "height of a sand column": [],
-    }  # fmt: skip
-    fronts, run_outs, heights = measured.values()
-    for cells in GRID_CELLS:
-        path = _path(dam(cells), base, 2 + math.ceil(GRID_DAM_S * DAM_RATE_HZ))
-        fronts.append(dam_front(path[-1], cells))
-        run_out, height = column_rows(GRID_ASPECT, *sand, base, cells)
-        run_outs.append(float(run_out.measured))
-        heights.append(float(height.measured))
+    measured: dict[str, list[float]] = {}
+    for count in cells:
+        path = _path(dam(count), base, 2 + math.ceil(GRID_DAM_S * DAM_RATE_HZ))
+        measured.setdefault("front of the dam break, in widths", []).append(dam_front(path[-1], count))
+        for row in column_rows(GRID_ASPECT, *sand, base, count):
+            what = row.case.rsplit(", ", 1)[1]
+            measured.setdefault(f"{what} of a sand column, in radii", []).append(float(row.measured))
+        for kind, name in enumerate(PAPER_MATERIALS):
+            path = _path(impact(kind, count), base, 2, 1 / GRID_IMPACT_S)
+            height = float(np.quantile(path[-1][:, 1], 0.95)) / IMPACT_SIDE - WALL / count
+            measured.setdefault(f"height of a block of {name} after its impact, in sides", []).append(height)
+    rows = []
     for name, values in measured.items():
-        coarse, fine = values[1] - values[0], values[2] - values[1]
-        rate = math.log2(abs(coarse / fine)) if coarse and fine else math.inf
-        limit = values[2] + fine / (2**rate - 1) if rate > 0.1 else math.nan
-        change = abs(values[2] / values[1] - 1)
-        beyond = (
-            f"{', '.join(f'{value:.3f} at {cells}' for value, cells in zip(values, GRID_CELLS, strict=True))} cells; "
-            f"order {rate:.2f}" + (f", towards {limit:.3f}" if math.isfinite(limit) else "")
-        )
-        more = {"cells": list(GRID_CELLS), "values": values, "order": rate if math.isfinite(rate) else None}
-        rows.append(Row(f"grid twice as fine: {name}", GRID_WITHIN, change, change <= GRID_WITHIN, beyond, more))
+        order, limit = convergence_order(cells, values)
+        change = abs(values[-1] / values[-2] - 1)
+        beyond = ", ".join(f"{value:.3f} at {count}" for value, count in zip(values, cells, strict=True)) + " cells; "
+        more: dict[str, Any] = {"cells": list(cells), "values": values, "order": order, "limit": limit}
+        beyond += "approaches nothing yet" if order is None else f"order {order:.2g}, towards {limit:.3f}"
+        case = f"grid of {cells[-1]} cells beside {cells[-2]}: {name}"
+        rows.append(Row(case, GRID_WITHIN, change, change <= GRID_WITHIN, beyond, more))
     return rows
+
+
+def convergence_order(cells: Sequence[int], values: Sequence[float]) -> tuple[float, float] | tuple[None, None]:
+    """p and the limit of limit + c / cells^p, as near to the values as can be; none where these turn round, or change
+    by no less a step than before, or where p is not between 0.1 and 4.
+    """
+    steps = np.diff(values)
+    slopes = steps / np.diff(np.log(cells))
+    if not ((steps > 0).all() or (steps < 0).all()) or abs(slopes[-1]) >= abs(slopes[0]):
+        return None, None
+    best = (math.inf, 0.0, 0.0)
+    for order in np.linspace(*ORDERS):
+        basis = np.stack([np.ones(len(cells)), np.asarray(cells, float) ** -order], axis=1)
+        solution = np.linalg.lstsq(basis, np.asarray(values), rcond=None)[0]
+        residual = float(np.square(basis @ solution - values).sum())
+        best = min(best, (residual, float(order), float(solution[0])))
+    return best[1:] if ORDERS[0] < best[1] < ORDERS[1] else (None, None)
+
+
+def impact(kind: int, cells: int) -> Scene:
+    """A block so many cells a side that is about to hit the floor, in a room four times as wide."""
+    scene = basin(kind, (cells,) * 3, (4 * cells, 2 * cells, 4 * cells), IMPACT_SIDE / cells)
+    shift = np.array([1.5, IMPACT_DROP, 1.5]) * IMPACT_SIDE
+    return dataclasses.replace(
+        scene, position_N3=(scene.position_N3 + shift).astype(np.float32),
+        velocity_N3=np.tile(np.array([0, -IMPACT_SPEED, 0], np.float32), (scene.particle_count, 1)),
+    )  # fmt: skip
 
 
 def columns(base: MpmConfig) -> list[Row]:
