@@ -62,6 +62,8 @@ class PlayPage:
         spacing = session.cell_size / session.particles_per_cell ** (1 / 3)
         self.stage = StageView(self.server, session.domain_size, spacing)
         self.ended, self.playing, self.steps = threading.Event(), True, 0
+        self.diverged = False  # it pauses for that, not because somebody asked for it
+        self.viewed = threading.Event()  # until somebody looks nothing happens
         self.wanted: queue.SimpleQueue[tuple[object, Callable[[], Any], Any]] = queue.SimpleQueue()
         self.meshes: dict[int, viser.MeshHandle] = {}
         self.shown: dict[int, PlacedObstacle] = {}
@@ -70,6 +72,7 @@ class PlayPage:
         self.frames_a_second = 0.0
         self._add_buttons(list(weights))
         self._add_mouse()
+        self.server.on_client_connect(lambda _: self.viewed.set())
         self._show()
         self._tell()
 
@@ -97,18 +100,18 @@ class PlayPage:
             one.add_notification("HGN", message, auto_close_seconds=10)
 
     def run(self) -> None:
-        """Simulates until `close`, at most as fast as time passes."""
+        """Simulates from the first viewer's coming until `close`, at most as fast as time passes."""
         due = told = time.monotonic()
         frames = 0
         while not self.ended.is_set():
             changed = self._do_all()
-            if self.playing or self.steps:
+            if (self.playing and self.viewed.is_set()) or self.steps:
                 self.steps = max(0, self.steps - 1)
                 try:
                     self.session.step()
                 except DivergedError as error:
-                    self.playing = False
-                    self._say(f"{error}; paused a frame before")
+                    self.playing, self.diverged = False, True
+                    self._say(f"{error}; paused a frame before. Back by or Restart")
                 frames, changed = frames + 1, True
             if changed:
                 self._show()
@@ -186,20 +189,18 @@ class PlayPage:
             save_scene = gui.add_button("Scene (YAML, zip)")
             save_rollout = gui.add_button("Rollout (VTKHDF)")
 
-        def playing(value: bool) -> None:
-            self.playing = value
-
         def one_step() -> None:
-            self.playing, self.steps = False, 1
+            self.play(False)
+            self.steps = 1
 
         def go_back(seconds: float) -> None:
-            self.playing = False
+            self.play(False)
             frames = max(1, round(seconds * self.rate))
             session.rewind(max(session.recording.earliest, session.frame - frames))
 
-        self.play_button.on_click(lambda event: self.do(lambda: playing(not self.playing), event.client))
+        self.play_button.on_click(lambda event: self.do(lambda: self.play(not self.playing), event.client))
         step.on_click(lambda event: self.do(one_step, event.client))
-        restart.on_click(lambda event: self.do(session.restart, event.client))
+        restart.on_click(lambda event: self.do(self.restart, event.client))
         add.on_click(lambda event: self.do(self._add_shape, event.client))
         remove.on_click(lambda event: self.do(self._remove_chosen, event.client))
         save_scene.on_click(lambda event: self.do(lambda: self._send_scene(event), event.client))
@@ -226,6 +227,15 @@ class PlayPage:
         def _(event: Any) -> None:
             file = event.target.value
             self.do(lambda: self._add_file(file.name, file.content), event.client)
+
+    def play(self, playing: bool) -> None:
+        """Goes on or pauses, as a viewer wants it."""
+        self.playing, self.diverged = playing, False
+
+    def restart(self) -> None:
+        """From the beginning; it stays paused where a viewer paused it, not where it diverged."""
+        self.session.restart()
+        self.playing, self.diverged = self.playing or self.diverged, False
 
     def _use(self, name: str) -> None:
         assert self.load is not None

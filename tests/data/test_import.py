@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -139,8 +140,6 @@ def hdf5(name: str, key: str, value: Any = None) -> Callable[[Path], None]:
     """Puts another array in the place of one, or takes it away."""
 
     def change(folder: Path) -> None:
-        import h5py
-
         with h5py.File(folder / name, "a") as file:
             old = file[key][()]
             del file[key]
@@ -170,6 +169,35 @@ def moving(array: np.ndarray) -> np.ndarray:
     return array + 0.01 * np.arange(len(array), dtype=np.float32)[:, None, None]
 
 
+def claimed(folder: Path) -> None:
+    """A file of few bytes that says of itself that it holds 7 TiB."""
+    with h5py.File(folder / "train.h5", "a") as file:
+        del file["00000/position"]
+        file.create_dataset("00000/position", (10**6, 10**6, 2), "f4", chunks=(1, 1000, 2))
+
+
+def cells(cell: Any, length: float = 1.0) -> Callable[[Path], None]:
+    """Obstacle cells of the plain layout."""
+
+    def change(folder: Path) -> None:
+        meta(obstacle_cell_size=1 / 64)(folder)
+        normal = np.tile(np.array([[0, length, 0]], np.float32), (len(cell), 1))
+        path = folder / "train.npz"
+        with np.load(path) as archive:
+            members = dict(archive)
+        np.savez(path, **members, **{"00001/obstacle_cell": np.array(cell), "00001/obstacle_normal": normal})
+
+    return change
+
+
+def at_the_side(folder: Path) -> None:
+    meta(periodic_boundary_conditions=[True] * 3)(folder)
+    hdf5("train.h5", "00000/position", lambda a: a - np.array([0.48, 0, 0], np.float32))(folder)
+
+
+WALK = np.zeros((9, 2, 3))
+
+
 def pickled(content: Callable[[Path], Any]) -> Callable[[Path], None]:
     return lambda folder: pickled_npz(folder / "train.npz", content(folder))
 
@@ -185,7 +213,22 @@ def pickled(content: Callable[[Path], Any]) -> Callable[[Path], None]:
         ("deepmind", meta(sequence_length=None), r"metadata.json: sequence_length must be a whole number, got None"),
         ("deepmind", meta(bounds=None), r"bounds must be given where .*metadata.json does not say it"),
         ("deepmind", meta(bounds=[[0, 0.2]] * 3), r"bounds must hold the particles, got .* of record|bounds must hold"),
-        ("deepmind", meta(dt="soon"), r"metadata.json must hold dim, dt, bounds as numbers"),
+        ("deepmind", meta(dt="soon"), r"metadata.json: dt must be a finite number, got 'soon'"),
+        ("deepmind", meta(dim=2.5), r"metadata.json: dim must be 2 or 3, got 2.5"),
+        ("deepmind", meta(bounds=[[0, 1], [0, 1], [0, float("inf")]]), r"bounds must be finite numbers in pairs"),
+        ("deepmind", meta(default_connectivity_radius=1e-12), r"radius must be 6.1e-05 or more, the box being 1 wide"),
+        ("deepmind", lambda folder: (folder / "metadata.json").write_text("[" * 9**6), r"metadata.json must be JSON"),
+        ("lagrangebench", meta(periodic_boundary_conditions="no"), r"conditions must be finite numbers in a list"),
+        ("lagrangebench", meta(write_every=0), r"metadata.json: write_every must be > 0, got 0.0"),
+        ("lagrangebench", hdf5("train.h5", "00000/particle_type", lambda a: 0 * a - 1), r"position must be of part"),
+        ("lagrangebench", claimed, r"train.h5: 00000: position is missing or damaged; Unable to allocate"),
+        ("plain", meta(obstacle_cell_size=0), r"metadata.json: obstacle_cell_size must be > 0, got 0.0"),
+        ("plain", meta(materials=["water"]), r"metadata.json: materials must be names by number, got \['water'\]"),
+        ("plain", meta(materials={"1": "Wa ter"}), r"materials must be names of lower-case letters.*got 'Wa ter'"),
+        ("plain", meta(boundary_types="none"), r"metadata.json: boundary_types must be finite numbers in a list"),
+        ("plain", cells([[2, 2, 2]] * 2), r"00001: obstacle_cell must be each there once, got '1 again'"),
+        ("plain", cells([[1 << 40, 2, 2]]), r"00001: obstacle_cell must be cells of the box"),
+        ("plain", cells([[2, 2, 2]], 5.0), r"00001: obstacle_normal must be of length 1, got 5"),
         ("deepmind", meta(dt=-1), r"metadata.json: dt must be a finite number > 0, got -1"),
         ("deepmind", meta(context_mean=[0.0]), r"context_mean must be absent, got a set with step_context"),
         ("deepmind", meta(dim=2), r"metadata.json: bounds must be \[low, high\] for each of 2 axes"),
@@ -193,6 +236,9 @@ def pickled(content: Callable[[Path], Any]) -> Callable[[Path], None]:
         ("geoelements", pickled(lambda folder: Hostile(folder / "ran")), r"gns_data must be .*no part of an array"),
         ("geoelements", pickled(lambda _: (np.zeros((9, 2, 3)),)), r"gns_data\[0\] must be \(position, particle_type"),
         ("geoelements", pickled(lambda _: (np.zeros((9, 2, 3), int), 5)), r"\[0\]: position must be float32"),
+        ("geoelements", pickled(lambda _: ([[1.0], [1.0, 2.0]], 5)), r"gns_data\[0\]: position must be an array, got"),
+        ("geoelements", pickled(lambda _: (WALK, [5, np.inf])), r"gns_data\[0\]: particle_type must be whole numbers"),
+        ("geoelements", pickled(lambda _: (WALK, 5, np.ones(7))), r"material_property must be numbers of one or 2"),
         ("geoelements", pickled(lambda _: (np.zeros((9, 2, 3)), [5, 6, 5])), r"\[0\]: particle_type must be one"),
         ("geoelements", pickled(lambda _: (np.zeros((9, 2, 2)), 5)), r"position must have shape \[any, any, 3\], got"),
         ("lagrangebench", cut("train.h5", 2000), r"train.h5 must be a whole HDF5 file"),
@@ -200,7 +246,7 @@ def pickled(content: Callable[[Path], Any]) -> Callable[[Path], None]:
         ("lagrangebench", hdf5("train.h5", "00000/particle_type"), r"train.h5: 00000: particle_type must be there"),
         ("lagrangebench", hdf5("train.h5", "00000/position", with_nan), r"position must be finite, got nan at \[3"),
         ("lagrangebench", hdf5("train.h5", "00000/particle_type", lambda a: a + 40), r"particle_type must have a"),
-        ("lagrangebench", meta(periodic_boundary_conditions=[True] * 3), r"conditions must be false .*cells"),
+        ("lagrangebench", at_the_side, r"conditions must be false on axis x, where particles of .*00000 come within"),
         ("lagrangebench", hdf5("train.h5", "00000/position", lambda a: a[:5]), r"must be 5 \+ 2 frames or more"),
         ("neuralmpm", hdf5("train/sim_0.h5", "boundary"), r"sim_0.h5: boundary is missing or damaged"),
         ("neuralmpm", hdf5("train/sim_0.h5", "boundary", moving), r"sim_0.h5: boundary must be at rest, got 'a motion"),
@@ -273,6 +319,56 @@ def test_gravity_that_the_metadata_contradict_is_refused(tmp_path):
         import_trajectories.main(arguments)
         (episode,) = EpisodeStore(tmp_path / f"mine{size}", "train").episodes
         assert episode.gravity == pytest.approx(expected, abs=2e-3)
+
+
+def flights(*gravities: tuple[float, ...]) -> dict[str, list[Any]]:
+    time_T11 = np.arange(20)[:, None, None] / 60
+    start = np.random.default_rng(1).uniform(0.4, 0.6, (10, 3))
+    paths = [(start + 0.5 * np.array(gravity) * time_T11**2).astype(np.float32) for gravity in gravities]
+    return {"train": [(path, np.full(10, 5), np.full((1, 3), 0.2, np.float32)) for path in paths]}
+
+
+@pytest.mark.parametrize("name", ["neuralmpm", "plain_h5"])
+def test_each_simulation_may_have_its_own_gravity(name, tmp_path):
+    """The file's, not an estimate over all; where its unit is nowhere written down, flights have to agree."""
+    own = [(0.0, -0.5, 0.0), (0.2, 0.3, 0.0)]
+    source = write(tmp_path / "foreign", name, flights(*own), metadata())
+    key = "grav" if name == "neuralmpm" else "gravity"
+
+    def tell(factor: float) -> None:
+        for number, gravity in enumerate(own):
+            path, place = (
+                (f"train/sim_{number}.h5", key) if name == "neuralmpm" else ("train.h5", f"0000{number}/{key}")
+            )
+            with h5py.File(source / path, "a") as file:
+                file.pop(place, None)
+                file[place] = factor * np.array(gravity)
+
+    tell(1.0)
+    import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
+    assert [e.gravity for e in EpisodeStore(tmp_path / "mine", "train").episodes] == own
+    if name == "neuralmpm":
+        tell(2.0)
+        with pytest.raises(ConfigError, match=r"sim_0.h5: gravity must be what flies there shows, .* got \[0.0, -1.0,"):
+            import_trajectories.main(options(tmp_path / "other", source, gravity=None))
+
+
+def test_what_published_files_have(tmp_path):
+    """LagrangeBench tells three axes of a flat set, and calls a box with walls periodic; geoelements' properties are
+    several for each particle."""
+    flat = {name: [tuple(part[..., :2] if part.ndim > 1 else part for part in one) for one in simulations]
+            for name, simulations in flights((0.0, 0.0, 0.0)).items()}  # fmt: skip
+    for number, sides in enumerate(([False, False, True], [True] * 3)):
+        info = metadata(2, periodic_boundary_conditions=sides, g_ext_magnitude=0)
+        source = write(tmp_path / f"sides{number}", "lagrangebench", flat, info)
+        import_trajectories.main(options(tmp_path / f"out{number}", source, gravity=None))
+    ((path, types, _),) = flights((0.0, 0.0, 0.0))["train"]
+    source = write(tmp_path / "own", "geoelements", {}, metadata())
+    pickled_npz(source / "train.npz", (path, types, np.arange(20.0).reshape(10, 2)))
+    import_trajectories.main(options(tmp_path / "mine", source))
+    (episode,) = EpisodeStore(tmp_path / "mine", "train").episodes
+    first, second = (episode.material_parameters[f"material_property{end}"] for end in ("", "_1"))
+    assert np.array_equal(first, 2.0 * np.arange(10)) and np.array_equal(second, first + 1)
 
 
 def flat_simulations(count: int = 24) -> dict[str, list[Any]]:

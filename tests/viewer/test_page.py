@@ -278,3 +278,37 @@ def test_a_film_plays_by_itself(browser: Any, play: PlayPage, tmp_path: Path) ->
     page = opened(browser, path.as_uri())
     until(lambda: blue(page) > 300)
     page.context.close()
+
+
+def test_it_begins_when_somebody_looks_and_restarts_as_it_was() -> None:
+    """No frame before the first viewer. Restart goes on after a divergence, and stays paused where a viewer paused."""
+    session = PlaySession(floating(), load_scene(CONF / "example/play.yaml"), CONF / "example")
+    page = PlayPage(session, port=0)
+    thread = threading.Thread(target=page.run)
+    thread.start()
+
+    def done(action: Callable[[], Any]) -> None:
+        """Done between two frames, and the frame behind it, too."""
+        for each in (action, lambda: None):
+            over = threading.Event()
+            page.do(lambda each=each, over=over: (each(), over.set()))
+            assert over.wait(300)
+
+    try:
+        done(lambda: None)
+        assert session.frame == 0 and page.playing
+        page.viewed.set()
+        until(lambda: session.frame > 0)
+        done(lambda: session.drop("water", (0.3, 0.8, 0.3), 0.1, speed=600.0))
+        until(lambda: page.diverged)
+        assert not page.playing
+        done(page.restart)
+        assert page.playing and not page.diverged
+        until(lambda: session.frame > 1)
+        done(lambda: page.play(False))
+        done(page.restart)
+        assert not page.playing and session.frame == 0
+    finally:
+        page.ended.set()
+        thread.join()
+        page.close()

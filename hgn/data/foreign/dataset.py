@@ -40,7 +40,7 @@ def import_set(source: Path, config: ImportConfig, progress: Callable[[Episode],
     info = set_info(source, find_format(source, config.format), config)
     first = list(itertools.islice(read_split(source, "train", info), LOOKED_AT))
     require(bool(first), "from", f"a folder with training trajectories ({info.format})", str(source))
-    gravity = info.gravity or _estimated(first, info)
+    gravity = info.gravity or _gravity(first, info)
     still = [points for points in (_boundary(trajectory, info) for trajectory in first) if len(points)]
     converter = Converter(info, gravity, config.history, obstacle_cell_size(info, still))
     del first, still
@@ -73,6 +73,26 @@ def import_set(source: Path, config: ImportConfig, progress: Callable[[Episode],
     }
     requested = {split: sum(len(shard.episodes) for shard in shards if shard.split == split) for split in SPLITS}
     return Manifest(identity_hash(identity), identity, requested, len(shards), ListedIndex(shards)).save(out)
+
+
+def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
+    """Of trajectories without their own; where all have one, the first one's."""
+    without = [trajectory for trajectory in first if trajectory.gravity is None]
+    if without:
+        return _estimated(without, info)
+    for trajectory in first if info.format == "neuralmpm" else ():  # whose units nobody has written down
+        told = np.array(trajectory.gravity)
+        try:
+            shown = np.array(_estimated([trajectory], info))
+        except ConfigError:  # too little flies
+            continue
+        if np.linalg.norm(shown - told) > 0.1 * np.linalg.norm(told):
+            raise ConfigError(
+                f"{trajectory.name}: gravity must be what flies there shows, length per second squared, got "
+                f"{told.tolist()} where it shows {shown.round(3).tolist()}; check dt, or give gravity=…"
+            )
+    assert first[0].gravity is not None
+    return first[0].gravity
 
 
 def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:

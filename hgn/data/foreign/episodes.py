@@ -54,12 +54,15 @@ class Converter:
 
     def episode(self, trajectory: Trajectory, key: str, index: int) -> Episode:
         """Raises: ConfigError naming the trajectory, for unknown types, moving boundaries, too few frames, and
-        particles outside of the box.
+        particles outside of the box or at a periodic side of it.
         """
         info, name = self.info, trajectory.name
         frames, first = len(trajectory.position_TND), self.history
         require(frames >= first + 2, f"{name}: position", f"{first} + 2 frames or more, for history={first}", frames)
         fixed_N = np.isin(trajectory.type_N, list(info.boundary_types))
+        require(
+            not fixed_N.all(), f"{name}: position", "of particles that are no obstacles, too", "none", "leave it out"
+        )
         position_TN3 = self._placed(trajectory.position_TND)
         still_TP3, free_TN3 = position_TN3[:, fixed_N], position_TN3[:, ~fixed_N]
         moved = float(np.abs(still_TP3 - still_TP3[:1]).max(initial=0))
@@ -69,6 +72,7 @@ class Converter:
                 f"{moved:.3g}: networks know obstacles at rest; say which types are obstacles with boundary_types=[...]"
             )
         self._require_inside(name, free_TN3[0])
+        self._require_not_across(name, free_TN3)
         boundary_P3 = still_TP3[0]
         if trajectory.boundary_PD is not None:
             boundary_P3 = np.concatenate([boundary_P3, self._placed(trajectory.boundary_PD)])
@@ -85,8 +89,9 @@ class Converter:
         self.maximum_initial_speed = max(self.maximum_initial_speed, speed)
         self.with_obstacles |= len(grid.cell_K3) > 0
         own: Mapping[str, np.ndarray] = {}
-        if trajectory.property_N is not None:
-            own = {"material_property": trajectory.property_N[~fixed_N]}
+        if trajectory.property_NK is not None:
+            columns = np.ascontiguousarray(trajectory.property_NK[~fixed_N].T)
+            own = {"material_property" + (f"_{k}" if k else ""): column for k, column in enumerate(columns)}
         return Episode(
             key=key,
             position_TN3=free_TN3[first:],
@@ -131,6 +136,17 @@ class Converter:
                 f"bounds must hold the particles, got {[list(pair) for pair in self.info.bounds]} with {outside:.0%} "
                 f"of those of {name} outside, which lie in {found}; give bounds=…"
             )
+
+    def _require_not_across(self, name: str, free_TN3: np.ndarray) -> None:
+        """What stays a radius away from a periodic side sees nothing behind it: LagrangeBench's dam has walls there."""
+        for axis, periodic in enumerate(self.info.periodic):
+            path_TN, high = free_TN3[..., axis], self.domain_size[axis]
+            if periodic and path_TN.size and min(path_TN.min(), high - path_TN.max()) < self.info.radius:
+                raise ConfigError(
+                    f"metadata.json: periodic_boundary_conditions must be false on axis {'xyz'[axis]}, where particles "
+                    f"of {name} come within a radius ({self.info.radius:g}) of the box's side: cells and walls of the "
+                    "networks end at the box, and do not meet their other side"
+                )
 
     def _grid(self, trajectory: Trajectory, boundary_P3: np.ndarray) -> ObstacleGrid:
         cell_size, cell_K3 = self.obstacle_cell_size, trajectory.obstacle_cell_K3

@@ -23,14 +23,16 @@ from hgn.config import ImportConfig
 from hgn.data.foreign.npz import read_npz
 from hgn.data.foreign.tfrecord import parse_sequence_example, read_records
 from hgn.data.foreign.trajectory import FLUID, SetInfo, Trajectory, checked, floats
+from hgn.scene.material import MATERIAL_NAME
 from hgn.scene.rollout_file import require_own_data
 from hgn.schema import ConfigError, require
 
 SPLIT_NAMES = {"train": ("train",), "validation": ("valid", "validation"), "test": ("test",)}
 # types of particles: of DeepMind's sets, which geoelements and NeuralMPM keep, and of LagrangeBench's
 _DEEPMIND = {0: "rigid", FLUID: "fluid", 5: "water", 6: "sand", 7: "goop"}
-_LAGRANGEBENCH = {0: "fluid", 3: "rigid"}
-_DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError)  # what h5py raises
+_LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # the last three: its copies of DeepMind's
+# what h5py raises, and NumPy for a size that is claimed
+_DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, MemoryError)
 
 
 def find_format(folder: Path, asked: str) -> str:
@@ -61,58 +63,79 @@ def find_format(folder: Path, asked: str) -> str:
 def set_info(folder: Path, name: str, config: ImportConfig) -> SetInfo:
     """What the metadata say of a set, and the command line instead of it.
 
-    Raises: ConfigError naming what is missing or wrong, and for periodic boxes and forces that change with time.
+    Raises: ConfigError naming what is missing or wrong, and for forces that change with time.
     """
     raw = _metadata(folder)
     if isinstance(raw.get("train"), Mapping):  # geoelements' may differ between training and rollout
         raw = dict(raw["train"])
-    if any(np.ravel(raw.get("periodic_boundary_conditions", False))):
-        raise ConfigError(
-            f"{folder}/metadata.json: periodic_boundary_conditions must be false on every axis, got "
-            f"{raw['periodic_boundary_conditions']}: cells and walls of the networks end at the box, and do not meet "
-            "their other side"
-        )
     if "context_mean" in raw:
         raise ConfigError(
             f"{folder}/metadata.json: context_mean must be absent, got a set with step_context: no network here takes "
             "a force that changes with time"
         )
-    types, boundary = (_LAGRANGEBENCH, {1, 2}) if name == "lagrangebench" else (_DEEPMIND, {3})
-    if name == "plain":
-        types = types | {_number(key, folder): str(value) for key, value in raw.get("materials", {}).items()}
-        boundary = {int(value) for value in raw.get("boundary_types", boundary)}
-    types = types | {_number(key, folder): value for key, value in config.materials.items()}
-    bounds: Any = config.bounds or raw.get("bounds")
-    dimensions: Any = config.dimensions or raw.get("dim") or (len(bounds) if bounds else None)
-    dt: Any = config.dt or raw.get("dt")
-    radius: Any = config.radius or raw.get("default_connectivity_radius")
+    types, boundary = (_LAGRANGEBENCH, [1, 2]) if name == "lagrangebench" else (_DEEPMIND, [3])
+
+    def given(key: str, option: Any, shape: tuple[int | None, ...], standard: Any = None) -> Any:
+        """Numbers of the command line, or else of the metadata, as lists of floats."""
+        value = option if option is not None else raw.get(key)
+        return standard if value is None else _numbers(f"{folder}/metadata.json: {key}", value, shape)
+
+    bounds = given("bounds", config.bounds, (None, 2))
+    dt, radius = given("dt", config.dt, ()), given("default_connectivity_radius", config.radius, ())
     for key, value in {"bounds": bounds, "dt": dt, "radius": radius}.items():
         rule = f"given where {folder}/metadata.json does not say it"
         require(value is not None, key, rule, value, f"as in {key}={_EXAMPLES[key]}")
-    gravity: Any = config.gravity if config.gravity is not None else raw.get("gravity")
-    size = raw.get("g_ext_magnitude")
-    if gravity is None and size == 0:
-        gravity = (0.0,) * int(dimensions)
+    dimensions = given("dim", config.dimensions, (), float(len(bounds)))
+    require(dimensions in (2, 3), f"{folder}/metadata.json: dim", "2 or 3", dimensions)
+    if name == "plain":
+        named = raw.get("materials", {})
+        require(isinstance(named, Mapping), f"{folder}/metadata.json: materials", "names by number", named)
+        types = types | {_number(key, folder): _material(value, folder) for key, value in named.items()}
+        boundary = given("boundary_types", None, (None,), boundary)
+    types = types | {_number(key, folder): value for key, value in config.materials.items()}
+    size = given("g_ext_magnitude", None, ())
+    gravity = given("gravity", config.gravity, (None,), [0.0] * int(dimensions) if size == 0 else None)
+    if name == "lagrangebench" and config.dt is None:
+        every = given("write_every", None, (), 1.0)
+        require(every > 0, f"{folder}/metadata.json: write_every", "> 0", every)
+        dt *= every
+    # LagrangeBench says it of three axes, also where there are two; then the third means nothing
+    key = "periodic_boundary_conditions"
+    sides = raw.get(key, False)
+    periodic = _numbers(f"{folder}/metadata.json: {key}", [sides] * 3 if isinstance(sides, bool) else sides, (None,))
+    return SetInfo(
+        format=name,
+        dimensions=int(dimensions),
+        frame_dt_s=dt,
+        bounds=tuple((low, high) for low, high in bounds),
+        radius=radius,
+        materials=types,
+        boundary_types=frozenset(map(int, boundary if config.boundary_types is None else config.boundary_types)),
+        ignored_types=frozenset({-1} if name == "lagrangebench" else ()),
+        gravity=None if gravity is None else tuple(gravity),
+        gravity_size=size,
+        obstacle_cell_size=given("obstacle_cell_size", None, ()),
+        periodic=tuple(bool(value) for value in periodic[: int(dimensions)]),
+        raw=raw,
+    )
+
+
+def _numbers(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
+    """A float, or nested lists of them, of this shape, where None stands for any length."""
     try:
-        every = float(raw.get("write_every", 1)) if name == "lagrangebench" and config.dt is None else 1.0
-        return SetInfo(
-            format=name,
-            dimensions=int(dimensions),
-            frame_dt_s=float(dt) * every,
-            bounds=tuple((float(low), float(high)) for low, high in bounds),
-            radius=float(radius),
-            materials=types,
-            boundary_types=frozenset(boundary if config.boundary_types is None else config.boundary_types),
-            ignored_types=frozenset({-1} if name == "lagrangebench" else ()),
-            gravity=None if gravity is None else tuple(float(value) for value in gravity),
-            gravity_size=None if size is None else float(size),
-            obstacle_cell_size=raw.get("obstacle_cell_size"),
-            raw=raw,
-        )
-    except (TypeError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{folder}/metadata.json must hold dim, dt, bounds as numbers, got {error}") from None
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.full((), np.nan)
+    fits = array.ndim == len(shape) and all(m in (n, None) for n, m in zip(array.shape, shape, strict=True))
+    rule = "a finite number" if not shape else "finite numbers" + (" in pairs" if len(shape) == 2 else " in a list")
+    require(fits and bool(np.isfinite(array).all()), name, rule, value)
+    return array.tolist()
+
+
+def _material(value: object, folder: Path) -> str:
+    fits = isinstance(value, str) and MATERIAL_NAME.fullmatch(value) is not None
+    require(fits, f"{folder}/metadata.json: materials", "names of lower-case letters, digits and _", value)
+    return str(value)
 
 
 def read_split(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
@@ -160,12 +183,9 @@ def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[Traje
                 raise ConfigError(
                     f"{name} must be (position, particle_type) or these and material_property, got {entry!r:.60}"
                 )
-            position_TND, type_N = checked(name, np.asarray(parts[0]), np.asarray(parts[1]), info.dimensions)
-            own = None
-            if len(parts) == 3:
-                own = np.broadcast_to(np.asarray(parts[2], np.float32), type_N.shape).copy()
-                floats(f"{name}: material_property", own, (len(type_N),))
-            yield Trajectory(name, position_TND, type_N, property_N=own)
+            position_TND, type_N = checked(name, parts[0], parts[1], info.dimensions)
+            own = parts[2] if len(parts) == 3 else None
+            yield Trajectory(name, position_TND, type_N, property_NK=_properties(name, own, len(type_N)))
 
 
 def _read_hdf5(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
@@ -217,17 +237,37 @@ def _of_members(name: str, members: Mapping[str, np.ndarray], info: SetInfo) -> 
         require(fits, f"{name}: obstacle_cell", rule, f"{cell.dtype} {list(cell.shape)}")
         require(normal is not None, f"{name}: obstacle_normal", "there with obstacle_cell", None)
         normal = floats(f"{name}: obstacle_normal", normal, cell.shape)
+        _require_cells(name, cell, normal)
     gravity = members.get("gravity")
     if gravity is not None:
         gravity = floats(f"{name}: gravity", gravity, (info.dimensions,))
-    own = members.get("material_property")
-    if own is not None:
-        own = np.broadcast_to(np.asarray(own, np.float32), kept_N.shape)[kept_N].copy()
-        floats(f"{name}: material_property", own, (len(type_N),))
+    own = _properties(name, members.get("material_property"), len(kept_N))
     return Trajectory(
-        name, position_TND, type_N, boundary, own, cell, normal,
+        name, position_TND, type_N, boundary, None if own is None else own[kept_N], cell, normal,
         None if gravity is None else tuple(float(value) for value in gravity),
     )  # fmt: skip
+
+
+def _require_cells(name: str, cell_K3: np.ndarray, normal_K3: np.ndarray) -> None:
+    lowest, highest = cell_K3.min(initial=0), cell_K3.max(initial=0)
+    require(lowest >= -1 and highest < _MOST_CELLS, f"{name}: obstacle_cell", "cells of the box", [lowest, highest])
+    alike = len(cell_K3) - len(np.unique(cell_K3, axis=0))
+    require(alike == 0, f"{name}: obstacle_cell", "each there once", f"{alike} again")
+    length_K = np.linalg.norm(normal_K3, axis=1)
+    require(bool((np.abs(length_K - 1) < 1e-3).all()), f"{name}: obstacle_normal", "of length 1", float(length_K.max()))
+
+
+def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
+    """One number for all particles, one for each, or several for each, as float32 [N, K]."""
+    if given is None:
+        return None
+    array = np.asarray(given)
+    rule = f"numbers of one or {count} particles"
+    fits = array.dtype.kind in "iuf" and array.ndim <= 2 and (array.ndim == 0 or len(array) in (1, count))
+    require(fits, f"{name}: material_property", rule, f"{array.dtype} {list(array.shape)}")
+    columns = array.astype(np.float32).reshape(1 if array.ndim == 0 else len(array), -1)
+    floats(f"{name}: material_property", columns, (None, None))
+    return np.broadcast_to(columns, (count, columns.shape[1]))
 
 
 def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
@@ -238,12 +278,18 @@ def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Traject
             axes = info.dimensions
             particles, boundary = (_wide(path, file, key, axes) for key in ("particles", "boundary"))
             types = _dataset(str(path), file, "types") if "types" in file else np.full((), FLUID)
+            own = next((_dataset(str(path), file, key) for key in ("grav", "gravity") if key in file), None)
         if types.ndim == 1 and len(types) == particles.shape[1] + boundary.shape[1]:  # the boundary's come first
             types = types[boundary.shape[1] :]
         position_TND, type_N = checked(str(path), particles, types, axes)
         moved = np.abs(boundary - boundary[:1]).max(initial=0)
         require(moved <= 1e-3 * info.radius, f"{path}: boundary", "at rest", f"a motion by {moved:.3g}")
-        yield Trajectory(str(path), position_TND, type_N, boundary[0] if boundary.size else None)
+        gravity = None
+        if own is not None and info.gravity is None:  # of its set with a gravity for each simulation
+            gravity = tuple(floats(f"{path}: grav", own, (axes,)).tolist())
+        yield Trajectory(
+            str(path), position_TND, type_N, boundary[0] if boundary.size else None, gravity=gravity
+        )  # fmt: skip
 
 
 def _wide(path: Path, file: h5py.File, key: str, axes: int) -> np.ndarray:
@@ -261,6 +307,7 @@ _READERS: dict[str, Callable[[Path, str, SetInfo], Iterator[Trajectory]]] = {
     "neuralmpm": _read_neuralmpm,
     "plain": _read_hdf5,
 }
+_MOST_CELLS = 1 << 16  # along an axis
 _EXAMPLES = {"bounds": "[[0.1,0.9],[0.1,0.9]]", "dt": "0.0025", "radius": "0.015"}
 
 
@@ -268,6 +315,8 @@ def _opened(path: Path) -> h5py.File:
     try:
         file = h5py.File(path, "r")
         require_own_data(file)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     except OSError as error:
         raise ConfigError(f"{path} must be a whole HDF5 file, got {error}; fetch it again") from None
     return file
@@ -295,7 +344,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
         return {}
     try:
         found = json.loads(path.read_text("utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path} must be JSON, got {error}") from None
     require(isinstance(found, dict), str(path), "a JSON object", type(found).__name__)
     return dict(found)

@@ -14,6 +14,7 @@ import numpy as np
 
 from hgn.schema import ConfigError, require
 
+MOST_RADII = 1 << 14  # across the box, for cells are counted in integers
 FLUID = 1  # the type of particles in files that give none
 
 
@@ -25,7 +26,7 @@ class Trajectory:
     position_TND: np.ndarray  # float32 or float64
     type_N: np.ndarray  # int64, the set's own numbers
     boundary_PD: np.ndarray | None = None  # at rest, beside the particles; none: they are among them, by their types
-    property_N: np.ndarray | None = None  # float32, geoelements' material_property
+    property_NK: np.ndarray | None = None  # float32, geoelements' material_property
     obstacle_cell_K3: np.ndarray | None = None  # of the plain layout: cells and normals as this project has them
     obstacle_normal_K3: np.ndarray | None = None
     gravity: tuple[float, ...] | None = None  # of this trajectory, length per second squared
@@ -46,6 +47,7 @@ class SetInfo:
     gravity: tuple[float, ...] | None = None  # length per second squared; none: to be estimated
     gravity_size: float | None = None  # where only that is known
     obstacle_cell_size: float | None = None
+    periodic: tuple[bool, ...] = ()  # of each axis
     raw: Mapping[str, Any] = field(default_factory=dict)  # the metadata as they are
 
     def __post_init__(self) -> None:
@@ -57,21 +59,27 @@ class SetInfo:
         rule = f"[low, high] for each of {self.dimensions} axes"
         require(shape == (self.dimensions, 2), "metadata.json: bounds", rule, self.bounds)
         require(all(low < high for low, high in self.bounds), "metadata.json: bounds", "low < high", self.bounds)
+        longest = max(high - low for low, high in self.bounds)
+        rule = f"{longest / MOST_RADII:.3g} or more, the box being {longest:g} wide"
+        require(self.radius * MOST_RADII >= longest, "metadata.json: default_connectivity_radius", rule, self.radius)
+        cell_size = self.obstacle_cell_size
+        require(cell_size is None or cell_size > 0, "metadata.json: obstacle_cell_size", "> 0", cell_size)
+        require(len(set(self.materials.values())) <= 256, "materials", "at most 256", len(set(self.materials.values())))
         if self.gravity is not None:
             rule = f"{self.dimensions} finite numbers, length per second squared"
             there = len(self.gravity) == self.dimensions and bool(np.isfinite(self.gravity).all())
             require(there, "gravity", rule, list(self.gravity))
 
 
-def checked(name: str, position: np.ndarray, types: np.ndarray, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
+def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions [T, N, D] and types int64 [N] of a file, where `types` may be one number for all particles.
 
     Raises: ConfigError naming the file and the field, for another type or shape, and for what is not finite.
     """
     position_TND = floats(f"{name}: position", position, (None, None, dimensions))
-    type_N = np.asarray(types)
+    type_N = _array(f"{name}: particle_type", types)
     if type_N.dtype.kind not in "iu":
-        whole = type_N.dtype.kind == "f" and bool((type_N == np.round(type_N)).all())
+        whole = type_N.dtype.kind == "f" and bool((np.isfinite(type_N) & (type_N == np.round(type_N))).all())
         if not whole:  # geoelements' own writers keep some as float64
             raise ConfigError(f"{name}: particle_type must be whole numbers, got {type_N.dtype}")
     count = position_TND.shape[1]
@@ -82,12 +90,19 @@ def checked(name: str, position: np.ndarray, types: np.ndarray, dimensions: int)
     return position_TND, type_N.astype(np.int64)
 
 
+def _array(name: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except ValueError as error:  # lists of different lengths
+        raise ConfigError(f"{name} must be an array, got {error}") from None
+
+
 def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     """A finite array of float32 or float64 of this shape, where None stands for any length above 0.
 
     Raises: ConfigError naming the file and the field.
     """
-    array = np.asarray(array)
+    array = _array(name, array)
     if array.dtype.kind != "f" or array.dtype.itemsize < 4:
         raise ConfigError(f"{name} must be float32 or float64, got {array.dtype}")
     fits = array.ndim == len(shape) and all(
