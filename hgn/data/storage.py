@@ -28,6 +28,7 @@ from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from hgn.schema import ConfigError, require
+from hgn.system.extras import missing_extra
 from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
 from hgn.system.hub import PREFIX, HubPlace, hub_token
 
@@ -250,8 +251,10 @@ class _Remote:
         try:
             self._files, self._root = fsspec.core.url_to_fs(address, **options)
         except (ValueError, ImportError) as error:
+            cause = error.__cause__  # of fsspec's ImportError: which package is missing
+            reason = (isinstance(cause, ModuleNotFoundError) and missing_extra(cause)) or error
             raise ConfigError(
-                f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({error})"
+                f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({reason})"
             ) from None
         self._known: tuple[bytes, str] | None = None  # the manifest last read, and its ETag at a dataset service
         self._lock = threading.Lock()

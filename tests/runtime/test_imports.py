@@ -14,6 +14,7 @@ from network.states import network_of
 
 import hgn
 from hgn.runtime.weights import WeightsInfo, save_weights
+from hgn.system.extras import EXTRA_OF
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAINING_STACK = (
@@ -28,6 +29,7 @@ TRAINING_STACK = (
     "hgn.training",
     "hgn.data",
     "datagen",
+    *EXTRA_OF,
 )
 PROGRAM = """
 import json, sys
@@ -52,7 +54,7 @@ def test_public_names() -> None:
 
 def test_simulating_loads_no_training_stack(tmp_path: Path) -> None:
     """Loading weights and simulating a scene file imports none of Lightning, Hydra, Taichi, WebDataset, TensorBoard,
-    nor the project's own training, data and generator."""
+    no package of any extra, nor the project's own training, data and generator."""
     network = network_of(torch.float32)
     weights = tmp_path / "weights.safetensors"
     save_weights(weights, network, WeightsInfo(network.config, 60.0, 1 / 64))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import os
 import re
 import subprocess
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from datagen.pool.worker import error_message
+from hgn.schema import ConfigError
 from hgn.system.extras import EXTRA_OF, missing_extra
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,6 +47,41 @@ def test_a_worker_names_the_extra_that_it_lacks(monkeypatch: pytest.MonkeyPatch)
     assert error_message(error) == ("config_error", told)
     monkeypatch.setattr("sys.version_info", (3, 13))
     assert "published for Python 3.11 and 3.12 alone" in error_message(error)[1]
+
+
+FOREIGN = {"bounds": [[0, 1]] * 3, "sequence_length": 10, "default_connectivity_radius": 0.035, "dim": 3, "dt": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("package", "module", "settings"),
+    [
+        ("viser", "hgn.play", {}),
+        ("pxr", "hgn.rollout", {"out": "water.usdc"}),
+        ("pysplashsurf", "hgn.rollout", {"out": "water.ply", "surface": True}),
+        ("onnxscript", "hgn.export", {"weights": "obstacles", "onnx": "step.onnx"}),
+        ("google_crc32c", "hgn.import_trajectories", {"from": "../foreign", "out": "mine"}),
+        ("huggingface_hub", "hgn.rollout", {"weights": "hf://name/weights"}),
+        ("s3fs", "hgn.evaluate", {"weights": "obstacles", "data": "s3://bucket/set"}),
+    ],
+)
+def test_what_is_optional_names_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, module: str, settings: dict[str, object]
+) -> None:
+    """Before anything is written, in the words of `missing_extra`."""
+    foreign, here = tmp_path / "foreign", tmp_path / "here"
+    foreign.mkdir()
+    here.mkdir()
+    (foreign / "train.tfrecord").write_bytes(bytes(16))
+    (foreign / "metadata.json").write_text(json.dumps(FOREIGN))
+    monkeypatch.chdir(here)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises((ModuleNotFoundError, ConfigError)) as caught:
+        importlib.import_module(module).main(settings)
+    told = str(caught.value)
+    if isinstance(caught.value, ModuleNotFoundError):
+        told = str(missing_extra(caught.value))
+    assert f"pip install 'hgn[{EXTRA_OF[package]}]'" in told
+    assert list(here.iterdir()) == []
 
 
 HIDE = """
