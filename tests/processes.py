@@ -9,9 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 TESTS = Path(__file__).parent
+PATIENCE_S = 600.0  # what hangs ends after it; no test expects a time
 
 
-def wait_until(condition: Callable[[], object], seconds: float = 90.0) -> None:
+def wait_until(condition: Callable[[], object], seconds: float = PATIENCE_S) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from processes import PATIENCE_S
 
 from hgn.cpu import allocator
 
@@ -25,7 +26,9 @@ print([page_faults() for _ in range(4)][-1])
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
 def test_freed_memory_is_taken_again():
     """Eight blocks of 4 MB (1,024 pages each) that were freed together give the next eight their pages."""
-    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, timeout=PATIENCE_S
+    )
     assert int(done.stdout) < 100
 
 

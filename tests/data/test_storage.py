@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 import uvicorn
 from ballistic_dataset import MakeConfig, MakeDataset
+from processes import PATIENCE_S
 from written_files import first_release
 
 import hgn.data.storage
@@ -162,7 +163,7 @@ def test_ranks_share_the_cache(folder: Path, serve: Callable[..., str], cache: P
     processes = [context.Process(target=_read, args=(url, barrier, results)) for _ in range(2)]
     for process in processes:
         process.start()
-    keys = [results.get(timeout=60) for _ in processes]
+    keys = [results.get(timeout=PATIENCE_S) for _ in processes]
     for process in processes:
         process.join()
     results.close()

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from ballistic_dataset import MakeConfig, MakeDataset
 from docs.pages import run_module
-from processes import processes_of_session, wait_until
+from processes import PATIENCE_S, processes_of_session, wait_until
 
 from datagen.__main__ import main
 from datagen.pool.progress import BarProgress, JsonProgress
@@ -43,7 +43,7 @@ def start(*arguments: str, **options: object) -> subprocess.Popen[str]:
 
 def run(*arguments: str, **options: object) -> tuple[int, str, str]:
     process = start(*arguments, **options)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     return process.returncode, output, errors
 
 
@@ -204,7 +204,7 @@ def test_stopping_leaves_a_resumable_folder(
         os.killpg(process.pid, number)  # a terminal signals the whole group
     else:
         os.kill(process.pid, number)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == code
     wait_until(lambda: not processes_of_session(process.pid))
     if number != signal.SIGKILL:
@@ -233,7 +233,7 @@ def test_two_generators_at_once(
     arguments = (*SMALL, "out=shared", "scenes=4", "dataset.validation_scenes=2")
     processes = [start(*arguments, cwd=tmp_path) for _ in range(2)]
     for process in processes:
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0 and "shared is complete: 4 train, 2 validation, 0 test episodes" in errors
     seeds = (control / "simulated.log").read_text().split()
     assert len(seeds) == len(set(seeds)) == 6

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from ballistic_dataset import MakeConfig, MakeDataset
+from processes import PATIENCE_S
 
 from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
@@ -84,7 +85,7 @@ def test_killed_at_any_instruction(control: Path, tmp_path: Path) -> None:
         env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     assert program.returncode == 0, program.stderr
     report = json.loads(program.stdout)

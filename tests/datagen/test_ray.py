@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from ballistic_dataset import MakeConfig
+from processes import PATIENCE_S
 
 from datagen.pool.pool import WorkerPlan
 from datagen.pool.ray_workers import RayWorkerFactory, plan_cluster
@@ -35,7 +36,7 @@ def test_lost_node(
         env=os.environ | {"PYTHONPATH": path, "RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0"},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     assert program.returncode == 0, program.stderr
     report = json.loads(program.stdout.splitlines()[-1])

@@ -9,6 +9,7 @@ import nbclient
 import nbformat
 import pytest
 from docs.pages import ROOT
+from processes import PATIENCE_S
 
 from tools.notebooks import DOCS, NOTEBOOKS, notebook
 
@@ -31,5 +32,5 @@ def test_quick_start_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         for text, other in SMALLER.items():
             cell.source = cell.source.replace(text, other)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    nbclient.NotebookClient(content, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    nbclient.NotebookClient(content, timeout=PATIENCE_S, resources={"metadata": {"path": str(tmp_path)}}).execute()
     assert (tmp_path / "my_scene.vtkhdf").is_file()

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from docs.pages import ROOT, Runner, blocks_of, run_module, shell_lines
+from processes import PATIENCE_S
 
 from hgn.scene.scene_file import load_scene
 
@@ -159,7 +160,7 @@ def test_serve(here: Path, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
     finally:
         for process in runner.background:
             process.send_signal(signal.SIGTERM)
-            process.communicate(timeout=60)
+            process.communicate(timeout=PATIENCE_S)
     assert len(list((here / "cache").rglob("*.tar"))) == len(list((here / "data/mine").glob("*.tar")))
 
 

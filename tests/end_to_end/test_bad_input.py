@@ -16,6 +16,7 @@ import pytest
 import torch
 from ballistic_dataset import MakeConfig, MakeDataset
 from network.states import network_of
+from processes import PATIENCE_S
 from training.runs import train_arguments, train_mapping
 
 import datagen.__main__
@@ -433,7 +434,7 @@ def test_as_processes(place: Place, warm_python: Path, module: str, arguments: l
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == EXIT_INPUT and done.stdout == "", done.stderr
     assert done.stderr.startswith(message) and done.stderr.count("\n") == 1

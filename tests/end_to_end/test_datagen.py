@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from processes import PATIENCE_S
 
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
@@ -33,18 +34,18 @@ def test_interrupted_dataset_is_completed(tmp_path: Path) -> None:
     """Ctrl-C after the first shard keeps it, bitwise; the same command makes the rest; a third run changes nothing."""
     process = start(tmp_path)
     folder = tmp_path / "made"
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + PATIENCE_S
     while not (folder / "manifest.json").exists() or Manifest.load(folder).revision == 0:
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130 and "run the same command to go on" in errors, errors
     first = (folder / "train-000000-000001.tar").read_bytes()
 
     for _ in range(2):
         process = start(tmp_path)
-        _, errors = process.communicate(timeout=300)
+        _, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, errors
         assert errors.splitlines()[-1] == "made is complete: 2 train, 1 validation, 0 test episodes"
     assert errors.count("\n") == 1

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from processes import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -21,7 +22,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built from the checkout with what is installed, without a network."""
     folder = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
-    built = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    built = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
     assert built.returncode == 0, built.stdout + built.stderr
     (path,) = folder.glob("hgn-*.whl")
     return path
@@ -35,7 +36,7 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     interpreter = folder / "bin" / "python"
     install = ["install", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-index", str(wheel)]
     pip = [sys.executable, "-m", "pip", "--python", str(interpreter), *install]
-    installed = subprocess.run(pip, capture_output=True, text=True, timeout=120)
+    installed = subprocess.run(pip, capture_output=True, text=True, timeout=PATIENCE_S)
     assert installed.returncode == 0, installed.stderr
     (packages,) = folder.glob("lib/python*/site-packages")
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
@@ -46,7 +47,7 @@ def run(python: Path, folder: Path, *arguments: str) -> str:
     """Standard output of a command that must succeed and leave the folder empty."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run(
-        [str(python), *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=120
+        [str(python), *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert done.returncode == 0, done.stderr
     assert list(folder.iterdir()) == []

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from processes import PATIENCE_S
 from training.runs import metrics, train_arguments
 
 from hgn.config import DatagenConfig
@@ -75,7 +76,7 @@ def start(script: str, *arguments: str, cwd: Path, **variables: str) -> subproce
 
 def run(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     process = start(script, *arguments, cwd=cwd, **variables)
-    output, errors = process.communicate(timeout=240)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
@@ -216,12 +217,12 @@ def test_slurm_trains_with_torchrun(
         "slurm/train_torchrun.sbatch", *arguments, "training.maximum_updates=1000000", cwd=tmp_path, **slurm
     )
     folder = tmp_path / "runs" / "small-4711"
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + PATIENCE_S
     while not (folder / "metrics.jsonl").exists():
         assert started.poll() is None and time.monotonic() < deadline, started.communicate()[1][-4000:]
         time.sleep(0.1)
     started.send_signal(signal.SIGUSR1)
-    errors = started.communicate(timeout=120)[1]
+    errors = started.communicate(timeout=PATIENCE_S)[1]
     assert started.returncode == 0, errors[-4000:]
     assert (tmp_path / "scontrol.log").read_text().splitlines() == ["show hostnames localhost", "requeue 4711"]
     updates = read_checkpoint(folder / "checkpoints" / "last.ckpt")["hgn"]["updates"]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from processes import wait_until
+from processes import PATIENCE_S, wait_until
 
 from datagen.service.server import make_app, make_server
 from datagen.service.supervisor import PoolState
@@ -105,7 +105,7 @@ def test_a_data_set_that_grows(
     wait_until(lambda: ask().startswith("5 "))
     process.communicate()
     refused = reader(address, tmp_path, **{TOKEN_HOST_VARIABLE: "elsewhere:443"})
-    assert "must be open to this program, got refused" in refused.communicate("\n", timeout=60)[1]
+    assert "must be open to this program, got refused" in refused.communicate("\n", timeout=PATIENCE_S)[1]
     waiting = reader(address, tmp_path, SSL_CERT_FILE="")
     assert waiting.stderr is not None
     try:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import processes_of_session, wait_until
+from processes import PATIENCE_S, processes_of_session, wait_until
 
 from datagen.generate import datagen_config
 from hgn.average import AverageConfig
@@ -54,7 +54,7 @@ def start(folder: Path, text: str | Path, *arguments: str, **variables: str) -> 
 
 def run(folder: Path, text: str | Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     process = start(folder, text, *arguments, **variables)
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
@@ -213,7 +213,7 @@ def test_signals_reach_the_commands(machine: Path, number: signal.Signals) -> No
         lambda: all(path.exists() and path.read_text() for path in (machine / "a.session", machine / "b.session"))
     )
     (os.kill if number == signal.SIGTERM else os.killpg)(process.pid, number)  # a terminal's go to the whole group
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, errors) == (128 + number, "")
     assert (machine / "a").read_text() == (machine / "b").read_text() == "state\n"
     assert not any((machine / name).exists() for name in ("went_on", "c", "d"))
@@ -242,7 +242,7 @@ def test_one_queue_a_folder(machine: Path) -> None:
     assert second.returncode == 2
     assert second.stderr.startswith("error: FOLDER must be one that no other queue works in, got 'runs/queue'; ")
     (machine / "end").touch()
-    first.communicate(timeout=120)
+    first.communicate(timeout=PATIENCE_S)
     assert first.returncode == 0
 
 

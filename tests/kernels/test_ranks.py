@@ -9,6 +9,7 @@ import pytest
 import torch
 from kernels.test_update import episode, updates_of
 from network.states import network_of
+from processes import PATIENCE_S
 
 from hgn.kernels.update.op import Updates
 
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("large_tiles")
 
 def run_together(ranks: list[Updates], chunks: list[list[Any]], rates: list[float]) -> list[int]:
     """Runs each rank in a thread, one at a time, until all want their gradients summed; how often each rank did."""
-    turn, meeting = threading.Lock(), threading.Barrier(len(ranks), timeout=120)
+    turn, meeting = threading.Lock(), threading.Barrier(len(ranks), timeout=PATIENCE_S)
     waiting: dict[int, torch.Tensor] = {}
     sums = [0] * len(ranks)
 

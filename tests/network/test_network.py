@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import pytest
@@ -41,12 +42,12 @@ def test_fcn_halves_equal_the_definition():
 @pytest.mark.parametrize(
     ("counts", "changes"),
     [
-        ((23, 9), {}),
+        ((12, 5), {}),
         ((1,), {}),
         ((1, 17, 3), {"levels": 1}),
         ((12,), {"levels": 4, "message_passing_steps": 1, "width": 7}),
         ((15,), {"obstacle_features": False, "velocity_history": 5}),
-        ((23, 9), {"inputs": "relative"}),
+        ((9, 4), {"inputs": "relative"}),
         ((1, 12), {"inputs": "relative", "levels": 1, "contact_reach_cells": 4.0}),
         ((12,), {"inputs": "relative", "obstacle_features": False}),
     ],
@@ -102,6 +103,12 @@ BLOCKS = [
 ]
 
 
+@functools.cache
+def output_with_gradients(counts: tuple[int, ...], inputs: str) -> torch.Tensor:
+    network = network_of(width=128, levels=4, inputs=inputs).train()
+    return network.normalised_acceleration(random_state(counts, spread=0.15)).detach()
+
+
 @pytest.mark.parametrize(
     ("counts", "rows", "kind", "threads", "inputs"), [*BLOCKS, *((*case[:3], 2, "relative") for case in BLOCKS[:3])]
 )
@@ -110,7 +117,7 @@ def test_blocks_change_nothing(monkeypatch, counts, rows, kind, threads, inputs)
     dtype, tolerance, row_class = kind
     network = network_of(width=128, levels=4, inputs=inputs).train()
     state = random_state(counts, spread=0.15)
-    expected = network.normalised_acceleration(state).detach()
+    expected = output_with_gradients(counts, inputs)
     monkeypatch.setattr("hgn.cpu.network.ROWS_AT_ONCE", rows)
     if row_class is not None:  # none: compiled, where there is a compiler
         monkeypatch.setattr("hgn.cpu.network.rows_class", lambda *_: row_class)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from network.states import network_of
+from processes import PATIENCE_S
 
 import hgn
 from hgn.runtime.weights import WeightsInfo, save_weights
@@ -66,7 +67,7 @@ def test_simulating_loads_no_training_stack(tmp_path: Path) -> None:
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     assert process.returncode == 0, process.stderr
     report = json.loads(process.stdout)

@@ -12,6 +12,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from processes import PATIENCE_S
 
 from datagen.pool.worker import error_message
 from hgn.schema import ConfigError
@@ -107,6 +108,6 @@ def test_missing_extra_is_named(tmp_path: Path, package: str, arguments: list[st
     (tmp_path / "sitecustomize.py").write_text(HIDE.format(package=package))
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
     command = [sys.executable, "-m", *arguments]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
     line = f"error: this needs {package}, which is not installed; pip install 'hgn[{EXTRA_OF[package]}]'"
     assert (done.returncode, done.stderr.splitlines()[-1]) == (1, line), done.stderr

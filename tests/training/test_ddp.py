@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import torch
 from ballistic_dataset import MakeConfig
+from processes import PATIENCE_S
 from training.runs import metrics, train_mapping
 
 from hgn import train
@@ -63,10 +64,10 @@ def torchrun(
 def output(process: subprocess.Popen[str]) -> str:
     """What it printed until it ended; nothing may hang."""
     try:
-        return process.communicate(timeout=180)[0]
+        return process.communicate(timeout=PATIENCE_S)[0]
     except subprocess.TimeoutExpired:
         process.terminate()
-        raise AssertionError(process.communicate(timeout=60)[0][-4000:]) from None
+        raise AssertionError(process.communicate(timeout=PATIENCE_S)[0][-4000:]) from None
 
 
 def load(path: Path) -> Any:

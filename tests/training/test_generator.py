@@ -6,13 +6,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from processes import PATIENCE_S
 
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError
 from hgn.training.generator import Generator
-
-PATIENCE_S = 120.0
 
 
 def small_config(folder: Path) -> DatagenConfig:
