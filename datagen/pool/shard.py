@@ -87,7 +87,7 @@ def join_tars(file: BinaryIO, sources: Iterable[Path]) -> None:
         members = (place for named in locate_members(source).values() for place in named.values())
         length = max((offset + size for offset, size in members), default=0)
         length += -length % tarfile.BLOCKSIZE
-        with source.open("rb", buffering=0) as staged:
+        with source.open("rb") as staged:  # buffered: else a read may bring less than was asked for
             for start in range(0, length, _COPY_BYTES):
                 file.write(staged.read(min(_COPY_BYTES, length - start)))
         written += length

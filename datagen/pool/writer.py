@@ -35,7 +35,7 @@ from hgn.data.identity import dataset_identity, identity_hash, require_same_data
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest, QuarantinedScene, ShardEntry
 from hgn.schema import ConfigError
-from hgn.system.files import TEMPORARY_SUFFIX, sync_file, sync_folder, temporary_file, temporary_target
+from hgn.system.files import TEMPORARY_SUFFIX, make_folder, sync_file, sync_folder, temporary_file, temporary_target
 from hgn.system.machine import available_cpus
 
 # seeds tried for one episode before the scene distribution itself is held to be at fault
@@ -80,10 +80,10 @@ class DatasetWriter:
         self._forget_published()
 
     def __enter__(self) -> DatasetWriter:
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
         self._locks = ShardLocks(self.folder)
         try:
-            (self.folder / STAGING_NAME).mkdir(exist_ok=True)
+            make_folder(self.folder / STAGING_NAME)
             with self._locks.manifest():
                 self._recover()
                 self._sweep()

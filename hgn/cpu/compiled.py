@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 
 from hgn.cpu.rows import Hidden, Rows, Segments
-from hgn.system.files import temporary_file
+from hgn.system.files import sync_written, temporary_file
 
 SOURCE = Path(__file__).with_name("rows.c")
 # None that changes the order of sums: each row is computed alike, whatever rows are beside it.
@@ -134,8 +134,7 @@ def _library(width: int) -> tuple[ctypes.CDLL | None, str | None]:
             with temporary_file(path) as temporary:  # other processes may be at it too
                 command = [*compiler, *options, str(SOURCE), "-o", str(temporary)]
                 subprocess.run(command, check=True, capture_output=True, text=True)
-                with temporary.open("rb") as file:
-                    os.fsync(file.fileno())
+                sync_written(temporary)
                 temporary.replace(path)
         return _load(path), None
     except subprocess.CalledProcessError as error:

@@ -31,7 +31,7 @@ from hgn.config import Split
 from hgn.data.statistics import Moments, Statistics
 from hgn.data.storage import open_storage
 from hgn.schema import ConfigError, NonNegative, from_mapping, require, require_bounds, to_mapping
-from hgn.system.files import errors_name, sync_file, sync_folder
+from hgn.system.files import errors_name, make_folder, sync_file, sync_folder
 
 SPLITS = ("train", "validation", "test")
 INDEX_NAME = "index"
@@ -405,7 +405,7 @@ def extend(
     Raises: OSError; ConfigError where the files are shorter than the index says.
     """
     state, totals = index.state, index.totals
-    (folder / INDEX_NAME).mkdir(exist_ok=True)
+    make_folder(folder / INDEX_NAME)
     rest = list(shards)
     while rest:
         number = state.shards // SEGMENT_SHARDS
@@ -426,13 +426,14 @@ def extend(
     return index.continued(Index(folder, state, totals))
 
 
-def begin(folder: Path) -> Index:
-    """An empty index beside those that are there. The last but one of these goes: nobody reads it any more."""
+def begin(folder: Path, current: int = 0) -> Index:
+    """An empty index beside those that are there. Those before the `current` generation, the head's, go: nobody reads
+    them any more. A later one, whose head was never written, may be there too."""
     generations: dict[int, list[Path]] = {}
     for path in (folder / INDEX_NAME).glob("[0-9]*-*.jsonl"):
         generations.setdefault(int(path.name.partition("-")[0]), []).append(path)
     last = max(generations, default=0)
-    for path in (path for generation, paths in generations.items() if generation < last for path in paths):
+    for path in (path for generation, paths in generations.items() if generation < current for path in paths):
         path.unlink()
     return Index(folder, IndexState(last + 1), no_totals())
 

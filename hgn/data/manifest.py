@@ -127,7 +127,11 @@ class Manifest:
 
     def save(self, folder: Path | str) -> Manifest:
         """Replaces what the folder lists by this, in an index of a new generation; returns it as it is read there."""
-        return replace(self, shards=begin(Path(folder))).extended(
+        try:
+            current = json.loads((Path(folder) / MANIFEST_NAME).read_bytes())["index"]["generation"]
+        except (FileNotFoundError, ValueError, LookupError, TypeError):  # none, or of the first release
+            current = 0
+        return replace(self, shards=begin(Path(folder), current)).extended(
             Path(folder), self.shards, self.quarantined, revision=self.revision
         )
 

@@ -22,7 +22,7 @@ from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import Rollout, rollout_velocity, write_rollout
 from hgn.schema import ConfigError
 from hgn.system.extras import require_installed
-from hgn.system.files import sync_folder
+from hgn.system.files import sync_folder, sync_written
 
 USD_ENDINGS = (".usdc", ".usda", ".usd")
 PLY_ENDING = ".ply"
@@ -53,6 +53,8 @@ def save_rollout(
             _write_ply(partial, rollout, surface, progress)
         else:
             _write_usd(partial, rollout, surface, progress)
+        for file in Path(folder).iterdir():
+            sync_written(file)
         written = [file.replace(path.parent / file.name) for file in sorted(Path(folder).iterdir())]
     sync_folder(path.parent)
     return written[0]

@@ -24,7 +24,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.stepped_rollout import advanced
 from hgn.runtime.weights import WeightsInfo
 from hgn.schema import require, to_mapping
-from hgn.system.files import write_atomically
+from hgn.system.files import sync_folder, sync_written, write_atomically
 
 INPUTS = ("position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal")
 OUTPUTS = ("next_position", "next_velocity")
@@ -149,7 +149,9 @@ def write_package(path: Path, program: torch.export.ExportedProgram, info: Weigh
             package_path=str(temporary.resolve()),
             inductor_configs={"aot_inductor.metadata": {"hgn": _description(info)}},
         )
+    sync_written(temporary)
     temporary.replace(path)
+    sync_folder(path.parent)
 
 
 def _description(info: WeightsInfo) -> str:

@@ -19,7 +19,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.renamed import current_names
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
-from hgn.system.files import write_atomically
+from hgn.system.files import make_folder, write_atomically
 from hgn.system.hub import PREFIX, hub_weights
 
 FORMAT_VERSION = 1
@@ -49,7 +49,7 @@ def save_weights(path: Path, network: ParticleNetwork, info: WeightsInfo, stored
         rounded = stored_precision == "fp16" and not name.startswith("normaliser.")
         tensors[name] = tensor.detach().to("cpu", torch.float16 if rounded else torch.float32).contiguous()
     payload = save(tensors, metadata={"hgn": json.dumps(to_mapping(info), sort_keys=True)})
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     write_atomically(path, payload)
 
 

@@ -64,7 +64,7 @@ def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:
     Raises: OSError as write_atomically does; ValueError for a number that JSON does not know, unless `allow_nan`.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     write_atomically(path, json.dumps(value, indent=1, allow_nan=allow_nan).encode() + b"\n")
 
 
@@ -75,7 +75,7 @@ def held(path: Path, field: str, refusal: str) -> Iterator[None]:
     Raises: ConfigError `<field> must be ...`, with `refusal`, when another one has it. A file system without locks lets
     everybody in.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with path.open("ab") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -89,10 +89,25 @@ def held(path: Path, field: str, refusal: str) -> Iterator[None]:
         yield
 
 
+def make_folder(path: Path) -> None:
+    """Makes a folder where it is missing, and those above it; a loss of power does not take them away again."""
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    for folder in missing:
+        with contextlib.suppress(PermissionError):  # to list the folder above
+            sync_folder(folder.parent)
+
+
 def sync_file(file: BinaryIO) -> None:
     """Brings what was written to the disk itself."""
     file.flush()
     os.fsync(file.fileno())
+
+
+def sync_written(path: Path) -> None:
+    """Brings to the disk itself what a library has written to a file."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:

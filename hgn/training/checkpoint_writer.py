@@ -16,7 +16,7 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning_utilities.core.apply_func import apply_to_collection
 
-from hgn.system.files import temporary_file, write_atomically
+from hgn.system.files import make_folder, temporary_file, write_atomically
 from hgn.training.checkpoint import LAST_NAMES
 
 TURN_S = 1e-4  # for which a checkpoint's writing keeps Python's lock from the training; Python's own are 5e-3
@@ -87,7 +87,7 @@ def _keep_earlier(folder: Path) -> None:
 
 
 def _write(checkpoint: dict[str, Any], path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     content = io.BytesIO()
     with _short_turns():
         torch.save(checkpoint, content)

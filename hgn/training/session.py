@@ -20,7 +20,7 @@ from hgn.network.build import build_network
 from hgn.runtime.backend import pick, set_matmul_precision, torch_unsupported_reason, training_unsupported_reason
 from hgn.schema import to_mapping
 from hgn.system.device import keep_to_quota
-from hgn.system.files import write_atomically
+from hgn.system.files import make_folder, write_atomically
 from hgn.system.provenance import provenance
 from hgn.training.checkpoint import DataInfo
 from hgn.training.distributed import first_on_machine, first_rank, layout
@@ -150,7 +150,7 @@ def precompile_kernels(config: TrainConfig, stack: ExitStack) -> Precompilation 
 
 def _write_run_files(config: TrainConfig, run: Path) -> None:
     """The resolved configuration, with the commit and the machine that it ran on."""
-    run.mkdir(parents=True, exist_ok=True)
+    make_folder(run)
     if not first_rank():
         return
     manifest = Manifest.load(config.dataset.folder)

@@ -124,6 +124,20 @@ def test_what_was_not_published_is_written_over(tmp_path: Path, small_segments: 
     assert [entry.first for entry in Index(tmp_path, index.state, index.totals)] == [0, 1, 2, 3]
 
 
+def test_a_list_that_is_written_anew_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writers that end before the head of a list written anew, several of them, leave what the head lists."""
+    manifest = Manifest(identity_hash({}), {}, {"train": 2}, 2, ListedIndex([shard(0), shard(1)]))
+    manifest.save(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("hgn.data.manifest.write_atomically", lambda path, content: 1 / 0)
+        for _ in range(3):
+            with pytest.raises(ZeroDivisionError):
+                manifest.save(tmp_path)
+            assert list(Manifest.load(tmp_path).shards) == list(manifest.shards)
+    manifest.save(tmp_path)
+    assert len(manifest.save(tmp_path).shards) == 2 and len({*(tmp_path / "index").glob("*-000000.jsonl")}) <= 3
+
+
 def test_first_releases_manifest_is_gone_on_with(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
     """A manifest that lists the shards itself reads like one with an index; the next publication writes that."""
     folder = make_dataset(make_config(training_scenes=3))

@@ -138,7 +138,7 @@ def publish(writer: DatasetWriter, shards: int) -> list[Work]:
             store.refresh()
             with Count() as claim:
                 writer.claim_next()
-            _stage(writer, number)
+            stage_small(writer, number)
             with Count() as publication:
                 writer.publish_next()
             with Count() as look:
@@ -161,7 +161,7 @@ def publish_one(writer: DatasetWriter, number: int) -> None:
     """Claims, stages and publishes a shard."""
     shard = writer.claim_next()
     assert shard is not None and shard.first == number
-    _stage(writer, number)
+    stage_small(writer, number)
     writer.publish_next()
 
 
@@ -221,7 +221,8 @@ def found(work: list[Work], service: dict[str, Any]) -> list[str]:
     return faults
 
 
-def _stage(writer: DatasetWriter, number: int) -> None:
+def stage_small(writer: DatasetWriter, number: int) -> None:
+    """An episode of two particles."""
     task = writer.task("train", number)
     generator = np.random.default_rng(number)
     none = np.zeros((0, 3))

@@ -23,7 +23,7 @@ from hgn.data.statistics import Statistics, episode_statistics, merge_statistics
 from hgn.data.storage import file_sha256
 from hgn.scene.episode import SCHEMA_VERSION, Episode
 from hgn.schema import ConfigError, require
-from hgn.system.files import sync_file, sync_folder, temporary_file
+from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
 SHARD_BYTES = 128 << 20
 LOOKED_AT = 4  # trajectories, for gravity and for the spacing of boundaries
@@ -44,7 +44,7 @@ def import_set(source: Path, config: ImportConfig, progress: Callable[[Episode],
     still = [points for points in (_boundary(trajectory, info) for trajectory in first) if len(points)]
     converter = Converter(info, gravity, config.history, obstacle_cell_size(info, still))
     del first, still
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     shards: list[ShardEntry] = []
     for split in SPLITS:
         episodes = (

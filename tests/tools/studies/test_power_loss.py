@@ -1,0 +1,42 @@
+"""python -m tools.studies.power_loss: a few of its folders, and that harm is seen."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+import hgn.training.checkpoint_writer
+from hgn.system import files
+from tools.studies import power_loss
+from tools.studies.power_loss import SCENARIOS, fail, lose_power
+
+
+@pytest.mark.parametrize(("name", "every"), [("generation", 30), ("checkpoints", 5), ("cache", 2)])
+def test_nothing_is_lost(tmp_path: Path, name: str, every: int) -> None:
+    """After a loss of power, or an error of the disk, before some calls, with reads and writes of 1,000 bytes at most:
+    what was published or saved is there, nothing else is taken for whole, and the next run makes the same files."""
+    calls, tried, faults = lose_power(SCENARIOS[name], tmp_path, every, 1, 0)
+    assert faults == [] and tried == calls // every > 3
+    failed, faults = fail(SCENARIOS[name], tmp_path, 2 * every, 1000)
+    assert faults == [] and failed > 1
+
+
+@pytest.mark.parametrize("skipped", ["sync_file", "sync_folder"])
+def test_harm_is_seen(tmp_path: Path, skipped: str) -> None:
+    """Without the sync of files, or of folders, saved checkpoints are lost."""
+    with mock.patch.object(files, skipped):
+        _, _, faults = lose_power(SCENARIOS["checkpoints"], tmp_path, 1, 3, 0)
+    assert any("was saved" in fault or "must be a whole checkpoint" in fault for fault in faults)
+
+
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exit code and the report say what was wrong."""
+    monkeypatch.setattr(power_loss, "SCENARIOS", {"checkpoints": SCENARIOS["checkpoints"]})
+    monkeypatch.setattr(hgn.training.checkpoint_writer, "write_atomically", lambda path, data: path.write_bytes(data))
+    out = tmp_path / "out.json"
+    assert power_loss.main({"out": str(tmp_path / "out"), "every": 4, "rounds": 1, "json": str(out)}) == 1
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["what"] == "checkpoints" and row["power_losses"] > 5 and row["faults"]
