@@ -272,11 +272,13 @@ class ServiceConfig:
 
     host: str = "127.0.0.1"
     port: int = 8000  # 0: any free one
+    health_port: int | None = None  # answers /healthz beside `port`, from a process of its own; null: none
     connections: Positive[int] = 1024  # at once; more are told to come back
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(0 <= self.port < 65536, "port", "0 to 65535", self.port)
+        for name, port in (("port", self.port), ("health_port", self.health_port or 0)):
+            require(0 <= port < 65536, name, "0 to 65535", port)
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,14 @@ from __future__ import annotations
 import errno
 import ipaddress
 import socket
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from datagen.generate import KEYS, StopSignal, datagen_config, require_local_folder
 from datagen.pool.progress import PROGRESS_KINDS, make_progress
 from datagen.pool.worker import Backend
+from datagen.service.health import HealthPage
 from datagen.service.supervisor import Supervisor
 from hgn.command import run_command
 from hgn.config import ServiceConfig
@@ -25,7 +27,7 @@ from hgn.schema import ConfigError, from_mapping, require
 from hgn.system.machine import allow_open_files
 
 _OPEN_FILES = 65536
-_SERVICE_KEYS = ("host", "port", "connections")
+_SERVICE_KEYS = ("host", "port", "health_port", "connections")
 
 
 def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
@@ -39,14 +41,19 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     if (folder / MANIFEST_NAME).exists():
         require_same_dataset(Manifest.load(folder).config, config, folder)
     token = dataset_token()
-    with _listen(service, token) as listener, StopSignal() as stop:
+    with ExitStack() as stack, StopSignal() as stop:
+        listener = stack.enter_context(_listen(service.host, service.port, token))
+        page = None
+        if service.health_port is not None:
+            page = stack.enter_context(HealthPage(_listen(service.host, service.health_port, token)))
         # this loads for a second, and the pool's processes, which import this file, do not need it
-        from datagen.service.server import make_app, make_server
+        from datagen.service.server import make_app, make_server, telling
 
         progress = make_progress(kind)
         with Supervisor(config.awaited, progress, backend) as supervisor:
             app = make_app(folder, token, lambda: supervisor.state)
-            server = make_server(app, service.connections, allow_open_files(_OPEN_FILES))
+            every_second = None if page is None else telling(page, app)
+            server = make_server(app, service.connections, allow_open_files(_OPEN_FILES), every_second=every_second)
 
             def end() -> None:
                 server.should_exit = True
@@ -64,12 +71,11 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     return 128 + (stop.signal or 0)
 
 
-def _listen(service: ServiceConfig, token: str | None) -> socket.socket:
+def _listen(host: str, port: int, token: str | None) -> socket.socket:
     """The socket to serve on.
 
     Raises: ConfigError when the port is taken, the host is none of this machine's, or anybody could read.
     """
-    host, port = service.host, service.port
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         if token is None and not ipaddress.ip_address(address[0]).is_loopback:

@@ -8,7 +8,7 @@
 | /<shard>.tar | a published shard | ETag: its sha256; Range, If-Range |
 | /progress | counts and the pool's state, JSON | |
 | /metrics | the same for Prometheus | |
-| /healthz | 200 while the service serves; needs no token | |
+| /healthz | 200 while the service serves; needs no token; see `datagen.service.health` for a busy one | |
 
 Nothing else of the folder can be reached, and no shard whose bytes are not those that the manifest promises. With a
 token each request must carry `Authorization: Bearer <token>`.
@@ -21,7 +21,7 @@ import hashlib
 import hmac
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -35,6 +35,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from datagen.service.health import HealthPage
 from datagen.service.sendfile import FileRange
 from datagen.service.supervisor import PoolState
 from datagen.service.uvicorn_compat import SendfileProtocol
@@ -163,7 +164,7 @@ class Guard:
         return len(given) == 1 and hmac.compare_digest(given[0], self._expected)
 
 
-def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> ASGIApp:
+def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> Starlette:
     """The service as an ASGI application."""
     published, counters = Published(folder), Counter[str]()
     hashing: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
@@ -239,9 +240,12 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         text = _metrics((await published.snapshot()).manifest, pool(), counters)
         return PlainTextResponse(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
-    async def healthz(request: Request) -> Response:
+    async def health() -> dict[str, str]:
         await published.snapshot()
-        return JSONResponse({"status": "ok", "generator": pool().status})
+        return {"status": "ok", "generator": pool().status}
+
+    async def healthz(request: Request) -> Response:
+        return JSONResponse(await health())
 
     async def unreadable(request: Request, error: Exception) -> Response:
         return PlainTextResponse(f"{error}\n", 503, {"retry-after": "1"})
@@ -260,11 +264,34 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
         exception_handlers={ConfigError: unreadable},
     )
     app.router.redirect_slashes = False
+    app.state.health = health
     return app
 
 
+def telling(page: HealthPage, app: Starlette) -> Callable[[], Awaitable[None]]:
+    """Tells `page` how an app of `make_app` is, without waiting for it: a folder may not answer."""
+    looks: set[asyncio.Task[None]] = set()
+
+    async def look() -> None:
+        try:
+            page.tell(200, await app.state.health())
+        except (ConfigError, OSError) as error:
+            page.tell(503, {"status": str(error)})
+
+    async def tell() -> None:
+        if not looks:
+            looks.add(task := asyncio.create_task(look()))
+            task.add_done_callback(looks.discard)
+
+    return tell
+
+
 def make_server(
-    app: ASGIApp, connections: int, open_files: int = OPEN_FILES, patience_s: float = SendfileProtocol.patience_s
+    app: ASGIApp,
+    connections: int,
+    open_files: int = OPEN_FILES,
+    patience_s: float = SendfileProtocol.patience_s,
+    every_second: Callable[[], Awaitable[None]] | None = None,
 ) -> uvicorn.Server:
     """Serves `app` to as many connections at once, or as `open_files` are enough for; more are told to come back."""
     most = max(1, min(connections, (open_files - _BACKLOG - _OTHER_FILES) // 2))  # a socket and a shard each
@@ -282,6 +309,8 @@ def make_server(
             server_header=False,
             limit_concurrency=most + 1,
             timeout_graceful_shutdown=_GRACE_S,
+            callback_notify=every_second,
+            timeout_notify=0,  # s; it is looked at every second
         )
     )
 

@@ -28,7 +28,7 @@ from hgn.schema import from_mapping
 
 K8S = Path(__file__).resolve().parents[2] / "jobs" / "k8s"
 OLDEST, NEWEST = "1.31", "1.37"
-SERVICE_KEYS = ("host", "port", "connections")
+SERVICE_KEYS = ("host", "port", "health_port", "connections")
 RAY_JOB = {
     "activeDeadlineSeconds",
     "backoffLimit",
@@ -175,7 +175,7 @@ def test_commands_take_what_the_files_give_them(monkeypatch: pytest.MonkeyPatch)
     mapping = composed(monkeypatch, "service", container["args"])
     assert datagen_config(mapping, KEYS | dict.fromkeys(SERVICE_KEYS)).dataset.folder == "/shared/data/obstacles"
     service = from_mapping(ServiceConfig, {key: mapping[key] for key in SERVICE_KEYS})
-    assert [port["containerPort"] for port in container["ports"]] == [service.port]
+    assert [port["containerPort"] for port in container["ports"]] == [service.port, service.health_port]
     assert (
         container["env"][0]["name"]
         == TOKEN_VARIABLE

@@ -169,30 +169,33 @@ def serve_and_poll(writer: DatasetWriter, folder: Path, config: ManyShardsConfig
     """Figures of the service while readers poll it and `later` shards are published."""
     start = config.shards
     with _child(_serve, config.service_nice, folder) as (service, served):
-        port: int = served.recv()
+        port, health_port = served.recv()
         with (
             _child(_poll, config.readers_nice, port, config.readers, start + later) as (_, readers),
-            _child(_probe, config.service_nice, port) as (_, probe),
+            _child(_probe, config.service_nice, port) as (_, beside),
+            _child(_probe, config.service_nice, health_port) as (_, probe),
         ):
-            readers.recv(), probe.recv()  # they are ready
+            readers.recv(), probe.recv(), beside.recv()  # they are ready
             stop_at = time.time() + later * config.publish_every_s + 5
             readers.send(stop_at)
             probe.send(stop_at)
+            beside.send(stop_at)
             used_before = _cpu_s(service.pid)
             for number in range(start, start + later):
                 time.sleep(config.publish_every_s)
                 publish_one(writer, number)
-            polled, asked = readers.recv(), probe.recv()
+            polled, asked, asked_beside = readers.recv(), probe.recv(), beside.recv()
         used = {name: after - used_before[name] for name, after in _cpu_s(service.pid).items()}
         memory = _status(service.pid, "VmHWM")
         served.send("end")
         handled = served.recv()
-    requests = polled["requests"] + len(asked)
+    requests = polled["requests"] + len(asked) + len(asked_beside)
     return {
         "shards": start + later,
         "readers": config.readers,
         **polled,
-        "healthz_wall_s": _quantiles(asked),
+        "healthz_wall_s": _quantiles(asked),  # at its own port
+        "healthz_beside_readers_wall_s": _quantiles(asked_beside),
         "healthz_in_service_s": _quantiles(handled),
         "service_cpu_ms_a_request": 1e3 * used["ran"] / requests,
         "service_cpu_s": used["ran"],
@@ -268,7 +271,8 @@ def _serve(connection: Connection, folder: Path) -> None:
     import socket
     import threading
 
-    from datagen.service.server import make_app, make_server
+    from datagen.service.health import HealthPage
+    from datagen.service.server import make_app, make_server, telling
     from datagen.service.supervisor import PoolState
 
     app, handled = make_app(folder, None, PoolState), []
@@ -279,8 +283,10 @@ def _serve(connection: Connection, folder: Path) -> None:
         if scope.get("path") == "/healthz":
             handled.append(time.perf_counter() - begun)
 
-    server = make_server(timed, 4096, allow_open_files(65_536))
-    with socket.create_server(("127.0.0.1", 0), backlog=1024) as listener:
+    health = socket.create_server(("127.0.0.1", 0))
+    health_port = health.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0), backlog=1024) as listener, HealthPage(health) as page:
+        server = make_server(timed, 4096, allow_open_files(65_536), every_second=telling(page, app))
 
         def end() -> None:
             connection.recv()
@@ -288,7 +294,7 @@ def _serve(connection: Connection, folder: Path) -> None:
             server.should_exit = server.force_exit = True
 
         threading.Thread(target=end, daemon=True).start()
-        connection.send(listener.getsockname()[1])
+        connection.send((listener.getsockname()[1], health_port))
         server.run(sockets=[listener])
 
 

@@ -79,7 +79,7 @@ class Disk:
         """While it is entered Python's calls are followed, in all threads."""
         self._sync = os.fsync
         with ExitStack() as stack:
-            stack.callback(lambda: [os.close(file) for file in self._kept_open])
+            stack.callback(self._close)
             for name in CALLS:
                 stack.enter_context(mock.patch.object(os, name, self._followed(getattr(os, name))))
             stack.enter_context(mock.patch.object(os, "fsync", self._fsync))
@@ -87,6 +87,10 @@ class Disk:
             stack.enter_context(mock.patch.object(io, "open", opened))
             stack.enter_context(mock.patch.object(builtins, "open", opened))
             yield
+
+    def _close(self) -> None:
+        for file in self._kept_open:
+            os.close(file)
 
     def step(self) -> None:
         """A call is about to be made."""

@@ -1,0 +1,95 @@
+"""/healthz at a port of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from processes import wait_until
+
+from datagen.service import health
+from datagen.service.health import HealthPage
+from datagen.service.server import make_app, telling
+from datagen.service.supervisor import PoolState
+
+
+@pytest.fixture
+def page() -> Iterator[tuple[HealthPage, int]]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    with HealthPage(listener) as page:
+        yield page, port
+
+
+def ask(port: int) -> tuple[int, dict[str, str]]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.request("GET", "/healthz")
+    answer = connection.getresponse()
+    content = json.loads(answer.read())
+    connection.close()
+    return answer.status, content
+
+
+def test_it_waits_for_nobody(page: tuple[HealthPage, int]) -> None:
+    """What was told last is answered by another process, and beside connections that ask nothing."""
+    assert page[0]._process.pid != os.getpid()
+    told, port = page
+    assert ask(port) == (503, {"status": "the service has not begun"})
+    told.tell(200, {"status": "ok"})
+    wait_until(lambda: ask(port) == (200, {"status": "ok"}))
+    with ExitStack() as stack:
+        for _ in range(40):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+        assert ask(port)[0] == 200
+
+
+def test_a_process_that_is_stopped_holds_nobody_up(page: tuple[HealthPage, int]) -> None:
+    """Telling does not wait; what was told last is answered once the process goes on."""
+    told, port = page
+    assert ask(port)[0] == 503
+    os.kill(told._process.pid, signal.SIGSTOP)
+    for number in range(5000):
+        told.tell(200, {"status": f"{number} {1000 * 'x'}"})
+    os.kill(told._process.pid, signal.SIGCONT)
+    wait_until(lambda: ask(port)[0] == 200)
+    told.tell(200, {"status": "ok"})
+    wait_until(lambda: ask(port) == (200, {"status": "ok"}))
+
+
+def test_silence_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A service that says nothing for long is not well, whatever it said last."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with ours, theirs:
+        theirs.setblocking(False)
+        page = health._Page(theirs)
+        ours.send(b'[200, {"status": "ok"}]')
+        page.listen()
+        assert page._page().startswith(b"HTTP/1.1 200 OK") and page._page().endswith(b'{"status": "ok"}')
+        monkeypatch.setattr(health, "SILENCE_S", -1.0)
+        assert page._page().startswith(b"HTTP/1.1 503") and b"has not moved for 0 s" in page._page()
+
+
+def test_what_is_told(tmp_path: Path, folder: Path) -> None:
+    """A service whose manifest can be read is well, one without is not."""
+
+    class Told(list[int]):
+        def tell(self, status: int, content: object) -> None:
+            self.append(status)
+
+    async def tell(place: Path, told: Told) -> None:
+        await telling(told, make_app(place, None, PoolState))()  # type: ignore[arg-type]
+        while not told:
+            await asyncio.sleep(0.01)
+
+    for place, status in ((folder, 200), (tmp_path / "none", 503)):
+        told = Told()
+        asyncio.run(tell(place, told))
+        assert told == [status]
