@@ -87,9 +87,9 @@ def test_grids() -> None:
     rows = solver_validation.grids(MpmConfig(device="cpu"), (4, 5, 6))
     quantities = ["front of the dam", "run-out of a sand", "height of a sand", *["height of a block"] * 3]
     assert all(what in row.case for what, row in zip(quantities, rows, strict=True))
-    snow = rows[-1].more["values"]
+    snow = rows[-1].more["series"]
     assert all(0.95 < height < 1.1 for height in snow)  # of a side: it hardly yields; water lies spread out by then
-    assert max(rows[3].more["values"]) < 0.3
+    assert max(rows[3].more["series"]) < 0.3
 
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 2.0])

@@ -145,7 +145,7 @@ def grids(base: MpmConfig, cells: Sequence[int]) -> list[Row]:
         order, limit = convergence_order(cells, values)
         change = abs(values[-1] / values[-2] - 1)
         beyond = ", ".join(f"{value:.3f} at {count}" for value, count in zip(values, cells, strict=True)) + " cells; "
-        more: dict[str, Any] = {"cells": list(cells), "values": values, "order": order, "limit": limit}
+        more: dict[str, Any] = {"cells": list(cells), "series": values, "order": order, "limit": limit}
         beyond += "approaches nothing yet" if order is None else f"order {order:.2g}, towards {limit:.3f}"
         case = f"grid of {cells[-1]} cells beside {cells[-2]}: {name}"
         rows.append(Row(case, GRID_WITHIN, change, change <= GRID_WITHIN, beyond, more))
