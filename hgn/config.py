@@ -144,6 +144,9 @@ class MpmConfig:
     # (Drucker-Prager) that has the angle in triaxial compression alone (Taichi Elements, with 45) or in plane_strain
     sand_friction_law: SandFrictionLaw = "matsuoka_nakai"  # or compression, plane_strain
     sand_volume_correction: SandVolumeCorrection = "tampubolon"  # or taichi_elements
+    # of grains that make friction grow with the rate of flow, mu(I) (Jop, Forterre and Pouliquen 2006), which tall
+    # columns show; 0: the same friction at any rate
+    sand_grain_diameter_m: NonNegative[float] = 0.0
     snow_hardening: NonNegative[float] = 10.0
     snow_critical_compression: NonNegative[float] = 0.025
     snow_critical_stretch: NonNegative[float] = 0.0045

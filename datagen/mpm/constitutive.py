@@ -19,6 +19,9 @@ LARGEST_VOLUME = 1e12  # of an elastic solid, whose stress goes with its square
 # of an elastic solid's stiffness, for the step: a single particle that hits the floor at 10 m/s gains energy with steps
 # of 0.8 of the limit, and none with 0.65
 ELASTIC_MARGIN = 1.6
+# mu(I) = mu_s (1 + RATE_FRICTION / (1 + RATE_NUMBER / I)), as Jop, Forterre and Pouliquen 2006 have it of glass beads:
+# mu_s = tan 20.9, mu_2 = tan 32.76 degrees
+RATE_FRICTION, RATE_NUMBER = 0.685, 0.279
 
 
 @ti.func
@@ -84,19 +87,20 @@ def settled(volume: ti.f32, density: ti.f32, share: ti.f32) -> ti.f32:
 
 
 @ti.func
-def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, taichi_elements_sand: ti.template()):
+def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, step: ti.f32, variant: ti.template()):
     """Return mapping of the principal log strains: new ones, and the new volume correction.
 
     Stress yields where |s| > alpha (-tr tau), s its deviator: alpha is constant (Drucker and Prager), or such that
     I1 I2 = (9 - sin² phi) / (1 - sin² phi) I3 for the invariants of tau (Matsuoka and Nakai 1974). The deviator shrinks
-    and keeps its direction: no plastic flow changes the volume.
+    and keeps its direction: no plastic flow changes the volume. With grains alpha grows with the inertial number
+    I = rate d sqrt(rho_grain / p) of the plastic shear of this step (Jop, Forterre and Pouliquen 2006).
 
     Tampubolon et al. 2017: v_c / 3 joins each log strain first, and v_c += log det F_trial - log det F_new.
-    `taichi_elements_sand` is Taichi Elements' form, where v_c enters the trace but not the strains.
+    In Taichi Elements' form v_c enters the trace but not the strains.
     """
     strain = log_strain
     trace = log_strain.sum() + volume
-    if ti.static(not taichi_elements_sand):
+    if ti.static(not variant & VARIANT.taichi_elements_sand):
         strain = log_strain + volume / 3.0
     deviator = strain - trace / 3.0
     new_volume = 0.0
@@ -118,9 +122,20 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, t
             root = ti.sqrt(a / 3.0)
             cosine = ti.min(ti.max(-half_b / (root * root * root), -1.0), 1.0)
             alpha = 1.0 / (6.0 * root * ti.cos(ti.acos(cosine) / 3.0))
-        excess = size + (3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * alpha
+        bearing = -(3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * alpha
+        excess = ti.max(size - bearing, 0.0)
+        if ti.static(bool(variant & VARIANT.rate_of_sand)):
+            # of the excess x is plastic: (excess - x) (k x + RATE_NUMBER) = bearing RATE_FRICTION k x, where k x is I
+            pressure = ti.max(-(3.0 * bulk + 2.0 * shear) / 3.0 * trace, 1e-3)
+            k = law[row + CONSTANT.grain] / (step * ti.sqrt(pressure))
+            half = 0.5 * (RATE_NUMBER + k * (bearing * RATE_FRICTION - excess))
+            root = ti.sqrt(half * half + k * excess * RATE_NUMBER)
+            if half > 0.0:
+                excess = excess * RATE_NUMBER / (half + root)
+            else:
+                excess = (root - half) / k
         # the mapping keeps the trace, so log det F takes up all of v_c, which ends at 0
-        new_strain = strain - deviator * (ti.max(excess, 0.0) / size)
+        new_strain = strain - deviator * (excess / size)
     return new_strain, new_volume
 
 
@@ -134,6 +149,7 @@ def solid(
     counter: ti.template(),
     scene: ti.i32,
     variant: ti.template(),
+    step: ti.f32,
 ):
     """Sand, snow and elastic solids from the trial F: new F, new volume, Kirchhoff stress, and the present stiffness,
     3 lambda + 2 mu at rest shape.
@@ -162,9 +178,7 @@ def solid(
     if ti.static(sand):
         if ti.static(not snow and not elastic) or material == SAND:
             log_strain = ti.log(sigma)
-            strain, new_volume_ = _project_sand(
-                log_strain, volume, law, row, ti.static(bool(variant & VARIANT.taichi_elements_sand))
-            )
+            strain, new_volume_ = _project_sand(log_strain, volume, law, row, step, variant)
             new_volume = new_volume_
             for i in ti.static(range(3)):
                 if strain[i] != log_strain[i]:

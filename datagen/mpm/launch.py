@@ -198,6 +198,7 @@ class Launch(ABC):
             + VARIANT.sheets * (ghost_room > 0)
             + VARIANT.moving * self.moving
             + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
+            + VARIANT.rate_of_sand * (config.sand_grain_diameter_m > 0)
             + VARIANT.taichi_elements_water * (config.water_volume_update == "taichi_elements")
             + VARIANT.stiffening_water * (config.water_equation == "stiffening")
             + VARIANT.several_laws * (len(laws) > 1)

@@ -14,6 +14,7 @@ from hgn.scene.material import FLUIDS, MATERIALS
 
 BLOCK = 4  # nodes along the side of a block of the grid
 BLOCK_NODES = BLOCK**3
+SOLID_FRACTION = 0.6  # of sand: grains are denser by as much
 
 
 class Constant(NamedTuple):
@@ -33,7 +34,8 @@ class Constant(NamedTuple):
     sand_sine: int = 11  # of the friction angle, where sand yields as Matsuoka and Nakai have it; else 0
     water_tension: int = 12  # share of the tension that stretched water bears
     viscosity: int = 13  # of water, Pa s
-    length: int = 14
+    grain: int = 14  # of sand, d sqrt(2 rho_grain), sqrt(kg / m): see constitutive
+    length: int = 15
 
 
 class Count(NamedTuple):
@@ -138,7 +140,8 @@ class Variant(NamedTuple):
     sheets: int = 1024  # some nodes have two fields
     moving: int = 2048  # obstacles move
     elastic: int = 4096
-    parts: int = 8192  # times the number of parts
+    rate_of_sand: int = 8192  # friction grows with the rate of flow
+    parts: int = 16384  # times the number of parts
 
 
 class Field(NamedTuple):
@@ -224,4 +227,5 @@ def constants(config: MpmConfig, unit_density: float | None = None) -> np.ndarra
     out[CONSTANT.smallest_singular_value] = config.minimum_singular_value
     out[CONSTANT.water_tension] = config.water_tension
     out[CONSTANT.viscosity] = config.water_viscosity_pa_s
+    out[CONSTANT.grain] = config.sand_grain_diameter_m * np.sqrt(2 * config.density_kg_m3 / SOLID_FRACTION)
     return out

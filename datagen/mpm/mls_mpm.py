@@ -207,6 +207,7 @@ def respond(
                 counter,
                 scene,
                 variant,
+                step,
             )
             new_F = solid_F
             new_volume = solid_volume

@@ -59,6 +59,7 @@ COLUMN_CELLS = 24  # in radius, and at least in height: a front lacks its last t
 COLUMN_DEPTH = 1 / 64  # of the radius: where sand is as deep, there is its edge
 COLUMN_WITHIN = 0.1
 COLUMN_ASPECTS = (0.5, 1.0, 1.5, 2.5, 4.0)
+COLUMN_GRAINS = 100  # in radius, where friction grows with the rate of flow
 COLUMN_ROOM = 1.6  # times the radius expected
 COLUMN_TOP_CELLS = 2.5  # around the axis, where the height is taken
 LUBE_ANGLE_DEG = 31.0  # at which the quartz sand of Lube et al. 2004 rests
@@ -181,11 +182,11 @@ def impact(kind: int, cells: int) -> Scene:
 
 def columns(base: MpmConfig) -> list[Row]:
     """Run-out and height of collapsed columns by the config's own law, and by others that are there for comparison."""
-    cases = [(aspect, base.sand_friction_law, base.sand_friction_angle_deg) for aspect in COLUMN_ASPECTS]
-    cases += [(aspect, law, angle) for law, angle in SAND_LAWS for aspect in OTHER_ASPECTS]
-    return [
-        row for case in cases for row in column_rows(*case, base, max(COLUMN_CELLS, math.ceil(COLUMN_CELLS / case[0])))
-    ]
+    own = base.sand_friction_law, base.sand_friction_angle_deg
+    grains = dataclasses.replace(base, sand_grain_diameter_m=COLUMN_RADIUS / COLUMN_GRAINS)
+    cases = [(aspect, *own, config) for config in (base, grains) for aspect in COLUMN_ASPECTS]
+    cases += [(aspect, law, angle, base) for law, angle in SAND_LAWS for aspect in OTHER_ASPECTS]
+    return [row for case in cases for row in column_rows(*case, max(COLUMN_CELLS, math.ceil(COLUMN_CELLS / case[0])))]
 
 
 def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cells: int) -> list[Row]:
@@ -204,6 +205,8 @@ def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cell
     room = math.ceil(COLUMN_ROOM * lube(aspect) * cells)
     touched = _strays(path / scene.cell_size, room, (0, 2))
     name = f"sand column, aspect {aspect:g}, {law.replace('_', ' ')}, {angle_deg:g} degrees, {cells} cells in radius"
+    if base.sand_grain_diameter_m > 0:
+        name += f", {COLUMN_RADIUS / base.sand_grain_diameter_m:.3g} grains"
     rows = []
     for what, value, published in (("run-out", run_out, (lube(aspect) - 1,)), ("height", height, heights(aspect))):
         expected = sum(published) / len(published)
