@@ -36,7 +36,7 @@ _INTERNAL = (
     "network.base.ParticleNetwork",
     "network.features.ParticleState",
 )
-_INTERNAL += ("runtime.backend.Backend", "runtime.simulator.InitialState", "scene.episode.Episode")
+_INTERNAL += ("runtime.torch_backend.Backend", "runtime.simulator.InitialState", "scene.episode.Episode")
 nitpick_ignore = [("py:class", f"hgn.{name}") for name in _INTERNAL]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"

@@ -15,9 +15,9 @@ from hgn.config import BackendName, Precision, Split
 from hgn.data.fresh import set_record
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
-from hgn.runtime.backend import Backend
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import find_weights, require_frame_rate
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode

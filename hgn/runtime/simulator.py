@@ -16,9 +16,10 @@ import torch
 from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState, material_rows
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
-from hgn.runtime.backend import Backend, build, choose, set_matmul_precision
+from hgn.runtime.backend import build, choose, set_matmul_precision
 from hgn.runtime.differentiable import Inputs, Pose, simulate
 from hgn.runtime.stepped_rollout import stepped
+from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights
 from hgn.scene.episode import Episode
 from hgn.scene.history import ballistic_velocities, require_past

@@ -16,8 +16,8 @@ from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.gns_edges import Edges
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import Backend, GnsBackend
 from hgn.runtime.parity import GRADIENT_BOUND, OUTPUT_BOUND, relative_error
+from hgn.runtime.torch_backend import Backend, GnsBackend
 from hgn.runtime.triton_rollout import CHECKED_PARTICLES, TritonRollout
 from hgn.schema import ConfigError
 

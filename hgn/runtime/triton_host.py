@@ -33,6 +33,11 @@ def host_unsupported_reason() -> str | None:
     return None
 
 
+def kernel_precision(precision: str, device: torch.device) -> str:
+    """What the kernels are given: without a GPU there is no TF32."""
+    return "fp32" if device.type == "cpu" and precision == "tf32" else precision
+
+
 def _cache() -> Path:
     named = os.environ.get("TRITON_CACHE_DIR")
     home = os.environ.get("TRITON_HOME") or os.path.expanduser("~")  # noqa: PTH111 - Path's raises where there is none

@@ -27,9 +27,9 @@ from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import kernel_precision
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
 from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error
+from hgn.runtime.triton_host import kernel_precision
 from hgn.schema import ConfigError
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4

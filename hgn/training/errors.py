@@ -15,7 +15,7 @@ import torch
 
 from hgn.data.batch import Batch, make_batch
 from hgn.network.base import ParticleNetwork
-from hgn.runtime.backend import Backend
+from hgn.runtime.torch_backend import Backend
 from hgn.scene.episode import Episode
 
 REPORTED_FRAMES = (10, 50, 150, 299)  # of rollouts

@@ -20,8 +20,8 @@ from hgn.kernels.triton_compat import JitMisses
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, UpdateSettings
 from hgn.network.base import ParticleNetwork
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import kernel_precision
 from hgn.runtime.triton_backend import updates_of
+from hgn.runtime.triton_host import kernel_precision
 from hgn.scene.symmetry import drawn_symmetry
 from hgn.training.graph_pushforward import GraphPushforwardPool
 from hgn.training.parity import require_parity

@@ -19,7 +19,8 @@ from hgn.data.episode_tensors import UpdateChunk
 from hgn.data.sampler import SamplerState
 from hgn.data.statistics import Statistics
 from hgn.network.base import ParticleNetwork
-from hgn.runtime.backend import Backend, build, fastest_stepped, with_gradients
+from hgn.runtime.backend import build, fastest_stepped, with_gradients
+from hgn.runtime.torch_backend import Backend
 from hgn.schema import to_mapping
 from hgn.training import lightning_compat
 from hgn.training.checkpoint import (

@@ -13,9 +13,10 @@ from network.test_gns_edges import output_and_gradients
 from hgn.kernels.gns.op import FusedEdges, Tuning, fits
 from hgn.network.features import ParticleState
 from hgn.network.gns_edges import PlainEdges
-from hgn.runtime.backend import GnsBackend, triton_unsupported_reason
+from hgn.runtime.backend import triton_unsupported_reason
 from hgn.runtime.gns_graph import padded
 from hgn.runtime.parity import relative_error
+from hgn.runtime.torch_backend import GnsBackend
 from hgn.runtime.triton_backend import TritonGnsBackend
 from hgn.schema import ConfigError
 

@@ -17,7 +17,7 @@ from hgn.data.reader import EpisodeStore
 from hgn.evaluate import EvaluateConfig, one_step_rows
 from hgn.export import export
 from hgn.network.build import build_network
-from hgn.runtime.backend import Backend
+from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import DataInfo, network_of_checkpoint, read_checkpoint

@@ -13,8 +13,8 @@ import torch
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import kernel_precision
 from hgn.runtime.parity import relative_error
+from hgn.runtime.triton_host import kernel_precision
 from tools.bench.contenders import (
     BOUNDS,
     GRADIENT_BOUNDS,

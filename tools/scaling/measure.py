@@ -26,8 +26,9 @@ from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
 from hgn.data.sampler import balanced_parts
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import kernel_precision, set_matmul_precision, triton_unsupported_reason
+from hgn.runtime.backend import set_matmul_precision, triton_unsupported_reason
 from hgn.runtime.parity import relative_error
+from hgn.runtime.triton_host import kernel_precision
 from hgn.system.machine import available_cpus
 from hgn.training.checkpoint import DataInfo
 from hgn.training.distributed import averaging_options
