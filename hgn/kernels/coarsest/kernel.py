@@ -1,6 +1,6 @@
 """What the coarsest cells add to the accelerations of relative inputs, so that momentum holds, and its gradient.
 
-Shape legend: N particles, C coarsest cells; geometry as in hgn.kernels.grid.kernel.
+Shape legend: N particles, C coarsest cells; geometry as in hgn.kernels.geometry.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.grid.kernel import FULLY, GEOMETRY_COLUMNS
+from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
 
 

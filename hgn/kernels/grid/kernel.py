@@ -2,8 +2,6 @@
 
 All levels of all scenes lie in one array of slots: a window of cells around the domain, a border of one cell at each
 level so that neighbours need no bounds check. Shape legend: N particles, C cells of a level, L levels.
-Row of the geometry table of a level: first slot, slots, cells of the window in y and z with borders, slots of a
-scene, capacity, first cell in tables, window cells in x with borders.
 Row of the obstacle table of a scene, int64: addresses of its hash buckets (0: no obstacle), keys and normals, the
 mask of the buckets, and the symmetry that it is seen under (hgn.scene.symmetry.Symmetry.code).
 """
@@ -13,15 +11,14 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 from hgn.scene.symmetry import CELL_BITS
 
-GEOMETRY_COLUMNS = tl.constexpr(8)
 OBSTACLE_COLUMNS = tl.constexpr(5)
 NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)  # of relative inputs
-FULLY = tl.constexpr(1 << 24)  # disturbed: what counts as 1
 OVERFLOW = tl.constexpr(1)  # more active cells than capacity
 OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
 CODE_BITS = tl.constexpr(3 + CELL_BITS)  # of an axis in a symmetry's code: where it comes from, whether mirrored, cells
