@@ -1,0 +1,268 @@
+"""What tools.error_vs_time measures, pairs and draws: errors of frames and rollouts against closed forms."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from network.states import gns_of, network_of
+from PIL import Image
+
+from hgn.config import MpmConfig
+from hgn.data.batch import make_batch
+from hgn.data.reader import EpisodeStore
+from hgn.runtime.rollouts import RolloutResult, simulate_scenes
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.scene.distance import share_inside
+from hgn.scene.shapes import shape_obstacle
+from hgn.training.errors import ballistic, frame_batches, one_step_errors
+from tools.error_vs_time import score
+from tools.error_vs_time.contenders import BaselineContender, TritonPredictor
+from tools.error_vs_time.paired import paired_difference, paired_lines, paired_rows
+from tools.error_vs_time.plot import draw_frames, draw_pareto
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.error_vs_time.sinkhorn import sinkhorn_divergences
+from tools.measures import energies, energy_scale, momentum_error, outside_domain
+from tools.solver_rollouts import FrameClock, other_grid
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def data(small_dataset: Path) -> str:
+    return str(small_dataset)
+
+
+def test_baseline_errors_are_those_of_training(data: str) -> None:
+    """One-step errors agree with what training measures, at every frame."""
+    (episode,) = EpisodeStore(data, "test").episodes
+    gravity = BaselineContender("fall", lambda e: 0.9 * np.asarray(e.gravity) / e.frame_rate_hz**2, CPU)
+    network = network_of(torch.float32, obstacle_features=False)
+    batches = frame_batches([episode], network, 1, 100)
+    expected = one_step_errors({"fall": lambda b: 0.9 * ballistic(b)}, batches, CPU, network.config.materials)
+    assert gravity.one_step(episode, 1, 0.0).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
+
+
+def test_the_fast_path_tells_its_own_errors(data: str) -> None:
+    """One-step errors of backend triton come from its kernels, several frames at once: in float32 they are the plain
+    network's; what is captured serves the next frames, and those of fewer particles too."""
+    (episode,) = EpisodeStore(data, "test").episodes
+    fewer = replace(
+        episode,
+        key="fewer",
+        position_TN3=episode.position_TN3[:, 1:],
+        initial_velocity_N3=episode.initial_velocity_N3[1:],
+        material_N=episode.material_N[1:],
+    )
+    network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1)
+    predict, made = TritonPredictor(network, "fp32"), []
+    with torch.inference_mode():
+        for samples in ([(episode, 0), (episode, 2)], [(fewer, 1), (fewer, 3)], [(episode, 3)]):
+            batch = make_batch(samples, network.config)
+            torch.testing.assert_close(predict(batch), network(batch.state()), rtol=1e-4, atol=1e-8)
+            made.append(predict._rollout)
+    assert made[0] is made[1] is not made[2]
+
+
+def test_ghost_acceleration_counts_particles_at_rest(data: str) -> None:
+    """Only particles that have not moved count, each with the length of what is predicted for it."""
+    (episode,) = EpisodeStore(data, "test").episodes
+    position_TN3 = np.repeat(np.array(episode.position_TN3[:1]), 9, axis=0)
+    position_TN3[:, 0] += np.arange(9, dtype=np.float32)[:, None] * 0.01
+    still = replace(
+        episode,
+        position_TN3=position_TN3,
+        initial_velocity_N3=np.zeros_like(episode.initial_velocity_N3),
+        gravity=(0.0, 0.0, 0.0),
+    )
+    step = BaselineContender("push", lambda e: np.array([3e-3, 0.0, 4e-3]), CPU).one_step(still, 1, 1e-4)
+    assert step.rest_count == 8 * (position_TN3.shape[1] - 1)
+    assert score.one_step_figures([step])["ghost"] == pytest.approx(5e-3, rel=1e-5)
+
+
+def test_a_diverging_scene_ends_alone(data: str) -> None:
+    """Beside one that diverges a scene goes on to the end; the other is kept as far as it came, with the cause."""
+    episodes = EpisodeStore(data, "validation").episodes
+    scenes = [InitialState.of_episode(episode) for episode in episodes]
+    scenes = [replace(s, material_N=np.full_like(s.material_N, i)) for i, s in enumerate(scenes)]
+    simulator = Simulator(network_of(torch.float32), 60.0)
+    simulator.backend.predict = lambda state: (state.material_N == 1)[:, None].float().expand(-1, 3)
+    through, failed = simulate_scenes(simulator, scenes, 5)
+    assert through.cause is None and through.frame_count == 5
+    assert failed.cause is not None and "diverged at frame 2" in failed.cause and failed.frame_count == 2
+    assert np.isfinite(failed.position_TN3).all()
+    assert simulate_scenes(simulator, [], 5) == []
+
+
+def test_sinkhorn_against_closed_forms() -> None:
+    """Zero for a permuted cloud, the square of the shift for a shifted one, NaN where a position is not finite."""
+
+    def sinkhorn_divergence(first: torch.Tensor, second: torch.Tensor, blur: float) -> float:
+        return sinkhorn_divergences([(first, second)], blur)[0]
+
+    generator = torch.Generator().manual_seed(0)
+    cloud = torch.rand(120, 3, generator=generator)
+    shift = torch.tensor([0.1, -0.05, 0.2])
+    assert abs(sinkhorn_divergence(cloud, cloud.flip(0), 0.01)) < 1e-9
+    assert sinkhorn_divergence(cloud, cloud + shift, 0.01) == pytest.approx(float(shift.square().sum()), rel=1e-4)
+    assert sinkhorn_divergence(cloud, cloud + 0.01 * shift, 0.01) == pytest.approx(5.25e-6, rel=1e-3)
+    assert sinkhorn_divergence(cloud[:1], cloud[1:2], 0.01) == pytest.approx(
+        float((cloud[0] - cloud[1]).square().sum()), rel=1e-5
+    )
+    others = [(cloud[:50], cloud[50:100] + shift), (cloud[:50], cloud[:50]), (cloud[:3], cloud[3:6])]
+    together = sinkhorn_divergences(
+        [*others, (cloud[:50] * 0.1, cloud[50:100]), (cloud[:50] * math.nan, cloud[:50])], 0.05
+    )
+    assert together[:3] == pytest.approx([sinkhorn_divergence(*pair, 0.05) for pair in others], rel=1e-4, abs=1e-9)
+    assert together[3] > 0 and math.isnan(together[4])
+    cloud[3, 0] = math.nan
+    assert math.isnan(sinkhorn_divergence(cloud, cloud, 0.01))
+
+
+def test_momentum_and_energy_against_closed_forms() -> None:
+    """Free fall keeps its energy and gains momentum as gravity says; standing still loses none and gains none."""
+    gravity = np.array([0.0, -1e-3, 0.0])
+    time = np.arange(20)[:, None, None]
+    start = np.random.default_rng(0).random((1, 7, 3))
+    fall = start + 0.5 * gravity * time**2
+    energy = energies(fall, gravity)
+    np.testing.assert_allclose(energy, energy[0], rtol=2e-4)
+    still = np.repeat(start, 20, axis=0)
+    assert momentum_error(fall, still) == pytest.approx(1e-3 * math.sqrt(np.mean((np.arange(19) + 0.5) ** 2)))
+    assert energy_scale(gravity, (1.0, 2.0, 3.0)) == pytest.approx(2e-3) and energy_scale(0 * gravity, (1, 1, 1)) == 1
+
+
+def test_shares_inside_obstacles_and_outside_of_the_domain() -> None:
+    """Closed bodies hold what is within them, sheets nothing; the domain ends at its planes."""
+    cone = shape_obstacle("cone", 0.4, (0.5, 0.5, 0.5), np.eye(3), "cone")
+    square = shape_obstacle("square", 0.4, (0.5, 0.5, 0.5), np.eye(3), "square")
+    point = np.array([[0.5, 0.5, 0.5], [0.9, 0.9, 0.9], [1.1, 0.5, 0.5], [0.5, -0.1, 0.5]])
+    assert share_inside(point, [cone]) == 0.25 and share_inside(point, [square]) == 0
+    assert outside_domain(point, (1.0, 1.0, 1.0)) == 0.5 and outside_domain(point[:0], (1.0, 1.0, 1.0)) == 0
+
+
+def test_frames_that_are_told_together_are_timed_together() -> None:
+    """The clock counts from the end of the first bunch of frames; with one bunch only it tells nothing."""
+    clock = FrameClock()
+    clock.ends = [1.0, 1.000001, 1.000002, 1.3, 1.300001, 1.300002]
+    assert clock.milliseconds() == pytest.approx(100, rel=1e-3)
+    clock.ends = [1.0, 1.1, 1.2]
+    assert clock.milliseconds() == pytest.approx(100)
+    clock.ends = [1.0, 1.000001]
+    assert clock.milliseconds() is None
+
+
+def test_other_grids_keep_their_walls() -> None:
+    """Three nodes of 1/64 are two of 1/32 at the least, and six of 1/128."""
+    cells = [other_grid(MpmConfig(), 1 / n, 1 / 64).wall_cells for n in (32, 48, 64, 128)]
+    assert cells == [2, 2, 3, 6]
+
+
+def test_scenes_that_failed_leave_the_means(data: str) -> None:
+    """Errors at a frame are means over the scenes that reached it, and say over how many."""
+    episodes = list(EpisodeStore(data, "validation").episodes)
+    config = ErrorVsTimeConfig(data="d", out="x", sinkhorn_points=4)
+    paths = [np.array(episode.position_TN3) for episode in episodes]
+    trials = [RolloutResult(paths[0] + np.float32(0.1)), RolloutResult(paths[1][:3] + np.float32(0.2), "why")]
+    row = score.rollout_figures(trials, episodes, config, CPU)
+    np.testing.assert_allclose(row["curve"], [*[0.075] * 3, *[0.03] * 3], rtol=1e-4)
+    assert row["by_scene"]["position MSE"]["5"] == [pytest.approx(0.03, rel=1e-3), None]
+    assert row["by_scene"]["Sinkhorn"]["5"][1] is None
+    assert row["scenes_reached"] == {"5": 1} and row["first_failure_frame"] == 3 and row["first_failure"] == "why"
+
+
+@pytest.mark.parametrize("kind", ["hgn", "gns"])
+def test_scenes_beside_one_that_diverges_go_their_way(data: str, kind: str) -> None:
+    """Off backend triton they are simulated once, as if it had never been there."""
+    episodes = EpisodeStore(data, "validation").episodes
+    scenes = [InitialState.of_episode(episode) for episode in (*episodes, episodes[0])]
+    scenes[1] = replace(scenes[1], velocity_N3=scenes[1].velocity_N3 + np.float32(60.0))
+    simulator, calls = Simulator((network_of if kind == "hgn" else gns_of)(torch.float32), 60.0), []
+    predict = simulator.backend.predict
+    simulator.backend.predict = lambda state: calls.append(len(state.position_N3)) or predict(state)
+    first, lost, last = simulate_scenes(simulator, scenes, 5)
+    assert lost.cause is not None and f"diverged at frame {lost.frame_count}" in lost.cause and len(calls) == 4
+    assert calls[0] > calls[-1]
+    for trial, scene in ((first, scenes[0]), (last, scenes[2])):
+        (alone,) = simulate_scenes(simulator, [scene], 5)
+        assert trial.cause is None
+        np.testing.assert_allclose(trial.position_TN3, alone.position_TN3, atol=1e-6)
+
+
+def report_row(system: str, error: float, ms: float | None, **more: Any) -> dict[str, Any]:
+    one_step = None if system in ("mpm", "chaos") else error
+    row = {"system": system, "one_step_mse": one_step, "one_step_quartiles": one_step and [0.5 * error, 2 * error]}
+    row |= {"one_step_by_material": one_step and {"water": 2 * error}, "position_mse": {"50": error, "299": 2 * error}}
+    row |= {"position_quartiles": {"50": [0.5 * error, 2 * error]}, "scenes_reached": {"50": 2, "299": 1}}
+    row |= {"seeds": [1, 2], "failed_scenes": 1, "curve": [0.0, error, None], "penetration": 0.01, "sinkhorn": {}}
+    row |= {"reference_penetration": 0.005, "ms": ms, "ms_batched": ms, "batch_scenes": 2}
+    return (
+        row | {"weights": f"{system}.safetensors", "levels": 3, "message_passing_steps": 4, "backend": "triton"} | more
+    )
+
+
+def report_rows() -> list[dict[str, Any]]:
+    return [
+        report_row("hgn", 1e-7, 0.5, precision="fp16"),
+        report_row("hgn", 1e-7, 2.0, precision="fp32"),
+        report_row("gns", 2e-7, 5.0, precision="fp16"),
+        report_row("gns_particles", 1e3, 50.0, precision="fp16"),
+        report_row("baseline", 1e-5, None, predictor="ballistic motion"),
+        report_row("mpm", 0.5e-7, 100.0, grid=64, step=0.5, precision="fp32"),
+        report_row("mpm", 1e-3, 20.0, grid=32, step=1.0, precision="fp32"),
+        report_row("chaos", 1e-9, None, floor="twice the step"),
+    ]
+
+
+def test_paired_differences() -> None:
+    """A constant difference is its own interval; noise about zero carries no word; a few scenes far off take the word
+    from the mean and leave it to the median; scenes without a value of either do not count."""
+    rng = np.random.default_rng(3)
+    base = rng.uniform(1, 2, 60)
+    lower = paired_difference(base - 0.5, base)
+    assert lower is not None and lower["median"] == pytest.approx([-0.5] * 3) == lower["mean"]
+    assert lower["median_says"] == lower["mean_says"] == "nearer"
+    higher = paired_difference([*(base + 0.5), None, 9.0], [*base, 0.0, None])
+    assert higher is not None and higher["mean_says"] == "farther" and higher["scenes"] == 60
+    noise = paired_difference(base + rng.normal(0, 1, 60), base)
+    assert noise is not None and noise["mean_says"] == noise["median_says"] == "no difference shown"
+    _, low, high = noise["mean"]
+    assert high - low == pytest.approx(2 * 1.96 / 60**0.5, rel=0.25)
+    far = base - 0.1
+    far[:2] += 20
+    few = paired_difference(far, base)
+    assert few is not None and (few["median_says"], few["mean_says"]) == ("nearer", "no difference shown")
+    assert paired_difference([1.0], [2.0]) is None
+
+
+def test_paired_rows_are_told() -> None:
+    """A network stands beside GNS and each setting of the solver, in the errors and frames that both have of scenes."""
+    rows = report_rows()
+    for row, values in ((rows[0], [1.0, 2.0, 3.0]), (rows[2], [2.0, 3.0, 4.0]), (rows[5], [0.0, 2.0, 4.0])):
+        row["by_scene"] = {"position MSE": {"50": values}}
+    rows[0]["by_scene"]["one-step MSE"] = rows[2]["by_scene"]["one-step MSE"] = {"0": [1.0, 1.0]}
+    made = paired_rows(rows)
+    of_hgn = [(row["other"].split(",")[0], row["error"]) for row in made if row["one"].startswith("HGN")]
+    assert of_hgn == [("GNS M = 4", "one-step MSE"), ("GNS M = 4", "position MSE"), ("MPM 64³", "position MSE")]
+    told = "\n".join(paired_lines(made))
+    assert "position MSE after 50 frames, 3 scenes: nearer in the median (-1.00e+00, -1.00e+00 to -1.00e+00)" in told
+    assert "MPM 64³, step 0.5, position MSE after 50 frames, 3 scenes: no difference shown in the median" in told
+    assert paired_lines([]) == []
+
+
+def test_the_figures_show_what_diverged(tmp_path: Path) -> None:
+    """Points beyond the panel, scenes that failed and a report without a single row are drawn too."""
+    meta = {"versions": {"torch": "2", "taichi": "1"}, "commit": "c", "date": "2026-01-01", "command": "x " * 200}
+    meta |= {"scenes": 2, "split": "test", "data": "d", "device": "a GPU", "reference": "the solver"}
+    rows = report_rows()
+    rows[2] |= {"position_mse": {"50": 1e-6}, "scenes_reached": {"50": 2, "299": 0}, "failed_scenes": 2}
+    for some in (rows, []):
+        for picture in (draw_pareto(some, meta), draw_pareto(some, meta, batched=True), draw_frames(some, meta)):
+            with Image.open(io.BytesIO(picture)) as image:
+                assert image.width > 500
