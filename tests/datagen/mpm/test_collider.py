@@ -52,8 +52,8 @@ def dropped(material: int, y: float, speed: float, *obstacles: Obstacle) -> Scen
 
 # a particle of each material: with it beside, every test shares one compiled kernel
 BESIDE = scene_of(
-    sheet(0.2), position_N3=np.float32([[0.3, 0.5, 0.5], [0.5, 0.5, 0.5], [0.7, 0.5, 0.5]]),
-    velocity_N3=np.zeros((3, 3), np.float32), material_N=np.arange(3).astype(np.uint8),
+    sheet(0.2), position_N3=np.float32([[x, 0.5, 0.5] for x in (0.3, 0.45, 0.6, 0.75)]),
+    velocity_N3=np.zeros((4, 3), np.float32), material_N=np.arange(4).astype(np.uint8),
 )  # fmt: skip
 
 
@@ -192,7 +192,7 @@ def test_bodies_keep_particles_out() -> None:
     thick = box((0.3, 0.25, 0.3), (0.7, 0.5, 0.7))
     thin = box((0.1, 0.48, 0.1), (0.9, 0.5, 0.9))
     scenes = [dropped(material, 0.63, 4, body) for material in range(3) for body in (thick, thin)]
-    for outcome in simulate(scenes, CONFIG, 11, 60.0):
+    for outcome in simulate([*scenes, BESIDE], CONFIG, 11, 60.0):
         assert isinstance(outcome, Simulated), outcome
         assert outcome.counters["particles_inside_obstacles_at_start"] == 0
         assert outcome.counters["particles_inside_obstacles_at_end"] == 0
@@ -210,7 +210,8 @@ def test_particles_inside_at_the_start_are_counted() -> None:
 def test_swept_test_alone_holds() -> None:
     """Without contact at the nodes particles pass a sheet and a cone; the swept test lets none pass, and counts."""
     cone = shape_obstacle("cone", 0.5, (0.5, 0.4, 0.5))
-    scenes = [dropped(material, 0.68, 6, body) for material in range(3) for body in (sheet(5.3 * CELL), cone)]
+    obstacles = (sheet(5.3 * CELL), cone)
+    scenes = [dropped(material, 0.68, 6, body) for material in range(len(MATERIALS)) for body in obstacles]
     for projection in (False, True):
         config = MpmConfig(device="cpu", collider_band_cells=0.0, collider_projection=projection)
         colliders = []

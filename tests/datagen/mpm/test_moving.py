@@ -32,6 +32,12 @@ def plate(height: float, rotation: np.ndarray, closed: bool) -> Obstacle:
     return Obstacle("plate", rotate(corner, rotation) * CELL + MIDDLE, triangle, closed)
 
 
+def sheet(floor: float) -> Obstacle:
+    """A level one so many cells high, from wall to wall."""
+    corner = np.array([[-9, floor, -9], [30, floor, -9], [30, floor, 30], [-9, floor, 30]], float) * CELL
+    return Obstacle("sheet", corner, QUAD, False)
+
+
 def moving(obstacle: Obstacle, time: list, translation: list, degrees: list | None = None) -> Obstacle:
     rotation = np.stack([euler_rotation(angles) for angles in degrees or [(0, 0, 0)] * len(time)])
     motion = Motion(np.array(time, float), np.array(translation, float), rotation, tuple(MIDDLE))
@@ -48,8 +54,12 @@ def block(material: int, low: tuple, size: tuple, rotation: np.ndarray, obstacle
 
 
 def paths(scenes: list[Scene], seconds: float) -> list[np.ndarray]:
-    """Places in cells from the middle."""
-    outcomes = simulate(scenes, CONFIG, 1 + round(seconds * RATE_HZ), RATE_HZ)
+    """In cells from the middle; with a moving sheet and all materials beside, tests share one compiled kernel."""
+    still = moving(sheet(2.5), [0.0, 1.0], [np.zeros(3)] * 2)
+    place = np.float32([[4.5, height, 4.5] for height in (5, 6, 7, 8)]) * np.float32(CELL)
+    kinds, domain = np.arange(4).astype(np.uint8), scenes[0].domain_size
+    beside = Scene(place, np.zeros((4, 3), np.float32), kinds, (still,), domain, CELL)
+    outcomes = simulate([*scenes, beside], CONFIG, 1 + round(seconds * RATE_HZ), RATE_HZ)[: len(scenes)]
     assert all(isinstance(outcome, Simulated) for outcome in outcomes), outcomes
     return [(outcome.position_TN3.astype(np.float64) - MIDDLE) / CELL for outcome in outcomes]
 
@@ -60,9 +70,8 @@ def test_piston() -> None:
     size = np.array([wide, 1.5, wide])
     count = round(8 * np.prod(size))
     place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * size + [2, floor + 0.02, 2]  # from wall to wall
-    corner = np.array([[-9, floor, -9], [30, floor, -9], [30, floor, 30], [-9, floor, 30]], float) * CELL
     way = [0.0, speed * (seconds - start), 0.0]
-    piston = moving(Obstacle("piston", corner, QUAD, False), [start, seconds], [np.zeros(3), way])
+    piston = moving(sheet(floor), [start, seconds], [np.zeros(3), way])
     scenes = [
         Scene(
             (place * CELL).astype(np.float32), np.zeros((count, 3), np.float32), np.full(count, material, np.uint8),
