@@ -150,7 +150,7 @@ def _started(
         "gravity_3",
         "left out for a network of absolute inputs, which knows no gravity but its data's",
         "a tensor",
-        "take weights of relative inputs",
+        "take weights of relative inputs, as mechanics",
     )
     count = len(scene.position_N3)
     position_N3 = given("position_N3", inputs.position_N3, scene.position_N3, (count, 3))

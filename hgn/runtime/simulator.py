@@ -248,7 +248,7 @@ class Simulator:
             require(float(np.linalg.norm(scene.gravity)) <= LARGEST_GRAVITY, "gravity", rule, scene.gravity)
         else:
             rule = f"the weights' {info.gravity}, which a network of absolute inputs cannot take from a scene"
-            remedy = "take weights of relative inputs, or train some on scenes with this gravity"
+            remedy = "take weights of relative inputs, as mechanics, or train some on scenes with this gravity"
             require(tuple(scene.gravity) == info.gravity, "gravity", rule, scene.gravity, remedy)
         if info.network.sees_obstacles:
             rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"

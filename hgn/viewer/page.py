@@ -261,7 +261,11 @@ class PlayPage:
         require(Path(file).suffix.lower() in MESH_SUFFIXES, "mesh", f"one of {', '.join(MESH_SUFFIXES)}", file)
         with tempfile.TemporaryDirectory() as folder:
             (Path(folder) / file).write_bytes(content)
-            self.chosen = self.session.add_mesh(Path(folder) / file, float(self.size.value), self._middle()).body.number
+            try:
+                added = self.session.add_mesh(Path(folder) / file, float(self.size.value), self._middle())
+            except ConfigError as error:  # by the name that it was sent with
+                raise ConfigError(str(error).replace(f"{folder}/", "")) from None
+        self.chosen = added.body.number
 
     def _remove_chosen(self) -> None:
         if self.chosen is not None:
