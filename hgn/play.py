@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hgn.system.threads  # noqa: F401  # isort: skip  # before torch is loaded
 
+import contextlib
 import sys
 import webbrowser
 from dataclasses import dataclass
@@ -60,7 +61,8 @@ def main(mapping: dict[str, Any]) -> int:
     if config.browser:
         webbrowser.open(page.address)
     try:
-        page.run()
+        with contextlib.suppress(KeyboardInterrupt):  # the way to end it
+            page.run()
     finally:
         page.close()
     return 0
