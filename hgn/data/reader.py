@@ -99,23 +99,43 @@ class EpisodeStore:
                 return False
         return True
 
-    def fetch_ahead(self) -> None:
-        """Begins to bring the shards known by now to this machine, one after the other, beside their use.
+    def fetch_ahead(self, episodes: Sequence[int] | None = None) -> None:
+        """Begins to bring shards to this machine, one after the other, beside their use: all that are known by now; or
+        those of these `episodes` alone, in their order, for which others leave a full cache.
 
         Does nothing for a folder.
         """
-        known = len(self.manifest.shards)
-        if is_remote(self.folder) and self._fetched < known and (self._fetcher is None or not self._fetcher.is_alive()):
-            self._fetcher = threading.Thread(target=self._fetch, args=(self.manifest,), name="shards", daemon=True)
-            self._fetcher.start()
+        if not is_remote(self.folder):
+            return
+        with self._lock:
+            if episodes is not None:
+                self._wanted = list({shard.name: shard for shard, _ in map(self._locate, episodes)}.values())
+                self._spared = frozenset(shard.sha256 for shard in self._wanted)
+            elif self._fetched == len(self.manifest.shards):
+                return
+            if self._fetcher is None or not self._fetcher.is_alive():
+                target = self._fetch_all if episodes is None else self._fetch_wanted
+                self._fetcher = threading.Thread(target=target, name="shards", daemon=True)
+                self._fetcher.start()
 
-    def _fetch(self, manifest: Manifest) -> None:
-        # whoever needs a shard that cannot be had meets the same error again, and says so
+    # whoever needs a shard that cannot be had meets the same error again, and says so
+
+    def _fetch_all(self) -> None:
         with contextlib.suppress(ConfigError, OSError):
-            for shard in manifest.shards.since(self._fetched):
+            for shard in self.manifest.shards.since(self._fetched):
                 if shard.split == self.split:
-                    open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, make_room=False)
+                    open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, spared=None)
                 self._fetched += 1
+
+    def _fetch_wanted(self) -> None:
+        with contextlib.suppress(ConfigError, OSError):
+            while True:
+                with self._lock:
+                    if not self._wanted:
+                        self._fetcher = None
+                        return
+                    shard, spared = self._wanted.pop(0), self._spared
+                open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, spared=spared)
 
     def digest(self, count: int) -> str | None:
         """Tells the first `count` episodes from any others; none where no shard ends with the last of them."""
@@ -174,6 +194,8 @@ class EpisodeStore:
         self._frames: list[int] = []  # of the episodes of the data set's first shards, where they may differ
         self._measured = 0  # how many shards these are
         self._fetched = 0  # of the data set's shards, how many were brought here one after the other
+        self._wanted: list[ShardEntry] = []  # to be brought here next
+        self._spared: frozenset[str] = frozenset()  # their sha256, and those of others that are needed soon
         self._lock = threading.Lock()
         holders.add(self)
 

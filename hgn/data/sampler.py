@@ -135,6 +135,18 @@ class EpisodeSampler:
         rows = zip(episode_K[mine].tolist(), frame_K[mine].tolist(), seed_K[mine].tolist(), strict=True)
         return [Sample(episode, frame, splitmix64(seed) >> 1) for episode, frame, seed in rows]
 
+    def upcoming(self, samples: int) -> list[int]:
+        """The episodes of this epoch's next samples, those of all ranks, in the order that they are needed in."""
+        ahead = self._order[self.state.position :][:samples]
+        return list(dict.fromkeys((self._first_sample.searchsorted(ahead, side="right") - 1).tolist()))
+
+    @property
+    def window_samples(self) -> int:
+        """How many samples are shuffled together, on average; 0: all."""
+        blocks = max(1, self._window // BLOCK_EPISODES) * BLOCK_EPISODES
+        windowed = 0 < self._window < self.state.episodes
+        return -(-len(self._order) * blocks // self.state.episodes) if windowed else 0
+
     def _part(self, episode_K: np.ndarray) -> np.ndarray:
         """Which of a global batch's samples are this rank's."""
         if self._particles is None:

@@ -22,7 +22,7 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
@@ -78,8 +78,11 @@ class Storage(Protocol):
         """Some bytes of a file. Raises: FileNotFoundError; UnreachableError; ConfigError (no access, too short)."""
         ...
 
-    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, make_room: bool = True) -> Path:
-        """The path of a shard on this machine, verified; others leave a full cache for it, if it may `make_room`.
+    def shard(
+        self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
+    ) -> Path:
+        """The path of a shard on this machine, verified; others leave a full cache for it, but those whose sha256 is
+        `spared` (none: all are).
 
         Raises: ConfigError; UnreachableError; OSError (a full disk, or cache).
         """
@@ -206,7 +209,9 @@ class _Folder:
             file.seek(start)
             return _whole(file.read(stop - start), f"{self._folder}/{name}", start, stop)
 
-    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, make_room: bool = True) -> Path:
+    def shard(
+        self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
+    ) -> Path:
         path = self._folder / name
         try:
             verify_file(path, sha256, size, "delete it and run the generator again")
@@ -278,13 +283,15 @@ class _Remote:
             data = data[start:stop]
         return _whole(data, f"{self._url}/{name}", start, stop)
 
-    def shard(self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, make_room: bool = True) -> Path:
+    def shard(
+        self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
+    ) -> Path:
         path = cache_folder() / f"{sha256}.tar"
         remedy = "it is fetched again"
         for again in (True, False):
             if not path.exists():
                 try:
-                    self._fetch_into_room(name, sha256, size, path, patience_s, make_room)
+                    self._fetch_into_room(name, sha256, size, path, patience_s, spared)
                 except FileNotFoundError:
                     raise ConfigError(
                         f"{self._url}/{name} is listed in the manifest but missing; run the generator again"
@@ -321,7 +328,7 @@ class _Remote:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
 
     def _fetch_into_room(
-        self, name: str, sha256: str, size: int, path: Path, patience_s: float, make_room: bool
+        self, name: str, sha256: str, size: int, path: Path, patience_s: float, spared: Collection[str] | None
     ) -> None:
         while True:
             try:
@@ -330,9 +337,9 @@ class _Remote:
                     raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
                 return self._fetch(name, sha256, size, path, patience_s)
             except OSError as error:
-                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or not make_room:
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or spared is None:
                     raise
-                if not _make_room(path.parent, max(over, size)):
+                if not _make_room(path.parent, max(over, size), spared):
                     raise
 
     def _fetch(self, name: str, sha256: str, size: int, path: Path, patience_s: float) -> None:
@@ -437,12 +444,14 @@ def _bytes_over(folder: Path, size: int) -> float:
     return sum(cached for _, cached, _ in _cached(folder)) + size - allowed
 
 
-def _make_room(folder: Path, size: float) -> bool:
-    """Removes the shards that were brought first; whether there was any."""
+def _make_room(folder: Path, size: float, spared: Collection[str]) -> bool:
+    """Removes the shards that were brought first, but those that are spared; whether there was any."""
     freed = 0
     for _, cached, path in _cached(folder):
         if freed >= size:
             break
+        if path.stem in spared:
+            continue
         for holder in list(holders):
             holder.release(path)
         path.unlink(missing_ok=True)

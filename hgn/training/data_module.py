@@ -59,6 +59,7 @@ class EpisodeDataModule(LightningDataModule):
         self.interrupted = interrupted
         self.sampler_state = SamplerState()  # where to begin; set from the checkpoint on a resume
         self._importance: dict[int, FrameImportance] = {}
+        self._fetched_from = (-1, -1)  # epoch and quarter of a window that shards were last asked for at
         self.waited_s = 0.0  # time that the training has waited for a batch
 
     def train_dataloader(self) -> DataLoader[Batch | UpdateSamples | UpdateChunk]:
@@ -79,6 +80,7 @@ class EpisodeDataModule(LightningDataModule):
             nonlocal update
             starts = self._starts(order, begun, update)
             update += 1
+            self._fetch_window(order)
             return (order.next_batch(), starts), order.state
 
         def read(drawn: tuple[list[Sample], Starts], state: SamplerState) -> Batch | UpdateSamples:
@@ -111,6 +113,7 @@ class EpisodeDataModule(LightningDataModule):
             starts = self._starts(order, begun, update)
             count = chunk_length(self.training, begun, update)
             update += count
+            self._fetch_window(order)
             return ([tuple(order.next_batch()) for _ in range(count)], starts), order.state
 
         def read(drawn: tuple[list[tuple[Sample, ...]], Starts], state: SamplerState) -> UpdateChunk:
@@ -128,6 +131,13 @@ class EpisodeDataModule(LightningDataModule):
             return UpdateChunk(drawn_frames, episodes, state, tuple(dropped), starts)
 
         yield from self._prefetched(draw, read)
+
+    def _fetch_window(self, order: EpisodeSampler) -> None:
+        """Has the shards of as many samples as a window has brought here before they are needed; each quarter of it."""
+        quarter = order.window_samples // 4
+        if quarter and (place := (order.state.epoch, order.state.position // quarter)) != self._fetched_from:
+            self._fetched_from = place
+            self.store.fetch_ahead(order.upcoming(order.window_samples + quarter))
 
     def _room(self) -> int:
         """How many episodes stay on the device: two windows of the order, where it has windows."""
@@ -229,7 +239,8 @@ class EpisodeDataModule(LightningDataModule):
     def _published(self, epoch: int) -> list[int]:
         """Frames of each published episode, the same on all ranks: rank 0 looks, the others follow."""
         self.store.refresh()
-        self.store.fetch_ahead()
+        if not 0 < self.training.shuffle_episodes < len(self.store):
+            self.store.fetch_ahead()
         count = agreed_count(self.store, self.trainer) if self.trainer is not None else len(self.store)
         return self.store.frames(count)
 

@@ -128,7 +128,7 @@ def test_other_shards_are_refused():
 @given(st.lists(st.integers(2, 5), min_size=1, max_size=60), st.integers(1, 40), st.integers(1, 4), st.integers(0, 99))
 def test_windows(frames: list[int], window: int, world_size: int, cut: int):
     """With a window each sample still comes once an epoch, on any number of ranks and through an interruption; between
-    two samples of an episode lie no more than those of a window's episodes."""
+    two samples of an episode lie no more than those of a window's episodes; what comes next is known in its order."""
     total = sum(frames) - len(frames)
 
     def ranks(state: SamplerState | None = None) -> list[EpisodeSampler]:
@@ -137,12 +137,15 @@ def test_windows(frames: list[int], window: int, world_size: int, cut: int):
 
     samples: list[tuple[int, int]] = []
     orders = ranks()
+    at, upcoming = 0, orders[0].upcoming(7)
     while len(samples) < total:
         if len(samples) == cut // world_size * world_size:
             orders = ranks(orders[0].state)
+            at, upcoming = len(samples), orders[0].upcoming(7)
         samples += [sample[:2] for order in orders for sample in order.next_batch()]
     epoch = samples[:total]
     assert sorted(epoch) == [(episode, frame) for episode, count in enumerate(frames) for frame in range(count - 1)]
+    assert upcoming == list(dict.fromkeys(episode for episode, _ in epoch[at : at + 7]))
     if window < len(frames):
         most = 4 * BLOCK_EPISODES * max(1, window // BLOCK_EPISODES)
         places = [[i for i, (episode, _) in enumerate(epoch) if episode == e] for e in range(len(frames))]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import resource
+import signal
 import struct
 import tempfile
 import zipfile
@@ -15,13 +17,16 @@ import h5py
 import pytest
 import torch
 import trimesh
+from data.test_index import shard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scene.test_rollout_file import make_rollout
 
 from datagen.solve import SolveConfig
 from hgn.config import NetworkConfig
-from hgn.data.index import parse_json
+from hgn.data.identity import identity_hash
+from hgn.data.index import SPLITS, ListedIndex, QuarantinedScene, parse_json
+from hgn.data.manifest import Manifest
 from hgn.data.shard import locate_members
 from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import read_rollout, write_rollout
@@ -134,7 +139,43 @@ def tar() -> tuple[str, bytes, Callable[[Path], object]]:
     return "shard.tar", header + b"abc".ljust(512, b"\0") + bytes(1024), locate_members
 
 
+def hdf5() -> tuple[str, bytes, Callable[[Path], object]]:
+    with tempfile.TemporaryDirectory() as folder:
+        write_rollout(Path(folder) / "rollout.vtkhdf", make_rollout())
+        return "rollout.vtkhdf", (Path(folder) / "rollout.vtkhdf").read_bytes(), read_rollout
+
+
+LISTED = tempfile.TemporaryDirectory()  # data sets without their shards
+
+
+def index(name: str) -> tuple[str, bytes, Callable[[Path], object]]:
+    """A file of a data set's index: all that it lists is read, and looked up."""
+    folder = Path(LISTED.name, name.strip("*"))
+    folder.mkdir()
+    shards = ListedIndex([shard(0), shard(1)], [QuarantinedScene("train-000000", 0, 7, "too stiff")])
+    Manifest(identity_hash({}), {}, {"train": 2}, 2, shards).save(folder)
+    (path,) = folder.rglob(name)
+    content = path.read_bytes()
+
+    def decode(damaged: Path) -> None:
+        path.write_bytes(damaged.read_bytes())
+        try:
+            manifest = Manifest.load(folder)
+            assert all(isinstance(entry.bytes, int) for entry in manifest.shards) and manifest.quarantined is not None
+            for split in SPLITS:
+                manifest.statistics(split)
+                manifest.shards.digest(split, manifest.published(split))
+        finally:
+            path.write_bytes(content)
+
+    return path.name, content, decode
+
+
 FILES = {
+    "hdf5": hdf5(),
+    "manifest": index("manifest.json"),
+    "segment": index("*-000000.jsonl"),
+    "quarantined": index("*-quarantined.jsonl"),
     **{suffix: mesh(suffix) for suffix in ("stl", "ply", "glb", "obj")},
     "checkpoint": checkpoint(),
     "tar": tar(),
@@ -143,13 +184,17 @@ FILES = {
 }
 
 
+EXAMPLES = int(os.environ.get("HGN_FUZZ_EXAMPLES", "25"))  # of each; more are other ones each time
+
+
 @pytest.mark.parametrize("kind", FILES)
 def test_decoders_bear_any_bytes(kind: str) -> None:
-    """A file with some bytes changed, cut or repeated is read, or refused with a message: nothing else comes out."""
+    """A file with some bytes changed, cut or repeated is read, or refused with a message: nothing else comes out, and
+    that in no more than 0.5 GB of memory."""
     name, content, decode = FILES[kind]
     places = st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255)), max_size=4)
 
-    @settings(max_examples=25, deadline=None, derandomize=True)
+    @settings(max_examples=EXAMPLES, deadline=None, derandomize=EXAMPLES == 25, database=None)
     @given(places, st.integers(0, len(content)), st.integers(0, 3))
     def damaged(changes: list[tuple[int, int]], cut: int, kind_of_cut: int) -> None:
         data = bytearray(content)
@@ -159,9 +204,14 @@ def test_decoders_bear_any_bytes(kind: str) -> None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / name
             path.write_bytes(data)
+            signal.alarm(60)  # a hang ends the tests
             try:
                 decode(path)
             except ConfigError as error:
                 assert str(error)
+            finally:
+                signal.alarm(0)
 
+    most_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     damaged()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < most_before + 500_000  # kB

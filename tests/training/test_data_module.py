@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import fsspec
 import numpy as np
@@ -105,35 +107,57 @@ def test_ranks_with_other_data_are_refused(folder: Path, here: bool) -> None:
         agreed_count(EpisodeStore(folder, "train"), trainer)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("ahead", "room"), [(False, 1 / 3), (True, 1 / 3), (True, 2 / 3)])
 def test_data_larger_than_the_cache(
     make_config: MakeConfig,
     make_dataset: MakeDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    ahead: bool,
+    room: float,
 ) -> None:
     """Shuffled in windows, an epoch fetches each shard once through a cache with room for a third of the data, and its
-    batches are those of a reader that has all of it."""
+    batches are those of a reader that has all of it. With room for two windows no shard is waited for but the first
+    window's: the order says what is needed next."""
     folder = make_dataset(make_config(training_scenes=32, validation_scenes=0, test_scenes=0, frames=3))
     training = replace(SETTINGS[1], shuffle_episodes=8)
     sizes = [shard.bytes for shard in EpisodeStore(folder, "train").manifest.shards]
     files = fsspec.filesystem("memory")
     files.put(str(folder), "/larger", recursive=True)
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setenv(LIMIT_VARIABLE, str(sum(sizes) / 3e9))
-    monkeypatch.setattr(EpisodeStore, "fetch_ahead", lambda store: None)
+    monkeypatch.setenv(LIMIT_VARIABLE, str(room * sum(sizes) / 1e9))
+    if not ahead:
+        monkeypatch.setattr(EpisodeStore, "fetch_ahead", lambda store, episodes=None: None)
     fetched: list[str] = []
-    real = files.cat_file
-    monkeypatch.setattr(files, "cat_file", lambda path, *a, **k: fetched.append(path) or real(path, *a, **k))
+    waited_for: list[int] = []  # batches so far, of each shard that was not fetched ahead
+    real, given = files.cat_file, 0
+
+    def cat_file(path: str, *arguments: Any, **options: Any) -> bytes:
+        fetched.append(path)
+        if path.endswith(".tar") and threading.current_thread().name != "shards":
+            waited_for.append(given)
+        return real(path, *arguments, **options)
+
+    monkeypatch.setattr(files, "cat_file", cat_file)
     epoch = 32 * 2 // 2
 
     def batches(place: Path | str, training: TrainingConfig) -> list[Batch]:
-        feed = EpisodeDataModule(EpisodeStore(place, "train"), SETTINGS[0], training, batches_ahead=0)
-        return list(islice(feed.batches(), epoch))
+        nonlocal given
+        given = 0
+        feed, found = EpisodeDataModule(EpisodeStore(place, "train"), SETTINGS[0], training, batches_ahead=0), []
+        for batch in islice(feed.batches(), epoch):
+            found.append(batch)
+            given = len(found)
+            if (fetcher := feed.store._fetcher) is not None:
+                fetcher.join()  # training takes its time
+        return found
 
     for here, there in zip(batches(folder, training), batches("memory://larger", training), strict=True):
         assert torch.equal(here.window_WN3, there.window_WN3) and here.sampler_state == there.sampler_state
     once = sorted(name for name in fetched if name.endswith(".tar"))
     assert len(once) == len(set(once)) == len(sizes) == 7
+    assert room < 2 / 3 or max(waited_for, default=0) == 0
+    assert ahead or len(waited_for) == 7
     fetched.clear()
     batches("memory://larger", SETTINGS[1])
     assert len([name for name in fetched if name.endswith(".tar")]) > 2 * len(sizes)
