@@ -34,6 +34,9 @@ class EpisodeStore:
     """
 
     _fetcher: threading.Thread | None = None
+    _lock: threading.Lock
+    _wanted: list[ShardEntry]  # to be brought here next
+    _spared: frozenset[str]  # their sha256, and those of others that are needed soon
 
     def __init__(self, folder: Path | str, split: str) -> None:
         """Raises: ConfigError when there is no readable manifest or the split is unknown; UnreachableError."""
@@ -194,8 +197,7 @@ class EpisodeStore:
         self._frames: list[int] = []  # of the episodes of the data set's first shards, where they may differ
         self._measured = 0  # how many shards these are
         self._fetched = 0  # of the data set's shards, how many were brought here one after the other
-        self._wanted: list[ShardEntry] = []  # to be brought here next
-        self._spared: frozenset[str] = frozenset()  # their sha256, and those of others that are needed soon
+        self._wanted, self._spared = [], frozenset()
         self._lock = threading.Lock()
         holders.add(self)
 
