@@ -34,6 +34,7 @@ GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 SYMMETRIES = ("none", "gravity")
 NETWORK_INPUTS = ("absolute", "relative")
+KEPT_MOMENTA = ("linear", "angular")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 TRAINING_BACKENDS = ("auto", "torch", "triton")
 PRECISIONS = ("fp32", "tf32", "fp16")
@@ -327,6 +328,8 @@ class NetworkConfig:
     # gravity are exact
     inputs: Annotated[str, one_of(*NETWORK_INPUTS)] = "absolute"
     contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
+    # what relative inputs keep where nothing touches, whatever the weights: linear momentum, or angular momentum too
+    momentum: Annotated[str, one_of(*KEPT_MOMENTA)] = "linear"
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     dimensions: int = 3  # 2: z is that of a plane; imported data alone have it
     maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
@@ -341,6 +344,8 @@ class NetworkConfig:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
             rule = "at least 2 with inputs=relative, which are of differences"
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
+        else:
+            require(not self.keeps_spin, "momentum", "linear with inputs=absolute, which keep none", self.momentum)
         if self.kind == "hgn":
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
         else:
@@ -366,6 +371,11 @@ class NetworkConfig:
     def relative(self) -> bool:
         """Whether inputs are relative: nothing depends on a motion that all particles have in common."""
         return self.inputs == "relative"
+
+    @property
+    def keeps_spin(self) -> bool:
+        """Whether angular momentum is kept by construction, too."""
+        return self.momentum == "angular"
 
     @property
     def feature_width(self) -> int:

@@ -92,7 +92,8 @@ class HierarchicalGraphNetwork(ParticleNetwork):
             return propagate(self.encode_particles(state, grid), grid)
         feature_NF = self.relative_features(state, grid)
         output_N9 = propagate(self.encode_features(feature_NF, state.material_N), grid)
-        return balanced(output_N9, *disturbance(feature_NF, grid, self.config), grid)
+        felt = disturbance(feature_NF, grid, self.config)
+        return balanced(output_N9, *felt, grid, self.config.keeps_spin)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

@@ -17,6 +17,8 @@ The decoder's nine numbers are an acceleration r and a stress sigma of each part
 added to gravity. It is 0 where nothing moves against anything: what flies freely in one piece has exactly the
 acceleration g, whatever the weights. And where no surface is within reach it keeps momentum, whatever the weights: a
 coarsest cell's mean is taken out of r, and cells push each other across their faces by antisymmetric impulses alone.
+With `network.momentum: angular` so is angular momentum: a cell's rotation is taken out too, and the one of two cells
+that push each other.
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
@@ -26,7 +28,7 @@ import torch
 
 from hgn.config import NetworkConfig
 from hgn.network.features import ParticleState
-from hgn.network.grid import DIRECTION_63, GridHierarchy
+from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy
 from hgn.network.obstacles import ObstacleCells
 
 WALL_LIMIT = 2.0  # of wall_nearness: beyond the plane by the reach
@@ -35,6 +37,10 @@ QUIET = 0.01  # s_a: changes and differences of velocity below it count by their
 OUTPUTS = 9  # of the decoder, a particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # its columns
 SMALLEST_MASS = 1e-30  # a cell that rounding gave no weight has no velocity either
+# What lies on a line has no rotation to take out: where the principal moments' product is below that of this share of
+# their mean, outputs fade away; and so they do where the mean itself is below …
+THIN = 0.2
+POINT = 1e-3  # of a coarsest cell's edge squared: a cube has it whose edge is a thirteenth of that
 
 
 def relative_features(
@@ -150,28 +156,101 @@ def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
 
 
 def balanced(
-    output_N9: torch.Tensor, disturbed_C: torch.Tensor, touched_C: torch.Tensor, grid: GridHierarchy
+    output_N9: torch.Tensor,
+    disturbed_C: torch.Tensor,
+    touched_C: torch.Tensor,
+    grid: GridHierarchy,
+    keeps_spin: bool = False,
 ) -> torch.Tensor:
     """Accelerations less gravity, normalised, [N, 3], of the decoder's output and what `disturbance` gives.
 
     With a particle's shares w_pC of the coarsest cells, their mass M, mean acceleration R and mean stress S, e from a
     cell to its neighbour C', d disturbed and t touched: a_p = sum_C w_pC d_C (r_p - (1 - t_C) R_C + A_C), where
-    A_C = sum_C' d_C' M_C' / (M_C + M_C') (S_C + S_C') e / 2. Times M_C this is antisymmetric, and no small mass is
-    divided by: sum_p a_p = sum_C d_C t_C M_C R_C, which is 0 where no surface is within reach. (Cells exchange momentum
-    across faces as in finite volumes; a symmetric stress makes no spin.)
+    A_C = sum_C' d_C' f' T, T = (S_C + S_C') e / 2, f = M_C / (M_C + M_C') and f' = 1 - f. Times M_C this is
+    antisymmetric, and no small mass is divided by: sum_p a_p = sum_C d_C t_C M_C R_C, which is 0 where no surface is
+    within reach. (Cells exchange momentum across faces as in finite volumes; a symmetric stress makes no spin.)
+
+    With `keeps_spin` sum_p x_p x a_p is 0 there, too. y_p is a particle's place seen from the cell's centre of mass X,
+    I and L sums of w over M of its inertia and of y x r, and (q, W) = `rotation`(I, L): r_p - R counts as
+    q (r_p - R) - W x y_p. And of T on one cell and -T on another, D = X' - X apart, the rotation that both have about
+    their common centre is taken out: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T, a cell gets
+    f' (q T + W x D) - W x y_p. That is a projection: nothing grows, however small or thin a cell's contents are.
     """
     level, cell_N8, weight_N8 = grid.levels[-1], coarsest_cells(grid), grid.weight_N8
-    value_N10 = torch.cat([output_N9, torch.ones_like(output_N9[:, :1])], dim=-1)
-    value_N8K = weight_N8[..., None] * value_N10[:, None]
-    sum_CK = value_N8K.new_zeros(level.cell_count, OUTPUTS + 1).index_add(0, cell_N8.flatten(), value_N8K.flatten(0, 1))
+    value_N8K = torch.cat([output_N9, torch.ones_like(output_N9[:, :1])], dim=-1)[:, None].expand(-1, 8, -1)
+    place_N83 = output_N9.new_zeros(0)
+    if keeps_spin:
+        place_N83 = coarsest_places(grid)
+        moment_N83 = torch.linalg.cross(place_N83, output_N9[:, None, :3].expand_as(place_N83))
+        square_N89 = (place_N83[..., :, None] * place_N83[..., None, :]).flatten(2)
+        value_N8K = torch.cat([moment_N83, place_N83, square_N89, value_N8K], dim=-1)
+    value_N8K = weight_N8[..., None] * value_N8K
+    sum_CK = value_N8K.new_zeros(level.cell_count, value_N8K.shape[-1])
+    sum_CK = sum_CK.index_add(0, cell_N8.flatten(), value_N8K.flatten(0, 1))
     mass_C = sum_CK[:, -1].clamp(min=SMALLEST_MASS)
-    mean_C9 = sum_CK[:, :OUTPUTS] / mass_C[:, None]
-    stress_C33 = mean_C9[:, torch.tensor(STRESS_33, device=mean_C9.device)]
+    mean_CK = sum_CK / mass_C[:, None]
+    mean_C3, stress_C33 = mean_CK[:, -10:-7], mean_CK[:, torch.tensor(STRESS_33, device=mean_CK.device) - 10]
     sender_E, receiver_E = level.sender_E, level.receiver_E
-    towards_E31 = DIRECTION_63.to(mean_C9)[level.direction_E, :, None]
-    traction_E3 = ((stress_C33[receiver_E] + stress_C33[sender_E]) @ towards_E31).squeeze(-1)
+    towards_E3 = DIRECTION_63.to(mean_CK)[level.direction_E]
+    traction_E3 = ((stress_C33[receiver_E] + stress_C33[sender_E]) @ towards_E3[..., None]).squeeze(-1)
     share_E = 0.5 * disturbed_C[sender_E] * mass_C[sender_E] / (mass_C[sender_E] + mass_C[receiver_E])
-    change_C3 = -(1 - touched_C)[:, None] * mean_C9[:, :3]
-    change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * traction_E3)
-    own_N3 = (weight_N8 * disturbed_C[cell_N8]).sum(1)[:, None] * output_N9[:, :3]
-    return own_N3 + (weight_N8[..., None] * change_C3[cell_N8]).sum(1)
+    own_C, free_C = disturbed_C, 1 - touched_C
+    change_C3 = -free_C[:, None] * mean_C3
+    if not keeps_spin:
+        change_C3 = change_C3.index_add(0, receiver_E, share_E[:, None] * traction_E3)
+    else:
+        centre_C3 = mean_CK[:, 3:6]
+        spread_C33 = mean_CK[:, 6:15].unflatten(1, (3, 3)) - centre_C3[:, :, None] * centre_C3[:, None, :]
+        inertia_C33 = inertia(spread_C33)
+        known_C, turn_C3 = rotation(inertia_C33, mean_CK[:, :3] - torch.linalg.cross(centre_C3, mean_C3))
+        own_C = disturbed_C * (touched_C + free_C * known_C)
+        apart_E3 = towards_E3 + centre_C3[sender_E] - centre_C3[receiver_E]
+        part_E = mass_C[receiver_E] / (mass_C[sender_E] + mass_C[receiver_E])
+        both_E = part_E * (1 - part_E)
+        inertia_E33 = both_E[:, None, None] * inertia(apart_E3[:, :, None] * apart_E3[:, None, :])
+        inertia_E33 = inertia_E33 + part_E[:, None, None] * inertia_C33[receiver_E]
+        inertia_E33 = inertia_E33 + (1 - part_E)[:, None, None] * inertia_C33[sender_E]
+        known_E, turn_E3 = rotation(inertia_E33, -both_E[:, None] * torch.linalg.cross(apart_E3, traction_E3))
+        push_E3 = known_E[:, None] * traction_E3 + torch.linalg.cross(turn_E3, apart_E3)
+        change_C3 = (free_C * known_C)[:, None] * -mean_C3
+        change_C3 = change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)
+        felt_E = 0.5 * disturbed_C[sender_E]
+        turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, felt_E[:, None] * turn_E3)
+        turn_C3 = disturbed_C[:, None] * turn_C3
+    change_C3 = disturbed_C[:, None] * change_C3
+    own_N3 = (weight_N8 * own_C[cell_N8]).sum(1)[:, None] * output_N9[:, :3]
+    change_N83 = change_C3[cell_N8]
+    if keeps_spin:
+        change_N83 = change_N83 - torch.linalg.cross(turn_C3[cell_N8], place_N83 - centre_C3[cell_N8])
+    return own_N3 + (weight_N8[..., None] * change_N83).sum(1)
+
+
+def coarsest_places(grid: GridHierarchy) -> torch.Tensor:
+    """Where particles are in the coarsest cells above their eight, [N, 8, 3]: from a cell's middle, of its edge."""
+    corner_83 = CORNER_83.to(grid.fraction_N3)
+    place_N83, cell_N8 = grid.fraction_N3[:, None] - corner_83, grid.cell_N8
+    for level in grid.levels[:-1]:
+        assert level.parent_C is not None and level.octant_C is not None
+        place_N83 = 0.5 * (place_N83 + corner_83[level.octant_C[cell_N8]] - 0.5)
+        cell_N8 = level.parent_C[cell_N8]
+    return place_N83
+
+
+def inertia(spread_K33: torch.Tensor) -> torch.Tensor:
+    """tr(G) - G of the second moments G of masses about their centre."""
+    one_33 = torch.eye(3, dtype=spread_K33.dtype, device=spread_K33.device)
+    return spread_K33.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * one_33 - spread_K33
+
+
+def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """How well a rotation is known, q [K] from 0 of a line or a point to 1, and W [K, 3] with I W = q L.
+
+    q = det I / (det I + m), W = adj(I) L / (det I + m), where m = (THIN (tr I / 3 + POINT))^3: both polynomials over
+    what is never 0, so that nothing jumps, and what is q times a field less W is without any angular momentum.
+    """
+    row = inertia_K33.unbind(1)
+    adjugate_K33 = torch.stack([torch.linalg.cross(row[i - 2], row[i - 1]) for i in range(3)], 1)
+    determinant_K = (row[0] * adjugate_K33[:, 0]).sum(-1).clamp(min=0)
+    mean_K = inertia_K33.diagonal(dim1=-2, dim2=-1).sum(-1) / 3
+    total_K = determinant_K + (THIN * (mean_K + POINT)) ** 3
+    return determinant_K / total_K, (adjugate_K33 @ moment_K3[..., None]).squeeze(-1) / total_K[:, None]

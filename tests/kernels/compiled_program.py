@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -44,8 +45,10 @@ print("CANARY", function.__name__, flush=True)
 CUDABackend.make_cubin = lambda *_: b""  # ptxas takes a fifth of the time, and nobody looks at what it makes
 settings = UpdateSettings(2, 1e-3, True, 1 / 64)
 relative = NetworkConfig(inputs="relative", width=16, levels=2, message_passing_steps=1)
-job = PrecompileJob(relative, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,))
-of_relative = launches_of(job)  # before any is compiled: what is would be launched
+of_relative = {}  # before any is compiled: what is would be launched
+for network in (relative, replace(relative, momentum="angular")):
+    job = PrecompileJob(network, settings, "fp16", False, False, 9000, (9000, 3000), 90, (2,))
+    of_relative |= launches_of(job)
 
 network = NetworkConfig(levels=1, message_passing_steps=1)
 for precision in ("fp16", "tf32"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import partial
 
 import torch
 
@@ -140,6 +141,8 @@ def _balanced(config, columns, pairs, output):
     """Of accelerations and stresses what keeps momentum, one coarsest cell after the other (relative.balanced)."""
     motion = 3 * (config.velocity_history - 1 + config.levels)
     top = [(row, tuple(k >> config.levels - 1 for k in cell), weight) for row, cell, weight, _ in pairs]
+    # in coarsest cells
+    place = [(torch.tensor(cell) + 0.5 - offset) / 2 ** (config.levels - 1) for _, cell, _, offset in pairs]
     disturbed, touched, mass, mean = {}, {}, {}, {}
     for row, cell, weight in top:
         walls, normals = columns[row][motion + 3 : motion + 9], columns[row][motion + 9 :]
@@ -154,6 +157,8 @@ def _balanced(config, columns, pairs, output):
         sides = [tuple(k + sign * (a == b) for b, k in enumerate(cell)) for a in range(3) for sign in (1, -1)]
         return max([values[cell], *(values[side] for side in sides if side in values)])
 
+    if config.keeps_spin:
+        return _without_turning(top, place, mass, mean, output, partial(around, touched), partial(around, disturbed))
     change = {}
     for cell in mass:
         rest = -(1 - around(touched, cell)) * mean[cell][:3] / mass[cell]
@@ -169,6 +174,50 @@ def _balanced(config, columns, pairs, output):
     result = [torch.zeros(3, dtype=value.dtype) for value in output]
     for row, cell, weight in top:
         result[row] = result[row] + weight * around(disturbed, cell) * (output[row][:3] + change[cell])
+    return result
+
+
+def _without_turning(top, place, mass, mean, output, touched, disturbed):
+    """The same with each cell's rotation taken out, and each two cells': fields over their particles, as they are."""
+    result = [torch.zeros(3, dtype=value.dtype) for value in output]
+
+    def free(field, cells):
+        """Accelerations of the pairs of particles and these cells, without what turns them all."""
+        mine = [i for i, (_, cell, _) in enumerate(top) if cell in cells]
+        total = sum(top[i][2] for i in mine)
+        centre = sum(top[i][2] * place[i] for i in mine) / total
+        mean = sum(top[i][2] * field[i] for i in mine) / total
+        turn, inertia = torch.zeros(3, dtype=mean.dtype), torch.zeros(3, 3, dtype=mean.dtype)
+        for i in mine:
+            y, share = place[i] - centre, top[i][2] / total
+            turn += share * torch.linalg.cross(y, field[i] - mean)
+            inertia += share * (y @ y * torch.eye(3, dtype=y.dtype) - torch.outer(y, y))
+        product, moments = torch.linalg.det(inertia), torch.trace(inertia) / 3
+        known = product / (product + (0.2 * (moments + 1e-3)) ** 3)
+        rate = torch.linalg.lstsq(inertia, turn, rcond=1e-10, driver="gelsd").solution
+        still = [field[i] - mean - torch.linalg.cross(rate, place[i] - centre) for i in mine]
+        return {i: known * value for i, value in zip(mine, still, strict=True)}
+
+    fields, pushes = [None] * len(top), []
+    for cell in mass:
+        own = {i: output[row][:3] for i, (row, at, _) in enumerate(top) if at == cell}
+        for i, value in free(own, {cell}).items():
+            fields[i] = disturbed(cell) * (touched(cell) * own[i] + (1 - touched(cell)) * value)
+        for axis in range(3):
+            other = tuple(k + (a == axis) for a, k in enumerate(cell))
+            if other in mass:
+                stress = (mean[cell] / mass[cell] + mean[other] / mass[other]) / 2
+                force = stress[list({0: (3, 8, 7), 1: (8, 4, 6), 2: (7, 6, 5)}[axis])]
+                pair = {
+                    i: force / mass[cell] if at == cell else -force / mass[other] for i, (_, at, _) in enumerate(top)
+                }
+                factor = disturbed(cell) * disturbed(other) * mass[cell] * mass[other] / (mass[cell] + mass[other])
+                pushes.append((factor, free(pair, {cell, other})))
+    for factor, values in pushes:
+        for i, value in values.items():
+            fields[i] = fields[i] + factor * value
+    for i, (row, _, weight) in enumerate(top):
+        result[row] = result[row] + weight * fields[i]
     return result
 
 

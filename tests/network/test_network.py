@@ -50,6 +50,8 @@ def test_fcn_halves_equal_the_definition():
         ((9, 4), {"inputs": "relative"}),
         ((1, 12), {"inputs": "relative", "levels": 1, "contact_reach_cells": 4.0}),
         ((12,), {"inputs": "relative", "obstacle_features": False}),
+        ((23, 1), {"inputs": "relative", "obstacle_features": False, "momentum": "angular"}),
+        ((19, 2), {"inputs": "relative", "levels": 1, "contact_reach_cells": 4.0, "momentum": "angular"}),
     ],
 )
 def test_network_equals_the_literal_definition(counts, changes):

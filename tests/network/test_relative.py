@@ -13,6 +13,7 @@ from scene.test_symmetry import CUBE, matrix_of
 from hgn.config import NetworkConfig
 from hgn.network.cell_keys import unpack
 from hgn.network.features import Normaliser, ParticleState
+from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import (
@@ -127,27 +128,125 @@ def test_what_is_disturbed_disturbs_its_body() -> None:
     assert gates(state.velocity_NM3).abs().max() < 1e-15
 
 
-@pytest.mark.parametrize("levels", [1, 2, 3])
-def test_momentum_is_kept_where_nothing_touches(levels: int) -> None:
+def few(place_N3: list[list[float]]) -> torch.Tensor:
+    """Places of a few particles about the middle of a domain, in finest cells, float64."""
+    return 0.45 + 0.035 * torch.tensor(place_N3, dtype=torch.float64)
+
+
+# on a line, in one place, on a line but for a hair, in one place but for one, two apart, on a plane
+ODD_BODIES = [
+    few([[0.3, 0.7, -0.2], [0.8, 1.7, -0.1], [-0.2, -0.3, -0.3], [1.8, 3.7, 0.1]]),
+    few([[0.4, 0.2, 0.1]] * 3),
+    few([[0.3, 0.7, -0.2], [0.8, 1.7, -0.1], [-0.2, -0.3, -0.3 + 1e-7]]),
+    few([[0.4, 0.2, 0.1], [0.4, 0.2, 0.1], [-3.4, 0.3, 0.2]]),
+    few([[0.0, 0.0, 0.0], [2.4, 3.1, 0.7]]),
+    few([[0.3, 0.2, 0.0], [4.1, -2.2, 0.0], [-1.7, 0.4, 0.0], [2.2, 2.1, 0.0]]),
+]
+
+
+@pytest.mark.parametrize(
+    ("levels", "momentum"), [(1, "linear"), (3, "linear"), (1, "angular"), (2, "angular"), (3, "angular")]
+)
+def test_momentum_is_kept_where_nothing_touches(levels: int, momentum: str) -> None:
     """With any weights, the accelerations of particles that move as they please, over many coarsest cells and alone in
-    theirs, sum to gravity's; near a wall they do not, nor do those of a part; and the means of cells differ."""
-    network, state = network_of(inputs="relative", levels=levels), airborne((60, 17, 1, 40))
+    theirs, on lines, planes and in one place, sum to gravity's; their moments to 0 too where angular momentum is kept,
+    and not where it is not. Near a wall they do not, nor do those of a part; and the means of cells differ."""
+    network = network_of(inputs="relative", levels=levels, momentum=momentum)
+    state = airborne((60, 17, 1, 40, *map(len, ODD_BODIES)))
     place_N3 = torch.where((state.scene_N == 3)[:, None], 0.35 + state.position_N3 / 2, state.position_N3)
-    state = replace(state, position_N3=place_N3)  # the last scene lies closely
+    place_N3[118:] = torch.cat(ODD_BODIES)
+    state = replace(state, position_N3=place_N3)  # the fourth scene lies closely
     extra_N3 = (network(state) - state.gravity_S3[state.scene_N]).detach()
+    moment_N3 = torch.linalg.cross(place_N3 - 0.5, extra_N3)
     for scene in range(state.scene_count):
-        mine_N3 = extra_N3[state.scene_N == scene]
-        assert float(mine_N3.sum(0).abs().max()) < 1e-12 * float(mine_N3.abs().sum()) + 1e-17
-        assert len(mine_N3) == 1 or float(mine_N3[::2].sum(0).abs().max()) > 1e-3 * float(mine_N3.abs().sum())
+        mine_N3, turn_3 = extra_N3[state.scene_N == scene], moment_N3[state.scene_N == scene].sum(0)
+        sizes = float(mine_N3.abs().sum())
+        assert float(mine_N3.sum(0).abs().max()) < 1e-12 * sizes + 3e-16
+        if momentum == "angular":
+            assert float(turn_3.abs().max()) < 1e-11 * sizes + 3e-16
+        if scene < 4 and len(mine_N3) > 1:
+            assert float(mine_N3[::2].sum(0).abs().max()) > 1e-3 * sizes
+            assert momentum == "angular" or float(turn_3.abs().max()) > 1e-5 * sizes
     grid = network.grid(state)
     disturbed_C, touched_C = disturbance(network.relative_features(state, grid), grid, network.config)
-    assert disturbed_C.min() > 0 and not touched_C.any()
+    assert not touched_C.any()
     stressed = torch.cat([torch.zeros(len(extra_N3), 3), torch.randn(len(extra_N3), 6)], 1).double()
-    pushed_N3 = balanced(stressed, disturbed_C, touched_C, grid)
+    pushed_N3 = balanced(stressed, disturbed_C, touched_C, grid, network.config.keeps_spin)
     assert float(pushed_N3.abs().max()) > 1e-2
-    by_wall = replace(state, domain_S3=state.position_N3.max(0).values.expand(4, 3))
+    by_wall = replace(state, domain_S3=state.position_N3.max(0).values.expand(state.scene_count, 3))
     extra_N3 = (network(by_wall) - state.gravity_S3[state.scene_N]).detach()
     assert float(extra_N3[state.scene_N == 0].sum(0).abs().max()) > 1e-2 * float(extra_N3.abs().max())
+
+
+def pushed(
+    place_N3: torch.Tensor, output_N9: torch.Tensor, keeps_spin: bool = True, levels: int = 3, touched: float = 0.0
+) -> torch.Tensor:
+    """What `balanced` makes of outputs at such places, all disturbed: accelerations [N, 3]."""
+    scene_N, origin_13 = torch.zeros(len(place_N3), dtype=torch.long), place_N3.new_zeros(1, 3)
+    grid = build_hierarchy(place_N3, scene_N, origin_13, 0.035, levels)
+    one_C = place_N3.new_ones(grid.levels[-1].cell_count)
+    return balanced(output_N9, one_C, touched * one_C, grid, keeps_spin)
+
+
+def drawn_outputs(count: int) -> torch.Tensor:
+    return torch.randn(count, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("levels", [1, 3])
+@pytest.mark.parametrize("way", ["through a line", "through one place", "into another cell"])
+def test_accelerations_are_continuous(way: str, levels: int) -> None:
+    """Where three particles pass through a line, meet in one place, or a body enters another coarsest cell, smaller
+    steps change accelerations less, in proportion: nothing jumps where a cell's inertia is that of a line or a point,
+    or where a cell begins."""
+    line_33 = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.4, 0.2], [2.0, 0.8, 0.4]], dtype=torch.float64)
+    across_33 = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.9, -0.3], [0.0, 0.2, 0.4]], dtype=torch.float64)
+    body_N3 = torch.rand(12, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+
+    def place(s: float) -> torch.Tensor:
+        if way == "through a line":
+            return 0.42 + 0.035 * (line_33 + (s - 0.5) * across_33)
+        if way == "through one place":
+            return 0.45 + 0.035 * ((s - 0.5) * (line_33 + across_33))
+        return 0.5425 + 0.05 * (body_N3 - body_N3.amax(0)) + 0.14 * (s - 0.5)
+
+    output_N9 = drawn_outputs(len(place(0.0)))
+    jumps = []
+    for steps in (2048, 16384):
+        path = [pushed(place(0.5 + i / steps), output_N9, levels=levels) for i in range(-20, 21)]
+        jumps.append(float(torch.stack(path).diff(dim=0).abs().max()))
+    assert jumps[0] > 1e-9 and jumps[1] < jumps[0] / 4
+
+
+@pytest.mark.parametrize("touched", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("keeps_spin", [False, True])
+def test_gradients_of_the_balance(keeps_spin: bool, touched: float) -> None:
+    """Those with respect to outputs, and to places, are finite differences."""
+    place_N3 = 0.42 + 0.2 * torch.rand(9, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+
+    def of(place: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
+        return pushed(place, output, keeps_spin, 2, touched)
+
+    inputs = (place_N3.requires_grad_(), drawn_outputs(9).requires_grad_())
+    assert torch.autograd.gradcheck(of, inputs, eps=1e-7, atol=1e-4)
+
+
+def test_a_body_may_still_turn() -> None:
+    """Two cells push each other so that both turn, against the way that they go around each other; and a pair of
+    particles in one cell is left alone, for no turn of a line is known."""
+    corner_83 = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=torch.float64)
+    place_N3 = torch.cat([0.30 + 0.04 * corner_83, 0.30 + 0.04 * corner_83])
+    place_N3[8:, 0] += 0.16
+    shear = torch.zeros(16, 9, dtype=torch.float64)
+    shear[:, 8] = 1.0
+    found_N3 = pushed(place_N3, shear)
+    first, second = found_N3[:8], found_N3[8:]
+    assert first.mean(0).abs().max() > 1e-2
+    torch.testing.assert_close(first.sum(0), -second.sum(0), rtol=0, atol=1e-12)
+    around = [
+        torch.linalg.cross(p - p.mean(0), a).sum(0)[2] for p, a in ((place_N3[:8], first), (place_N3[8:], second))
+    ]
+    assert around[0] * around[1] > 0 and abs(around[0]) > 1e-3
+    assert pushed(ODD_BODIES[4], drawn_outputs(2), levels=4).abs().max() < 1e-12
 
 
 def test_each_scene_has_its_gravity() -> None:
@@ -190,8 +289,9 @@ def turned_outputs(output_N9: torch.Tensor, turn_33: torch.Tensor) -> torch.Tens
     return torch.cat([output_N9[:, :3] @ turn_33.T, stress_N33[:, rows, columns]], 1)
 
 
+@pytest.mark.parametrize("keeps_spin", [False, True])
 @pytest.mark.parametrize("symmetry", ALL_48, ids=lambda s: f"{s.source}{s.mirrored}")
-def test_impulses_turn_with_the_scene(symmetry: Symmetry) -> None:
+def test_impulses_turn_with_the_scene(symmetry: Symmetry, keeps_spin: bool) -> None:
     """What `balanced` makes of outputs turned and mirrored with the scene is turned and mirrored with it."""
     network, state = network_of(inputs="relative", cell_size=1 / 8), random_state((60,), spread=0.95)
     turn_33 = torch.tensor(matrix_of(symmetry), dtype=torch.float64)
@@ -204,7 +304,7 @@ def test_impulses_turn_with_the_scene(symmetry: Symmetry) -> None:
         grid = network.grid(scene)
         coordinate_C3 = unpack(grid.levels[-1].key_C)[1]
         distance_C = ((coordinate_C3 + 0.5) * 4 / 8 - 0.5).square().sum(1)
-        results.append(balanced(outputs, torch.exp(-distance_C), distance_C / 4, grid))
+        results.append(balanced(outputs, torch.exp(-distance_C), distance_C / 4, grid, keeps_spin))
     assert float(results[0].norm()) > 1
     torch.testing.assert_close(results[1], results[0] @ turn_33.T, rtol=0, atol=1e-12)
 
@@ -313,6 +413,8 @@ def test_one_scale_for_all_axes() -> None:
         ({"inputs": "relative", "velocity_history": 1}, "velocity_history must be at least 2 with inputs=relative"),
         ({"contact_reach_cells": 0.0}, "contact_reach_cells must be"),
         ({"kind": "gns", "levels": 1, "inputs": "relative"}, "inputs must be absolute for gns, got 'relative'"),
+        ({"inputs": "relative", "momentum": "spin"}, "momentum must be one of linear, angular, got 'spin'"),
+        ({"momentum": "angular"}, "momentum must be linear with inputs=absolute, which keep none, got 'angular'"),
     ],
 )
 def test_bad_input(changes: dict[str, object], message: str) -> None:

@@ -29,6 +29,11 @@ from hgn.schema import ConfigError
 EXAMPLES = Path(__file__).resolve().parents[2] / "tools/deploy"
 TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
 FRAMES = 4
+NETWORKS = {
+    "absolute": {},
+    "relative": {"inputs": "relative"},
+    "angular": {"inputs": "relative", "momentum": "angular"},
+}
 SIZES = [(1, True), (1, False), (216, True), (216, False), (4_096, True)]
 
 
@@ -41,17 +46,19 @@ def whole_precision() -> Iterator[None]:
     torch.set_float32_matmul_precision(before)
 
 
-@pytest.mark.parametrize("inputs", ["absolute", pytest.param("relative", marks=pytest.mark.slow)])
-def test_onnx_is_the_step(tmp_path: Path, inputs: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["absolute", *(pytest.param(name, marks=pytest.mark.slow) for name in list(NETWORKS)[1:])]
+)
+def test_onnx_is_the_step(tmp_path: Path, name: str) -> None:
     """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles; the file says
     what its weights say of themselves; the example in Python simulates a scene's arrays."""
     path = tmp_path / "step.onnx"
     scene = {"scene": str(config_directory() / "example/own_mesh.yaml"), "arrays": str(tmp_path / "arrays")}
-    network = exported(tmp_path, inputs, onnx=str(path), **scene)
+    network = exported(tmp_path, name, onnx=str(path), **scene)
     session = onnxruntime.InferenceSession(path)
     assert [item.name for item in session.get_inputs()] == list(INPUTS)
     declared = json.loads(session.get_modelmeta().custom_metadata_map["hgn"])
-    assert declared["frame_rate_hz"] == 60.0 and declared["network"]["inputs"] == inputs
+    assert declared["frame_rate_hz"] == 60.0 and declared["network"].items() >= NETWORKS[name].items()
     compare(network, lambda arrays: session.run(None, arrays))
     simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
     assert_rollout(network, scene["scene"], simulate(str(path), scene["arrays"], FRAMES))
@@ -62,12 +69,12 @@ def test_onnx_is_the_step(tmp_path: Path, inputs: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("inputs", ["absolute", "relative"])
-def test_package_is_the_step(tmp_path: Path, inputs: str) -> None:
+@pytest.mark.parametrize("name", NETWORKS)
+def test_package_is_the_step(tmp_path: Path, name: str) -> None:
     """The same of a package that PyTorch compiled, and of the example in C++."""
     path = tmp_path / "step.pt2"
     scene = {"scene": str(config_directory() / "example/own_mesh.yaml"), "arrays": str(tmp_path / "arrays")}
-    network = exported(tmp_path, inputs, package=str(path), **scene)
+    network = exported(tmp_path, name, package=str(path), **scene)
     package = torch._inductor.aoti_load_package(str(path))
     compare(network, lambda arrays: [x.numpy() for x in package(*map(torch.from_numpy, arrays.values()))])
     if shutil.which("cmake") is None:
@@ -93,9 +100,9 @@ def test_what_is_refused(options: dict[str, str], message: str) -> None:
         export.main(options)
 
 
-def exported(folder: Path, inputs: str, **options: str) -> HierarchicalGraphNetwork:
+def exported(folder: Path, name: str, **options: str) -> HierarchicalGraphNetwork:
     """The network whose step the command writes."""
-    network = network_of(torch.float32, inputs=inputs, levels=2, message_passing_steps=1)
+    network = network_of(torch.float32, levels=2, message_passing_steps=1, **NETWORKS[name])
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
     assert export.main({"weights": str(folder / "w.safetensors"), **options}) == 0
     return network

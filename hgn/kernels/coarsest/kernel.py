@@ -10,6 +10,10 @@ import triton.language as tl
 
 from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
+from hgn.network.relative import OUTPUTS, POINT, THIN
+
+THINNEST, SMALLEST = tl.constexpr(THIN), tl.constexpr(POINT)  # of a cell's contents, for a rotation to be known
+DECODED = tl.constexpr(OUTPUTS)
 
 
 @triton.jit
@@ -24,13 +28,38 @@ def _coarsest_cells(cell_of, parent, geometry, row, here, LEVELS: tl.constexpr):
 
 
 @triton.jit
+def _coarsest_places(cell_of, parent, octant, fraction_of, geometry, row, here, LEVELS: tl.constexpr):
+    """The coarsest cells above the particles' eight, [N, 8], and where these are in them, three [N, 8]: from the cells'
+    middles, in their edges."""
+    corner = tl.arange(0, 8)[None, :]
+    cell = tl.load(cell_of + row[:, None] * 8 + corner, mask=here, other=0)
+    at = fraction_of + row[:, None] * 3 + 0 * corner
+    x = tl.load(at, mask=here, other=0.0) - (corner >> 2 & 1).to(tl.float32)
+    y = tl.load(at + 1, mask=here, other=0.0) - (corner >> 1 & 1).to(tl.float32)
+    z = tl.load(at + 2, mask=here, other=0.0) - (corner & 1).to(tl.float32)
+    for level in tl.static_range(LEVELS - 1):
+        first = tl.load(geometry + level * GEOMETRY_COLUMNS + 6)
+        part = tl.load(octant + first + cell, mask=here, other=0)
+        x = 0.5 * (x + (part >> 2 & 1).to(tl.float32) - 0.5)
+        y = 0.5 * (y + (part >> 1 & 1).to(tl.float32) - 0.5)
+        z = 0.5 * (z + (part & 1).to(tl.float32) - 0.5)
+        # a parent past the capacity: the frame is void, but nothing may be read out of bounds
+        cell = tl.maximum(tl.load(parent + first + cell, mask=here, other=0), 0)
+    return cell, x, y, z
+
+
+@triton.jit
 def sum_coarsest(
-    x, cell_of, weight_of, parent, neighbour, geometry, counts, disturbed, felt, sums, particle_count, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, FEEL: tl.constexpr, BLOCK: tl.constexpr,
+    x, cell_of, weight_of, fraction_of, parent, octant, neighbour, geometry, counts, disturbed, felt, sums, moments,
+    particle_count, capacity,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, FEEL: tl.constexpr, SPIN: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds the first USED columns of the particles' rows of x [N, OUT] to their coarsest cells' sums [C, OUT], with
     their weights. With FEEL felt [C, 2] is how disturbed and how touched a coarsest cell and those across its faces are
-    at most, 0 to 1. Programs for as many particles as for coarsest cells.
+    at most, 0 to 1. With SPIN columns USED to USED + 2 are the moments of columns 0 to 2 about the cells' middles, and
+    with both `moments` [C, OUT] are sums of places and of their products xx, yy, zz, yz, xz, xy. Programs for as many
+    particles as for coarsest cells.
 
     Reference: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
     """
@@ -49,7 +78,10 @@ def sum_coarsest(
     live = row < count
     corner = tl.arange(0, 8)[None, :]
     here = live[:, None] & (corner >= 0)
-    cell = _coarsest_cells(cell_of, parent, geometry, row, here, LEVELS)
+    if SPIN:
+        cell, px, py, pz = _coarsest_places(cell_of, parent, octant, fraction_of, geometry, row, here, LEVELS)
+    else:
+        cell = _coarsest_cells(cell_of, parent, geometry, row, here, LEVELS)
     weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=here, other=0.0)
     # most of a particle's cells lie below one: only the first of them adds, for all
     same = cell[:, :, None] == cell[:, None, :]
@@ -58,9 +90,25 @@ def sum_coarsest(
     share = tl.where(tl.max(earlier.to(tl.int32), 2) > 0, 0.0, share)
     column = tl.arange(0, OUT)[None, :]
     value = tl.load(x + row[:, None] * OUT + column, mask=live[:, None] & (column < USED), other=0.0)
-    adds = (share > 0)[:, :, None] & (column < USED)[:, None, :]
-    at = sums + cell[:, :, None] * OUT + column[:, None, :]
-    tl.atomic_add(at, share[:, :, None] * value[:, None, :], mask=adds, sem="relaxed")
+    part = column[:, None, :]
+    added = share[:, :, None] * value[:, None, :]
+    if SPIN:
+        vx = tl.load(x + row * OUT, mask=live, other=0.0)[:, None]
+        vy = tl.load(x + row * OUT + 1, mask=live, other=0.0)[:, None]
+        vz = tl.load(x + row * OUT + 2, mask=live, other=0.0)[:, None]
+        added = tl.where(part == USED, (share * (py * vz - pz * vy))[:, :, None], added)
+        added = tl.where(part == USED + 1, (share * (pz * vx - px * vz))[:, :, None], added)
+        added = tl.where(part == USED + 2, (share * (px * vy - py * vx))[:, :, None], added)
+    adds = (share > 0)[:, :, None] & (part < USED + 3 * SPIN)
+    tl.atomic_add(sums + cell[:, :, None] * OUT + part, added, mask=adds, sem="relaxed")
+    if SPIN and FEEL:
+        px, py, pz = px[:, :, None], py[:, :, None], pz[:, :, None]
+        one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
+        other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
+        adds = (share > 0)[:, :, None] & (part < 9)
+        tl.atomic_add(
+            moments + cell[:, :, None] * OUT + part, share[:, :, None] * one * other, mask=adds, sem="relaxed"
+        )
 
 
 @triton.jit
@@ -123,6 +171,191 @@ def balance_cells_backward(
 
 
 @triton.jit
+def _rotation(inertia, x, y, z):
+    """How well a rotation is known, and the rate at which it turns, of moments about a centre: as
+    hgn.network.relative.rotation. The inertia is xx, yy, zz, yz, xz, xy."""
+    xx, yy, zz, yz, xz, xy = inertia
+    axx, ayy, azz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    ayz, axz, axy = xy * xz - xx * yz, xy * yz - yy * xz, xz * yz - zz * xy
+    determinant = tl.maximum(xx * axx + xy * axy + xz * axz, 0.0)
+    least = THINNEST * ((xx + yy + zz) / 3 + SMALLEST)
+    inverse = 1 / (determinant + least * least * least)
+    turn = (axx * x + axy * y + axz * z, axy * x + ayy * y + ayz * z, axz * x + ayz * y + azz * z)
+    return determinant * inverse, turn[0] * inverse, turn[1] * inverse, turn[2] * inverse
+
+
+@triton.jit
+def _inertia(xx, yy, zz, yz, xz, xy):
+    """Of second moments about a centre."""
+    return yy + zz, xx + zz, xx + yy, -yz, -xz, -xy
+
+
+@triton.jit
+def _body(moments, cell, mask, inverse, OUT: tl.constexpr):
+    """Centres of mass in coarsest cells, from their middles, and the inertia over the mass, in their edges."""
+    at = moments + cell * OUT
+    x = tl.load(at, mask=mask, other=0.0) * inverse
+    y = tl.load(at + 1, mask=mask, other=0.0) * inverse
+    z = tl.load(at + 2, mask=mask, other=0.0) * inverse
+    xx = tl.load(at + 3, mask=mask, other=0.0) * inverse - x * x
+    yy = tl.load(at + 4, mask=mask, other=0.0) * inverse - y * y
+    zz = tl.load(at + 5, mask=mask, other=0.0) * inverse - z * z
+    yz = tl.load(at + 6, mask=mask, other=0.0) * inverse - y * z
+    xz = tl.load(at + 7, mask=mask, other=0.0) * inverse - x * z
+    xy = tl.load(at + 8, mask=mask, other=0.0) * inverse - x * y
+    return x, y, z, _inertia(xx, yy, zz, yz, xz, xy)
+
+
+@triton.jit
+def _three(table, cell, column, mask, factor, OUT: tl.constexpr):
+    """Three neighbouring columns of the cells' rows, times a factor."""
+    at = table + cell * OUT + column
+    x = tl.load(at, mask=mask, other=0.0) * factor
+    y = tl.load(at + 1, mask=mask, other=0.0) * factor
+    return x, y, tl.load(at + 2, mask=mask, other=0.0) * factor
+
+
+@triton.jit
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@triton.jit
+def _pairs(
+    moments, neighbour, felt, motion, geometry, cell, there, mass, centre, inertia, capacity,
+    LEVELS: tl.constexpr, OUT: tl.constexpr,
+):  # fmt: skip
+    """Of the cells across the faces [C, 8], the last two of which are none: their numbers, one over their masses, half
+    of how disturbed they are, the axis and the sign of the direction to them, this cell's share of both masses, the
+    product of both shares, their centres of mass from their middles, how far these are apart, and the inertia of both
+    about the centre of all."""
+    slot = tl.arange(0, 8)[None, :]
+    other = tl.load(neighbour + slot * capacity + cell[:, None], mask=there[:, None] & (slot < 6), other=-1)
+    found = other >= 0
+    beside = _mass(motion, geometry, other, found, LEVELS)
+    inverse = _inverse(beside)
+    half = 0.5 * tl.load(felt + other * 2, mask=found, other=0.0)
+    axis, sign = slot // 2, 1.0 - 2.0 * (slot % 2).to(tl.float32)
+    part = tl.where(found, mass[:, None] * _inverse(mass[:, None] + beside), 0.0)
+    both = part * (1 - part)
+    x, y, z, theirs = _body(moments, other, found, inverse, OUT)
+    middle = (x, y, z)
+    x = x + tl.where(axis == 0, sign, 0.0) - centre[0][:, None]
+    y = y + tl.where(axis == 1, sign, 0.0) - centre[1][:, None]
+    z = z + tl.where(axis == 2, sign, 0.0) - centre[2][:, None]
+    apart = _inertia(x * x, y * y, z * z, y * z, x * z, x * y)
+    total = ()
+    for i in tl.static_range(6):
+        whole = both * apart[i] + part * inertia[i][:, None] + (1 - part) * theirs[i]
+        total = total + (whole,)  # noqa: RUF005 - Triton knows no unpacking here
+    return other, inverse, half, axis, sign, part, both, middle, (x, y, z), total
+
+
+@triton.jit
+def balance_bodies(
+    sums, moments, felt, motion, neighbour, geometry, counts, table, capacity,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """As `balance_cells` where angular momentum is kept: what coarsest cells add to their particles' accelerations at
+    their middles in columns 0 to 2 of table [C, OUT], the factor of these particles' own in column 3, and the rate of
+    rotation that they add in columns 4 to 6.
+
+    Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
+    """
+    count = tl.load(counts + LEVELS - 1)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    cell, there, mass, inverse, disturbed, touched = _coarsest_of(felt, motion, geometry, count, LEVELS, BLOCK)
+    x, y, z, inertia = _body(moments, cell, there, inverse, OUT)
+    centre, free = (x, y, z), 1 - touched
+    mean = _three(sums, cell, 0, there, inverse, OUT)
+    moment = _three(sums, cell, DECODED, there, inverse, OUT)
+    lever = _cross(centre, mean)
+    known, wx, wy, wz = _rotation(inertia, moment[0] - lever[0], moment[1] - lever[1], moment[2] - lever[2])
+    other, beside, half, axis, sign, part, both, _, apart, whole = _pairs(
+        moments, neighbour, felt, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
+    )
+    traction = ()
+    for i in tl.static_range(3):
+        column = tl.where(axis == i, 3 + i, 9 - axis - i)  # of xx, yy, zz, yz, xz, xy behind the accelerations
+        own = tl.load(sums + cell[:, None] * OUT + column, mask=other >= 0, other=0.0) * inverse[:, None]
+        theirs = tl.load(sums + other * OUT + column, mask=other >= 0, other=0.0) * beside
+        traction = traction + (sign * (own + theirs),)  # noqa: RUF005
+    lever = _cross(apart, traction)
+    felt_by, tx, ty, tz = _rotation(whole, -both * lever[0], -both * lever[1], -both * lever[2])
+    swing = _cross((tx, ty, tz), apart)
+    share = half * (1 - part)
+    turn = (
+        -disturbed * (free * wx + tl.sum(half * tx, 1)),
+        -disturbed * (free * wy + tl.sum(half * ty, 1)),
+        -disturbed * (free * wz + tl.sum(half * tz, 1)),
+    )
+    lever = _cross(turn, centre)
+    line = table + cell * OUT
+    for i in tl.static_range(3):
+        pushed = tl.sum(share * (felt_by * traction[i] + swing[i]), 1) - free * known * mean[i]
+        tl.store(line + i, disturbed * pushed - lever[i], mask=there)
+        tl.store(line + 4 + i, turn[i], mask=there)
+    tl.store(line + 3, disturbed * (touched + free * known), mask=there)
+
+
+@triton.jit
+def balance_bodies_backward(
+    sums, moments, felt, motion, neighbour, geometry, counts, table, capacity,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """As `balance_cells_backward` where angular momentum is kept, of the sums of the gradients and their moments: in
+    columns 0 to 8 of table [C, OUT] what coarsest cells add to the gradients of their particles' outputs at their
+    middles, in column 9 the factor of the accelerations' own, and in columns 10 to 12 the rate of rotation.
+
+    Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
+    """
+    count = tl.load(counts + LEVELS - 1)
+    if tl.program_id(0) * BLOCK >= count:
+        return
+    cell, there, mass, inverse, disturbed, touched = _coarsest_of(felt, motion, geometry, count, LEVELS, BLOCK)
+    x, y, z, inertia = _body(moments, cell, there, inverse, OUT)
+    centre, free = (x, y, z), 1 - touched
+    mean = _three(sums, cell, 0, there, inverse, OUT)
+    moment = _three(sums, cell, 3, there, inverse, OUT)
+    lever = _cross(centre, mean)
+    moment = (moment[0] - lever[0], moment[1] - lever[1], moment[2] - lever[2])
+    known, wx, wy, wz = _rotation(inertia, moment[0], moment[1], moment[2])
+    factor = -disturbed * free
+    turn = (factor * wx, factor * wy, factor * wz)
+    lever = _cross(turn, centre)
+    line = table + cell * OUT
+    for i in tl.static_range(3):
+        tl.store(line + i, factor * known * mean[i] - lever[i], mask=there)
+        tl.store(line + 10 + i, turn[i], mask=there)
+    tl.store(line + 9, disturbed * (touched + free * known), mask=there)
+    other, beside, half, axis, sign, part, both, middle, apart, whole = _pairs(
+        moments, neighbour, felt, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
+    )
+    their_mean = _three(sums, other, 0, other >= 0, beside, OUT)
+    their_moment = _three(sums, other, 3, other >= 0, beside, OUT)
+    lever = _cross(middle, their_mean)
+    gap = (mean[0][:, None] - their_mean[0], mean[1][:, None] - their_mean[1], mean[2][:, None] - their_mean[2])
+    swing = _cross(apart, gap)
+    turned = ()
+    for i in tl.static_range(3):
+        own = part * moment[i][:, None] + (1 - part) * (their_moment[i] - lever[i])
+        turned = turned + (both * swing[i] - own,)  # noqa: RUF005
+    felt_by, tx, ty, tz = _rotation(whole, turned[0], turned[1], turned[2])
+    swing = _cross((tx, ty, tz), apart)
+    share = half * (1 - part) * sign
+    push = ()
+    for i in tl.static_range(3):
+        push = push + (share * (felt_by * gap[i] - swing[i]),)  # noqa: RUF005
+    for i in tl.static_range(3):
+        tl.store(line + 3 + i, disturbed * tl.sum(tl.where(axis == i, push[i], 0.0), 1), mask=there)
+        # a shear is of two faces
+        shear = tl.where(axis == (i + 2) % 3, push[(i + 1) % 3], 0.0)
+        shear = tl.where(axis == (i + 1) % 3, push[(i + 2) % 3], shear)
+        tl.store(line + 6 + i, disturbed * tl.sum(shear, 1), mask=there)
+
+
+@triton.jit
 def _coarsest_of(felt, motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.constexpr):
     """This program's coarsest cells: their masses, one over these, disturbed and touched, [BLOCK] each."""
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -160,11 +393,13 @@ def _across(
 
 @triton.jit
 def add_coarsest(
-    x, table, cell_of, weight_of, parent, geometry, particle_count,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
+    x, table, cell_of, weight_of, fraction_of, parent, octant, geometry, particle_count,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, COLUMNS: tl.constexpr, SPIN: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Multiplies columns 0 to 2 of the particles' rows of x [N, OUT] by column USED of the coarsest cells' table
-    [C, OUT], and adds its columns before that, each with the particles' weights. COLUMNS: a power of two above USED.
+    [C, OUT], and adds its columns before that, each with the particles' weights; with SPIN also the rotation in columns
+    USED + 1 to USED + 3 about the cells' middles. COLUMNS: a power of two above USED.
 
     Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -174,13 +409,20 @@ def add_coarsest(
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     corner = tl.arange(0, 8)[None, :]
     here = (row < count)[:, None] & (corner >= 0)
-    cell = _coarsest_cells(cell_of, parent, geometry, row, here, LEVELS)
+    if SPIN:
+        cell, px, py, pz = _coarsest_places(cell_of, parent, octant, fraction_of, geometry, row, here, LEVELS)
+    else:
+        cell = _coarsest_cells(cell_of, parent, geometry, row, here, LEVELS)
     weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=here, other=0.0)
     column = tl.arange(0, COLUMNS)[None, :]
     at = table + cell[:, :, None] * OUT + column[:, None, :]
     found = tl.load(at, mask=here[:, :, None] & (column <= USED)[:, None, :], other=0.0)
     total = tl.sum(weight[:, :, None] * found, 1)
     factor = tl.sum(tl.where(column == USED, total, 0.0), 1)
+    if SPIN:
+        swing = _cross(_three(table, cell, USED + 1, here, weight, OUT), (px, py, pz))
+        for i in tl.static_range(3):
+            total += tl.where(column == i, tl.sum(swing[i], 1)[:, None], 0.0)
     live = (row < count)[:, None]
     at = x + row[:, None] * OUT + column
     total += factor[:, None] * tl.load(at, mask=live & (column < 3), other=0.0)

@@ -122,7 +122,8 @@ class DeviceGrid:
     children of level l as views; per particle cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF.
     For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other; and of the
     coarsest cells there are disturbed_C2, disturbed and touched by their own particles in units of FULLY, felt_C2, by
-    those across their faces too, and what `balance` sums up and spreads, sum_C and table_C.
+    those across their faces too, and what `balance` sums up and spreads, sum_C and table_C; where angular momentum is
+    kept moment_C, the first and second moments of what they hold.
     """
 
     def __init__(
@@ -135,6 +136,7 @@ class DeviceGrid:
         cell_size: float,
         device: torch.device,
         relative: bool = False,
+        keeps_spin: bool = False,
     ) -> None:
         assert scenes < SCENE_LIMIT
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
@@ -146,7 +148,7 @@ class DeviceGrid:
             start += rows[-1][1]
             at += capacity
         assert start < 2**31, "slots are numbered in int32"
-        self.largest = max(row[1] for row in rows)
+        self.largest, self.keeps_spin = max(row[1] for row in rows), keeps_spin
 
         def integers(*shape: int) -> torch.Tensor:
             return torch.zeros(shape, dtype=torch.int32, device=device)
@@ -163,10 +165,10 @@ class DeviceGrid:
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
         self.feature_NF = torch.zeros(particles, features, device=device)
         coarsest = self.capacities[-1] if relative else 0
-        parts = [4 * at if relative else 4, 2 * coarsest, SUMS * coarsest]
+        parts = [4 * at if relative else 4, 2 * coarsest, SUMS * coarsest, SUMS * coarsest * keeps_spin]
         self._moved = torch.zeros(sum(parts), device=device)  # one piece, cleared at once
-        motion, disturbed, sums = self._moved.split(parts)
-        self.motion_C4, self.sum_C = motion.view(-1, 4), sums.view(-1, SUMS)
+        motion, disturbed, sums, moments = self._moved.split(parts)
+        self.motion_C4, self.sum_C, self.moment_C = motion.view(-1, 4), sums.view(-1, SUMS), moments.view(-1, SUMS)
         self.disturbed_C2 = disturbed.view(torch.int32).view(-1, 2)
         self.felt_C2 = torch.zeros(coarsest, 2, device=device)
         self.table_C = torch.zeros(coarsest, SUMS, device=device)
@@ -262,29 +264,34 @@ class DeviceGrid:
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
         """From what the decoder puts out [N, OUT] to accelerations less gravity in columns 0 to 2, in place."""
-        self._through_coarsest(output, count, coarsest_kernel.balance_cells, OUTPUTS, 3)
+        between = coarsest_kernel.balance_bodies if self.keeps_spin else coarsest_kernel.balance_cells
+        self._through_coarsest(output, count, between, OUTPUTS, 3)
 
     def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
         """From the gradient of what `balance` leaves to that of what it was given, in place."""
         self.sum_C.zero_()
-        self._through_coarsest(gradient, count, coarsest_kernel.balance_cells_backward, 3, OUTPUTS)
+        between = coarsest_kernel.balance_bodies_backward if self.keeps_spin else coarsest_kernel.balance_cells_backward
+        self._through_coarsest(gradient, count, between, 3, OUTPUTS)
 
     def _through_coarsest(self, x: torch.Tensor, count: torch.Tensor, between: Any, taken: int, left: int) -> None:
         """Sums of the first columns on the coarsest cells, what these make of them, and that back to particles."""
         particles, capacity, coarsest = self.particles, self.capacities[-1], self.neighbour(self.levels - 1)
+        spin = self.keeps_spin
         cells = {"neighbour": coarsest, "geometry": self.geometry, "counts": self.counts_L, "capacity": capacity}
         pairs = {"cell_of": self.cell_N8, "weight_of": self.weight_N8, "parent": self._parent, "particle_count": count}
+        pairs |= {"fraction_of": self.fraction_N3, "octant": self._octant}
+        bodies = {"moments": self.moment_C} if spin else {}
         sizes = {"LEVELS": self.levels, "OUT": x.shape[1], "BLOCK": PARTICLE_BLOCK}
         coarsest_kernel.sum_coarsest[(triton.cdiv(max(particles, capacity), PARTICLE_BLOCK),)](
-            x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=self.sum_C, USED=taken,
-            FEEL=taken == OUTPUTS, **sizes,
+            x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=self.sum_C,
+            moments=self.moment_C if spin else self.sum_C, USED=taken, FEEL=taken == OUTPUTS, SPIN=spin, **sizes,
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
-            sums=self.sum_C, felt=self.felt_C2, motion=self.motion_C4, **cells, table=self.table_C, **sizes
+            sums=self.sum_C, felt=self.felt_C2, motion=self.motion_C4, **bodies, **cells, table=self.table_C, **sizes
         )
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
             x=x, table=self.table_C, **pairs, geometry=self.geometry, USED=left,
-            COLUMNS=triton.next_power_of_2(left + 1), **sizes,
+            COLUMNS=triton.next_power_of_2(left + 1), SPIN=spin, **sizes,
         )  # fmt: skip
 
 
