@@ -42,6 +42,8 @@ SETTLING_S, SLIDING_S = 0.3, 0.2  # until a block that came to lie on a surface 
 # along it
 SLIDING_SPEED = 0.5  # m/s
 FALLING_S = 0.6
+HANGING_S = 0.2  # in which what is free falls three cells more
+BELOW_CELLS = 2.0  # a sheet: what hangs there
 RIM_CELLS = 0.5  # snow that hangs over the rim of a sheet reaches so far below it
 QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
@@ -142,7 +144,9 @@ def flight_errors(
 
 
 def glued_below(cases: Sequence[tuple[Setting, int]], config: MpmConfig) -> list[float]:
-    """Of a block of each material that falls onto a sheet smaller than itself, the fraction that ends just below it."""
+    """Of a block of each material that falls onto a sheet smaller than itself, the fraction that is just below it
+    FALLING_S later and still there after HANGING_S: pieces that swing in below its rim fall on.
+    """
     width, _, depth = FALLING_CELLS
     half = width / 3
     scenes = [
@@ -152,15 +156,18 @@ def glued_below(cases: Sequence[tuple[Setting, int]], config: MpmConfig) -> list
         )
         for setting, material in cases
     ]  # fmt: skip
-    frames = 1 + round(FALLING_S * FRAME_RATE_HZ)
+    looks = [round(FALLING_S * FRAME_RATE_HZ), round((FALLING_S + HANGING_S) * FRAME_RATE_HZ)]
     fractions = []
-    for (setting, _), outcome in zip(cases, simulate(scenes, config, frames, FRAME_RATE_HZ), strict=True):
+    for (setting, _), outcome in zip(cases, simulate(scenes, config, 1 + looks[1], FRAME_RATE_HZ), strict=True):
         if isinstance(outcome, SceneFailure):
             raise RuntimeError(outcome.cause)
         middle = rotate(setting.place(np.zeros((1, 3))), setting.rotation.T)
-        place = (rotate(outcome.position_TN3[-1].astype(np.float64), setting.rotation.T) - middle) / setting.cell_size
-        below = (np.abs(place[:, [0, 2]]) < half - RIM_CELLS).all(axis=1) & (place[:, 1] < 0) & (place[:, 1] > -2)
-        fractions.append(float(below.mean()))
+        hangs = np.ones(outcome.position_TN3.shape[1], bool)
+        for position in outcome.position_TN3[looks].astype(np.float64):
+            place = (rotate(position, setting.rotation.T) - middle) / setting.cell_size
+            hangs &= (np.abs(place[:, [0, 2]]) < half - RIM_CELLS).all(axis=1)
+            hangs &= (place[:, 1] < 0) & (place[:, 1] > -BELOW_CELLS)
+        fractions.append(float(hangs.mean()))
     return fractions
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from datagen.mpm.solver import simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, MATERIALS, SAND, SNOW, WATER
+from tools.stability import solver_contact
 from tools.stability.solver_contact import (
     DOMAIN_CELLS,
     FLIGHT_ERROR,
@@ -45,6 +47,20 @@ def test_nothing_is_glued_below_a_sheet() -> None:
     cases = [(Setting(offset, "aligned", CELL), material) for offset in (0.3, 0.5) for material in (WATER, SAND)]
     cases += [(Setting(0.3, "aligned", CELL), material) for material in (SNOW, ELASTIC)]
     assert glued_below(cases, CONFIG) == [0.0] * len(cases)
+
+
+def test_what_hangs_below_a_sheet_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three particles half a cell below a sheet, the one that stays counts; one that falls and one that goes do not."""
+    setting = Setting(0.3, "tilted", CELL)
+
+    def drift(scenes: object, config: object, frames: int, rate: float) -> list[SimpleNamespace]:
+        way = np.array([[0, 0, 0], [0, -0.1, 0], [0.1, 0, 0]])  # cells a frame, after the first look
+        after = np.maximum(np.arange(frames) - 72, 0)[:, None, None]
+        place = (np.array([0, -0.5, 0]) + after * way).reshape(-1, 3)
+        return [SimpleNamespace(position_TN3=setting.place(place).reshape(frames, 3, 3))]
+
+    monkeypatch.setattr(solver_contact, "simulate", drift)
+    assert glued_below([(setting, SNOW)], CONFIG) == [pytest.approx(1 / 3)]
 
 
 @pytest.mark.parametrize("friction", FRICTIONS)
