@@ -50,7 +50,7 @@ def test_nothing_is_glued_below_a_sheet() -> None:
 
 
 def test_what_hangs_below_a_sheet_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of three particles half a cell below a sheet, the one that stays counts; one that falls and one that goes do not."""
+    """Of three particles half a cell below a sheet the one that stays counts; one that falls, one that goes do not."""
     setting = Setting(0.3, "tilted", CELL)
 
     def drift(scenes: object, config: object, frames: int, rate: float) -> list[SimpleNamespace]:
