@@ -193,8 +193,12 @@ def test_how_to(here: Path) -> None:
 
 
 def test_gradients() -> None:
-    """Gradients: of velocities and of a turned obstacle; the launch that hits a target is the closed form's."""
-    runner = Runner(SETTINGS)
+    """Gradients: of velocities and of a turned obstacle; the launch that hits a target is the closed form's; the
+    bucket is filled to 90 % of what a search over angles reaches, which stays among the best here."""
+    runner = Runner(SETTINGS, {"range(-60, 61, 4)": "(-24, -16, -8)"})
     runner.run(ROOT / "docs/how_to/gradients.md")
-    assert bool(runner.names["turn_3"].grad.any()) and bool(runner.names["velocity_N3"].grad.any())
-    assert (runner.names["velocity_3"] - runner.names["launch_3"]).abs().max() < 1e-4
+    names = runner.names
+    assert bool(names["turn_3"].grad.any()) and bool(names["velocity_N3"].grad.any())
+    assert (names["velocity_3"] - names["launch_3"]).abs().max() < 1e-4
+    assert names["filled"](names["degrees"]) >= 0.9 * max(names["search"].values()) > 0.5
+    assert names["angles"][0] == 20 and len(names["angles"]) < 10
