@@ -8,25 +8,24 @@ from __future__ import annotations
 from xdist.scheduler import LoadScopeScheduling
 
 LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
-    *("solver", "viewer/test_page"),
-    *("training/test_ddp", "jobs/test_jobs"),
+    *("solver", "generator", "viewer/test_page", "training/test_ddp", "jobs/test_jobs"),
     *("kernels/test_triton_compat", "network/test_network", "datagen/test_command", "datagen/test_pool"),
-    *("tools/test_bench", "kernels/test_rollout", "docs/test_tutorials", "end_to_end/test_bad_input"),
-    *("end_to_end/test_datagen", "kernels/test_kernels_alone", "datagen/test_kills"),
-    *("training/test_generator", "training/test_train", "scene/test_random_scene", "end_to_end/test_wheel"),
+    *("tools/test_bench", "kernels/test_rollout", "end_to_end/test_bad_input", "kernels/test_kernels_alone"),
+    *("datagen/test_kills", "training/test_train", "scene/test_random_scene", "end_to_end/test_wheel"),
     *("tools/test_error_vs_time", "kernels/test_relative", "kernels/test_update", "jobs/test_queue"),
     *("datagen/test_service", "training/test_resume", "training/test_live_service", "kernels/test_memory"),
     *("test_command", "kernels/test_symmetry", "kernels/test_network", "training/test_precompile"),
 )
-
-
+GENERATING = ("training/test_generator", "end_to_end/test_datagen", "docs/test_tutorials")  # water around a solid
 PLACES = {name: number for number, name in enumerate(LONGEST_FILES)}
 
 
 def group_of(nodeid: str) -> str:
-    """What runs in one process: a file, or all that simulate."""
+    """What runs in one process: a file, all that simulate, or all that generate the same kind of scene."""
     path = nodeid.split("::", 1)[0].removeprefix("tests/").removesuffix(".py")
-    return "solver" if path.startswith(("datagen/mpm/", "tools/test_stability")) else path
+    if path.startswith(("datagen/mpm/", "tools/test_stability")):
+        return "solver"
+    return "generator" if path in GENERATING else path
 
 
 def place_of(nodeid: str) -> int:

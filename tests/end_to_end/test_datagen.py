@@ -19,7 +19,8 @@ ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [
     *(sys.executable, "-m", "datagen", "+experiment=obstacles", "out=made", "scenes=2", "mpm.device=cpu"),
     *("dataset.validation_scenes=1", "dataset.test_scenes=0", "dataset.frames=8", "dataset.workers=1"),
-    *("scene.obstacle_count=2", "scene.group_count=2", "scene.materials=[water]"),
+    *("scene.obstacle_count=2", "scene.obstacle_shapes=[cone,pyramid]", "scene.group_count=2"),
+    "scene.materials=[water]",
 ]
 
 

@@ -16,7 +16,9 @@ from hgn.training.generator import Generator
 
 def small_config(folder: Path) -> DatagenConfig:
     return DatagenConfig(
-        scene=SceneConfig(obstacle_count=0, group_count=1, group_size=0.03, materials=("water",)),
+        scene=SceneConfig(
+            obstacle_count=1, obstacle_shapes=("cone",), group_count=1, group_size=0.03, materials=("water",)
+        ),
         mpm=MpmConfig(device="cpu"),
         dataset=DatasetConfig(
             folder=str(folder), training_scenes=2, validation_scenes=1, test_scenes=0, frames=3, workers=1
