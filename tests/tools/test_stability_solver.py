@@ -9,6 +9,7 @@ import pytest
 from hgn.config import MpmConfig
 from hgn.schema import ConfigError
 from tools.stability import solver_leak, solver_steps, solver_validation
+from tools.stability.row import Row
 from tools.stability.solver import main
 from tools.stability.solver_leak import crossing_paths, leaks
 from tools.stability.solver_loads import _sinks_until
@@ -83,14 +84,20 @@ def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rows[5].measured < rows[9].measured  # so few cells tell heights apart, not run-outs
 
 
-def test_grids() -> None:
+def test_grids(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fronts, run-outs and heights on each grid, with what they lead to."""
-    rows = solver_validation.grids(MpmConfig(device="cpu"), (4, 5, 6))
-    quantities = ["front of the dam", "run-out of a sand", "height of a sand", *["height of a block"] * 3]
-    assert all(what in row.case for what, row in zip(quantities, rows, strict=True))
-    snow = rows[-1].more["series"]
-    assert all(0.95 < height < 1.1 for height in snow)  # of a side: it hardly yields; water lies spread out by then
-    assert max(rows[3].more["series"]) < 0.3
+
+    def columns(aspect: float, law: str, angle: float, base: MpmConfig, cells: int) -> list[Row]:
+        return [Row(f"column, {what}", 3.0, 3 - 2 / cells, True, "") for what in ("run-out", "height")]
+
+    monkeypatch.setattr(solver_validation, "column_rows", columns)
+    monkeypatch.setattr(solver_validation, "PAPER_MATERIALS", ("water",))
+    front, run_out, height, block = solver_validation.grids(MpmConfig(device="cpu"), (4, 5, 6))
+    assert ("front of the dam" in front.case, "height of a block of water" in block.case) == (True, True)
+    assert run_out.more["order"] == height.more["order"] == pytest.approx(1.0, rel=0.02)
+    assert run_out.measured == pytest.approx((3 - 2 / 6) / (3 - 2 / 5) - 1)
+    assert all(2.9 < value < 3.5 for value in front.more["series"])  # widths
+    assert all(0.1 < value < 0.3 for value in block.more["series"])  # of a side: it has spread by then
 
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 2.0])
