@@ -147,7 +147,8 @@ def write_package(path: Path, program: torch.export.ExportedProgram, info: Weigh
         torch._inductor.aoti_compile_and_package(
             program,
             package_path=str(temporary.resolve()),
-            inductor_configs={"aot_inductor.metadata": {"hgn": _description(info)}},
+            # threads as the program that runs it has them, not as this one
+            inductor_configs={"aot_inductor.metadata": {"hgn": _description(info)}, "cpp.dynamic_threads": True},
         )
     sync_written(temporary)
     temporary.replace(path)

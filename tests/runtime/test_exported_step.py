@@ -9,6 +9,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import onnxruntime
@@ -24,7 +25,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.runtime.stepped_rollout import stepped
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.scene_file import load_scene
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, to_mapping
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "tools/deploy"
 TOLERANCE = 1e-6  # of positions and displacements in a frame, domain units
@@ -34,7 +35,15 @@ NETWORKS = {
     "relative": {"inputs": "relative"},
     "angular": {"inputs": "relative", "momentum": "angular"},
 }
-SIZES = [(1, True), (1, False), (216, True), (216, False), (4_096, True)]
+SIZES = [(particles, obstacles) for particles in (1, 216, 4_096, 30_000) for obstacles in (True, False)]
+SCENE = str(config_directory() / "example/own_mesh.yaml")
+
+
+class Written(NamedTuple):
+    """A network, and the file that holds its step; beside it the folder `arrays`."""
+
+    network: HierarchicalGraphNetwork
+    path: Path
 
 
 @pytest.fixture(autouse=True)
@@ -46,41 +55,57 @@ def whole_precision() -> Iterator[None]:
     torch.set_float32_matmul_precision(before)
 
 
-@pytest.mark.parametrize(
-    "name", ["absolute", *(pytest.param(name, marks=pytest.mark.slow) for name in list(NETWORKS)[1:])]
+@pytest.fixture(scope="module")
+def onnx_step(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Written:
+    """A network's step as ONNX, and what the scene SCENE starts with."""
+    return exported(tmp_path_factory.mktemp("onnx"), request.param, "onnx")
+
+
+ABSOLUTE = pytest.mark.parametrize("onnx_step", ["absolute"], indirect=True)
+ALL = pytest.mark.parametrize(
+    "onnx_step",
+    ["absolute", *(pytest.param(name, marks=pytest.mark.slow) for name in list(NETWORKS)[1:])],
+    indirect=True,
 )
-def test_onnx_is_the_step(tmp_path: Path, name: str) -> None:
+
+
+@ALL
+def test_onnx_is_the_step(onnx_step: Written) -> None:
     """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles; the file says
     what its weights say of themselves; the example in Python simulates a scene's arrays."""
-    path = tmp_path / "step.onnx"
-    scene = {"scene": str(config_directory() / "example/own_mesh.yaml"), "arrays": str(tmp_path / "arrays")}
-    network = exported(tmp_path, name, onnx=str(path), **scene)
+    network, path = onnx_step
     session = onnxruntime.InferenceSession(path)
     assert [item.name for item in session.get_inputs()] == list(INPUTS)
     declared = json.loads(session.get_modelmeta().custom_metadata_map["hgn"])
-    assert declared["frame_rate_hz"] == 60.0 and declared["network"].items() >= NETWORKS[name].items()
+    assert declared["frame_rate_hz"] == 60.0 and declared["network"] == to_mapping(network.config)
     compare(network, lambda arrays: session.run(None, arrays))
     simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
-    assert_rollout(network, scene["scene"], simulate(str(path), scene["arrays"], FRAMES))
-    if shutil.which("cmake") is None or "ONNXRUNTIME_FOLDER" not in os.environ:
-        pytest.skip("the C++ example needs cmake and a release of ONNX Runtime, ONNXRUNTIME_FOLDER")
+    assert_rollout(network, simulate(str(path), str(path.parent / "arrays"), FRAMES))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="needs cmake")
+@pytest.mark.skipif(
+    "ONNXRUNTIME_FOLDER" not in os.environ, reason="needs ONNXRUNTIME_FOLDER, a release of ONNX Runtime"
+)
+@ABSOLUTE
+def test_onnx_runs_in_cpp(onnx_step: Written) -> None:
+    """The example in C++ simulates a scene's arrays."""
     options = [f"-DONNXRUNTIME_FOLDER={os.environ['ONNXRUNTIME_FOLDER']}", "-DCMAKE_DISABLE_FIND_PACKAGE_Torch=ON"]
-    assert_rollout(network, scene["scene"], built_and_run(tmp_path, "step_onnx", path, options))
+    assert_rollout(onnx_step.network, built_and_run("step_onnx", onnx_step.path, options))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NETWORKS)
 def test_package_is_the_step(tmp_path: Path, name: str) -> None:
     """The same of a package that PyTorch compiled, and of the example in C++."""
-    path = tmp_path / "step.pt2"
-    scene = {"scene": str(config_directory() / "example/own_mesh.yaml"), "arrays": str(tmp_path / "arrays")}
-    network = exported(tmp_path, name, package=str(path), **scene)
+    network, path = exported(tmp_path, name, "package")
     package = torch._inductor.aoti_load_package(str(path))
     compare(network, lambda arrays: [x.numpy() for x in package(*map(torch.from_numpy, arrays.values()))])
     if shutil.which("cmake") is None:
         pytest.skip("the C++ example needs cmake")
     options = [f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"]
-    assert_rollout(network, scene["scene"], built_and_run(tmp_path, "step_package", path, options))
+    assert_rollout(network, built_and_run("step_package", path, options))
 
 
 @pytest.mark.parametrize(
@@ -100,12 +125,14 @@ def test_what_is_refused(options: dict[str, str], message: str) -> None:
         export.main(options)
 
 
-def exported(folder: Path, name: str, **options: str) -> HierarchicalGraphNetwork:
-    """The network whose step the command writes."""
+def exported(folder: Path, name: str, kind: str) -> Written:
+    """What the command writes of a small network, and beside it a scene's arrays."""
     network = network_of(torch.float32, levels=2, message_passing_steps=1, **NETWORKS[name])
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
+    path = folder / ("step.onnx" if kind == "onnx" else "step.pt2")
+    options = {kind: str(path), "scene": SCENE, "arrays": str(folder / "arrays"), "device": "cpu"}
     assert export.main({"weights": str(folder / "w.safetensors"), **options}) == 0
-    return network
+    return Written(network, path)
 
 
 def compare(network: HierarchicalGraphNetwork, step: Callable[[dict[str, np.ndarray]], Sequence[np.ndarray]]) -> None:
@@ -117,13 +144,14 @@ def compare(network: HierarchicalGraphNetwork, step: Callable[[dict[str, np.ndar
         np.testing.assert_allclose(velocity_NM3, after.velocity_NM3.numpy(), rtol=0, atol=TOLERANCE)
 
 
-def assert_rollout(network: HierarchicalGraphNetwork, scene: str, found_TN3: np.ndarray) -> None:
-    (expected_TN3,) = Simulator(network, 60.0, "torch").rollout([load_scene(scene)], FRAMES)
+def assert_rollout(network: HierarchicalGraphNetwork, found_TN3: np.ndarray) -> None:
+    (expected_TN3,) = Simulator(network, 60.0, "torch").rollout([load_scene(SCENE)], FRAMES)
     np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=FRAMES * TOLERANCE)
 
 
-def built_and_run(folder: Path, program: str, model: Path, options: Sequence[str]) -> np.ndarray:
+def built_and_run(program: str, model: Path, options: Sequence[str]) -> np.ndarray:
     """Positions that a C++ example writes."""
+    folder = model.parent
     subprocess.run(["cmake", "-S", EXAMPLES, "-B", folder / "build", *options], check=True, capture_output=True)
     subprocess.run(["cmake", "--build", folder / "build", "--target", program], check=True, capture_output=True)
     arguments = [folder / "build" / program, model, folder / "arrays", str(FRAMES), folder / "out.npy"]

@@ -1,13 +1,18 @@
 """python -m tools.studies.exported: steps that hgn.export wrote against the backend torch, and their times beside ours.
 
-From one particle on, with and without obstacles. Where one is not the backend's to 1e-6 the exit code is 1.
+A frame from one particle on, with and without obstacles; and a scene that the examples in C++ simulate. A frame that
+is not the backend's to 1e-6 ends in exit code 1. Frames after the first are told beside those of a scene displaced by
+1e-6, for they are chaotic.
 """
 
 from __future__ import annotations
 
 import json
+import subprocess
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,30 +20,37 @@ import onnxruntime
 import torch
 
 from hgn.command import run_command
+from hgn.export import main as export
+from hgn.export import write_arrays
 from hgn.runtime.backend import build
 from hgn.runtime.exported_step import INPUTS, initial_arrays
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.stepped_rollout import stepped
+from hgn.scene.scene_file import find_scene, load_scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import Positive, from_mapping, require_bounds
 from hgn.system.files import write_json
 from hgn.system.provenance import provenance
 from tools.bench.contenders import PASS
 from tools.bench.states import Workload, scene_of
-from tools.bench.timing import Timed, alternate, once
+from tools.bench.timing import Timed, alternate
 
 TOLERANCE = 1e-6  # domain units, of positions and displacements in a frame
 SIZES = (1, 216, 4_096, 30_000)
+PROGRAMS = {"step_onnx": "onnx", "step_package": "pt2"}
+AFTER = (1, 10, 50, 299)  # frames
 EXIT_RED = 1
 
 
 @dataclass(frozen=True)
 class ExportedConfig:
-    """`python -m tools.studies.exported`: whose steps, compiled for the CPU."""
+    """`python -m tools.studies.exported`: whose steps, where they are written, where the examples are."""
 
-    onnx: str
-    package: str
-    weights: str = "obstacles"
+    folder: str  # of steps, by the weights' names; those that are missing are written
+    weights: tuple[str, ...] = ("obstacles", "mechanics", "obstacles_small")
+    examples: str | None = None  # the folder that CMake built tools/deploy in; none: without them
+    scene: str = "play"  # what the examples simulate
+    frames: Positive[int] = 300
     rounds: Positive[int] = 5
     json: str | None = None
 
@@ -47,28 +59,36 @@ class ExportedConfig:
 
 
 def main(mapping: dict[str, Any]) -> int:
-    """Prints and stores a row for each size; the exit code says whether all agree."""
+    """Prints and stores a row for each frame and simulation; the exit code says whether all agree."""
     config = from_mapping(ExportedConfig, mapping)
-    simulator = Simulator.load(config.weights, "cpu", "torch", "fp32")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    session = onnxruntime.InferenceSession(config.onnx, options)
-    package = torch._inductor.aoti_load_package(config.package)
-    rows = []
-    for particles in SIZES:
-        for obstacles in (False, True):
-            rows.append(measured(simulator, session, package, particles, obstacles, config.rounds))
-            print(json.dumps(rows[-1]), flush=True)
+    rows: dict[str, list[dict[str, Any]]] = {"steps": [], "examples": []}
+
+    def add(kind: str, row: dict[str, Any]) -> None:
+        rows[kind].append(row)
+        print(json.dumps(row), flush=True)
+
+    for name in config.weights:
+        paths = {ending: Path(config.folder) / f"{name}.{ending}" for ending in PROGRAMS.values()}
+        for key, path in zip(("onnx", "package"), paths.values(), strict=True):
+            if not path.exists():
+                export({"weights": name, "device": "cpu", key: str(path)})
+        simulator = Simulator.load(name, "cpu", "torch", "fp32")
+        for particles in SIZES:
+            for obstacles in (False, True):
+                row = measured(simulator, paths, particles, obstacles, config.rounds)
+                add("steps", {"weights": name} | row)
+        if config.examples is not None:
+            for row in simulated(simulator, paths, config):
+                add("examples", {"weights": name} | row)
     if config.json is not None:
-        meta = provenance("cpu") | {"weights": config.weights, "threads": torch.get_num_threads()}
-        write_json(config.json, {"meta": meta, "rows": rows})
-    return 0 if all(row["check"] == PASS for row in rows) else EXIT_RED
+        write_json(config.json, {"meta": provenance("cpu"), **rows})
+    return 0 if all(row["check"] == PASS for kind in rows.values() for row in kind) else EXIT_RED
 
 
 def measured(
-    simulator: Simulator, session: Any, package: Any, particles: int, obstacles: bool, rounds: int
+    simulator: Simulator, paths: dict[str, Path], particles: int, obstacles: bool, rounds: int
 ) -> dict[str, Any]:
-    """Errors, and the median milliseconds of each."""
+    """Errors on all threads, and the least CPU time of a frame on one, in turns: other work beside it counts little."""
     network = simulator.network
     scene = scene_of(Workload(particles, 1), 0, network.config.cell_size)
     if obstacles:
@@ -77,23 +97,76 @@ def measured(
     state = simulator.start([scene])
     arrays = initial_arrays(state)
     tensors = [torch.from_numpy(arrays[name]) for name in INPUTS]
+    onnx, compiled = paths["onnx"], torch._inductor.aoti_load_package(str(paths["pt2"]))
+    own = build("cpu", network, "fp32")
     after = stepped(simulator.backend.predict, state)
+    expected = (after.position_N3.numpy(), after.velocity_NM3.numpy())
+    found = {"onnx": onnxruntime.InferenceSession(onnx).run(None, arrays), "package": compiled(*tensors)}
+    row: dict[str, Any] = {"particles": particles, "obstacle_cells": len(arrays["obstacle_cell"])}
+    for name, outputs in found.items():
+        row[f"error_{name}"] = max(
+            float(np.abs(np.asarray(x) - y).max()) for x, y in zip(outputs, expected, strict=True)
+        )
+    row["check"] = checked(row["error_onnx"], row["error_package"])
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(onnx, options)
     steps: dict[str, Callable[[], Any]] = {
         "onnx": lambda: session.run(None, arrays),
-        "package": lambda: package(*tensors),
+        "package": lambda: compiled(*tensors),
         "torch": lambda: stepped(simulator.backend.predict, state),
-        "cpu": lambda: stepped(build("cpu", network, "fp32").predict, state),
+        "cpu": lambda: stepped(own.predict, state),
     }
-    row: dict[str, Any] = {"particles": particles, "obstacle_cells": len(arrays["obstacle_cell"])}
-    for name in ("onnx", "package"):
-        found = zip(map(np.asarray, steps[name]()), (after.position_N3, after.velocity_NM3), strict=True)
-        row[f"error_{name}"] = max(float(np.abs(value - expected.numpy()).max()) for value, expected in found)
-    row["check"] = PASS if max(row["error_onnx"], row["error_package"]) <= TOLERANCE else "fail"
-    contenders = [Timed(lambda step=step: [once(step, simulator.device)]) for step in steps.values()]  # type: ignore[misc]
+    contenders = [
+        Timed(lambda step=step: [cpu_milliseconds(step)], rounds)  # type: ignore[misc]
+        for step in steps.values()
+    ]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     alternate(contenders, rounds, seconds=60.0)
-    for name, timed in zip(steps, contenders, strict=True):
-        row[f"ms_{name}"] = timed.quartiles()[1]
-    return row
+    torch.set_num_threads(threads)
+    return row | {f"ms_{name}": min(timed.milliseconds) for name, timed in zip(steps, contenders, strict=True)}
+
+
+def simulated(simulator: Simulator, paths: dict[str, Path], config: ExportedConfig) -> list[dict[str, Any]]:
+    """What each example makes of the scene, against the backend torch: the largest error of the first frame, and how
+    far particles are apart later (root mean square), where a start displaced by 1e-6 is the measure."""
+    assert config.examples is not None
+    arrays = Path(config.folder) / f"{config.scene}_arrays"
+    write_arrays(arrays, simulator, config.scene)
+    scene = load_scene(find_scene(config.scene))
+    offset_N3 = TOLERANCE * np.random.default_rng(0).choice([-1, 1], scene.position_N3.shape).astype(np.float32)
+    (expected_TN3,) = simulator.rollout([scene], config.frames)
+    (displaced_TN3,) = simulator.rollout([replace(scene, position_N3=scene.position_N3 + offset_N3)], config.frames)
+    rows = [{"program": "backend torch, displaced", "check": PASS} | distances(displaced_TN3, expected_TN3)]
+    for program, ending in PROGRAMS.items():
+        out = Path(config.folder) / f"{program}.npy"
+        words = [str(word) for word in (Path(config.examples) / program, paths[ending], arrays, config.frames, out)]
+        subprocess.run(words, check=True)
+        found_TN3 = np.load(out)
+        error = float(np.abs(found_TN3[1] - expected_TN3[1]).max())
+        row = {"program": program, "error": error, "check": checked(error)}
+        rows.append(row | distances(found_TN3, expected_TN3))
+    return [{"scene": config.scene, "particles": len(offset_N3)} | row for row in rows]
+
+
+def distances(found_TN3: np.ndarray, expected_TN3: np.ndarray) -> dict[str, Any]:
+    """Root mean square over particles, domain units, by frame."""
+    rms_T = np.sqrt(np.square(found_TN3 - expected_TN3).sum(-1).mean(-1))
+    return {"rms": {str(frame): float(rms_T[frame]) for frame in AFTER if frame < len(rms_T)}}
+
+
+def checked(*errors: float) -> str:
+    """Whether all are within TOLERANCE; what is not finite is not."""
+    return PASS if all(error <= TOLERANCE for error in errors) else "fail"
+
+
+def cpu_milliseconds(run: Callable[[], object]) -> float:
+    """CPU time of one run, of all of the process' threads."""
+    started = time.process_time()
+    run()
+    return (time.process_time() - started) * 1e3
 
 
 if __name__ == "__main__":
