@@ -35,7 +35,15 @@ from hgn.data.identity import dataset_identity, identity_hash, require_same_data
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest, QuarantinedScene, ShardEntry
 from hgn.schema import ConfigError
-from hgn.system.files import TEMPORARY_SUFFIX, make_folder, sync_file, sync_folder, temporary_file, temporary_target
+from hgn.system.files import (
+    TEMPORARY_SUFFIX,
+    make_folder,
+    read_replaced,
+    sync_file,
+    sync_folder,
+    temporary_file,
+    temporary_target,
+)
 from hgn.system.machine import available_cpus
 
 # seeds tried for one episode before the scene distribution itself is held to be at fault
@@ -360,7 +368,7 @@ class DatasetWriter:
 
     def _reload(self) -> None:
         try:
-            content = (self.folder / MANIFEST_NAME).read_bytes()
+            content = read_replaced(self.folder / MANIFEST_NAME)
         except FileNotFoundError:  # removed by hand: it is written anew with the next shard
             return
         if content != self._content:

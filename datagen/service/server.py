@@ -43,6 +43,7 @@ from hgn.data.index import INDEX_NAME, SEGMENT_SHARDS, Index
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.storage import verify_file
 from hgn.schema import ConfigError, to_mapping
+from hgn.system.files import read_replaced
 
 _OPEN_PATHS = ("/healthz",)
 _GRACE_S = 5  # for answers that are being sent when the service is stopped; readers go on where they were cut
@@ -109,7 +110,7 @@ class Published:
             raise ConfigError("the data set has no manifest yet; ask again in a moment") from None
         stamp = (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
         if self._snapshot is None or stamp != self._stamp:
-            content = path.read_bytes()
+            content = read_replaced(path)
             manifest = Manifest.parse(content, self.folder)
             if self._snapshot is not None:
                 manifest = replace(manifest, shards=self._snapshot.manifest.shards.continued(manifest.shards))

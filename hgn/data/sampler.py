@@ -26,6 +26,7 @@ class SamplerState:
     episodes: int = 0  # episodes in this epoch; 0: not decided yet
     digest: str = ""  # of the shards that hold these; none: not known (checkpoints of 0.1.0)
     window: int = 0  # episodes whose samples are shuffled together; 0: all
+    seed: int | None = None  # of the order; null: not known (checkpoints of 0.1.0)
 
 
 class Sample(NamedTuple):  # which Python makes faster than other classes: a thousand in a second are drawn
@@ -111,6 +112,11 @@ class EpisodeSampler:
                 f"training.shuffle_episodes must be {self.state.window} to go on in the middle of epoch "
                 f"{self.state.epoch}, got {window}; set it so, or start another run"
             )
+        if self.state.position > 0 and self.state.seed not in (None, seed):
+            raise ConfigError(
+                f"training.seed must be {self.state.seed} to go on in the middle of epoch {self.state.epoch}, got "
+                f"{seed}: samples would come twice; set it so, or start another run"
+            )
         self._order = np.zeros(0, np.int64)
         self._first_sample = np.zeros(1, np.int64)
         self._first_seed = np.uint64(0)  # of an epoch's samples, which have one after the other
@@ -172,4 +178,4 @@ class EpisodeSampler:
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_order(self.seed, epoch, self._first_sample, self._window)
         self._first_seed = np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0]
-        self.state = SamplerState(epoch, position, len(frame_counts), found, self._window)
+        self.state = SamplerState(epoch, position, len(frame_counts), found, self._window, self.seed)

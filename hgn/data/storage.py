@@ -29,7 +29,7 @@ from urllib.parse import urlsplit
 
 from hgn.schema import ConfigError, require
 from hgn.system.extras import missing_extra
-from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, sync_folder
+from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, read_replaced, sync_folder
 from hgn.system.hub import PREFIX, HubPlace, hub_token
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
@@ -202,7 +202,7 @@ class _Folder:
         self._folder = folder
 
     def manifest(self, name: str, patience_s: float = PATIENCE_S) -> bytes:
-        return (self._folder / name).read_bytes()
+        return read_replaced(self._folder / name)
 
     def read(self, name: str, start: int, stop: int) -> bytes:
         with (self._folder / name).open("rb") as file:

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 from hgn.schema import ConfigError
 
 TEMPORARY_SUFFIX = ".partial"
+_LOST_AT_MOST = 10  # times one after the other
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)  # of file systems that know none
 
 
@@ -56,6 +57,20 @@ def write_atomically(path: Path, data: bytes) -> None:
             sync_file(file)
         temporary.replace(path)
     sync_folder(path.parent)
+
+
+def read_replaced(path: Path) -> bytes:
+    """The bytes of a file that others replace. Where NFS has lost the one that was opened, those of its successor.
+
+    Raises: OSError.
+    """
+    for _ in range(_LOST_AT_MOST):
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            if error.errno != errno.ESTALE:
+                raise
+    return path.read_bytes()
 
 
 def write_json(path: Path | str, value: Any, allow_nan: bool = True) -> None:

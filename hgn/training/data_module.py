@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import islice
 from typing import Any, TypeVar
@@ -241,7 +241,10 @@ class EpisodeDataModule(LightningDataModule):
         self.store.refresh()
         if not 0 < self.training.shuffle_episodes < len(self.store):
             self.store.fetch_ahead()
-        count = agreed_count(self.store, self.trainer) if self.trainer is not None else len(self.store)
+        count = len(self.store)
+        if self.trainer is not None:
+            names = ("seed", "batch_scenes", "shuffle_episodes")
+            count = agreed_count(self.store, self.trainer, {name: getattr(self.training, name) for name in names})
         return self.store.frames(count)
 
 
@@ -258,15 +261,23 @@ def chunk_length(training: TrainingConfig, begun: int, update: int) -> int:
     return min(until_due, until_end, UPDATES_AT_ONCE, max(1, update - begun))
 
 
-def agreed_count(store: EpisodeStore, trainer: Trainer) -> int:
+def agreed_count(store: EpisodeStore, trainer: Trainer, order: Mapping[str, int] | None = None) -> int:
     """How many episodes rank 0 knows; the other ranks wait until they see as many. All ranks call this.
 
+    `order` is what the order of samples stands on beside the data: settings of `training`.
+
     Episodes come in publication order, so that the first `count` are then the same everywhere.
-    Raises: ConfigError when a node does not see them for SHARED_FOLDER_PATIENCE_S; on every rank when one sees others.
+    Raises: ConfigError when a node does not see them for SHARED_FOLDER_PATIENCE_S; on every rank when one sees others,
+    or was given another order.
     """
     if trainer.world_size == 1:
         return len(store)
-    count, digest = trainer.strategy.broadcast((len(store), store.digest(len(store))))
+    count, digest, others = trainer.strategy.broadcast((len(store), store.digest(len(store)), order))
+    if order is not None and not trainer.strategy.reduce_boolean_decision(order == others, all=True):
+        raise ConfigError(
+            f"training.{', '.join(order or {})} must be the same on all ranks, got {order} on rank "
+            f"{trainer.global_rank} and {others} on rank 0: samples would come twice; start all with the same command"
+        )
     deadline = time.monotonic() + SHARED_FOLDER_PATIENCE_S
     while len(store) < count:
         if time.monotonic() > deadline:

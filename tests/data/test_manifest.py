@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
+import errno
 import json
 from pathlib import Path
 
@@ -10,6 +12,8 @@ import pytest
 from ballistic_dataset import MakeConfig
 from written_files import first_release
 
+from datagen.pool.writer import DatasetWriter
+from datagen.service.server import Published
 from hgn.data.identity import dataset_identity, identity_differences, identity_hash
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import EpisodeEntry, Manifest, QuarantinedScene, ShardEntry
@@ -97,3 +101,24 @@ def test_differences_are_named() -> None:
         "d is 3 there, nothing is asked for",
         "e is nothing there, 5 is asked for",
     ]
+
+
+def test_manifest_that_is_replaced_while_it_is_read(
+    make_config: MakeConfig, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On NFS a file that another machine has replaced is lost to whoever had opened it: reader, writer and service read
+    the one in its place."""
+    real, lost = Path.read_bytes, 0
+
+    def read_bytes(path: Path) -> bytes:
+        nonlocal lost
+        if path.name == "manifest.json" and (lost := lost + 1) % 3:
+            raise OSError(errno.ESTALE, "Stale file handle")
+        return real(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    assert Manifest.load(folder).complete
+    with DatasetWriter(make_config()) as writer:
+        assert writer.complete
+    asyncio.run(Published(folder).snapshot())
+    assert lost >= 9

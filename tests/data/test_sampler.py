@@ -93,7 +93,7 @@ def test_growing_data_waits_for_the_next_epoch():
     assert sorted(s[:2] for s in first + rest) == [(0, 0), (0, 1)]
     assert again.state.episodes == 1
     assert sorted(s[:2] for s in take(again, 5)) == [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]
-    assert again.state == SamplerState(1, 5, 2)
+    assert again.state == SamplerState(1, 5, 2, seed=again.seed)
 
 
 def test_epochs_and_seeds_differ():
@@ -159,6 +159,16 @@ def test_window_cannot_change_within_an_epoch():
     with pytest.raises(ConfigError, match=r"training\.shuffle_episodes must be 8 to go on in the middle of epoch 0"):
         EpisodeSampler(0, 1, lambda _: [5] * 20, order.state)
     assert EpisodeSampler(0, 1, lambda _: [5] * 20, SamplerState(1, 0, 20, "", 8)).state.window == 0
+
+
+def test_seed_cannot_change_within_an_epoch():
+    """Another seed is another order: an epoch goes on with its own; the next one, and old checkpoints, with any."""
+    order = EpisodeSampler(7, 1, lambda _: [5] * 3)
+    take(order, 2)
+    with pytest.raises(ConfigError, match=r"training\.seed must be 7 to go on in the middle of epoch 0, got 8"):
+        EpisodeSampler(8, 1, lambda _: [5] * 3, order.state)
+    EpisodeSampler(8, 1, lambda _: [5] * 3, replace(order.state, seed=None))
+    assert EpisodeSampler(8, 1, lambda _: [5] * 3, SamplerState(1, 0, 3)).state.seed == 8
 
 
 def test_order_is_the_same_everywhere():

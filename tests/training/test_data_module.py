@@ -95,16 +95,21 @@ def test_shard_made_again_is_not_mixed_up(make_config: MakeConfig, make_dataset:
 def test_ranks_with_other_data_are_refused(folder: Path, here: bool) -> None:
     """Ranks whose data were published in another order end together, wherever the difference is seen."""
 
+    asked: list[bool] = []
+
     class Strategy:
-        def broadcast(self, mine: tuple[int, str]) -> tuple[int, str]:
-            return (mine[0], "another order" if here else mine[1])
+        def broadcast(self, mine: tuple[int, str, Any]) -> tuple[int, str, Any]:
+            return (mine[0], "another order" if here else mine[1], {"seed": 0})
 
         def reduce_boolean_decision(self, same: bool, all: bool) -> bool:
-            return same and here
+            asked.append(same)
+            return same and (here or len(asked) == 1)
 
     trainer = SimpleNamespace(world_size=2, global_rank=1, strategy=Strategy())
     with pytest.raises(ConfigError, match=r"must show the same 5 episodes on every node, got others.* rank"):
-        agreed_count(EpisodeStore(folder, "train"), trainer)  # type: ignore[arg-type]
+        agreed_count(EpisodeStore(folder, "train"), trainer, {"seed": 0})  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"training.seed must be the same on all ranks, got \{'seed': 1\} on rank 1"):
+        agreed_count(EpisodeStore(folder, "train"), trainer, {"seed": 1})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("ahead", "room"), [(False, 1 / 3), (True, 1 / 3), (True, 2 / 3)])

@@ -71,6 +71,7 @@ class Disk:
         self._names: dict[int, dict[str, int]] = {}  # of folders: their entries' inodes
         self._bytes: dict[int, bytes] = {}  # of files
         self._folders: set[int] = set()
+        self.written = set[str]()  # names of files that were opened for writing, or truncated
         self._kept_open: list[int] = []  # so that no inode's number is given to another file
         self._lock = threading.RLock()
 
@@ -127,6 +128,7 @@ class Disk:
     def _followed(self, call: Callable[..., Any]) -> Callable[..., Any]:
         def followed(path: Any, *arguments: Any, **options: Any) -> Any:
             if self._is_ours(path):
+                self.written |= {_path_of(path).name} if call.__name__ == "truncate" else set()
                 self.step()
             return call(path, *arguments, **options)
 
@@ -147,8 +149,7 @@ class Disk:
                 self._bytes[inode] = Path(f"/proc/self/fd/{descriptor}").read_bytes()
 
     def _is_ours(self, path: Any) -> bool:
-        path = Path(f"/proc/self/fd/{path}").readlink() if isinstance(path, int) else Path(os.fsdecode(path)).absolute()
-        return path.is_relative_to(self.folder)
+        return _path_of(path).is_relative_to(self.folder)
 
     def _opened(self, call: Callable[..., Any]) -> Callable[..., Any]:
         disk = self
@@ -171,6 +172,8 @@ class Disk:
             writes = bool(set("wax+") & set(mode))
             if not self._is_ours(file) or not (writes or self.piece):
                 return call(file, mode, buffering, encoding, errors, newline, closefd, opener)
+            if writes:
+                self.written.add(_path_of(file).name)
             if writes and not isinstance(file, int):
                 self.step()
             raw = Raw(file, mode.replace("b", "").replace("t", ""), closefd, opener)
@@ -179,6 +182,10 @@ class Disk:
             return stream if "b" in mode else io.TextIOWrapper(stream, encoding, errors, newline)
 
         return opened
+
+
+def _path_of(file: Any) -> Path:
+    return Path(f"/proc/self/fd/{file}").readlink() if isinstance(file, int) else Path(os.fsdecode(file)).absolute()
 
 
 def _entries(folder: Path) -> dict[str, int]:

@@ -11,7 +11,7 @@ import pytest
 import hgn.training.checkpoint_writer
 from hgn.system import files
 from tools.studies import power_loss
-from tools.studies.power_loss import SCENARIOS, fail, lose_power
+from tools.studies.power_loss import SCENARIOS, Disk, fail, lose_power
 
 
 @pytest.mark.parametrize(("name", "every"), [("generation", 30), ("checkpoints", 5), ("cache", 2)])
@@ -22,6 +22,17 @@ def test_nothing_is_lost(tmp_path: Path, name: str, every: int) -> None:
     assert faults == [] and tried == calls // every > 3
     failed, faults = fail(SCENARIOS[name], tmp_path, 2 * every, 1000)
     assert faults == [] and failed > 1
+
+
+def test_what_is_mapped_never_shrinks(tmp_path: Path) -> None:
+    """No file is written to under a shard's name, in a data set or in a cache: it gets that name when it is whole, and
+    loses it whole. So a map of a shard ends a reader (SIGBUS) only where another program truncates it."""
+    for name in ("generation", "cache"):
+        disk = Disk(tmp_path)
+        with disk.followed():
+            SCENARIOS[name].write(tmp_path, {})
+        written = {path for path in disk.written if not path.endswith(files.TEMPORARY_SUFFIX)}
+        assert disk.written - written and all(path.endswith(".jsonl") for path in written)
 
 
 @pytest.mark.parametrize("skipped", ["sync_file", "sync_folder"])
