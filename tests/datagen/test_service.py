@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -122,7 +123,11 @@ def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
         assert hash_may_end.wait(60)
         return file_sha256(path)
 
-    monkeypatch.setattr(Manifest, "parse", staticmethod(counted("parse", Manifest.parse)))
+    def slowly(*arguments: Any, real: Callable[..., Any] = Manifest.parse) -> Manifest:
+        time.sleep(0.1)  # for others to begin, were they let
+        return real(*arguments)
+
+    monkeypatch.setattr(Manifest, "parse", staticmethod(counted("parse", slowly)))
     monkeypatch.setattr(ShardEntry, "__post_init__", counted("line", ShardEntry.__post_init__))
     monkeypatch.setattr(hgn.data.storage, "file_sha256", counted("hash", slow))
     monkeypatch.setattr(datagen.service.server, "to_mapping", counted("told", to_mapping))
@@ -133,6 +138,7 @@ def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
         readers = [asyncio.create_task(request(app, SHARD)) for _ in range(60)]
         while not work["hash"]:
             await asyncio.sleep(0)
+        await asyncio.sleep(0.2)
         assert (await request(app, "/healthz"))[0] == 200 and not any(reader.done() for reader in readers)
         hash_may_end.set()
         return await asyncio.gather(*readers)
