@@ -27,6 +27,42 @@ def spare_repeated_work() -> None:
         return found[dtype.name]
 
     interpreter._get_np_dtype = np_dtype
+    _remember_shapes(language.core, language.semantic.TritonSemantic)
+
+
+def _remember_shapes(core: ModuleType, semantic: type) -> None:
+    """Of tensors and their types, which the language wraps number by number for each result; of two tensors of one
+    shape none is broadcast."""
+    block_init, tensor_init, broadcast = core.block_type.__init__, core.tensor.__init__, semantic.broadcast_impl_value
+    blocks: dict[tuple[int, ...], tuple[Any, int, str]] = {}
+    tensors: dict[tuple[int, ...], tuple[Any, Any]] = {}
+
+    def init_block(self: Any, element_ty: Any, shape: Any) -> None:
+        key = tuple(one.value if isinstance(one, core.constexpr) else one for one in shape)
+        if key in blocks:
+            self.element_ty = element_ty
+            self.shape, self.numel, begin = blocks[key]
+            self.name = f"{begin}{element_ty}>"
+        else:
+            block_init(self, element_ty, shape)
+            blocks[key] = self.shape, self.numel, self.name.removesuffix(f"{element_ty}>")
+
+    def init_tensor(self: Any, handle: Any, type: Any) -> None:
+        key = tuple(type.shape) if type.is_block() else ()
+        if key in tensors:
+            self.handle, self.type, self.dtype = handle, type, type.scalar
+            self.shape, self.numel = tensors[key]
+        else:
+            tensor_init(self, handle, type)
+            tensors[key] = self.shape, self.numel
+
+    def broadcast_unlike(self: Any, lhs: Any, rhs: Any) -> Any:
+        if lhs.type.is_block() and rhs.type.is_block() and lhs.type.shape is rhs.type.shape:
+            return lhs, rhs
+        return broadcast(self, lhs, rhs)
+
+    core.block_type.__init__, core.tensor.__init__ = init_block, init_tensor
+    semantic.broadcast_impl_value = broadcast_unlike
 
 
 class PatchOnce:

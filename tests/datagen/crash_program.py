@@ -49,13 +49,13 @@ class Lines:
         return self
 
 
-def run(folder: Path, files: set[str | None], last: int | None = None) -> tuple[int, int]:
+def run(folder: Path, files: set[str | None] | None = None, last: int | None = None) -> tuple[int, int]:
     """Makes what is missing in a process of its own, which ends before line `last` of `files`: wait status, lines."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
-        lines = Lines(files, last)
-        sys.settrace(lines)
+        lines = Lines(files or set(), last)
+        sys.settrace(lines if files else None)
         make_dataset(config(folder))
         sys.settrace(None)
         os.write(writer, str(lines.count).encode())
@@ -95,7 +95,7 @@ def main(folder: Path, kills: int) -> None:
         met["partial"] += any(place.rglob("*.partial"))
         met["staged"] += any(place.glob(".staging/*.tar"))
         met["unlisted"] += len(list(place.glob("*.tar"))) > len(published)
-        run(place, OURS)
+        run(place)
         verified_shards(place, published)
         if {path.name for path in place.rglob("*")} != expected:
             wrong.append(f"{sorted(path.name for path in place.rglob('*'))} after line {last}")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from network.states import silent
 
 from hgn import rollout
 from hgn.config import NetworkConfig
@@ -65,7 +66,7 @@ def test_a_network_without_obstacles_gets_none(tmp_path: Path) -> None:
     """Its random scene is one of the second data set's: four cubes and nothing else."""
     config = NetworkConfig(width=8, levels=2, message_passing_steps=1, obstacle_features=False)
     file, out = tmp_path / "free.safetensors", str(tmp_path / "a.vtkhdf")
-    save_weights(file, build_network(config), WeightsInfo(config, 60.0, 1 / 64))
+    save_weights(file, silent(build_network(config)), WeightsInfo(config, 60.0, 1 / 64))
     assert rollout.main({"weights": str(file), "frames": 2, "out": out}) == 0
     made = read_rollout(out)
     assert not made.obstacles and made.position_TN3.shape[1] == 4296
