@@ -22,7 +22,7 @@ from hgn.schema import ConfigError, require
 # what trimesh raises for damaged files of these formats
 _READ_ERRORS = (
     *(ValueError, LookupError, TypeError, AttributeError, EOFError, struct.error, ImportError),
-    *(ArithmeticError, MemoryError, RecursionError, OSError),
+    *(ArithmeticError, MemoryError, RecursionError, NotImplementedError, OSError),
 )
 
 

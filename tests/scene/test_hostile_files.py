@@ -95,6 +95,15 @@ def test_mesh_that_names_other_files(tmp_path: Path, uri: str) -> None:
         load_mesh(folder / "mesh.glb")
 
 
+def test_mesh_of_another_gltf(tmp_path: Path) -> None:
+    """A GLB of a version that is not read is refused with a message."""
+    content = bytearray(trimesh.creation.box().export(file_type="glb"))
+    content[4] = 0
+    (tmp_path / "mesh.glb").write_bytes(content)
+    with pytest.raises(ConfigError, match="mesh must be a readable GLB file"):
+        load_mesh(tmp_path / "mesh.glb")
+
+
 def test_rollout_with_data_of_other_files(tmp_path: Path) -> None:
     """HDF5 can take data from any file that its reader may read: such a file is refused."""
     path, foreign = tmp_path / "rollout.vtkhdf", tmp_path / "foreign"
