@@ -1,5 +1,5 @@
 # make demo: from nothing to a trained, exported and simulated network, in minutes on two CPU cores
-# make test: the tests        make check: all that CI runs
+# make test: the tests        make slow: those of them that compile for minutes        make check: all that CI runs
 PYTHON ?= $(shell command -v python3.12 >/dev/null 2>&1 && python3.12 --version >/dev/null 2>&1 && echo python3.12 \
 	|| (command -v python3.11 >/dev/null 2>&1 && python3.11 --version >/dev/null 2>&1 && echo python3.11) || echo python3)
 VENV := .venv
@@ -10,7 +10,7 @@ TEST_PROCESSES ?= 2
 # the tests start a hundred processes, each of which would compile the package anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test check format lint types layers docs film clean
+.PHONY: setup demo test slow check format lint types layers docs film clean
 
 setup: $(VENV)/.installed
 
@@ -52,6 +52,10 @@ demo: $(VENV)/.demo
 
 test: setup
 	$(RUN) -m pytest -n $(TEST_PROCESSES)
+
+# exported packages of each kind of network, which PyTorch compiles: before a release, and where exports change
+slow: setup
+	$(RUN) -m pytest -n $(TEST_PROCESSES) -m slow
 
 check: setup format lint types layers docs test
 

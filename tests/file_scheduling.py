@@ -15,6 +15,8 @@ LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them 
     *("tools/test_error_vs_time", "kernels/test_relative", "kernels/test_update", "jobs/test_queue"),
     *("datagen/test_service", "training/test_resume", "training/test_live_service", "kernels/test_memory"),
     *("test_command", "kernels/test_symmetry", "kernels/test_network", "training/test_precompile"),
+    *("kernels/test_training", "tools/studies/test_solver_targets", "runtime/test_exported_step"),
+    *("docs/test_notebooks", "runtime/test_differentiable"),
 )
 GENERATING = ("training/test_generator", "end_to_end/test_datagen", "docs/test_tutorials")  # water around a solid
 PLACES = {name: number for number, name in enumerate(LONGEST_FILES)}
