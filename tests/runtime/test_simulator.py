@@ -203,6 +203,9 @@ def test_what_loaded_weights_cannot_take(tmp_path: Path) -> None:
             ConfigError, match=r"gravity must be the weights' \(0.0, -9.8, 0.0\), .* got \(0.0, 0.0, 0.0\)"
         ):
             simulator.start([floating])
+        simulator.start([replace(start, gravity=(0.0, -9.8002, 1e-4))])  # as estimated from trajectories
+        with pytest.raises(ConfigError, match="gravity must be the weights'"):
+            simulator.start([replace(start, gravity=(0.0, -9.82, 0.0))])
         if sees:
             with pytest.raises(ConfigError, match=r"cell_size must be the weights' 0.015625, .* got 0.03125"):
                 next(simulator.frames(coarse))
