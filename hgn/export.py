@@ -10,6 +10,7 @@ import numpy as np
 
 from hgn.command import run_command
 from hgn.config import StoredPrecision
+from hgn.network.features import ParticleState
 from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, write_package
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
@@ -65,7 +66,7 @@ def main(mapping: dict[str, Any]) -> int:
     if config.arrays is not None:
         assert config.scene is not None
         simulator = Simulator(network, info.frame_rate_hz, "torch", info=info)
-        write_arrays(Path(config.arrays), simulator, config.scene)
+        write_arrays(Path(config.arrays), simulator.start([load_scene(find_scene(config.scene))]))
         print(config.arrays)
     if config.onnx is not None or config.package is not None:
         program = traced_step(network, info)
@@ -103,10 +104,10 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32") -> 
     save_weights(out, network, info, stored_precision)
 
 
-def write_arrays(folder: Path, simulator: Simulator, scene: str) -> None:
-    """What a step is first given for a scene, an .npy file each. Raises: ConfigError as Simulator.start."""
+def write_arrays(folder: Path, state: ParticleState) -> None:
+    """What a step is first given, an .npy file each."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, array in initial_arrays(simulator.start([load_scene(find_scene(scene))])).items():
+    for name, array in initial_arrays(state).items():
         np.save(folder / f"{name}.npy", array)
 
 

@@ -291,7 +291,7 @@ class _Remote:
         for again in (True, False):
             if not path.exists():
                 try:
-                    self._fetch_into_room(name, sha256, size, path, patience_s, spared)
+                    self._fetch(name, sha256, size, path, patience_s, spared)
                 except FileNotFoundError:
                     raise ConfigError(
                         f"{self._url}/{name} is listed in the manifest but missing; run the generator again"
@@ -327,41 +327,42 @@ class _Remote:
         if written != expected:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
 
-    def _fetch_into_room(
+    def _fetch(
         self, name: str, sha256: str, size: int, path: Path, patience_s: float, spared: Collection[str] | None
     ) -> None:
-        while True:
-            try:
-                over = _bytes_over(path.parent, size)
-                if over > 0:
-                    raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
-                return self._fetch(name, sha256, size, path, patience_s)
-            except OSError as error:
-                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or spared is None:
-                    raise
-                if not _make_room(path.parent, max(over, size), spared):
-                    raise
-
-    def _fetch(self, name: str, sha256: str, size: int, path: Path, patience_s: float) -> None:
         self._require_not_away(name, patience_s)
         _make_folder(path.parent)
         with _owned(path, f"{self._url}/{name}", patience_s) as file:
             if file is None:
                 return
-            # what a process that ended had fetched is gone on with, unless the disk did not keep it
-            for resume in (True, False):
-                if not resume:
-                    file.truncate(0)
-                if self._fill(file, name, size, patience_s) == sha256:
+            while True:  # room is made by the file's owner alone: two that need one shard would make it twice
+                over = _bytes_over(path.parent, size)
+                try:
+                    if over > 0:
+                        raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
+                    self._fill_whole(file, name, sha256, size, patience_s)
                     break
-            else:
-                raise ConfigError(
-                    f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
-                )
-            os.fsync(file.fileno())
+                except OSError as error:
+                    if error.errno not in (errno.ENOSPC, errno.EDQUOT) or spared is None:
+                        raise
+                    if not _make_room(path.parent, max(over, size), spared):
+                        raise
             Path(file.name).replace(path)
         sync_folder(path.parent)
         _verified.add(_identity(path, sha256))
+
+    def _fill_whole(self, file: io.BufferedRandom, name: str, sha256: str, size: int, patience_s: float) -> None:
+        # what a process that ended had fetched is gone on with, unless the disk did not keep it
+        for resume in (True, False):
+            if not resume:
+                file.truncate(0)
+            if self._fill(file, name, size, patience_s) == sha256:
+                break
+        else:
+            raise ConfigError(
+                f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
+            )
+        os.fsync(file.fileno())
 
     def _fill(self, file: io.BufferedRandom, name: str, size: int, patience_s: float) -> str:
         """Appends what is missing and returns the sha256 of the whole."""

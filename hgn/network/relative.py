@@ -166,7 +166,7 @@ def balanced(
 
     With a particle's shares w_pC of the coarsest cells, their mass M, mean acceleration R and mean stress S, e from a
     cell to its neighbour C', d disturbed and t touched: a_p = sum_C w_pC d_C (r_p - (1 - t_C) R_C + A_C), where
-    A_C = sum_C' d_C' f' T, T = (S_C + S_C') e / 2, f = M_C / (M_C + M_C') and f' = 1 - f. Times M_C this is
+    A_C = sum_C' d_C' f' T, T = (S_C + S_C') e / 2, f = M_C / (M_C + M_C') and f' = 1 - f. Times M_C d_C this is
     antisymmetric, and no small mass is divided by: sum_p a_p = sum_C d_C t_C M_C R_C, which is 0 where no surface is
     within reach. (Cells exchange momentum across faces as in finite volumes; a symmetric stress makes no spin.)
 

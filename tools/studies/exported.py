@@ -75,7 +75,7 @@ def main(mapping: dict[str, Any]) -> int:
         simulator = Simulator.load(name, "cpu", "torch", "fp32")
         for particles in SIZES:
             for obstacles in (False, True):
-                row = measured(simulator, paths, particles, obstacles, config.rounds)
+                row = measured(simulator, paths, particles, obstacles, config)
                 add("steps", {"weights": name} | row)
         if config.examples is not None:
             for row in simulated(simulator, paths, config):
@@ -86,7 +86,7 @@ def main(mapping: dict[str, Any]) -> int:
 
 
 def measured(
-    simulator: Simulator, paths: dict[str, Path], particles: int, obstacles: bool, rounds: int
+    simulator: Simulator, paths: dict[str, Path], particles: int, obstacles: bool, config: ExportedConfig
 ) -> dict[str, Any]:
     """Errors on all threads, and the least CPU time of a frame on one, in turns: other work beside it counts little."""
     network = simulator.network
@@ -107,7 +107,13 @@ def measured(
         row[f"error_{name}"] = max(
             float(np.abs(np.asarray(x) - y).max()) for x, y in zip(outputs, expected, strict=True)
         )
-    row["check"] = checked(row["error_onnx"], row["error_package"])
+    if config.examples is not None:
+        folder = Path(config.folder) / "case_arrays"
+        write_arrays(folder, state)
+        for program in PROGRAMS:
+            found_TN3 = run_example(program, paths, folder, 2, config)
+            row[f"error_{program}"] = float(np.abs(found_TN3[1] - expected[0]).max())
+    row["check"] = checked(*(value for key, value in row.items() if key.startswith("error_")))
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
@@ -119,12 +125,12 @@ def measured(
         "cpu": lambda: stepped(own.predict, state),
     }
     contenders = [
-        Timed(lambda step=step: [cpu_milliseconds(step)], rounds)  # type: ignore[misc]
+        Timed(lambda step=step: [cpu_milliseconds(step)], config.rounds)  # type: ignore[misc]
         for step in steps.values()
     ]
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    alternate(contenders, rounds, seconds=60.0)
+    alternate(contenders, config.rounds, seconds=60.0)
     torch.set_num_threads(threads)
     return row | {f"ms_{name}": min(timed.milliseconds) for name, timed in zip(steps, contenders, strict=True)}
 
@@ -132,23 +138,27 @@ def measured(
 def simulated(simulator: Simulator, paths: dict[str, Path], config: ExportedConfig) -> list[dict[str, Any]]:
     """What each example makes of the scene, against the backend torch: the largest error of the first frame, and how
     far particles are apart later (root mean square), where a start displaced by 1e-6 is the measure."""
-    assert config.examples is not None
-    arrays = Path(config.folder) / f"{config.scene}_arrays"
-    write_arrays(arrays, simulator, config.scene)
-    scene = load_scene(find_scene(config.scene))
+    scene, arrays = load_scene(find_scene(config.scene)), Path(config.folder) / f"{config.scene}_arrays"
+    write_arrays(arrays, simulator.start([scene]))
     offset_N3 = TOLERANCE * np.random.default_rng(0).choice([-1, 1], scene.position_N3.shape).astype(np.float32)
     (expected_TN3,) = simulator.rollout([scene], config.frames)
     (displaced_TN3,) = simulator.rollout([replace(scene, position_N3=scene.position_N3 + offset_N3)], config.frames)
     rows = [{"program": "backend torch, displaced", "check": PASS} | distances(displaced_TN3, expected_TN3)]
-    for program, ending in PROGRAMS.items():
-        out = Path(config.folder) / f"{program}.npy"
-        words = [str(word) for word in (Path(config.examples) / program, paths[ending], arrays, config.frames, out)]
-        subprocess.run(words, check=True)
-        found_TN3 = np.load(out)
+    for program in PROGRAMS:
+        found_TN3 = run_example(program, paths, arrays, config.frames, config)
         error = float(np.abs(found_TN3[1] - expected_TN3[1]).max())
         row = {"program": program, "error": error, "check": checked(error)}
         rows.append(row | distances(found_TN3, expected_TN3))
     return [{"scene": config.scene, "particles": len(offset_N3)} | row for row in rows]
+
+
+def run_example(program: str, paths: dict[str, Path], arrays: Path, frames: int, config: ExportedConfig) -> np.ndarray:
+    """The positions [T, N, 3] that a program in C++ makes of what a step is first given."""
+    assert config.examples is not None
+    out = Path(config.folder) / f"{program}.npy"
+    words = (Path(config.examples) / program, paths[PROGRAMS[program]], arrays, frames, out)
+    subprocess.run([str(word) for word in words], check=True, stdout=subprocess.DEVNULL)
+    return np.asarray(np.load(out))
 
 
 def distances(found_TN3: np.ndarray, expected_TN3: np.ndarray) -> dict[str, Any]:
