@@ -301,12 +301,18 @@ def lose_power(scenario: Any, folder: Path, every: int, rounds: int, seed: int) 
         scenario.write(folder / "disk", promised)
     for place, then in laid_out:
         tried += 1
-        try:
-            scenario.check(place, then)
-        except (AssertionError, ConfigError, OSError, LookupError, ValueError) as error:
-            faults.append(f"{place.name}: {type(error).__name__}: {error}")
+        faults += broken(scenario, place, then, place.name)
         shutil.rmtree(place)
     return calls, tried, faults
+
+
+def broken(scenario: Any, place: Path, promised: dict[str, Any], when: str) -> list[str]:
+    """What a folder does not hold of what was promised, none or one."""
+    try:
+        scenario.check(place, promised)
+    except (AssertionError, ConfigError, OSError, LookupError, ValueError) as error:
+        return [f"{when}: {type(error).__name__}: {error}"]
+    return []
 
 
 def fail(scenario: Any, folder: Path, every: int, piece: int | None) -> tuple[int, list[str]]:
@@ -333,10 +339,7 @@ def fail(scenario: Any, folder: Path, every: int, piece: int | None) -> tuple[in
         if calls < number:
             return last, faults
         last += 1
-        try:
-            scenario.check(place, promised)
-        except (AssertionError, ConfigError, OSError, LookupError, ValueError) as error:
-            faults.append(f"after call {number}: {type(error).__name__}: {error}")
+        faults += broken(scenario, place, promised, f"after call {number}")
         shutil.rmtree(place)
         number += every
 
