@@ -1,4 +1,6 @@
-"""On a GPU: teams of one block and of several give what one launch a substep gives."""
+"""On a GPU: teams of one block and of several give what one launch a substep gives, also where not all fit."""
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,12 @@ SHEET = Obstacle(
 )  # fmt: skip
 
 
+def _scene() -> Scene:
+    position = np.random.default_rng(0).uniform((0.3, 0.35, 0.3), (0.5, 0.55, 0.5), (3000, 3)).astype(np.float32)
+    kinds = (np.arange(3000) % 3).astype(np.uint8)
+    return Scene(position, np.tile(np.float32((0, -2, 0)), (3000, 1)), kinds, (SHEET,), cell_size=1 / 32)
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize(("threads", "blocks", "run"), [(256, 1, 8), (128, 2, 8), (128, 40, 1), (512, 60, 8)])
@@ -20,17 +28,34 @@ def test_teams_agree_with_one_launch_a_substep(threads: int, blocks: int, run: i
     """Three materials on a sheet: one frame agrees to 1e-6, twelve to 1e-4 of the domain; as many substeps. With 60
     blocks of 512 threads two teams take three scenes.
     """
-    from datagen.mpm.solver import Simulated, Team, simulate
+    from datagen.mpm.solver import Team, simulate
 
-    position = np.random.default_rng(0).uniform((0.3, 0.35, 0.3), (0.5, 0.55, 0.5), (3000, 3)).astype(np.float32)
-    kinds = (np.arange(3000) % 3).astype(np.uint8)
-    scene = Scene(position, np.tile(np.float32((0, -2, 0)), (3000, 1)), kinds, (SHEET,), cell_size=1 / 32)
     config = MpmConfig(device="gpu")
-    (expected,) = simulate([scene], config, 13, 60.0, team=Team(0))
-    found = simulate([scene] * 3, config, 13, 60.0, team=Team(threads, blocks, run))
-    assert isinstance(expected, Simulated)
-    for one in found:
-        assert isinstance(one, Simulated)
-        away_T = np.abs(one.position_TN3 - expected.position_TN3).max(axis=(1, 2))
+    expected = simulate([_scene()], config, 13, 60.0, team=Team(0))
+    _require_alike(expected * 3, simulate([_scene()] * 3, config, 13, 60.0, team=Team(threads, blocks, run)))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_blocks_that_do_not_fit_end_in_one_launch_a_substep(monkeypatch: pytest.MonkeyPatch) -> None:
+    """4,000 blocks of 512 threads that wait for each other are more than any GPU runs at once: a warning, no hang, and
+    the right result, apart from the order of sums.
+    """
+    from datagen.mpm import solver
+
+    monkeypatch.setattr(solver, "_teams_at_once", lambda device, team: 1)
+    config = MpmConfig(device="gpu")
+    expected = solver.simulate([_scene()], config, 13, 60.0, team=solver.Team(0))
+    with pytest.warns(RuntimeWarning, match="does not run 4000 blocks"):
+        found = solver.simulate([_scene()], config, 13, 60.0, team=solver.Team(512, 4000))
+    _require_alike(expected, found)
+
+
+def _require_alike(expected: list[Any], found: list[Any]) -> None:
+    from datagen.mpm.solver import Simulated
+
+    for one, other in zip(found, expected, strict=True):
+        assert isinstance(one, Simulated) and isinstance(other, Simulated)
+        away_T = np.abs(one.position_TN3 - other.position_TN3).max(axis=(1, 2))
         assert away_T[1] < 1e-6 and away_T.max() < 1e-4
-        assert one.counters["substeps"] == expected.counters["substeps"]
+        assert one.counters["substeps"] == other.counters["substeps"]
