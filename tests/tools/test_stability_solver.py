@@ -71,10 +71,12 @@ def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver_validation, "COLUMN_CELLS", 4)
     monkeypatch.setattr(solver_validation, "COLUMN_ASPECTS", (1.0,))
     monkeypatch.setattr(solver_validation, "OTHER_ASPECTS", (1.0,))
+    monkeypatch.setattr(solver_validation, "OTHER_GRAINS", ())
     monkeypatch.setattr(solver_validation, "SAND_LAWS", (("compression", 45.0),))
     monkeypatch.setattr(solver_validation, "REST_S", 3.0)
     cpu = MpmConfig(device="cpu")
-    rows = [row for part in ("rest", "dam_breaks", "columns") for row in getattr(solver_validation, part)(cpu)]
+    parts = ("rest", "dam_breaks", "columns", "column_laws")
+    rows = [row for part in parts for row in getattr(solver_validation, part)(cpu)]
     assert [row.case.split(",")[0] for row in rows] == [
         "level of water at rest", *["dam break"] * 3, *["sand column"] * 6
     ]  # fmt: skip

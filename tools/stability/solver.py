@@ -25,11 +25,12 @@ from tools.stability.solver_contact import contacts
 from tools.stability.solver_leak import OFFSETS, leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
 from tools.stability.solver_steps import Point, draw, largest_steps
-from tools.stability.solver_validation import columns, dam_breaks, grids, reposes, rest
+from tools.stability.solver_validation import column_laws, columns, dam_breaks, grids, reposes, rest
 
 PART = "solver"
 CASES = (
-    "steps", "stiffness", "impact", "convergence", "contact", "leak", "long", "rest", "dam", "column", "repose", "grid"
+    "steps", "stiffness", "impact", "convergence", "contact", "leak", "long", "rest", "dam", "column",
+    "column_law", "repose", "grid",
 )  # fmt: skip
 
 
@@ -37,7 +38,7 @@ CASES = (
 class StabilitySolverConfig:
     """`python -m tools.stability solver`: what is tried."""
 
-    # steps, stiffness, impact, convergence, contact, leak, long, rest, dam, column, repose, grid; null: all
+    # steps, stiffness, impact, convergence, contact, leak, long, rest, dam, column, column_law, repose, grid; null: all
     cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     device: Processor = "auto"  # or cpu, gpu
     leak_seconds: Positive[float] = 5.0  # simulated, for each row of the table of leaks
@@ -80,6 +81,7 @@ def main(mapping: dict[str, Any]) -> int:
         "rest": lambda: rest(mpm),
         "dam": lambda: dam_breaks(mpm),
         "column": lambda: columns(mpm),
+        "column_law": lambda: column_laws(mpm),
         "repose": lambda: reposes(mpm),
         "grid": lambda: grids(mpm, config.grid_cells),
     }

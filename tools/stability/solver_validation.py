@@ -60,6 +60,7 @@ COLUMN_DEPTH = 1 / 64  # of the radius: where sand is as deep, there is its edge
 COLUMN_WITHIN = 0.1
 COLUMN_ASPECTS = (0.5, 1.0, 1.5, 2.5, 4.0)
 COLUMN_GRAINS = 100  # in radius, where friction grows with the rate of flow
+OTHER_GRAINS = (50, 200)
 COLUMN_ROOM = 1.6  # times the radius expected
 COLUMN_TOP_CELLS = 2.5  # around the axis, where the height is taken
 LUBE_ANGLE_DEG = 31.0  # at which the quartz sand of Lube et al. 2004 rests
@@ -181,16 +182,30 @@ def impact(kind: int, cells: int) -> Scene:
 
 
 def columns(base: MpmConfig) -> list[Row]:
-    """Run-out and height of collapsed columns by the config's own law, and by others that are there for comparison."""
+    """Run-out and height of collapsed columns by the config's own law: as it is, and with grains as small beside the
+    radius as those of the experiments, where friction grows with the rate of flow.
+    """
     own = base.sand_friction_law, base.sand_friction_angle_deg
-    grains = dataclasses.replace(base, sand_grain_diameter_m=COLUMN_RADIUS / COLUMN_GRAINS)
-    cases = [(aspect, *own, config) for config in (base, grains) for aspect in COLUMN_ASPECTS]
-    cases += [(aspect, law, angle, base) for law, angle in SAND_LAWS for aspect in OTHER_ASPECTS]
-    return [row for case in cases for row in column_rows(*case, max(COLUMN_CELLS, math.ceil(COLUMN_CELLS / case[0])))]
+    configs = [dataclasses.replace(base, sand_grain_diameter_m=size) for size in (0.0, COLUMN_RADIUS / COLUMN_GRAINS)]
+    return [
+        row for config in configs for aspect in COLUMN_ASPECTS for row in column_rows(aspect, *own, config)
+    ]  # fmt: skip
 
 
-def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cells: int) -> list[Row]:
+def column_laws(base: MpmConfig) -> list[Row]:
+    """Run-out and height by other sizes of grains and other laws than the config's own."""
+    own = base.sand_friction_law, base.sand_friction_angle_deg
+    rows = []
+    for grains in OTHER_GRAINS:
+        config = dataclasses.replace(base, sand_grain_diameter_m=COLUMN_RADIUS / grains)
+        rows += [row for aspect in OTHER_ASPECTS for row in column_rows(aspect, *own, config)]
+    base = dataclasses.replace(base, sand_grain_diameter_m=0.0)
+    return rows + [row for law in SAND_LAWS for aspect in OTHER_ASPECTS for row in column_rows(aspect, *law, base)]
+
+
+def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cells: int | None = None) -> list[Row]:
     """How far a column of so many cells in radius runs out, and how high it stays at its axis, in initial radii."""
+    cells = cells or max(COLUMN_CELLS, math.ceil(COLUMN_CELLS / aspect))
     scene = column(aspect, cells)
     duration = TIMES * math.sqrt(aspect * COLUMN_RADIUS / GRAVITY)
     config = _sand(base, law, angle_deg)
