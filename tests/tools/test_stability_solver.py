@@ -81,7 +81,7 @@ def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
         "level of water at rest", *["dam break"] * 3, *["sand column"] * 6
     ]  # fmt: skip
     assert rows[1].held and rows[2].held
-    assert [row.predicted for row in rows[4:6]] == pytest.approx([1.24, 0.74])
+    assert [row.predicted for row in rows[4:6]] == pytest.approx([1.24, 0.81])
     assert rows[6].case.endswith("100 grains, run-out") and rows[6].predicted == rows[4].predicted
     assert rows[5].measured < rows[9].measured  # so few cells tell heights apart, not run-outs
 
@@ -100,6 +100,21 @@ def test_grids(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run_out.measured == pytest.approx((3 - 2 / 6) / (3 - 2 / 5) - 1)
     assert all(2.9 < value < 3.5 for value in front.more["series"])  # widths
     assert all(0.1 < value < 0.3 for value in block.more["series"])  # of a side: it has spread by then
+
+
+def test_rows_of_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slopes rest where sand shears along them, tan = 2 sin / sqrt(3 + sin²), or still move and do not hold; the quartz
+    sand's angle of repose is a row of its own.
+    """
+
+    def rests(angle: float, start: float, *_: object) -> tuple[float, float, float]:
+        return start, start if start < angle else {20.0: 22.2, 31.0: 30.8, 40.0: 32.9}[angle], 0.05 * (angle == 20)
+
+    monkeypatch.setattr(solver_validation, "repose", rests)
+    rows = solver_validation.reposes(MpmConfig(device="cpu"))
+    assert [row.predicted for row in rows] == pytest.approx([17, 21.2, 28, 29.7, 31, 37, 34.8], abs=0.05)
+    assert [row.held for row in rows] == [True, False, *[True] * 5]
+    assert rows[4].case.endswith("as quartz sand has it")
 
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 2.0])

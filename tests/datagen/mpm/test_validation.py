@@ -233,8 +233,11 @@ def test_sand_column_and_its_laws(low_column: tuple[Row, Row]) -> None:
 
 
 def test_published_heights_of_columns() -> None:
-    """Low columns keep their top, glass beads no more than 0.74; for tall ones two publications differ by a third."""
-    assert heights(0.5) == (0.5,) and heights(1.5) == (0.74,)
+    """Low columns keep their top, glass beads no more than 0.74; from where it meets a column's own height on, sand's
+    is a power of the aspect, a third higher at aspect 4.
+    """
+    assert heights(0.5) == (0.5, 0.5) and heights(0.8) == (0.74, 0.8)
+    assert heights(1.5) == pytest.approx((0.74, 0.9415), abs=1e-3)
     assert heights(4.0) == pytest.approx((0.74, 1.109), abs=1e-3)
 
 
