@@ -38,7 +38,8 @@ class StabilityNetworkConfig:
     cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
     frames: int = 300
     long_frames: int = 3000  # of the case rest
-    scenes_at_once: Positive[int] = 1  # in each rollout of throw, gravity and collision, at least
+    # in each rollout of throw, gravity and collision; null: as many as a row has throws
+    scenes_at_once: Positive[int] | None = None
     # also ask the solver, which needs Taichi: for slope, collision and rest; without it rest is left out
     solver: bool = True
     solver_device: Processor = "auto"  # or cpu, gpu

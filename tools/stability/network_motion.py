@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
@@ -70,11 +71,11 @@ def motion_rows(
     scene: SceneConfig,
     materials: Sequence[str],
     cases: Sequence[str],
-    together: int,
+    together: int | None,
     solver: MpmConfig | None,
 ) -> Iterator[Row]:
-    """Rows of the cases throw, gravity and collision among `cases`, with at least so many scenes `together` in each
-    rollout. With settings of the solver that simulates collisions too.
+    """Rows of the cases throw, gravity and collision among `cases`, with so many scenes `together` in each rollout;
+    none: a row's throws side by side. With settings of the solver that simulates collisions too.
     """
     for material in materials:
         for speed in SPEEDS if "throw" in cases else ():
@@ -88,7 +89,7 @@ def motion_rows(
         if "gravity" in cases and solver is not None and len(set(scene.domain_size)) == 1:
             yield from turned_rows(simulator, scene, material, solver)
         if "collision" in cases:
-            yield meeting_row(simulator, scene, material, together, solver)
+            yield meeting_row(simulator, scene, material, together or 1, solver)
 
 
 def cube(scene: SceneConfig, material: str, centre_3: np.ndarray, velocity_3: np.ndarray, seed: int = 0) -> Scene:
@@ -112,17 +113,22 @@ def flight_row(
     scene: SceneConfig,
     material: str,
     throws: dict[str, np.ndarray],
-    together: int,
+    together: int | None,
 ) -> Row:
     """Whether all throws keep their velocity and fall as gravity says, in each frame of the flight."""
     middle_3 = 0.5 * np.array(scene.domain_size)
-    labels = list(throws) * -(-together // len(throws))  # the same again with other random places
+    together = together or len(throws)
+    # full rollouts: the same throws again with other random places
+    labels = list(islice(cycle(throws), together * -(-len(throws) // together)))
     scenes = [cube(scene, material, middle_3, throws[label], seed) for seed, label in enumerate(labels)]
     reach = REACH * simulator.network.config.cell_size
     frames = [flight_frames(item, simulator.frame_rate_hz, reach) for item in scenes]
-    trials = _rollouts(simulator, scenes, max(frames) + 1)
-    if isinstance(trials, str):
-        return Row(name, GRAVITY_WITHIN, "refused", False, trials)
+    trials: list[RolloutResult] = []
+    for first in range(0, len(scenes), together):
+        some = _rollouts(simulator, scenes[first : first + together], max(frames[first : first + together]) + 1)
+        if isinstance(some, str):
+            return Row(name, GRAVITY_WITHIN, "refused", False, some)
+        trials += some
     causes = [trial.cause for trial, last in zip(trials, frames, strict=True) if trial.frame_count <= last]
     if causes:
         return Row(name, GRAVITY_WITHIN, "diverged", False, str(causes[0]))
@@ -130,7 +136,7 @@ def flight_row(
     at = max(range(len(flights)), key=lambda i: flights[i].error)
     worst, error = flights[at], flights[at].error
     beyond, held = f"gravities off in frame {worst.error_frame} {labels[at]}", error <= GRAVITY_WITHIN
-    more: dict[str, object] = {"scenes": len(scenes), "particles": sum(item.particle_count for item in scenes)}
+    more: dict[str, object] = {"scenes": together, "particles": sum(item.particle_count for item in scenes[:together])}
     kept = {i: found.kept for i, found in enumerate(flights) if found.kept is not None}
     if kept:
         at = min(kept, key=lambda i: kept[i])
