@@ -14,10 +14,9 @@ unexport PYTHONDONTWRITEBYTECODE
 
 setup: $(VENV)/.installed
 
-# modules are compiled as they are used: that of all at once takes longer than the tests of some
-INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --progress-bar off --no-compile -c constraints.txt
+INSTALL = .ci/install $(VENV)
 
-# but Taichi, which Python warns of as it compiles it
+# modules are compiled as they are used, but Taichi here: Python warns of it as it compiles it
 COMPILE = $(RUN) -W ignore -m compileall -q $(VENV)/lib/python*/site-packages/taichi
 
 $(VENV)/.created:
