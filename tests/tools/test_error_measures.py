@@ -242,14 +242,19 @@ def test_paired_differences() -> None:
 
 
 def test_paired_rows_are_told() -> None:
-    """A network stands beside GNS and each setting of the solver, in the errors and frames that both have of scenes."""
+    """A network stands beside GNS, each setting of the solver and other weights at its precision, in the errors and
+    frames that both have of scenes.
+    """
     rows = report_rows()
+    other = rows[0] | {"weights": "other.safetensors", "by_scene": {"position MSE": {"50": [1.5, 2.5, 3.5]}}}
     for row, values in ((rows[0], [1.0, 2.0, 3.0]), (rows[2], [2.0, 3.0, 4.0]), (rows[5], [0.0, 2.0, 4.0])):
         row["by_scene"] = {"position MSE": {"50": values}}
     rows[0]["by_scene"]["one-step MSE"] = rows[2]["by_scene"]["one-step MSE"] = {"0": [1.0, 1.0]}
     made = paired_rows(rows)
     of_hgn = [(row["other"].split(",")[0], row["error"]) for row in made if row["one"].startswith("HGN")]
     assert of_hgn == [("GNS M = 4", "one-step MSE"), ("GNS M = 4", "position MSE"), ("MPM 64³", "position MSE")]
+    beside = paired_rows([*rows, other, other | {"precision": "another"}])
+    assert [(row["error"], row["mean"][0]) for row in beside if "(other" in row["other"]] == [("position MSE", -0.5)]
     told = "\n".join(paired_lines(made))
     assert "position MSE after 50 frames, 3 scenes: nearer in the median (-1.00e+00, -1.00e+00 to -1.00e+00)" in told
     assert "MPM 64³, step 0.5, position MSE after 50 frames, 3 scenes: no difference shown in the median" in told

@@ -39,13 +39,18 @@ def paired_difference(one_S: Sequence[float | None], other_S: Sequence[float | N
 
 
 def paired_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Every network at every precision beside every GNS and every setting of the solver, for each error that both have
-    of scenes: {"one", "other", "error", "frame", …} and `paired_difference`.
+    """Every network at every precision beside every GNS, every setting of the solver, and later rows of the same kind
+    with other weights at its precision, for each error that both have of scenes: {"one", "other", "error", "frame", …}
+    and `paired_difference`.
     """
     told = [row for row in rows if row.get("by_scene")]
     made = []
-    for one in (row for row in told if row["system"] in NETWORK_KINDS):
-        for other in (row for row in told if row["system"] in (*NETWORK_KINDS[1:], "mpm") and row is not one):
+    for i, one in enumerate(told):
+        if one["system"] not in NETWORK_KINDS:
+            continue
+        alike = [row for row in told[i + 1 :] if row["system"] == one["system"] == "hgn" and _other_weights(row, one)]
+        others = [row for row in told if row["system"] in (*NETWORK_KINDS[1:], "mpm") and row is not one]
+        for other in (*alike, *others):
             for error, values in one["by_scene"].items():
                 for frame in values.keys() & other["by_scene"].get(error, {}).keys():
                     found = paired_difference(values[frame], other["by_scene"][error][frame])
@@ -67,6 +72,10 @@ def paired_lines(rows: Sequence[Row]) -> list[str]:
             f"  {row['one']} beside {row['other']}, {row['error']}{at}, {row['scenes']} scenes: {'; '.join(parts)}"
         )
     return lines
+
+
+def _other_weights(one: Row, other: Row) -> bool:
+    return one["weights"] != other["weights"] and one["precision"] == other["precision"]
 
 
 @functools.cache
