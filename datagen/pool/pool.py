@@ -159,6 +159,7 @@ class Pool:
         self._makers: list[Worker] = []
         self._solvers: list[Worker] = []
         self._counted, self._next_look, self._said_waiting = self._writer.done, 0.0, False
+        self._awake_at = time.monotonic()
         self._progress.start(self._writer.done, self._writer.total, self._config.dataset.frames)
         try:
             while True:
@@ -285,10 +286,12 @@ class Pool:
             else:
                 self._replace(worker, worker.cause_of_death())
         # a process that is stopped, or waits for a device for ever; actors of a cluster speak at the end alone
-        silence = self._config.dataset.worker_silence_s
+        silence, now = self._config.dataset.worker_silence_s, time.monotonic()
+        slept, self._awake_at = now - self._awake_at > silence / 2, now
         for worker in (*self._makers, *self._solvers):
-            silent = isinstance(worker, LocalWorker) and time.monotonic() - worker.heard_at > silence
-            if silent and worker.tasks:
+            if slept:  # this process was stopped itself (Ctrl-Z, a frozen container), and they with it
+                worker.heard_at = now
+            elif isinstance(worker, LocalWorker) and worker.tasks and now - worker.heard_at > silence:
                 self._replace(worker, f"it said nothing for {silence:.0f} s")
 
     def _handle(self, worker: Worker, kind: str, *values: Any) -> None:

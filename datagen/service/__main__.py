@@ -10,6 +10,7 @@ import errno
 import ipaddress
 import socket
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from datagen.generate import KEYS, StopSignal, datagen_config, require_local_fol
 from datagen.pool.progress import PROGRESS_KINDS, make_progress
 from datagen.pool.worker import Backend
 from datagen.service.health import HealthPage
+from datagen.service.log import UnhurriedLog
 from datagen.service.supervisor import Supervisor
 from hgn.command import run_command
 from hgn.config import ServiceConfig
@@ -43,6 +45,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     token = dataset_token()
     with ExitStack() as stack, StopSignal() as stop:
         listener = stack.enter_context(_listen(service.host, service.port, token))
+        log = stack.enter_context(UnhurriedLog())
         page = None
         if service.health_port is not None:
             page = stack.enter_context(HealthPage(_listen(service.host, service.health_port, token)))
@@ -51,7 +54,9 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
 
         progress = make_progress(kind)
         with Supervisor(config.awaited, progress, backend) as supervisor:
-            app = make_app(folder, token, lambda: supervisor.state)
+            app = make_app(
+                folder, token, lambda: replace(supervisor.state, log_error=log.error or supervisor.state.log_error)
+            )
             every_second = None if page is None else telling(page, app)
             server = make_server(app, service.connections, allow_open_files(_OPEN_FILES), every_second=every_second)
 

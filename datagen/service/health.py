@@ -33,25 +33,39 @@ class HealthPage:
 
     def __init__(self, listener: socket.socket) -> None:
         self._listener = listener
+        self._taken_at = 0.0  # when the process last took what it was told
 
     def tell(self, status: int, content: dict[str, Any]) -> None:
-        """What to answer from now on. Waits for nobody."""
-        with contextlib.suppress(BlockingIOError, ConnectionError):
+        """What to answer from now on. Waits for nobody; a process that has ended, or takes nothing, is replaced."""
+        try:
             self._ours.send(json.dumps([status, content]).encode()[:_LARGEST_PAGE])
+            self._taken_at = time.monotonic()
+        except (BlockingIOError, ConnectionError):
+            if self._process.poll() is not None or time.monotonic() - self._taken_at > SILENCE_S:
+                self._end()
+                self._begin()
 
     def __enter__(self) -> HealthPage:
+        self._begin()
+        return self
+
+    def _begin(self) -> None:
         self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._ours.setblocking(False)
-        with self._listener, theirs:
+        self._taken_at = time.monotonic()
+        with theirs:
             files = self._listener.fileno(), theirs.fileno()
             command = [sys.executable, "-m", "datagen.service.health", *map(str, files)]
             # the package is found where this one was
             self._process = subprocess.Popen(command, pass_fds=files, cwd=Path(__file__).resolve().parents[2])
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._end()
+        self._listener.close()
+
+    def _end(self) -> None:
         self._ours.close()
         self._process.kill()
         self._process.wait()
@@ -61,7 +75,7 @@ class _Page:
     def __init__(self, source: socket.socket) -> None:
         self._source = source
         self._told: tuple[float, int, Any] = (time.monotonic(), 503, {"status": "the service has not begun"})
-        self._connections = 0
+        self._connections: dict[asyncio.StreamWriter, None] = {}  # the oldest first
 
     def listen(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -69,17 +83,20 @@ class _Page:
                 self._told = (time.monotonic(), *json.loads(self._source.recv(_LARGEST_PAGE)))
 
     async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._connections += 1
+        self._connections[writer] = None
+        if len(self._connections) > _CONNECTIONS:
+            oldest = next(iter(self._connections))
+            del self._connections[oldest]
+            oldest.transport.abort()
         try:
-            if self._connections <= _CONNECTIONS:
-                async with asyncio.timeout(_PATIENCE_S):
-                    await reader.readuntil(b"\r\n\r\n")
-                    writer.write(self._page())
-                    await writer.drain()
+            async with asyncio.timeout(_PATIENCE_S):
+                await reader.readuntil(b"\r\n\r\n")
+                writer.write(self._page())
+                await writer.drain()
         except (OSError, EOFError, asyncio.LimitOverrunError):  # TimeoutError is an OSError
             pass
         finally:
-            self._connections -= 1
+            self._connections.pop(writer, None)
             writer.close()
 
     def _page(self) -> bytes:

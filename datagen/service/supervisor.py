@@ -1,8 +1,8 @@
 """The pool as a process of its own, kept alive by the service: whatever becomes of it, what is published is served.
 
-A pool that dies, or ends for want of disk space, is started again after a pause that grows while no episode gets
-finished. One whose configuration is at fault is not: the service says so and goes on serving. A log that cannot be
-written ends nothing; a fault of the supervisor itself ends the service.
+A pool that dies, says nothing, or ends for want of disk space, is started again after a pause that grows while no
+episode gets finished. One whose configuration is at fault is not: the service says so and goes on serving. A log that
+cannot be written ends nothing; a fault of the supervisor itself ends the service.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -25,6 +26,7 @@ from hgn.system.processes import die_with_parent
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STOP_PATIENCE_S = 60.0
+_LOOK_S, _BEAT_S = 0.2, 1.0
 _EVENTS = ("start", "frame", "episode", "found", "shard", "message", "close")
 
 
@@ -107,21 +109,23 @@ class Supervisor:
         child.close()
         self._set(status="running", starts=self.state.starts + 1)
         outcome, text = "died", ""
-        asked, patience = False, _STOP_PATIENCE_S
+        asked, patience, silent_s, silence = False, _STOP_PATIENCE_S, 0.0, self._config.dataset.worker_silence_s
         try:
             while True:
                 if self._stopping.is_set() and not asked:
                     process.terminate()
                     asked = True
-                if not connection.poll(0.2):
-                    patience -= 0.2 * asked
-                    if patience < 0:
+                if not connection.poll(_LOOK_S):
+                    patience -= _LOOK_S * asked
+                    silent_s += _LOOK_S  # by looks, not by a clock: this process may have been stopped, too
+                    if patience < 0 or silent_s > silence:
                         process.kill()
                     continue
                 kind, *values = connection.recv()
+                silent_s = 0.0
                 if kind in _EVENTS:
                     self._note(kind, *values)
-                else:
+                elif kind != "alive":
                     outcome, text = kind, " ".join(str(value) for value in values if value is not None)
         except (EOFError, ConnectionResetError):
             process.join()
@@ -130,6 +134,8 @@ class Supervisor:
         if outcome == "died":
             code = process.exitcode or 0
             text = f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+            if silent_s > silence:
+                text = f"it said nothing for {silence:.0f} s"
         return outcome, text
 
     def _note(self, kind: str, *values: Any) -> None:
@@ -174,7 +180,16 @@ def _generate(connection: Connection, config: DatagenConfig, backend: Backend | 
         if parent is None or os.getppid() != parent.pid:
             return
         try:
-            finished = generate(config, _PipeProgress(connection), stop.requested, backend)
+            spoke_at = -_BEAT_S
+
+            def should_stop() -> bool:
+                nonlocal spoke_at
+                if time.monotonic() - spoke_at > _BEAT_S:  # so that a pool that is stopped is noticed
+                    spoke_at = time.monotonic()
+                    connection.send(("alive",))
+                return stop.requested()
+
+            finished = generate(config, _PipeProgress(connection), should_stop, backend)
             connection.send(("complete",) if finished else ("stopped",))
         except (BrokenPipeError, ConnectionResetError):
             return  # the service is gone; what is finished is kept

@@ -31,9 +31,9 @@ class _Length:
 class SendfileProtocol(H11Protocol):
     """Uvicorn's HTTP on asyncio's own loop with `http.response.zerocopysend`, and with an end to all waiting.
 
-    A connection on which no whole request comes for `patience_s`, or whose answer is not taken, is cut. Where there are
-    more than `most_connections`, the one that has been without a request for longest makes room. Uvicorn's own limits
-    are silent until a first answer was sent, and count connections without a request as load.
+    A connection on which no whole request comes for `patience_s`, or whose answer is taken too slowly, is cut. Where
+    there are more than `most_connections`, the one that has been without a request for longest makes room. Uvicorn's
+    own limits are silent until a first answer was sent, and count connections without a request as load.
     """
 
     patience_s = 30.0
@@ -42,7 +42,7 @@ class SendfileProtocol(H11Protocol):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.app = cast(Any, partial(self._with_extension, self.app))
-        self._seen: tuple[int, int] | None = None
+        self._seen: tuple[Any, bool, int] | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -62,13 +62,15 @@ class SendfileProtocol(H11Protocol):
     def _look(self) -> None:
         if self not in self.connections:
             return
-        unsent = self.transport.get_write_buffer_size()
-        seen = id(self.cycle), unsent
-        if seen == self._seen and (unsent or not self.busy):
-            self.transport.abort()
-        else:
-            self._seen = seen
-            self.loop.call_later(self.patience_s, self._look)
+        before, now = self._seen, (self.cycle, self.busy, self.transport.get_write_buffer_size())
+        self._seen = now
+        if before is not None and before[0] is self.cycle:
+            idle = not (before[1] or any(now[1:]))
+            slow = min(before[2], now[2]) > 0 and before[2] - now[2] < _PIECE_BYTES
+            if idle or slow:
+                self.transport.abort()
+                return
+        self.loop.call_later(self.patience_s, self._look)
 
     async def _with_extension(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
         async def send_all(message: Message) -> None:

@@ -32,7 +32,7 @@ import hgn.data.storage
 from datagen.service.server import make_app, make_server
 from datagen.service.supervisor import PoolState
 from hgn.command import run_command
-from hgn.data.manifest import Manifest
+from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import (
     CACHE_VARIABLE,
@@ -314,6 +314,21 @@ def test_full_cache(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, 
         path.unlink()
     with pytest.raises(OSError, match="the cache is full"):
         store.episodes[0]
+
+
+def test_clock_that_was_set_back(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was brought first makes room, also when this machine's clock stood in the future then."""
+    url = in_memory(folder, "clock")
+    first, second, third, *_ = sorted(Manifest.load(url).shards, key=lambda shard: -shard.bytes)
+
+    def bring(entry: ShardEntry) -> Path:
+        return open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
+
+    os.utime(bring(first), (2**33, 2**33))
+    brought = bring(second)
+    monkeypatch.setenv(LIMIT_VARIABLE, str((second.bytes + third.bytes) / 1e9))
+    expected = sorted([brought, bring(third)])
+    assert sorted(cache.glob("*.tar")) == expected
 
 
 def test_link_in_the_cache(folder: Path, cache: Path, tmp_path: Path) -> None:

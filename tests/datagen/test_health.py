@@ -46,7 +46,7 @@ def test_it_waits_for_nobody(page: tuple[HealthPage, int]) -> None:
     told.tell(200, {"status": "ok"})
     wait_until(lambda: ask(port) == (200, {"status": "ok"}))
     with ExitStack() as stack:
-        for _ in range(40):
+        for _ in range(100):
             stack.enter_context(socket.create_connection(("127.0.0.1", port)))
         assert ask(port)[0] == 200
 
@@ -62,6 +62,27 @@ def test_a_process_that_is_stopped_holds_nobody_up(page: tuple[HealthPage, int])
     wait_until(lambda: ask(port)[0] == 200)
     told.tell(200, {"status": "ok"})
     wait_until(lambda: ask(port) == (200, {"status": "ok"}))
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_process_that_is_gone_is_replaced(
+    page: tuple[HealthPage, int], monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """A process that was killed, or takes nothing for long, is replaced: who asks meanwhile is answered then."""
+    monkeypatch.setattr(health, "SILENCE_S", 0.0)
+    told, port = page
+    wait_until(lambda: ask(port)[0] == 503)
+    first = told._process
+    os.kill(first.pid, number)
+
+    def tell() -> bool:
+        told.tell(200, {"status": f"ok {1000 * 'x'}"})
+        return told._process is not first
+
+    wait_until(tell)
+    told.tell(200, {"status": "ok"})
+    wait_until(lambda: ask(port) == (200, {"status": "ok"}))
+    assert first.returncode == -signal.SIGKILL
 
 
 def test_silence_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

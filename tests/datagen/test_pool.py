@@ -328,8 +328,8 @@ class StoppedWorker(LocalWorker):
 
 def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     """A solver that has work and says nothing for too long (SIGSTOP, a device that hangs) is ended; one without work
-    is left alone. Its scene is tried again by another."""
-    now = [1000.0]
+    is left alone, and so are all when the pool was stopped, too. Its scene is tried again by another."""
+    now, passes = [1000.0], iter([250, 250, 10_000, 250, 250, 250, 250])
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     solvers: list[StoppedWorker] = []
 
@@ -342,9 +342,9 @@ def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest
             return solvers[-1]
 
         def receive(self, workers: Any, timeout: float) -> Any:
-            now[0] += 301
             if len(solvers) > 1:
                 raise TimeoutError("the test ends")
+            now[0] += next(passes)
             made = [(worker, task) for worker in workers for task in worker.tasks.values()]
             return [(worker, ("made", MadeScene(t, None, None))) for worker, t in made if isinstance(t, SceneTask)]
 
@@ -352,4 +352,4 @@ def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest
     with DatasetWriter(config) as writer, pytest.raises(TimeoutError):
         Pool(config, writer, recorder, ONE, Workers()).run()  # type: ignore[arg-type]
     assert recorder.messages[0].startswith("a worker died (it said nothing for 600 s); it is replaced")
-    assert solvers[0].killed and solvers[0].heard_at > 1000
+    assert solvers[0].killed and solvers[0].heard_at > 1000 and list(passes) == [250]

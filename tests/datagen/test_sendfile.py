@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import http.client
+import itertools
 import logging
 import socket
 import sys
 import threading
+from asyncio.selector_events import _SelectorSocketTransport
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -51,7 +53,8 @@ def serve(file: Path) -> Iterator[Port]:
 
     def serve(**limits: Any) -> tuple[int, uvicorn.Server]:
         listener = socket.create_server(("127.0.0.1", 0))
-        app = Starlette(routes=[Route("/file", answer)], middleware=[Middleware(Guard, token=None, counters=Counter())])
+        routes = [Route("/file", answer), Route("/page", lambda request: Response(bytes(2**24)))]
+        app = Starlette(routes=routes, middleware=[Middleware(Guard, token=None, counters=Counter())])
         server = make_server(app, **limits)
         begun.append((server, threading.Thread(target=server.run, kwargs={"sockets": [listener]})))
         begun[-1][1].start()
@@ -167,11 +170,20 @@ def test_who_only_waits_keeps_nobody_out(serve: Port, sent: bytes, file: Path) -
         assert len(server.server_state.connections) <= 8
 
 
-def test_waiting_comes_to_an_end(serve: Port) -> None:
-    """Connections that send nothing, half a request, or never read their answer, are cut."""
+@pytest.mark.parametrize("taken", [0, 1])
+def test_waiting_comes_to_an_end(serve: Port, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
+    """Connections that send nothing, half a request, or never read their answer, or a byte of it now and then, are
+    cut."""
+    real, left = _SelectorSocketTransport.get_write_buffer_size, itertools.count(2**23, -taken)
+    monkeypatch.setattr(
+        _SelectorSocketTransport, "get_write_buffer_size", lambda transport: min(real(transport), next(left))
+    )
     port, server = serve(**EIGHT, patience_s=0.2)
-    with waiting(port, b""), waiting(port, HALF), waiting(port, HALF + b"Host: x\r\n\r\n"):
-        wait_until(lambda: len(server.server_state.connections) == 3)
+    asked = (b"", HALF, HALF + b"Host: x\r\n\r\n", b"GET /page HTTP/1.1\r\nHost: x\r\n\r\n")
+    with ExitStack() as stack:
+        for sent in asked:
+            stack.enter_context(waiting(port, sent))
+        wait_until(lambda: len(server.server_state.connections) == 4)
         wait_until(lambda: not server.server_state.connections)
 
 

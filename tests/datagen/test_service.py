@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import multiprocessing
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -14,7 +16,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import unquote
 
@@ -285,6 +289,38 @@ def test_pool_that_dies_is_started_again(make_config: MakeConfig, backend: Backe
     assert Manifest.load(config.dataset.folder).complete
 
 
+def test_pool_that_says_nothing_is_started_again(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pool that was stopped, or hangs (in a folder that does not answer, say), is ended and started again."""
+    monkeypatch.setattr(datagen.service.supervisor, "_LOOK_S", 0.01)
+    started: list[Any] = []
+
+    class Process:
+        exitcode = None
+
+        def __init__(self, args: tuple[Any, ...], **options: Any) -> None:
+            self.connection = Connection(os.dup(args[0].fileno()))
+            started.append(self)
+
+        def start(self) -> None:
+            if len(started) > 1:
+                self.connection.send(("complete",))
+                self.connection.close()
+
+        def kill(self) -> None:
+            self.exitcode = -signal.SIGKILL
+            self.connection.close()
+
+        def join(self) -> None:
+            pass
+
+    context = SimpleNamespace(Pipe=multiprocessing.Pipe, Process=Process)
+    monkeypatch.setattr(multiprocessing, "get_context", lambda kind: context)
+    recorder = Recorder()
+    with Supervisor(make_config(worker_silence_s=0.05), recorder) as supervisor:
+        wait_until(lambda: supervisor.state.status == "complete")
+    assert len(started) == 2 and "the pool ended (it said nothing for 0 s); it is started" in recorder.messages[0]
+
+
 def test_full_disk_is_waited_for(make_config: MakeConfig, backend: Backend, tmp_path: Path) -> None:
     """A pool that the machine is in the way of ends, and begins again by itself when it is not."""
     blocked = tmp_path / "blocked"
@@ -396,25 +432,31 @@ def test_generator_that_cannot_begin_ends_the_service(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
 def test_stopping_leaves_a_resumable_folder(backend: Backend, control: Path, tmp_path: Path) -> None:
-    """SIGTERM ends the service with 143, and its pool in order: no process stays behind, nothing is half-written.
+    """SIGTERM ends the service with 143, and its pool in order: no process stays behind, nothing is half-written. All
+    that beside a log that takes nothing, for nobody reads it.
 
     `kill -9` is what test_kills.py is about.
     """
     (control / "slow").touch()
     path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
     arguments = ["out=made", "scenes=3", "dataset.validation_scenes=0", "dataset.test_scenes=0", "dataset.frames=5"]
-    with (tmp_path / "log").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "ballistic_service", *arguments, "port=0", "dataset.workers=1"],
-            cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": path},
-            stderr=log,
-            start_new_session=True,
-        )
-    wait_until(lambda: "published" in (tmp_path / "log").read_text())
+    unread, log = os.pipe()
+    os.set_blocking(log, False)
+    while select.select([], [log], [], 0)[1]:
+        os.write(log, bytes(4096))
+    os.set_blocking(log, True)
+    folder = tmp_path / "made"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ballistic_service", *arguments, "port=0", "dataset.workers=1"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": path},
+        stderr=log,
+        start_new_session=True,
+    )
+    wait_until(lambda: (folder / "manifest.json").exists() and Manifest.load(folder).revision >= 1)
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143
     wait_until(lambda: not processes_of_session(process.pid))
-    folder = tmp_path / "made"
+    os.close(unread), os.close(log)
     assert not list(folder.rglob("*.partial"))
     assert Manifest.load(folder).revision >= 1 and not Manifest.load(folder).complete
