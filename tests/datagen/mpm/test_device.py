@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import taichi as ti
@@ -27,6 +29,20 @@ def test_a_fault_in_a_kernel_names_its_line() -> None:
     assert f'File "{__file__}", line {line}, in faulty:\n' in str(fault.value) and "no_such_function()" not in str(
         fault.value
     )
+
+
+def test_kernels_are_defined_without_a_look_through_all_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frame that imports a kernel's module has no source, and inspect knows of it at once."""
+    asked = []
+
+    class Watched(ModuleType):
+        __file__ = property(lambda self: asked.append(True))
+
+    for name in ("_bootstrap", "_bootstrap_external"):
+        monkeypatch.setitem(sys.modules, "watched", Watched("watched"))
+        names = {"sys": sys}
+        exec(compile("frame = sys._getframe()", f"<frozen importlib.{name}>", "exec"), names)
+        assert inspect.getframeinfo(names["frame"]).code_context is None and not asked
 
 
 PROGRAM = """
