@@ -40,6 +40,15 @@ VALUES: dict[str, dict[Any, str]] = {
 }
 
 
+# Settings younger than some data sets, of the solver: what it did before it had them.
+BEFORE: dict[str, Any] = {
+    "mpm.transfer_speed_m_s": None,
+    "mpm.time_integration": "symplectic_euler",
+    "mpm.water_density_relaxation_s": None,
+    "mpm.sand_grain_diameter_m": 0.0,
+}
+
+
 # Prefixes of logged metrics, old to new: metrics.jsonl of earlier runs stays as it is.
 METRICS = {"trivial/": "baseline/", "one_step_gain/": "baseline_ratio/", "own_states/": "pushforward/"}
 
@@ -60,8 +69,10 @@ def current_value(key: str, value: Any) -> Any:
 
 
 def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """A stored mapping with today's keys and values; `section` is its dotted name in the configuration."""
-    result = {}
+    """A stored mapping with today's keys and values; `section` is its dotted name in the configuration. What a setting
+    did before there was one stands where it is missing.
+    """
+    result = {key.removeprefix("mpm."): value for key, value in BEFORE.items()} if section == "mpm" else {}
     for old, value in mapping.items():
         key = KEYS.get(_join(section, old), _join(section, old))
         inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)

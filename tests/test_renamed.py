@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hgn.config import DatagenConfig, NetworkConfig, SceneConfig, TrainConfig
+from hgn.config import DatagenConfig, MpmConfig, NetworkConfig, SceneConfig, TrainConfig
 from hgn.data.identity import dataset_identity
 from hgn.evaluate import EvaluateConfig
 from hgn.export import ExportConfig
@@ -59,6 +59,18 @@ def test_todays_table(config: type, mapping: dict[str, Any], message: str) -> No
     with pytest.raises(ConfigError, match=message) as caught:
         from_mapping(config, mapping)
     assert "\n" not in str(caught.value)
+
+
+def test_data_of_before_settings() -> None:
+    """A data set from before a setting of the solver was made without what it sets, whatever new data have."""
+    stored = to_mapping(MpmConfig(sand_friction_angle_deg=45.0))
+    for key in ("transfer_speed_m_s", "time_integration", "water_density_relaxation_s", "sand_grain_diameter_m"):
+        del stored[key]
+    config = from_stored(MpmConfig, stored, "mpm")
+    assert (config.transfer_speed_m_s, config.time_integration) == (None, "symplectic_euler")
+    assert (config.water_density_relaxation_s, config.sand_grain_diameter_m) == (None, 0.0)
+    assert config.sand_friction_angle_deg == 45.0
+    assert from_stored(MpmConfig, to_mapping(MpmConfig()), "mpm") == MpmConfig()
 
 
 def test_files_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,7 +31,7 @@ from datagen.mpm.layout import (
 )
 from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
-from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS, MATERIALS
+from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, MATERIAL_PARAMETERS, MATERIALS, SAND
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
@@ -198,7 +198,7 @@ class Launch(ABC):
             + VARIANT.sheets * (ghost_room > 0)
             + VARIANT.moving * self.moving
             + VARIANT.taichi_elements_sand * (config.sand_volume_correction == "taichi_elements")
-            + VARIANT.rate_of_sand * (config.sand_grain_diameter_m > 0)
+            + VARIANT.rate_of_sand * bool(config.sand_grain_diameter_m > 0 and SAND in label & MATERIAL_MASK)
             + VARIANT.taichi_elements_water * (config.water_volume_update == "taichi_elements")
             + VARIANT.stiffening_water * (config.water_equation == "stiffening")
             + VARIANT.several_laws * (len(laws) > 1)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hgn.config import MpmConfig, Processor
-from hgn.schema import Positive, from_mapping, one_of, require, require_bounds, to_mapping
+from hgn.schema import NonNegative, Positive, from_mapping, one_of, require, require_bounds, to_mapping
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
@@ -25,7 +25,16 @@ from tools.stability.solver_contact import contacts
 from tools.stability.solver_leak import OFFSETS, leaks
 from tools.stability.solver_loads import convergence, impacts, long_run, stiffnesses
 from tools.stability.solver_steps import Point, draw, largest_steps
-from tools.stability.solver_validation import column_laws, columns, dam_breaks, grids, reposes, rest
+from tools.stability.solver_validation import (
+    COLUMN_ASPECTS,
+    COLUMN_GRAINS,
+    column_laws,
+    columns,
+    dam_breaks,
+    grids,
+    reposes,
+    rest,
+)  # fmt: skip
 
 PART = "solver"
 CASES = (
@@ -47,6 +56,10 @@ class StabilitySolverConfig:
     # of the case grid, in widths of dams, radii of columns and sides of blocks; four such fit into a domain, so 8 to 32
     # are what 32 to 128 cells a side give; 32 want a GPU
     grid_cells: tuple[int, ...] = (8, 12, 16)
+    column_aspects: tuple[Positive[float], ...] = COLUMN_ASPECTS  # height over radius, of the case column
+    column_cells: int = 0  # in radius, where that is more than the 24 that columns are wide and high at least
+    # in radius, which make friction grow with the rate of flow; 0: friction does not
+    column_grains: tuple[NonNegative[float], ...] = COLUMN_GRAINS
     leak_band_cells: float | None = None  # mpm.collider_band_cells for the table of leaks; null: the solver's own
     picture: str | None = None  # also draw stable and unstable steps against the formula, as PNG
     json: str | None = None  # also write the rows to this file; --json FILE does the same
@@ -80,7 +93,7 @@ def main(mapping: dict[str, Any]) -> int:
         "long": lambda: long_run(mpm),
         "rest": lambda: rest(mpm),
         "dam": lambda: dam_breaks(mpm),
-        "column": lambda: columns(mpm),
+        "column": lambda: columns(mpm, config.column_aspects, config.column_grains, config.column_cells),
         "column_law": lambda: column_laws(mpm),
         "repose": lambda: reposes(mpm),
         "grid": lambda: grids(mpm, config.grid_cells),

@@ -17,7 +17,7 @@ from hgn.scene.material import ELASTIC, WATER
 from hgn.scene.scene import Scene
 from tools.stability import solver_validation
 from tools.stability.row import Row
-from tools.stability.solver_validation import column_rows, edge, heights, repose, rest
+from tools.stability.solver_validation import column_rows, edge, heights, repose, rest, run_outs
 
 CELL = 1 / 16
 WALL = 2  # cells: the last node that stops motion, and three from the other end
@@ -232,10 +232,13 @@ def test_sand_column_and_its_laws(low_column: tuple[Row, Row]) -> None:
     assert "walls" not in low.beyond
 
 
-def test_published_heights_of_columns() -> None:
+def test_what_is_published_of_columns() -> None:
     """Low columns keep their top, glass beads no more than 0.74; from where it meets a column's own height on, sand's
-    is a power of the aspect, a third higher at aspect 4.
+    is a power of the aspect, a third higher at aspect 4. A cone of glass beads holds what the column held.
     """
+    assert run_outs(0.5) == pytest.approx((0.62,)) and run_outs(4.0) == pytest.approx((3.2,))
+    sand, beads = run_outs(1.5)
+    assert sand == pytest.approx(1.86) and np.pi * (1 + beads) ** 2 * 0.74 / 3 == pytest.approx(1.5 * np.pi)
     assert heights(0.5) == (0.5, 0.5) and heights(0.8) == (0.74, 0.8)
     assert heights(1.5) == pytest.approx((0.74, 0.9415), abs=1e-3)
     assert heights(4.0) == pytest.approx((0.74, 1.109), abs=1e-3)
