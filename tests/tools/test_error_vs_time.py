@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from hgn.schema import ConfigError, from_mapping
 from tools.error_vs_time import score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
 from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.error_vs_time.timing import Timing
 
 CPU = torch.device("cpu")
 
@@ -218,6 +220,30 @@ def test_what_counts_most_comes_first(
     ]
     assert [row["scenes_reached"]["5"] for row in rows[:4]] == [0, 2, 2, 0]
     assert all(row["ms"] > 0 and row["failed_scenes"] == 0 for row in rows[:4])
+
+
+@pytest.mark.parametrize(("system", "frames"), [("mpm", 12), ("hgn", 8)])
+def test_the_solver_is_timed_over_whole_rollouts(system: str, frames: int) -> None:
+    """Its frames take longest once material has landed, so `timed_frames` is not for it."""
+
+    class Recorder:
+        row, asked, stepped = {"system": system}, [0], True
+
+        def trials(self, episodes: Any, frames: int, on_frame: Any) -> list[Any]:
+            self.asked.append(frames)
+            for frame in range(frames):
+                on_frame(frame)
+            return []
+
+        def release(self) -> None:
+            pass
+
+    options = {"out": "report", "data": "data", "timed_frames": 8, "mpm_timed_frames": 300, "timed_batches": [2]}
+    episode: Any = SimpleNamespace(material_N=np.zeros(3), position_TN3=np.zeros((12, 3, 3)))
+    timing = Timing([episode], from_mapping(ErrorVsTimeConfig, options), CPU)
+    contender: Any = Recorder()
+    timing.round(timing.begun(contender))
+    assert max(contender.asked) == frames
 
 
 def test_shipped_weights_that_fit(

@@ -57,9 +57,9 @@ class Timing:
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats(self.device)
             before = torch.cuda.memory_allocated(self.device)
-        most = min(self.config.timed_frames, len(self.singles[0][0].position_TN3))
+        most = self.config.mpm_timed_frames if kind == "mpm" else self.config.timed_frames
+        most = min(most, len(self.singles[0][0].position_TN3))
         if kind == "mpm":
-            most = min(most, self.config.mpm_timed_frames)
             for scenes in self.singles:  # kernels are compiled for the materials that a scene holds
                 frame_milliseconds(contender, scenes, min(SOLVER_WARM_FRAMES, most))
         # what looks at its frames 32 at a time tells nothing of fewer
