@@ -21,22 +21,14 @@ import hgn.data.reader
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
-from hgn.data.index import EpisodeEntry, Index, ListedIndex, ShardEntry, begin, extend
+from hgn.data.index import Index, ListedIndex, begin, extend
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.statistics import Moments, Statistics
 from hgn.schema import ConfigError
 from tools.studies.many_shards import Count
+from tools.studies.many_shards import empty_shard as shard
 
 MANY = 10_000
-STATISTICS = Statistics(*2 * [Moments(10**6, (0.1, 0.2, 1 / 3), (0.1, 0.2, 1 / 3))])
-MEMBERS = {f"{name}.npy": (512, 10_000_000) for name in ("position", "material")}
-
-
-def shard(index: int) -> ShardEntry:
-    entry = EpisodeEntry(f"train-{index:06d}", index, 2**62 + index, 0, 4296 + index % 1000, 6, MEMBERS)
-    name = f"train-{index:06d}-{index + 1:06d}.tar"
-    return ShardEntry(name, "train", index, index + 1, f"{index:064x}", 0, (entry,), STATISTICS)
 
 
 def listed(config: DatagenConfig, count: int) -> Path:

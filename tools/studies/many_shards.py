@@ -26,8 +26,10 @@ from datagen.pool.shard import stage_episode
 from datagen.pool.writer import DatasetWriter
 from hgn.command import run_command
 from hgn.config import DatagenConfig, DatasetConfig
-from hgn.data.index import SEGMENT_SHARDS
+from hgn.data.index import SEGMENT_SHARDS, EpisodeEntry, ShardEntry
+from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
+from hgn.data.statistics import Moments, Statistics
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import NonNegative, Positive, from_mapping, require, require_bounds
@@ -50,6 +52,7 @@ class ManyShardsConfig:
 
     out: str  # a new folder
     shards: Positive[int] = 100_000  # of one episode of two particles
+    listed: NonNegative[int] = 0  # of these, at once and empty: the others are counted behind them, in minutes
     readers: Positive[int] = 1_000  # that poll once a second
     seconds: Positive[float] = 60.0
     publish_every_s: Positive[float] = 3.0  # meanwhile
@@ -105,7 +108,7 @@ def main(mapping: dict[str, Any]) -> int:
         episodes_per_shard=1,
     )  # fmt: skip
     with DatasetWriter(DatagenConfig(dataset=dataset)) as writer:
-        work = publish(writer, config.shards)
+        work = publish(writer, config.shards, config.listed)
         service = serve_and_poll(writer, folder, config, later)
     faults = found(work, service)
     for row in work:
@@ -125,14 +128,19 @@ def main(mapping: dict[str, Any]) -> int:
     return EXIT_RED if faults else 0
 
 
-def publish(writer: DatasetWriter, shards: int) -> list[Work]:
-    """Publishes one after the other; counts now and then, always at one place of an index segment."""
+def publish(writer: DatasetWriter, shards: int, listed: int = 0) -> list[Work]:
+    """Publishes one after the other, but those that are `listed` at once after the first count; counts now and then,
+    always at one place of an index segment."""
     work = []
     segments = (shards - 1 - PLACE) // SEGMENT_SHARDS
     probes = {PLACE + SEGMENT_SHARDS * number for number in (1, 8, 78, segments) if 0 < number <= segments}
     store: EpisodeStore | None = None
     progress = bar("publishing", shards, unit="shard")
-    for number in range(shards):
+    number, first = 0, min(probes)
+    while number < shards:
+        if number == first + 1 and listed:
+            list_at_once(writer, range(number, number + listed))
+            number += listed
         progress.update()
         if number in probes and store is not None:
             store.refresh()
@@ -144,15 +152,16 @@ def publish(writer: DatasetWriter, shards: int) -> list[Work]:
             with Count() as look:
                 store.refresh()
             with Count() as start:
-                EpisodeStore(writer.folder, "train").episodes[number // 2].position_TN3[0].sum()
+                EpisodeStore(writer.folder, "train").episodes[0 if listed else number // 2].position_TN3[0].sum()
             counts = {"claim": claim, "publication": publication, "look": look, "start": start}
             memory = _status(os.getpid(), "VmRSS")
             work += [Work(number, what, c.lines, c.read, c.written, memory) for what, c in counts.items()]
         else:
             publish_one(writer, number)
-        if number == min(probes) // 2:  # what runs for the first time costs more
+        if number == first // 2:  # what runs for the first time costs more
             store = EpisodeStore(writer.folder, "train")
             store.episodes[0]
+        number += 1
     progress.close()
     return work
 
@@ -163,6 +172,25 @@ def publish_one(writer: DatasetWriter, number: int) -> None:
     assert shard is not None and shard.first == number
     stage_small(writer, number)
     writer.publish_next()
+
+
+def list_at_once(writer: DatasetWriter, numbers: range) -> None:
+    """Shards that are there by name and in the index alone, as if another generator had published them."""
+    shards = [empty_shard(number) for number in numbers]
+    for shard in shards:
+        (writer.folder / shard.name).touch()
+    manifest = Manifest.load(writer.folder)
+    manifest.extended(writer.folder, shards, (), revision=manifest.revision + len(shards))
+    writer.refresh()
+
+
+def empty_shard(number: int) -> ShardEntry:
+    """The entry of a training shard of one episode and no bytes."""
+    members = {f"{name}.npy": (512, 10_000_000) for name in ("position", "material")}
+    entry = EpisodeEntry(f"train-{number:06d}", number, 2**62 + number, 0, 4296 + number % 1000, 6, members)
+    statistics = Statistics(*2 * [Moments(10**6, (0.1, 0.2, 1 / 3), (0.1, 0.2, 1 / 3))])
+    name = f"train-{number:06d}-{number + 1:06d}.tar"
+    return ShardEntry(name, "train", number, number + 1, f"{number:064x}", 0, (entry,), statistics)
 
 
 def serve_and_poll(writer: DatasetWriter, folder: Path, config: ManyShardsConfig, later: int) -> dict[str, Any]:
