@@ -52,6 +52,8 @@ class HealthPage:
     def _begin(self) -> None:
         self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._ours.setblocking(False)
+        # room for some twenty pages: a process that takes none is soon noticed
+        self._ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _LARGEST_PAGE)
         self._taken_at = time.monotonic()
         with theirs:
             files = self._listener.fileno(), theirs.fileno()

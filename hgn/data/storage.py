@@ -278,7 +278,15 @@ class _Remote:
             return content
 
     def read(self, name: str, start: int, stop: int) -> bytes:
-        data = self._patiently(name, PATIENCE_S, _read_range(self._files, start, stop))
+        read = _read_range(self._files, start, stop)
+
+        def whole(path: str) -> bytes:
+            data = read(path)
+            if self._http and len(data) < stop - start:
+                raise ConnectionError(f"{len(data)} bytes instead of {stop - start}: a proxy may have an older file")
+            return data
+
+        data = self._patiently(name, PATIENCE_S, whole)
         if len(data) > stop - start:  # from a server without ranges
             data = data[start:stop]
         return _whole(data, f"{self._url}/{name}", start, stop)
@@ -479,7 +487,8 @@ def _transient(error: Exception, url: str) -> str | None:
         ) from None
     if status == 410:
         raise ConfigError(f"{url} is damaged at its service; delete it there and run the generator again") from None
-    if isinstance(status, int) and 400 <= status < 500 and status not in (408, 425, 429):
+    # 416: beyond the end of an index file that a proxy remembers
+    if isinstance(status, int) and 400 <= status < 500 and status not in (408, 416, 425, 429):
         raise ConfigError(
             f"{url} must be a file of a data set, got the answer {status}; check dataset.folder"
         ) from None

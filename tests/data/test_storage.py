@@ -278,6 +278,31 @@ def test_answers_are_bounded(monkeypatch: pytest.MonkeyPatch, attack: str) -> No
             server.shutdown()
 
 
+def test_proxy_that_remembers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A proxy that has an older, shorter file of the index is asked again until it has the one that the manifest is
+    about."""
+    monkeypatch.setattr("hgn.data.storage._FIRST_PAUSE_S", 0.01)
+    answers = iter([(416, b""), (206, b"56"), (206, b"5678")])
+
+    class Proxy(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            status, content = next(answers)
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Proxy) as server:
+        threading.Thread(target=server.serve_forever).start()
+        try:
+            assert open_storage(f"http://127.0.0.1:{server.server_port}").read("index", 5, 9) == b"5678"
+        finally:
+            server.shutdown()
+
+
 @pytest.mark.parametrize("full", ["limit", "disk"])
 def test_full_cache(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
     """A data set that is larger than the cache's limit, or its disk, is read all the same, again and again: shards that
