@@ -53,12 +53,12 @@ def test_teams_agree_with_the_other_launch() -> None:
     assert np.abs(alone.position_TN3 - found[1].position_TN3).max() < 1e-3
 
 
-def test_blocks_that_wait_for_each_other_agree_with_one() -> None:
-    """A scene of two blocks ends where that of one does, particles added up one by one or in runs, beside one that
+def test_blocks_that_wait_for_each_other_agree_with_the_other_launch() -> None:
+    """A scene of two blocks ends where one launch a substep does, particles added up one by one, beside one that
     fails.
     """
     scenes = [mixed(120, 0, (0, -3, 0)), mixed(40, 3, (0, 1e6, 0))]
-    one, other = (simulate(scenes, CONFIG, 4, 60.0, team=team) for team in (Team(1), Team(1, 2, 1)))
+    one, other = (simulate(scenes, CONFIG, 4, 60.0, team=team) for team in (Team(0), Team(1, 2, 1)))
     assert isinstance(one[0], Simulated) and isinstance(other[0], Simulated)
     assert isinstance(one[1], SceneFailure) and one[1] == other[1]
     assert np.abs(one[0].position_TN3 - other[0].position_TN3).max() < 1e-5
