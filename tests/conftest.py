@@ -66,6 +66,10 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+def pytest_unconfigure() -> None:
+    gc.unfreeze()  # else Triton tells of all that it still holds
+
+
 @pytest.fixture(autouse=True)
 def keep_signal_handlers() -> Iterator[None]:
     """Commands that a test runs in this process leave theirs behind."""
