@@ -8,24 +8,26 @@ from __future__ import annotations
 from xdist.scheduler import LoadScopeScheduling
 
 LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
-    *("solver", "generator", "viewer/test_page", "training/test_ddp", "jobs/test_jobs"),
+    *("solver", "datagen/mpm/test_team", "generator", "viewer/test_page", "training/test_ddp", "jobs/test_jobs"),
     *("kernels/test_triton_compat", "network/test_network", "datagen/test_command", "datagen/test_pool"),
-    *("tools/test_bench", "kernels/test_rollout", "end_to_end/test_bad_input", "kernels/test_kernels_alone"),
+    *("runtime/test_exported_step", "runtime/test_differentiable", "kernels/test_rollout", "kernels/test_relative"),
+    *("tools/test_bench", "end_to_end/test_bad_input", "kernels/test_training", "kernels/test_kernels_alone"),
     *("datagen/test_kills", "training/test_train", "scene/test_random_scene", "end_to_end/test_wheel"),
-    *("tools/test_error_vs_time", "kernels/test_relative", "kernels/test_update", "jobs/test_queue"),
+    *("tools/test_error_vs_time", "network/test_relative", "kernels/test_update", "jobs/test_queue"),
     *("datagen/test_service", "training/test_resume", "training/test_live_service", "kernels/test_memory"),
     *("test_command", "kernels/test_symmetry", "kernels/test_network", "training/test_precompile"),
-    *("kernels/test_training", "tools/studies/test_solver_targets", "runtime/test_exported_step"),
-    *("docs/test_notebooks", "runtime/test_differentiable"),
+    *("test_defaults", "data/test_import", "cpu/test_rows", "kernels/test_pushforward", "docs/test_notebooks"),
+    *("docs/test_pages", "tools/studies/test_solver_targets", "data/test_index"),
 )
 GENERATING = ("training/test_generator", "end_to_end/test_datagen", "docs/test_tutorials")  # water around a solid
 PLACES = {name: number for number, name in enumerate(LONGEST_FILES)}
 
 
 def group_of(nodeid: str) -> str:
-    """What runs in one process: a file, all that simulate, or all that generate the same kind of scene."""
+    """What runs in one process: a file, all that simulate, or all that generate the same kind of scene; teams apart,
+    whose kernels nothing else takes."""
     path = nodeid.split("::", 1)[0].removeprefix("tests/").removesuffix(".py")
-    if path.startswith(("datagen/mpm/", "tools/test_stability")):
+    if path.startswith(("datagen/mpm/", "tools/test_stability")) and path != "datagen/mpm/test_team":
         return "solver"
     return "generator" if path in GENERATING else path
 
