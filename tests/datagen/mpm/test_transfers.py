@@ -7,7 +7,7 @@ import pytest
 
 from datagen.mpm.solver import Simulated, simulate
 from hgn.config import MpmConfig
-from hgn.scene.material import SAND, SNOW, WATER
+from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 from tools.stability.solver_scenes import block, height_cells
@@ -20,7 +20,7 @@ EVERY_STEP = dataclasses.replace(CONFIG, transfer_speed_m_s=None)
 def cube(velocity: tuple, stiffness: float = 1.0, cell: float = CELL) -> Scene:
     """200 particles of all materials at random places above the floor; all tests share the kernel compiled for them."""
     place = np.random.default_rng(0).uniform((0.4, 0.25, 0.4), (0.55, 0.4, 0.55), (200, 3)).astype(np.float32)
-    kinds = np.arange(200) % 3
+    kinds = np.arange(200) % 4
     modulus = np.full(200, 1e6 * stiffness, np.float32)
     return Scene(
         place, np.tile(np.float32(velocity), (200, 1)), kinds.astype(np.uint8), cell_size=cell,
@@ -74,7 +74,7 @@ def test_what_is_stiff_leaves_water_as_it_is() -> None:
     at each step it would be smoothed several times as much.
     """
     water = block(WATER, (30, 4, 30), (5, 5, 5), (0, -4.5, 0))
-    far = [block(kind, (6, 30, 6 + 4 * kind), (1, 1, 1)) for kind in (SAND, SNOW)]
+    far = [block(kind, (6, 30, 6 + 4 * kind), (1, 1, 1)) for kind in (SAND, SNOW, ELASTIC)]
     both = [
         Scene(
             np.concatenate([s.position_N3 for s in (water, *far)]),
@@ -82,7 +82,7 @@ def test_what_is_stiff_leaves_water_as_it_is() -> None:
             np.concatenate([s.material_N for s in (water, *far)]),
             cell_size=water.cell_size,
             material_parameters={
-                "youngs_modulus_pa": np.repeat(np.float32([1e6, modulus]), [water.particle_count, 16])
+                "youngs_modulus_pa": np.repeat(np.float32([1e6, modulus]), [water.particle_count, 24])
             },
         )
         for modulus in (1e6, 1e8)
