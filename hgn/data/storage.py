@@ -41,6 +41,7 @@ _CHUNK_BYTES = 16 * 2**20  # of a shard at a time: what is lost when a connectio
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 10.0
 _CONNECT_S, _SILENCE_S = 10.0, 60.0
 _AWAY_S = 10.0
+_LOCK_PAUSE_S = 0.05
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
@@ -505,7 +506,7 @@ def _owned(path: Path, url: str, patience_s: float) -> Iterator[io.BufferedRando
     """The partial file of `path`, for this process alone and with what others had written; none when `path` is there.
 
     The kernel frees a process's hold when it ends, so the next one goes on.
-    Raises: UnreachableError when another one has it and there is no patience to wait.
+    Raises: UnreachableError when another one has it, and brings nothing for as long as there is patience.
     """
     partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
     while True:
@@ -517,9 +518,7 @@ def _owned(path: Path, url: str, patience_s: float) -> Iterator[io.BufferedRando
             raise ConfigError(f"{partial} must be a file, got a symbolic link to another; delete it") from None
         with opened as file:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | (0 if patience_s else fcntl.LOCK_NB))
-            except BlockingIOError:
-                raise UnreachableError(url, patience_s, "it is being fetched") from None
+                _take(file, url, patience_s)
             except OSError as error:
                 if error.errno not in NO_LOCKS:
                     raise
@@ -544,6 +543,22 @@ def _owned(path: Path, url: str, patience_s: float) -> Iterator[io.BufferedRando
                     partial.unlink(missing_ok=True)
                 raise
             return
+
+
+def _take(file: io.BufferedRandom, url: str, patience_s: float) -> None:
+    """The file's lock. A process that was stopped may have it: it is waited for while what it brings grows."""
+    size, begin = -1, time.monotonic()
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            now, size = size, os.fstat(file.fileno()).st_size
+            if now != size:
+                begin = time.monotonic()
+            if time.monotonic() - begin >= patience_s or _without_patience.is_set():
+                raise UnreachableError(url, patience_s, "another process is fetching it") from None
+            _without_patience.wait(_LOCK_PAUSE_S)
 
 
 def _open_file(name: str, flags: int) -> int:

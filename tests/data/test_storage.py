@@ -44,6 +44,7 @@ from hgn.data.storage import (
     is_remote,
     open_storage,
     verify_file,
+    without_patience,
 )
 from hgn.schema import ConfigError
 
@@ -354,6 +355,21 @@ def test_clock_that_was_set_back(folder: Path, cache: Path, monkeypatch: pytest.
     monkeypatch.setenv(LIMIT_VARIABLE, str((second.bytes + third.bytes) / 1e9))
     expected = sorted([brought, bring(third)])
     assert sorted(cache.glob("*.tar")) == expected
+
+
+@pytest.mark.parametrize("patience_s", [0.0, 0.2, 1e6])
+def test_who_fetches_was_stopped(folder: Path, cache: Path, patience_s: float) -> None:
+    """A process that was stopped while it fetched a shard is not waited for without end, and not at all by a training
+    that ends."""
+    url = in_memory(folder, "stopped")
+    entry = Manifest.load(url).shards[0]
+    cache.mkdir(parents=True)
+    with (cache / f".{entry.sha256}.tar.partial").open("wb") as partial, contextlib.ExitStack() as stack:
+        fcntl.flock(partial, fcntl.LOCK_EX)
+        if patience_s == 1e6:
+            stack.enter_context(without_patience())
+        with pytest.raises(UnreachableError, match="another process is fetching it"):
+            open_storage(url).shard(entry.name, entry.sha256, entry.bytes, patience_s)
 
 
 def test_link_in_the_cache(folder: Path, cache: Path, tmp_path: Path) -> None:
