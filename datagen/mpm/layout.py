@@ -151,11 +151,10 @@ class Field(NamedTuple):
     velocity: int = 3
     affine: int = 6
     volume: int = 15
-    mass: int = 16  # of the nodes around, interpolated, at the end of an interval
-    fluid: int = 17  # fields of particles without a deformation gradient
-    deformation: int = 17
-    stretch: int = 26  # xx, yy, zz, xy, xz, yz: see mls_mpm.respond
-    solid: int = 32  # fields of particles with a deformation gradient
+    fluid: int = 16  # fields of particles without a deformation gradient
+    deformation: int = 16
+    stretch: int = 25  # xx, yy, zz, xy, xz, yz: see mls_mpm.respond
+    solid: int = 31  # fields of particles with a deformation gradient
 
 
 class Tag(NamedTuple):

@@ -16,6 +16,7 @@ With one thread a block it runs on a CPU too; the tests check it there against t
 
 import taichi as ti
 
+from datagen.mpm.device_memory import load, store
 from datagen.mpm.layout import COUNT, FIELD, LIVE, SETTING, SHAPE, STATUS, TAG, VALUE, VARIANT, has_solid
 from datagen.mpm.mls_mpm import (
     Integers,
@@ -70,11 +71,13 @@ def _strain(
     particles: ti.i32,
     tags: ti.i32,
     stride: ti.i32,
+    velocities: ti.i32,
     step: ti.f32,
     begins: ti.f32,
-    state: ti.template(),
+    state: ti.u64,
     tag: ti.template(),
     hidden: ti.template(),
+    node: ti.u64,
     block: ti.template(),
     live: ti.template(),
     counter: ti.template(),
@@ -86,8 +89,8 @@ def _strain(
     variant: ti.template(),
     threads: ti.template(),
 ):
-    """The materials' answer of each particle, left in place of C; in the first step of an interval also which nodes it
-    touches.
+    """The materials' answer of each particle to the gradient of the nodes' velocities, left in place of C; in the first
+    step of an interval to C, and also which nodes it touches.
     """
     solid = ti.static(has_solid(variant))
     largest = 0.0
@@ -96,9 +99,11 @@ def _strain(
     while own < owned:
         p = dealt(own, part, chunk, blocks)
         place = particles + p
+        x = get_vector(state, place, stride, FIELD.position)
+        C = ti.Matrix.zero(ti.f32, 3, 3)
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
         if begins == 1.0:
-            x = get_vector(state, place, stride, FIELD.position)
+            C = get_matrix(state, place, stride, FIELD.affine)
             if ti.static(bool(variant & VARIANT.sheets)):
                 hidden[first + p] = find_hidden(x, scene, 0.0, contact, contact_normal, setting, shape, variant)
             mark(
@@ -106,7 +111,11 @@ def _strain(
                 shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks], live, scene * LIVE.length + LIVE.blocks,
             )  # fmt: skip
         else:
-            v = get_vector(state, place, stride, FIELD.velocity)
+            bits = 0
+            if ti.static(bool(variant & VARIANT.sheets)):
+                bits = hidden[first + p]
+            v, found_C, _ = gather(x, bits, scene, velocities, node, setting, shape, contact, variant)
+            C = found_C
             fastest = ti.max(fastest, v.dot(v))
             if ti.static(solid):
                 stretch = get_symmetric(state, place, stride, FIELD.stretch)
@@ -117,14 +126,14 @@ def _strain(
         if ti.static(bool(variant & VARIANT.several_laws)):
             row = tag[tags + TAG.law_row * stride + p]
         A, new_stretch, new_F, volume, stiffness = respond(
-            get_matrix(state, place, stride, FIELD.affine), stretch, F, state[place + FIELD.volume * stride],
+            C, stretch, F, load(state, place + FIELD.volume * stride),
             tag[tags + TAG.material * stride + p], row, step, begins, scene, counter, setting, law, variant,
         )  # fmt: skip
         put_matrix(state, place, stride, FIELD.affine, A)
         if ti.static(solid):
             put_matrix(state, place, stride, FIELD.deformation, new_F)
             put_symmetric(state, place, stride, FIELD.stretch, new_stretch)
-        state[place + FIELD.volume * stride] = volume
+        store(state, place + FIELD.volume * stride, volume)
         largest = ti.max(largest, stiffness)
         own += threads
     raise_by_warps(lane, counter, scene, COUNT.stiffness_bits, largest, threads)
@@ -139,11 +148,15 @@ def _move(
     blocks: ti.i32,
     lane: ti.i32,
     scene: ti.i32,
+    first: ti.i32,
     particles: ti.i32,
     tags: ti.i32,
     stride: ti.i32,
-    state: ti.template(),
+    velocities: ti.i32,
+    state: ti.u64,
     tag: ti.template(),
+    hidden: ti.template(),
+    node: ti.u64,
     scene_value: ti.template(),
     counter: ti.template(),
     setting: ti.template(),
@@ -153,25 +166,27 @@ def _move(
     variant: ti.template(),
     threads: ti.template(),
 ):
-    """New positions; velocities as obstacles leave them."""
+    """New velocities and their gradients, as obstacles leave them, and new positions."""
     largest = 0.0
     own = lane
     while own < owned:
         p = dealt(own, part, chunk, blocks)
         place = particles + p
         x = get_vector(state, place, stride, FIELD.position)
+        bits = 0
+        if ti.static(bool(variant & VARIANT.sheets)):
+            bits = hidden[first + p]
+        v, C, mass = gather(x, bits, scene, velocities, node, setting, shape, contact, variant)
         moved, speed, speed_square = move(
-            x, get_vector(state, place, stride, FIELD.velocity), get_matrix(state, place, stride, FIELD.affine), scene,
-            scene_value, counter, setting, shape, contact, contact_normal, variant,
-        )  # fmt: skip
+            x, v, C, scene, scene_value, counter, setting, shape, contact, contact_normal, variant
+        )
         if ti.static(bool(variant & VARIANT.water)):  # noqa: SIM102 (this one is the compiler's)
             if tag[tags + TAG.material * stride + p] == WATER and settles(scene, scene_value, setting):
                 volume = place + FIELD.volume * stride
-                state[volume] = settle(
-                    x, state[volume], state[place + FIELD.mass * stride], scene, scene_value, setting, shape
-                )
+                store(state, volume, settle(x, load(state, volume), mass, scene, scene_value, setting, shape))
         put_vector(state, place, stride, FIELD.position, moved)
         put_vector(state, place, stride, FIELD.velocity, speed)
+        put_matrix(state, place, stride, FIELD.affine, C)
         largest = ti.max(largest, speed_square)
         own += threads
     raise_by_warps(lane, counter, scene, COUNT.speed_square_bits, largest, threads)
@@ -184,7 +199,9 @@ def advance(
     blocks: ti.i32,
     patience: ti.i32,
     frame_s: ti.f32,
-    state: Scalars,
+    state_address: ti.u64,
+    node_address: ti.u64,
+    node_entries: ti.i32,
     tag: Integers,
     rank: Integers,
     hidden: Integers,
@@ -195,7 +212,6 @@ def advance(
     live: Integers,
     columns: Integers,
     meeting: Integers,
-    node: Scalars,
     turn: Integers,
     scene_value: ti.types.ndarray(dtype=ti.f32, ndim=2),
     counter: ti.types.ndarray(dtype=ti.i64, ndim=2),
@@ -213,12 +229,13 @@ def advance(
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
     Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another; with `several` blocks
-    all of the launch have to run at once. Particles are sorted at the begin of each frame. Arrays, with P particles
-    and G nodes of all scenes: state [2 * fields * P], tag [2 * 3 * P]; rank, hidden (see grid_kernel.substep) and
-    column_list [P] are work space; node [2, G, 4] holds what comes to momentum in a step and to mass in an interval,
-    zero between them, and then velocities, with the mass for an interval's end; cell_count [G], column_count [G / 4],
-    the flags in block [3 * G / 64], columns [3 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at
-    first; turn [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
+    all of the launch have to run at once. Particles are sorted at the begin of each frame. With P particles and G nodes
+    of all scenes there are at addresses (see device_memory) state [2 * fields * P], and node [2, G, 4], which holds
+    what comes to momentum in a step and to mass in an interval, zero between them, and then velocities, with the mass
+    for an interval's end. Arrays: tag [2 * 3 * P]; rank, hidden (see grid_kernel.substep) and column_list [P] are work
+    space; cell_count [G], column_count [G / 4], the flags in block [3 * G / 64], columns [3 * blocks * teams] and
+    meeting [MEETING * (teams + 1)] are zero at first; turn [scenes] says which scene comes when (long ones first). A
+    scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
     for item in range(teams * (blocks * ti.static(threads if threads > 1 else CPU_ITEMS))):
@@ -231,7 +248,9 @@ def advance(
         lane = item % items
         member = part * threads + lane
         stride = rank.shape[0]
-        velocities = node.shape[0] // 2
+        velocities = node_entries // 2
+        state = state_address
+        node = node_address
         meetings = 0
         choices = 0
         at = (team + 1) * MEETING
@@ -275,27 +294,20 @@ def advance(
                     fall = falls(scene, scene_value)
                     going = step > 0.0 and columns[segment + LEAVES] == 0
                     if going:
-                        if begins == 1.0:
-                            if not sorted_already:
-                                sort(
-                                    owned, part, chunk, blocks, scene, first, copy, segment, at, lane, meetings,
-                                    stride, state, tag, rank, cell_count, column_count, column_list, columns, live,
-                                    meeting, patience, setting, shape, fields, threads, several,
-                                )  # fmt: skip
-                                copy = 1 - copy
-                                particles = copy * fields * stride + first
-                                tags = copy * TAG.length * stride + first
-                                sorted_already = True
-                        else:
-                            gather(
-                                owned, part, chunk, blocks, lane, scene, first, particles, stride, velocities, state,
-                                hidden, node, setting, shape, contact, False, variant, threads,
+                        if begins == 1.0 and not sorted_already:
+                            sort(
+                                owned, part, chunk, blocks, scene, first, copy, segment, at, lane, meetings, stride,
+                                state, tag, rank, cell_count, column_count, column_list, columns, live, meeting,
+                                patience, setting, shape, fields, threads, several,
                             )  # fmt: skip
-                            wait(threads)
+                            copy = 1 - copy
+                            particles = copy * fields * stride + first
+                            tags = copy * TAG.length * stride + first
+                            sorted_already = True
                         _strain(
-                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, step, begins,
-                            state, tag, hidden, block, live, counter, setting, law, shape, contact, contact_normal,
-                            variant, threads,
+                            owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, velocities, step,
+                            begins, state, tag, hidden, node, block, live, counter, setting, law, shape, contact,
+                            contact_normal, variant, threads,
                         )  # fmt: skip
                         wait(threads)
                         scatter(
@@ -312,14 +324,10 @@ def advance(
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         if ends:
-                            gather(
-                                owned, part, chunk, blocks, lane, scene, first, particles, stride, velocities, state,
-                                hidden, node, setting, shape, contact, True, variant, threads,
-                            )  # fmt: skip
-                            wait(threads)
                             _move(
-                                owned, part, chunk, blocks, lane, scene, particles, tags, stride, state, tag,
-                                scene_value, counter, setting, shape, contact, contact_normal, variant, threads,
+                                owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, velocities,
+                                state, tag, hidden, node, scene_value, counter, setting, shape, contact,
+                                contact_normal, variant, threads,
                             )  # fmt: skip
                             meet_and_choose(
                                 at, lane, scene, meetings, choices, meeting, columns, segment, patience, scene_value,
@@ -330,7 +338,7 @@ def advance(
                     p = dealt(own, part, chunk, blocks)
                     target = frame * stride + first + tag[tags + TAG.origin * stride + p]
                     for axis in ti.static(range(3)):
-                        output[3 * target + axis] = state[particles + p + (FIELD.position + axis) * stride]
+                        output[3 * target + axis] = load(state, particles + p + (FIELD.position + axis) * stride)
                     own += threads
                 if member == 0 and counter[scene, COUNT.status] == STATUS.running:
                     live[live_at + LIVE.frames] += 1

@@ -16,6 +16,7 @@ from hgn.schema import ConfigError
 import taichi as ti  # isort: skip
 
 from datagen.mpm import team_kernel  # isort: skip
+from datagen.mpm.device_memory import address  # isort: skip
 from datagen.mpm.team_meeting import APART, MEETING, SEGMENT  # isort: skip
 from datagen.mpm.team_transfers import LANES  # isort: skip
 
@@ -130,10 +131,10 @@ class TeamLaunch(Launch):
         self.turn.from_numpy(np.argsort(-work, kind="stable").astype(np.int32))
         self.meeting.fill(0)
         team_kernel.advance(
-            frames, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s, self.state, self.tag,
-            self.rank, self.hidden, self.cell_count, self.column_count, self.column_list, self.block, self.live,
-            self.columns, self.meeting, self.node, self.turn, self.scene_value, self.counter, self.setting, self.law,
-            self.shape, self.contact, self.contact_normal, output, self.variant, self.team.threads, self.team.blocks >
-            1, self.team.run,
+            frames, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s, address(self.state),
+            address(self.node), self.node.shape[0], self.tag, self.rank, self.hidden, self.cell_count,
+            self.column_count, self.column_list, self.block, self.live, self.columns, self.meeting, self.turn,
+            self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact, self.contact_normal,
+            output, self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
         )  # fmt: skip
         return output

@@ -5,6 +5,7 @@ State is stored by field, `state[copy, field, particle]`, in two copies; sorting
 
 import taichi as ti
 
+from datagen.mpm.device_memory import load, store
 from datagen.mpm.layout import BLOCK, BLOCK_NODES, FIELD, LIVE, SETTING, TAG
 from datagen.mpm.mls_mpm import base_node, node_place
 from datagen.mpm.team_meeting import meet_team, wait
@@ -21,38 +22,38 @@ def dealt(own: ti.i32, part: ti.i32, chunk: ti.i32, blocks: ti.i32) -> ti.i32:
 
 
 @ti.func
-def get_vector(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
-    return ti.Vector([state[place + (field + i) * stride] for i in range(3)])
+def get_vector(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template()):
+    return ti.Vector([load(state, place + (field + i) * stride) for i in range(3)])
 
 
 @ti.func
-def get_matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
-    return ti.Matrix([[state[place + (field + 3 * i + j) * stride] for j in range(3)] for i in range(3)])
+def get_matrix(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template()):
+    return ti.Matrix([[load(state, place + (field + 3 * i + j) * stride) for j in range(3)] for i in range(3)])
 
 
 @ti.func
-def put_vector(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
+def put_vector(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template(), value):
     for i in ti.static(range(3)):
-        state[place + (field + i) * stride] = value[i]
+        store(state, place + (field + i) * stride, value[i])
 
 
 @ti.func
-def put_matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
+def put_matrix(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template(), value):
     for i, j in ti.static(ti.ndrange(3, 3)):
-        state[place + (field + 3 * i + j) * stride] = value[i, j]
+        store(state, place + (field + 3 * i + j) * stride, value[i, j])
 
 
 @ti.func
-def get_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
+def get_symmetric(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template()):
     """A matrix from xx, yy, zz, xy, xz, yz."""
-    s = ti.Vector([state[place + (field + i) * stride] for i in range(6)])
+    s = ti.Vector([load(state, place + (field + i) * stride) for i in range(6)])
     return ti.Matrix([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
 
 
 @ti.func
-def put_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
+def put_symmetric(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template(), value):
     for i, row, column in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
-        state[place + (field + i) * stride] = value[row, column]
+        store(state, place + (field + i) * stride, value[row, column])
 
 
 @ti.func
@@ -80,7 +81,7 @@ def sort(
     lane: ti.i32,
     meetings: ti.template(),
     stride: ti.i32,
-    state: ti.template(),
+    state: ti.u64,
     tag: ti.template(),
     rank: ti.template(),
     cell_count: ti.template(),
@@ -137,9 +138,11 @@ def sort(
         place = ti.min(first + cell_count[cell] + rank[first + p], stride - 1)
         target = (1 - copy) * fields * stride + place
         for group in ti.static(range(0, fields, COPIED)):
-            values = ti.Vector([state[source + field * stride] for field in range(group, min(group + COPIED, fields))])
+            values = ti.Vector(
+                [load(state, source + field * stride) for field in range(group, min(group + COPIED, fields))]
+            )
             for i in ti.static(range(values.n)):
-                state[target + (group + i) * stride] = values[i]
+                store(state, target + (group + i) * stride, values[i])
         for i in ti.static(range(TAG.length)):
             tag[((1 - copy) * TAG.length + i) * stride + place] = tag[(copy * TAG.length + i) * stride + first + p]
         own += threads

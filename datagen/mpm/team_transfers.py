@@ -1,104 +1,85 @@
 """What passes between the particles of a team's scene and its nodes.
 
-Four threads share a particle, one for each component of a node (x, y and z of momentum or velocity, and mass): together
-they read and add up whole sectors of memory.
+Nodes are read whole. Where particles give to them four threads share a particle, one for each component of a node (x, y
+and z of momentum, and mass): together they add up whole sectors of memory.
 """
 
 import taichi as ti
 
+from datagen.mpm.device_memory import add, load, load4, store4
 from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
 from datagen.mpm.mls_mpm import base_node, ghost_place, node_place, node_places, node_velocity, spline, weights
 from datagen.mpm.team_particles import dealt, get_vector
 
-LANES = 4  # threads that share a particle where it meets the nodes; each has one component of theirs
+LANES = 4  # components of a node, and threads that share a particle where it gives to nodes
 MASS = 3  # the component
 
 
 @ti.func
-def _entry(place: ti.i32, component: ti.i32) -> ti.i32:
-    return LANES * place + component
+def _vector(entries):
+    return ti.Vector([entries[axis] for axis in range(MASS)])
 
 
 @ti.func
 def gather(
-    owned: ti.i32,
-    part: ti.i32,
-    chunk: ti.i32,
-    blocks: ti.i32,
-    lane: ti.i32,
+    x,
+    bits: ti.i32,
     scene: ti.i32,
-    first: ti.i32,
-    particles: ti.i32,
-    stride: ti.i32,
     velocities: ti.i32,
-    state: ti.template(),
-    hidden: ti.template(),
-    node: ti.template(),
+    node: ti.u64,
     setting: ti.template(),
     shape: ti.template(),
     contact: ti.template(),
-    ends: ti.i32,
     variant: ti.template(),
-    threads: ti.template(),
 ):
-    """Velocity and its gradient at each particle from the nodes around, at an interval's end their mass too, left in
-    the state.
-    """
+    """Velocity, its gradient and the mass at x from the nodes around, of which sheets hide `bits`."""
     inverse_dx = setting[SETTING.inverse_cell_size]
+    scaled = x * inverse_dx
+    base = ti.floor(scaled - 0.5, ti.i32)
+    fx = scaled - ti.cast(base, ti.f32)
+    w0, w1, w2 = weights(fx)
+    w = ti.static((w0, w1, w2))
     first_entry = velocities + LANES * scene * shape[SHAPE.scene_blocks] * BLOCK_NODES
-    task = lane
-    while task < LANES * owned:
-        p = dealt(task // LANES, part, chunk, blocks)
-        component = task % LANES
-        place = particles + p
-        if component < MASS or ends:
-            scaled = get_vector(state, place, stride, FIELD.position) * inverse_dx
-            base = ti.floor(scaled - 0.5, ti.i32)
-            fx = scaled - ti.cast(base, ti.f32)
-            w0, w1, w2 = weights(fx)
-            w = ti.static((w0, w1, w2))
-            index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
-            total = 0.0
-            gradient = ti.Vector([0.0, 0.0, 0.0])
-            for i in ti.static(range(3)):
-                plane = 0.0
-                plane_y = 0.0
-                plane_z = 0.0
-                for j in ti.static(range(3)):
-                    line = 0.0
-                    line_z = 0.0
-                    for k in ti.static(range(3)):
-                        share = w[k][2] * node[index_x[i] + index_y[j] + index_z[k]]
-                        line += share
-                        line_z += (k - fx[2]) * share
-                    plane += w[j][1] * line
-                    plane_y += w[j][1] * (j - fx[1]) * line
-                    plane_z += w[j][1] * line_z
-                total += w[i][0] * plane
-                gradient += w[i][0] * ti.Vector([(i - fx[0]) * plane, plane_y, plane_z])
-            if ti.static(bool(variant & VARIANT.sheets)):
-                bits = hidden[first + p]
-                if component == MASS:
-                    bits = 0
-                n = 0
-                while bits != 0:
-                    if bits & 1:
-                        index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
-                        offset = ti.cast(index, ti.f32) - scaled
-                        seen = node[velocities + _entry(node_place(index, scene, shape), component)]
-                        change = node[velocities + _entry(ghost_place(index, scene, contact, shape), component)] - seen
-                        change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
-                        total += change
-                        gradient += change * offset
-                    bits >>= 1
-                    n += 1
-            if component == MASS:
-                state[place + FIELD.mass * stride] = total
-            else:
-                state[place + (FIELD.velocity + component) * stride] = total
-                for j in ti.static(range(3)):
-                    state[place + (FIELD.affine + 3 * component + j) * stride] = 4.0 * inverse_dx * gradient[j]
-        task += threads
+    index_x, index_y, index_z = node_places(base, first_entry, shape, LANES)
+    total = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    gradient_x = ti.Vector([0.0, 0.0, 0.0])
+    gradient_y = ti.Vector([0.0, 0.0, 0.0])
+    gradient_z = ti.Vector([0.0, 0.0, 0.0])
+    for i in ti.static(range(3)):
+        plane = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        plane_y = ti.Vector([0.0, 0.0, 0.0])
+        plane_z = ti.Vector([0.0, 0.0, 0.0])
+        for j in ti.static(range(3)):
+            line = ti.Vector([0.0, 0.0, 0.0, 0.0])
+            line_z = ti.Vector([0.0, 0.0, 0.0])
+            for k in ti.static(range(3)):
+                share = w[k][2] * load4(node, index_x[i] + index_y[j] + index_z[k])
+                line += share
+                line_z += (k - fx[2]) * _vector(share)
+            plane += w[j][1] * line
+            plane_y += w[j][1] * (j - fx[1]) * _vector(line)
+            plane_z += w[j][1] * line_z
+        total += w[i][0] * plane
+        gradient_x += w[i][0] * ((i - fx[0]) * _vector(plane))
+        gradient_y += w[i][0] * plane_y
+        gradient_z += w[i][0] * plane_z
+    v = _vector(total)
+    gradient = ti.Matrix.cols([gradient_x, gradient_y, gradient_z])
+    if ti.static(bool(variant & VARIANT.sheets)):
+        left = bits
+        n = 0
+        while left != 0:
+            if left & 1:
+                index = base + ti.Vector([n // 9, n // 3 % 3, n % 3])
+                offset = ti.cast(index, ti.f32) - scaled
+                seen = load4(node, velocities + LANES * node_place(index, scene, shape))
+                change = _vector(load4(node, velocities + LANES * ghost_place(index, scene, contact, shape)) - seen)
+                change *= spline(offset[0]) * spline(offset[1]) * spline(offset[2])
+                v += change
+                gradient += change.outer_product(offset)
+            left >>= 1
+            n += 1
+    return v, 4.0 * inverse_dx * gradient, total[MASS]
 
 
 @ti.func
@@ -114,10 +95,10 @@ def scatter(
     tags: ti.i32,
     stride: ti.i32,
     begins: ti.f32,
-    state: ti.template(),
+    state: ti.u64,
     tag: ti.template(),
     hidden: ti.template(),
-    node: ti.template(),
+    node: ti.u64,
     setting: ti.template(),
     law: ti.template(),
     shape: ti.template(),
@@ -156,10 +137,10 @@ def scatter(
             A = ti.Vector([0.0, 0.0, 0.0])
             v = 1.0
             if component < MASS:
-                A = dx * ti.Vector([state[place + (FIELD.affine + 3 * component + j) * stride] for j in range(3)])
+                A = dx * ti.Vector([load(state, place + (FIELD.affine + 3 * component + j) * stride) for j in range(3)])
                 v = -A.dot(fx)
                 if begins == 1.0:
-                    v += state[place + (FIELD.velocity + component) * stride]
+                    v += load(state, place + (FIELD.velocity + component) * stride)
             if ti.static(bool(variant & VARIANT.several_laws)):
                 scale = law[tag[tags + TAG.law_row * stride + p] + CONSTANT.mass]
                 v *= scale
@@ -183,7 +164,7 @@ def scatter(
                         away = ti.cast(corner, ti.f32)
                         weight = spline(away[0] - fx[0]) * spline(away[1] - fx[1]) * spline(away[2] - fx[2])
                         ghost = ghost_place(base + corner, scene, contact, shape)
-                        ti.atomic_add(node[_entry(ghost, component)], weight * (v + A.dot(away)))
+                        add(node, LANES * ghost + component, weight * (v + A.dot(away)))
                     bits >>= 1
                     n += 1
             p += 1
@@ -195,35 +176,32 @@ def scatter(
                 climbs = p < end and (following == base + ti.Vector([0, 1, 0])).all()
                 index_x, index_y, index_z = node_places(base, first_entry + component, shape, LANES)
                 for i, k in ti.static(ti.ndrange(3, 3)):
-                    ti.atomic_add(node[index_x[i] + index_y[0] + index_z[k]], gain[9 * i + k])
+                    add(node, index_x[i] + index_y[0] + index_z[k], gain[9 * i + k])
                     gain[9 * i + k] = gain[9 * i + 3 + k]
                     gain[9 * i + 3 + k] = gain[9 * i + 6 + k]
                     gain[9 * i + 6 + k] = 0.0
                 if not climbs:
                     for i, j, k in ti.static(ti.ndrange(3, 2, 3)):
-                        ti.atomic_add(node[index_x[i] + index_y[j + 1] + index_z[k]], gain[9 * i + 3 * j + k])
+                        add(node, index_x[i] + index_y[j + 1] + index_z[k], gain[9 * i + 3 * j + k])
                         gain[9 * i + 3 * j + k] = 0.0
                 base = following
         task += threads
 
 
 @ti.func
-def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
+def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.u64):
     """What came to its momentum, its mass, and its velocity before (none where an interval begins)."""
-    before = ti.Vector([0.0, 0.0, 0.0])
+    before = ti.Vector([0.0, 0.0, 0.0, 0.0])
     if begins == 0.0:
-        before = ti.Vector([node[velocities + place + c] for c in range(3)])
-    return ti.Vector([node[place + c] for c in range(3)]), node[place + MASS], before
+        before = load4(node, velocities + place)
+    gain = load4(node, place)
+    return _vector(gain), gain[MASS], _vector(before)
 
 
 @ti.func
-def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, node: ti.template()):
-    for c in ti.static(range(3)):
-        node[place + c] = 0.0
-        node[velocities + place + c] = v[c]
-    if ends:
-        node[velocities + place + MASS] = mass
-        node[place + MASS] = 0.0
+def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, node: ti.u64):
+    store4(node, place, 0.0, 0.0, 0.0, 0.0 if ends else mass)
+    store4(node, velocities + place, v[0], v[1], v[2], mass)
 
 
 @ti.func
@@ -235,7 +213,7 @@ def update_nodes(
     ends: ti.i32,
     block: ti.template(),
     live: ti.template(),
-    node: ti.template(),
+    node: ti.u64,
     fall,
     scene_value: ti.template(),
     shape: ti.template(),
@@ -253,7 +231,7 @@ def update_nodes(
         corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
         local = n % BLOCK_NODES
         # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
-        place = _entry(touched * BLOCK_NODES + local, 0)
+        place = LANES * (touched * BLOCK_NODES + local)
         entry = -1
         if ti.static(bool(variant & VARIANT.contact)):
             entry = contact[touched * BLOCK_NODES + local]
@@ -267,7 +245,7 @@ def update_nodes(
             _write_node(place, velocities, v, mass, ends, node)
         if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
             if entry >= 0 and entry < shape[SHAPE.ghosts]:
-                ghost = _entry(shape[SHAPE.ghost_begin] + entry, 0)
+                ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
                 gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
                 v = node_velocity(
                     before_there, gain_there, mass_there, local, 2 * entry + 1, corner, fall, scene, scene_value,
