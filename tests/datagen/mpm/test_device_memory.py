@@ -1,8 +1,12 @@
 """Floats at an address: Taichi's kernels read and write what numpy sees."""
 
+from pathlib import Path
+
+import llvmlite.binding as llvm
 import numpy as np
 import taichi as ti
 
+from datagen.mpm import device_memory
 from datagen.mpm.device_memory import add, address, load, load4, store, store4
 
 
@@ -29,3 +33,12 @@ def test_reads_writes_and_sums_are_those_of_the_array() -> None:
         expected[n] = values[n + 1] + 0.5
     expected[32] += 24
     assert np.array_equal(array.to_numpy(), expected) and np.array_equal(out.to_numpy(), values[:32:8])
+
+
+def test_the_bitcode_is_that_of_the_source() -> None:
+    """LLVM 14 assembles device_memory.ll into device_memory.bc, byte by byte."""
+    source = Path(device_memory.__file__).with_suffix(".ll")
+    llvm.initialize()
+    module = llvm.parse_assembly(source.read_text())
+    module.verify()
+    assert module.as_bitcode() == source.with_suffix(".bc").read_bytes()
