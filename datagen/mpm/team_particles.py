@@ -22,36 +22,36 @@ def dealt(own: ti.i32, part: ti.i32, chunk: ti.i32, blocks: ti.i32) -> ti.i32:
 
 
 @ti.func
-def get_vector(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template()):
+def get_vector(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
     return ti.Vector([load(state, place + (field + i) * stride) for i in range(3)])
 
 
 @ti.func
-def get_matrix(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template()):
+def get_matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
     return ti.Matrix([[load(state, place + (field + 3 * i + j) * stride) for j in range(3)] for i in range(3)])
 
 
 @ti.func
-def put_vector(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template(), value):
+def put_vector(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
     for i in ti.static(range(3)):
         store(state, place + (field + i) * stride, value[i])
 
 
 @ti.func
-def put_matrix(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template(), value):
+def put_matrix(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
     for i, j in ti.static(ti.ndrange(3, 3)):
         store(state, place + (field + 3 * i + j) * stride, value[i, j])
 
 
 @ti.func
-def get_symmetric(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template()):
+def get_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template()):
     """A matrix from xx, yy, zz, xy, xz, yz."""
     s = ti.Vector([load(state, place + (field + i) * stride) for i in range(6)])
     return ti.Matrix([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
 
 
 @ti.func
-def put_symmetric(state: ti.u64, place: ti.i32, stride: ti.i32, field: ti.template(), value):
+def put_symmetric(state: ti.template(), place: ti.i32, stride: ti.i32, field: ti.template(), value):
     for i, row, column in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
         store(state, place + (field + i) * stride, value[row, column])
 
@@ -81,7 +81,7 @@ def sort(
     lane: ti.i32,
     meetings: ti.template(),
     stride: ti.i32,
-    state: ti.u64,
+    state: ti.template(),
     tag: ti.template(),
     rank: ti.template(),
     cell_count: ti.template(),

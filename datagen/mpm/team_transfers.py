@@ -26,7 +26,7 @@ def gather(
     bits: ti.i32,
     scene: ti.i32,
     velocities: ti.i32,
-    node: ti.u64,
+    node: ti.template(),
     setting: ti.template(),
     shape: ti.template(),
     contact: ti.template(),
@@ -95,10 +95,10 @@ def scatter(
     tags: ti.i32,
     stride: ti.i32,
     begins: ti.f32,
-    state: ti.u64,
+    state: ti.template(),
     tag: ti.template(),
     hidden: ti.template(),
-    node: ti.u64,
+    node: ti.template(),
     setting: ti.template(),
     law: ti.template(),
     shape: ti.template(),
@@ -189,7 +189,7 @@ def scatter(
 
 
 @ti.func
-def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.u64):
+def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
     """What came to its momentum, its mass, and its velocity before (none where an interval begins)."""
     before = ti.Vector([0.0, 0.0, 0.0, 0.0])
     if begins == 0.0:
@@ -199,7 +199,7 @@ def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.u64):
 
 
 @ti.func
-def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, node: ti.u64):
+def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, node: ti.template()):
     store4(node, place, 0.0, 0.0, 0.0, 0.0 if ends else mass)
     store4(node, velocities + place, v[0], v[1], v[2], mass)
 
@@ -213,7 +213,7 @@ def update_nodes(
     ends: ti.i32,
     block: ti.template(),
     live: ti.template(),
-    node: ti.u64,
+    node: ti.template(),
     fall,
     scene_value: ti.template(),
     shape: ti.template(),

@@ -11,8 +11,9 @@ from datagen.mpm.device_memory import add, address, load, load4, store, store4
 
 
 @ti.kernel
-def _exercise(begin: ti.u64, out: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+def _exercise(memory: ti.u64, out: ti.types.ndarray(dtype=ti.f32, ndim=1)):
     for n in range(4):
+        begin = memory
         four = load4(begin, 8 * n)
         store4(begin, 8 * n + 4, four[3], four[2], four[1], four[0])
         store(begin, 8 * n, load(begin, 8 * n + 1) + 0.5)
