@@ -1,5 +1,7 @@
 """Floats in a device's memory at an address, which Taichi's kernels take as a number (see device_memory.ll).
 
+The team's kernel alone needs it, so GPUs, and CPUs in tests. Taichi reads the bitcode of LLVM 14 beside this file as it
+compiles; after a change of the source `llvmlite.binding.parse_assembly(source).as_bitcode()` of llvmlite 0.43 makes it.
 `base` is a variable of the kernel that holds the address: copies of it cost a third of the time to compile.
 """
 
