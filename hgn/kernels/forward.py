@@ -19,7 +19,7 @@ from hgn.kernels.grid.op import DeviceGrid
 from hgn.kernels.mlp.kernel import clear_rows, gather_project, gather_sums, mlp_forward
 from hgn.kernels.packing import PackedMLP, PackedNetwork, rounded_to_tf32
 from hgn.kernels.particle_cell.kernel import particle_cell_forward
-from hgn.kernels.triton_compat import capability, interpreting
+from hgn.kernels.triton_compat import overlaps
 from hgn.kernels.tuning import LIGHT_BLOCK, Tuning, many
 from hgn.schema import require
 
@@ -125,7 +125,7 @@ class FusedNetwork(Buffers):
             products=(self.by_particle_down, self.by_particle_up),
             fractions=(packed.particle_to_cell.parts[-1], packed.cell_to_particle.parts[-1]), fine=self.fine,
         )  # fmt: skip
-        self._clear(self.down[0].cell[0])
+        self._clear(self.down[0].cell[0], self.overlaps())
         self._particle_cell(
             packed.particle_to_cell, self.by_particle_down, self.by_particle_down, self.pairs_down,
             self.down[0].cell[0], True,
@@ -165,18 +165,19 @@ class FusedNetwork(Buffers):
         """What every kernel with products takes."""
         return {"weights": self.weights, "values": self.values, "WIDTH": self.width, "PRECISION": self.precision}
 
-    def _clear(self, x: torch.Tensor) -> None:
+    def _clear(self, x: torch.Tensor, overlap: bool = False) -> None:
         """Zeros into the finest cells' rows of x."""
         clear_rows[self._blocks(len(x), CLEAR_ROWS)](
-            x=x, count_ptr=self.grid.count(0), WIDTH=self.width, BLOCK=CLEAR_ROWS, num_warps=4
-        )
+            x=x, count_ptr=self.grid.count(0), WIDTH=self.width, OVERLAP=overlap, BLOCK=CLEAR_ROWS,
+            num_warps=4, launch_pdl=overlap,
+        )  # fmt: skip
 
     def _blocks(self, rows: int, block: int) -> tuple[int]:
         return (triton.cdiv(rows, block),)
 
     def overlaps(self) -> bool:
         """Whether the kernels of a message step start before the one before has ended."""
-        return self.tuning.overlap and not interpreting() and capability() >= 90
+        return self.tuning.overlap and overlaps()
 
     def stores_pair_hidden(self) -> bool:
         """Whether the hidden layer of the pairs is stored for the backward pass (see particle_cell_forward)."""
@@ -207,7 +208,7 @@ class FusedNetwork(Buffers):
         block, warps = self.tuning.row_tile(len(x))
         at, bias_at = (*following, 0, 0), (*following_bias, NONE, NONE)
         into = (*products, hidden, hidden)
-        loops = self.tuning.loops_over(len(x), block, 4)
+        loops, overlap = self.tuning.loops_over(len(x), block, 4), self.overlaps()
         mlp_forward[self.tuning.row_programs(len(x), block, loops, 1 if norm else 2)](
             x=x, count_ptr=count, **self._operands(), first_weights=first[0], first_at=first[1],
             offset_at=offset[0], bias_at=mlp.first_bias, **mlp.layers(),
@@ -217,7 +218,8 @@ class FusedNetwork(Buffers):
             fraction_at_0=fractions[0], fraction_at_1=fractions[1], y=y, hidden=hidden, next_0=into[0],
             next_1=into[1], INPUT=x.shape[-1], OUT=mlp.out, GATHER=gathered is not None, OFFSET=offset[1],
             BIAS=bias, NORM=norm, RESIDUAL=residual, NEXT=len(following), FRACTION=fractions != (0, 0),
-            SAVE=self.training, FINE=fine, BLOCK=block, LOOP=loops, num_warps=warps,
+            SAVE=self.training, FINE=fine, BLOCK=block, LOOP=loops, OVERLAP=overlap, num_warps=warps,
+            launch_pdl=overlap,
         )  # fmt: skip
 
     def _particle_cell(
@@ -230,13 +232,13 @@ class FusedNetwork(Buffers):
         to_cell: bool,
     ) -> None:
         grid, tuning = self.grid, self.tuning
-        at_once, registers = tuning.light_programs, tuning.light_registers
+        at_once, registers, overlap = tuning.light_programs, tuning.light_registers, self.overlaps()
         particle_cell_forward[self.tuning.programs(grid.particles, tuning.pair_particles, at_once)](
             by_particle=by_particle, by_cell=by_cell, particle=self.latent, cell_of=grid.cell_N8,
             weight_of=grid.weight_N8, count_ptr=self.particle_count, **self._operands(),
             offset_at=mlp.parts[-1], **mlp.layers(), **stored._asdict(), out=out, TO_CELL=to_cell,
-            SAVE=self.training, PARTICLES=self.tuning.pair_particles, num_warps=self.tuning.pair_warps,
-            maxnreg=registers,
+            SAVE=self.training, PARTICLES=self.tuning.pair_particles, OVERLAP=overlap,
+            num_warps=self.tuning.pair_warps, maxnreg=registers, launch_pdl=overlap,
         )  # fmt: skip
 
     def _gather(self, level: int, x: torch.Tensor, table: torch.Tensor, y: torch.Tensor, edges: bool = False) -> None:
@@ -255,14 +257,15 @@ class FusedNetwork(Buffers):
         if from_children and self.tuning.gathers(rows):
             self._gather(level, self.message[level - 1], grid.children(level), block.cell[0])
             from_children = False
-        loops = not from_children and self.tuning.loops_over(rows, size)
+        loops, overlap = not from_children and self.tuning.loops_over(rows, size), self.overlaps()
         if loops:
             size, warps = LIGHT_BLOCK
         gather_project[self.tuning.row_programs(rows, size, loops, 2)](
             x=self.message[level - 1] if from_children else block.cell[0], table=grid.children(level),
             count_ptr=grid.count(level), **self._operands(), at_0=edge.parts[0], at_1=edge.parts[1],
             bias_at=edge.first_bias, y=block.cell[0], next_0=block.send[0], next_1=block.receive[0],
-            capacity=rows, SUM=8 if from_children else 0, BLOCK=size, LOOP=loops, num_warps=warps,
+            capacity=rows, SUM=8 if from_children else 0, BLOCK=size, LOOP=loops, OVERLAP=overlap, num_warps=warps,
+            launch_pdl=overlap,
         )  # fmt: skip
 
     def _passing(self, block: Block) -> None:

@@ -46,6 +46,11 @@ def capability() -> int:
     return target.arch if target.backend == "cuda" else 0
 
 
+def overlaps() -> bool:
+    """Whether kernels may start before the one before them has ended (programmatic dependent launch)."""
+    return not interpreting() and capability() >= 90
+
+
 def settle_keys(names: dict[str, Any]) -> None:
     """Asks for the keys of a module's functions in the order of their definition; call it at the module's end.
 

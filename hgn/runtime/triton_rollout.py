@@ -22,6 +22,7 @@ from hgn.kernels.forward import FusedNetwork, feature_columns
 from hgn.kernels.grid.op import OUT_OF_WINDOW, OVERFLOW, DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
 from hgn.kernels.rollout.kernel import DIVERGED, advance, integrate
+from hgn.kernels.triton_compat import overlaps
 from hgn.kernels.tuning import Tuning
 from hgn.network.cell_keys import COORDINATE_LIMIT, pack
 from hgn.network.features import ParticleState
@@ -266,14 +267,18 @@ class TritonRollout:
         self.fused.forward()
 
     def _integrate(self) -> None:
+        overlap = overlaps()
         integrate[(-(-self.particles // INTEGRATE_BLOCK),)](
             output=self.fused.output, position=self.position_N3, velocity=self.velocity_NV,
             scene_of=self.scene_N, domain=self.domain_S3, gravity=self.gravity_S3, mean=self.mean, std=self.std,
             particle_count=self.count, status=self.grid.status, lost=self.lost, frame=self.frame,
             path=self.path_TN3, OUT=OUT, HISTORY=self.config.velocity_history,
-            COLUMNS=1 << (3 * self.config.velocity_history - 1).bit_length(), BLOCK=INTEGRATE_BLOCK,
+            COLUMNS=1 << (3 * self.config.velocity_history - 1).bit_length(), OVERLAP=overlap,
+            BLOCK=INTEGRATE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
-        advance[(1,)](status=self.grid.status, lost=self.lost, frame=self.frame)
+        advance[(1,)](
+            status=self.grid.status, lost=self.lost, frame=self.frame, OVERLAP=overlap, num_warps=1, launch_pdl=overlap
+        )
 
     def run(self, frames: int, on_frame: Callable[[int], None] | None = None) -> np.ndarray:
         """Simulates `frames` more frames; their positions, float32 [frames, N, 3].

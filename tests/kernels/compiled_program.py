@@ -1,6 +1,7 @@
 """What Triton makes of a small training's kernels for an H100, a line each: CANARY and what of Triton's interface held,
-COMPILED and a kernel of a grid with relative inputs, PRODUCT, kernel, tiles copied ahead and products under way
-meanwhile, HAZARDS, kernel, precision and their number, SHARED, kernel and its bytes of shared memory."""
+COMPILED and a kernel of a grid with relative inputs or the first of a name that starts early, EARLY, such a one, how
+often it waits, and its writes before, PRODUCT, kernel, tiles copied ahead and products under way meanwhile, HAZARDS,
+kernel, precision and their number, SHARED, kernel and its bytes of shared memory."""
 
 from __future__ import annotations
 
@@ -73,7 +74,14 @@ for function, data in launches_of(FrameJob(((narrow, "fp16"),), ((40_000, 10_000
     print("SHARED", function.__name__, triton_compat.preload(function, data).metadata.shared, flush=True)
 
 triton_compat.use_target(90)
+seen = set()
 for function, data in of_relative.values():
-    if function.fn.__module__ in ("hgn.kernels.grid.kernel", "hgn.kernels.coarsest.kernel"):
-        triton_compat.preload(function, data)
-        print("COMPILED", function.__name__, flush=True)
+    name, early = function.__name__, json.loads(data)["options"]["launch_pdl"]
+    of_grid = function.fn.__module__ in ("hgn.kernels.grid.kernel", "hgn.kernels.coarsest.kernel")
+    if not of_grid and (not early or name in seen):
+        continue
+    seen.add(name)
+    before, *after = triton_compat.preload(function, data).asm["ptx"].split("griddepcontrol.wait")
+    print("COMPILED", name, flush=True)
+    if early:
+        print("EARLY", name, len(after), before.count("st.global") + before.count("atom.global"), flush=True)

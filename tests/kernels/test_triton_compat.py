@@ -47,6 +47,16 @@ def test_what_the_interpreter_forgives(lines: list[list[str]]) -> None:
     assert set(compiled) > names and len(compiled) > len(set(compiled)), compiled
 
 
+def test_who_starts_early_waits(lines: list[list[str]]) -> None:
+    """Every kernel that may start before the one before it has ended waits for that, and those of a forward pass before
+    they write; but for three whose writes nobody before them looks at: beside the tables, the encoder, the decoder."""
+    early = [(name, int(waits), int(writes)) for name, waits, writes in (x[1:] for x in lines if x[0] == "EARLY")]
+    assert {name for name, *_ in early} >= {"mlp_forward", "gather_project", "particle_cell_forward", "advance"}
+    assert all(waits for _, waits, _ in early), early
+    writers = {name for name, _, writes in early if writes and not name.endswith("_backward")}
+    assert writers == {"prepare_particles", "clear_rows", "sum_coarsest"}, early
+
+
 def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines: list[list[str]]) -> None:
     """Of the weights' products tiles are copied to shared memory ahead, and each product is over before the next copy:
     the compiler keeps too few buffers for one that is under way meanwhile."""

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS
-from hgn.kernels.triton_compat import settle_keys
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import OUTPUTS, POINT, THIN
 
 THINNEST, SMALLEST = tl.constexpr(THIN), tl.constexpr(POINT)  # of a cell's contents, for a rotation to be known
@@ -17,49 +17,33 @@ DECODED = tl.constexpr(OUTPUTS)
 
 
 @triton.jit
-def _coarsest_cells(cell_of, parent, geometry, row, here, LEVELS: tl.constexpr):
-    """The coarsest cells above the particles' eight, [N, 8]."""
-    cell = tl.load(cell_of + row[:, None] * 8 + tl.arange(0, 8)[None, :], mask=here, other=0)
-    for level in tl.static_range(LEVELS - 1):
-        first = tl.load(geometry + level * GEOMETRY_COLUMNS + 6)
-        # a parent past the capacity: the frame is void, but nothing may be read out of bounds
-        cell = tl.maximum(tl.load(parent + first + cell, mask=here, other=0), 0)
-    return cell
+def _coarsest_cells(coarsest_of, share_of, row, live):
+    """The particles' coarsest cells, each once and -1 elsewhere, and their shares of these, [N, 8] each."""
+    at = row[:, None] * 8 + tl.arange(0, 8)[None, :]
+    cell = tl.load(coarsest_of + at, mask=live[:, None], other=-1)
+    return cell, tl.load(share_of + at, mask=cell >= 0, other=0.0)
 
 
 @triton.jit
-def _coarsest_places(cell_of, parent, octant, fraction_of, geometry, row, here, LEVELS: tl.constexpr):
-    """The coarsest cells above the particles' eight, [N, 8], and where these are in them, three [N, 8]: from the cells'
-    middles, in their edges."""
+def _coarsest_places(place_of, row, live):
+    """Where particles are in these cells, three [N, 8]: from the cells' middles, in edges."""
     corner = tl.arange(0, 8)[None, :]
-    cell = tl.load(cell_of + row[:, None] * 8 + corner, mask=here, other=0)
-    at = fraction_of + row[:, None] * 3 + 0 * corner
-    x = tl.load(at, mask=here, other=0.0) - (corner >> 2 & 1).to(tl.float32)
-    y = tl.load(at + 1, mask=here, other=0.0) - (corner >> 1 & 1).to(tl.float32)
-    z = tl.load(at + 2, mask=here, other=0.0) - (corner & 1).to(tl.float32)
-    for level in tl.static_range(LEVELS - 1):
-        first = tl.load(geometry + level * GEOMETRY_COLUMNS + 6)
-        part = tl.load(octant + first + cell, mask=here, other=0)
-        x = 0.5 * (x + (part >> 2 & 1).to(tl.float32) - 0.5)
-        y = 0.5 * (y + (part >> 1 & 1).to(tl.float32) - 0.5)
-        z = 0.5 * (z + (part & 1).to(tl.float32) - 0.5)
-        # a parent past the capacity: the frame is void, but nothing may be read out of bounds
-        cell = tl.maximum(tl.load(parent + first + cell, mask=here, other=0), 0)
-    return cell, x, y, z
+    at = place_of + row * 3
+    x = tl.load(at, mask=live, other=0.0)[:, None] - (corner >> 2 & 1).to(tl.float32)
+    y = tl.load(at + 1, mask=live, other=0.0)[:, None] - (corner >> 1 & 1).to(tl.float32)
+    return x, y, tl.load(at + 2, mask=live, other=0.0)[:, None] - (corner & 1).to(tl.float32)
 
 
 @triton.jit
 def sum_coarsest(
-    x, cell_of, weight_of, fraction_of, parent, octant, neighbour, geometry, counts, disturbed, felt, sums, moments,
-    particle_count, capacity,
+    x, coarsest_of, share_of, place_of, neighbour, counts, disturbed, felt, sums, particle_count, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, FEEL: tl.constexpr, SPIN: tl.constexpr,
-    BLOCK: tl.constexpr,
+    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds the first USED columns of the particles' rows of x [N, OUT] to their coarsest cells' sums [C, OUT], with
-    their weights. With FEEL felt [C, 2] is how disturbed and how touched a coarsest cell and those across its faces are
-    at most, 0 to 1. With SPIN columns USED to USED + 2 are the moments of columns 0 to 2 about the cells' middles, and
-    with both `moments` [C, OUT] are sums of places and of their products xx, yy, zz, yz, xz, xy. Programs for as many
-    particles as for coarsest cells.
+    their shares. With SPIN the next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL
+    felt [C, 2] is how disturbed and how touched a coarsest cell and those across its faces are at most, 0 to 1.
+    Programs for as many particles as for coarsest cells.
 
     Reference: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
     """
@@ -72,59 +56,46 @@ def sum_coarsest(
             other = tl.load(neighbour + slot * capacity + row, mask=there, other=-1)[:, None]
             most = tl.maximum(most, tl.load(disturbed + other * 2 + part, mask=other >= 0, other=0))
         tl.store(felt + row[:, None] * 2 + part, most.to(tl.float32) / FULLY, mask=there[:, None])
-    count = tl.load(particle_count)
-    if tl.program_id(0) * BLOCK >= count:
-        return
-    live = row < count
-    corner = tl.arange(0, 8)[None, :]
-    here = live[:, None] & (corner >= 0)
+    live = row < tl.load(particle_count)
+    cell, share = _coarsest_cells(coarsest_of, share_of, row, live)
     if SPIN:
-        cell, px, py, pz = _coarsest_places(cell_of, parent, octant, fraction_of, geometry, row, here, LEVELS)
-    else:
-        cell = _coarsest_cells(cell_of, parent, geometry, row, here, LEVELS)
-    weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=here, other=0.0)
-    # most of a particle's cells lie below one: only the first of them adds, for all
-    same = cell[:, :, None] == cell[:, None, :]
-    earlier = same & (tl.arange(0, 8)[None, None, :] < tl.arange(0, 8)[None, :, None])
-    share = tl.sum(tl.where(same, weight[:, None, :], 0.0), 2)
-    share = tl.where(tl.max(earlier.to(tl.int32), 2) > 0, 0.0, share)
+        px, py, pz = _coarsest_places(place_of, row, live)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     column = tl.arange(0, OUT)[None, :]
     value = tl.load(x + row[:, None] * OUT + column, mask=live[:, None] & (column < USED), other=0.0)
     part = column[:, None, :]
     added = share[:, :, None] * value[:, None, :]
     if SPIN:
-        vx = tl.load(x + row * OUT, mask=live, other=0.0)[:, None]
-        vy = tl.load(x + row * OUT + 1, mask=live, other=0.0)[:, None]
-        vz = tl.load(x + row * OUT + 2, mask=live, other=0.0)[:, None]
+        vx, vy, vz = _three(x, row, 0, live, 1.0, OUT)
+        vx, vy, vz = vx[:, None], vy[:, None], vz[:, None]
         added = tl.where(part == USED, (share * (py * vz - pz * vy))[:, :, None], added)
         added = tl.where(part == USED + 1, (share * (pz * vx - px * vz))[:, :, None], added)
         added = tl.where(part == USED + 2, (share * (px * vy - py * vx))[:, :, None], added)
-    adds = (share > 0)[:, :, None] & (part < USED + 3 * SPIN)
+    # up to a multiple of four, which are added at once
+    adds = (cell >= 0)[:, :, None] & (part < (USED + 3 * SPIN + 3) // 4 * 4)
     tl.atomic_add(sums + cell[:, :, None] * OUT + part, added, mask=adds, sem="relaxed")
-    if SPIN and FEEL:
-        px, py, pz = px[:, :, None], py[:, :, None], pz[:, :, None]
-        one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
-        other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
-        adds = (share > 0)[:, :, None] & (part < 9)
-        tl.atomic_add(
-            moments + cell[:, :, None] * OUT + part, share[:, :, None] * one * other, mask=adds, sem="relaxed"
-        )
 
 
 @triton.jit
 def balance_cells(
     sums, felt, motion, neighbour, geometry, counts, table, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """What the coarsest cells add to their particles' accelerations, and how disturbed they are, in columns 0 to 3 of
     table [C, OUT]; of the sums of what particles put out.
 
     Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     count = tl.load(counts + LEVELS - 1)
     if tl.program_id(0) * BLOCK >= count:
         return
-    cell, there, mass, inverse, disturbed, touched = _coarsest_of(felt, motion, geometry, count, LEVELS, BLOCK)
+    cell, there, mass, inverse = _coarsest_of(motion, geometry, count, LEVELS, BLOCK)
+    disturbed, touched = _felt(felt, cell, there)
     column = tl.arange(0, 4)[None, :]
     used = there[:, None] & (column < 3)
     change = -(1 - touched)[:, None] * inverse[:, None] * tl.load(sums + cell[:, None] * OUT + column, used, other=0.0)
@@ -142,17 +113,21 @@ def balance_cells(
 @triton.jit
 def balance_cells_backward(
     sums, felt, motion, neighbour, geometry, counts, table, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """What the coarsest cells add to the gradients of their particles' outputs, and how disturbed they are, in columns
     0 to 9 of table [C, OUT]; of the sums of the gradients of what `balance_cells` leads to.
 
     Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     count = tl.load(counts + LEVELS - 1)
     if tl.program_id(0) * BLOCK >= count:
         return
-    cell, there, mass, inverse, disturbed, touched = _coarsest_of(felt, motion, geometry, count, LEVELS, BLOCK)
+    cell, there, mass, inverse = _coarsest_of(motion, geometry, count, LEVELS, BLOCK)
+    disturbed, touched = _felt(felt, cell, there)
     column = tl.arange(0, OUT)[None, :]
     mean = there[:, None] & (column < 3)
     value = -(1 - touched)[:, None] * tl.load(sums + cell[:, None] * OUT + column, mask=mean, other=0.0)
@@ -222,19 +197,17 @@ def _cross(a, b):
 
 @triton.jit
 def _pairs(
-    moments, neighbour, felt, motion, geometry, cell, there, mass, centre, inertia, capacity,
+    moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr,
 ):  # fmt: skip
-    """Of the cells across the faces [C, 8], the last two of which are none: their numbers, one over their masses, half
-    of how disturbed they are, the axis and the sign of the direction to them, this cell's share of both masses, the
-    product of both shares, their centres of mass from their middles, how far these are apart, and the inertia of both
-    about the centre of all."""
+    """Of the cells across the faces [C, 8], the last two of which are none: their numbers, one over their masses, the
+    axis and the sign of the direction to them, this cell's share of both masses, the product of both shares, their
+    centres of mass from their middles, how far these are apart, and the inertia of both about the centre of all."""
     slot = tl.arange(0, 8)[None, :]
     other = tl.load(neighbour + slot * capacity + cell[:, None], mask=there[:, None] & (slot < 6), other=-1)
     found = other >= 0
     beside = _mass(motion, geometry, other, found, LEVELS)
     inverse = _inverse(beside)
-    half = 0.5 * tl.load(felt + other * 2, mask=found, other=0.0)
     axis, sign = slot // 2, 1.0 - 2.0 * (slot % 2).to(tl.float32)
     part = tl.where(found, mass[:, None] * _inverse(mass[:, None] + beside), 0.0)
     both = part * (1 - part)
@@ -248,13 +221,13 @@ def _pairs(
     for i in tl.static_range(6):
         whole = both * apart[i] + part * inertia[i][:, None] + (1 - part) * theirs[i]
         total = total + (whole,)  # noqa: RUF005 - Triton knows no unpacking here
-    return other, inverse, half, axis, sign, part, both, middle, (x, y, z), total
+    return other, inverse, axis, sign, part, both, middle, (x, y, z), total
 
 
 @triton.jit
 def balance_bodies(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """As `balance_cells` where angular momentum is kept: what coarsest cells add to their particles' accelerations at
     their middles in columns 0 to 2 of table [C, OUT], the factor of these particles' own in column 3, and the rate of
@@ -265,16 +238,23 @@ def balance_bodies(
     count = tl.load(counts + LEVELS - 1)
     if tl.program_id(0) * BLOCK >= count:
         return
-    cell, there, mass, inverse, disturbed, touched = _coarsest_of(felt, motion, geometry, count, LEVELS, BLOCK)
+    cell, there, mass, inverse = _coarsest_of(motion, geometry, count, LEVELS, BLOCK)
     x, y, z, inertia = _body(moments, cell, there, inverse, OUT)
-    centre, free = (x, y, z), 1 - touched
+    centre = (x, y, z)
+    other, beside, axis, sign, part, both, _, apart, whole = _pairs(
+        moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
+    )
+    # until here of places alone
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    disturbed, touched = _felt(felt, cell, there)
+    free = 1 - touched
+    half = 0.5 * tl.load(felt + other * 2, mask=other >= 0, other=0.0)
     mean = _three(sums, cell, 0, there, inverse, OUT)
     moment = _three(sums, cell, DECODED, there, inverse, OUT)
     lever = _cross(centre, mean)
     known, wx, wy, wz = _rotation(inertia, moment[0] - lever[0], moment[1] - lever[1], moment[2] - lever[2])
-    other, beside, half, axis, sign, part, both, _, apart, whole = _pairs(
-        moments, neighbour, felt, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
-    )
     traction = ()
     for i in tl.static_range(3):
         column = tl.where(axis == i, 3 + i, 9 - axis - i)  # of xx, yy, zz, yz, xz, xy behind the accelerations
@@ -302,7 +282,7 @@ def balance_bodies(
 @triton.jit
 def balance_bodies_backward(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """As `balance_cells_backward` where angular momentum is kept, of the sums of the gradients and their moments: in
     columns 0 to 8 of table [C, OUT] what coarsest cells add to the gradients of their particles' outputs at their
@@ -313,9 +293,19 @@ def balance_bodies_backward(
     count = tl.load(counts + LEVELS - 1)
     if tl.program_id(0) * BLOCK >= count:
         return
-    cell, there, mass, inverse, disturbed, touched = _coarsest_of(felt, motion, geometry, count, LEVELS, BLOCK)
+    cell, there, mass, inverse = _coarsest_of(motion, geometry, count, LEVELS, BLOCK)
     x, y, z, inertia = _body(moments, cell, there, inverse, OUT)
-    centre, free = (x, y, z), 1 - touched
+    centre = (x, y, z)
+    other, beside, axis, sign, part, both, middle, apart, whole = _pairs(
+        moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
+    )
+    disturbed, touched = _felt(felt, cell, there)
+    free = 1 - touched
+    half = 0.5 * tl.load(felt + other * 2, mask=other >= 0, other=0.0)
+    # until here of places alone
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     mean = _three(sums, cell, 0, there, inverse, OUT)
     moment = _three(sums, cell, 3, there, inverse, OUT)
     lever = _cross(centre, mean)
@@ -329,9 +319,6 @@ def balance_bodies_backward(
         tl.store(line + i, factor * known * mean[i] - lever[i], mask=there)
         tl.store(line + 10 + i, turn[i], mask=there)
     tl.store(line + 9, disturbed * (touched + free * known), mask=there)
-    other, beside, half, axis, sign, part, both, middle, apart, whole = _pairs(
-        moments, neighbour, felt, motion, geometry, cell, there, mass, centre, inertia, capacity, LEVELS, OUT
-    )
     their_mean = _three(sums, other, 0, other >= 0, beside, OUT)
     their_moment = _three(sums, other, 3, other >= 0, beside, OUT)
     lever = _cross(middle, their_mean)
@@ -356,13 +343,18 @@ def balance_bodies_backward(
 
 
 @triton.jit
-def _coarsest_of(felt, motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.constexpr):
-    """This program's coarsest cells: their masses, one over these, disturbed and touched, [BLOCK] each."""
+def _coarsest_of(motion, geometry, count, LEVELS: tl.constexpr, BLOCK: tl.constexpr):
+    """This program's coarsest cells: their masses, and one over these, [BLOCK] each."""
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there = cell < count
     mass = _mass(motion, geometry, cell, there, LEVELS)
-    disturbed = tl.load(felt + cell * 2, mask=there, other=0.0)
-    return cell, there, mass, _inverse(mass), disturbed, tl.load(felt + cell * 2 + 1, mask=there, other=0.0)
+    return cell, there, mass, _inverse(mass)
+
+
+@triton.jit
+def _felt(felt, cell, there):
+    """How disturbed and how touched cells are."""
+    return tl.load(felt + cell * 2, mask=there, other=0.0), tl.load(felt + cell * 2 + 1, mask=there, other=0.0)
 
 
 @triton.jit
@@ -393,40 +385,35 @@ def _across(
 
 @triton.jit
 def add_coarsest(
-    x, table, cell_of, weight_of, fraction_of, parent, octant, geometry, particle_count,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, COLUMNS: tl.constexpr, SPIN: tl.constexpr,
+    x, table, coarsest_of, share_of, place_of, particle_count,
+    OUT: tl.constexpr, USED: tl.constexpr, COLUMNS: tl.constexpr, SPIN: tl.constexpr, OVERLAP: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Multiplies columns 0 to 2 of the particles' rows of x [N, OUT] by column USED of the coarsest cells' table
-    [C, OUT], and adds its columns before that, each with the particles' weights; with SPIN also the rotation in columns
+    [C, OUT], and adds its columns before that, each with the particles' shares; with SPIN also the rotation in columns
     USED + 1 to USED + 3 about the cells' middles. COLUMNS: a power of two above USED.
 
     Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
-    count = tl.load(particle_count)
-    if tl.program_id(0) * BLOCK >= count:
-        return
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    corner = tl.arange(0, 8)[None, :]
-    here = (row < count)[:, None] & (corner >= 0)
+    live = row < tl.load(particle_count)
+    cell, share = _coarsest_cells(coarsest_of, share_of, row, live)
     if SPIN:
-        cell, px, py, pz = _coarsest_places(cell_of, parent, octant, fraction_of, geometry, row, here, LEVELS)
-    else:
-        cell = _coarsest_cells(cell_of, parent, geometry, row, here, LEVELS)
-    weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=here, other=0.0)
+        place = _coarsest_places(place_of, row, live)
     column = tl.arange(0, COLUMNS)[None, :]
+    own = tl.load(x + row[:, None] * OUT + column, mask=live[:, None] & (column < 3), other=0.0)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     at = table + cell[:, :, None] * OUT + column[:, None, :]
-    found = tl.load(at, mask=here[:, :, None] & (column <= USED)[:, None, :], other=0.0)
-    total = tl.sum(weight[:, :, None] * found, 1)
+    found = tl.load(at, mask=(cell >= 0)[:, :, None] & (column <= USED)[:, None, :], other=0.0)
+    total = tl.sum(share[:, :, None] * found, 1)
     factor = tl.sum(tl.where(column == USED, total, 0.0), 1)
     if SPIN:
-        swing = _cross(_three(table, cell, USED + 1, here, weight, OUT), (px, py, pz))
+        swing = _cross(_three(table, cell, USED + 1, cell >= 0, share, OUT), place)
         for i in tl.static_range(3):
             total += tl.where(column == i, tl.sum(swing[i], 1)[:, None], 0.0)
-    live = (row < count)[:, None]
-    at = x + row[:, None] * OUT + column
-    total += factor[:, None] * tl.load(at, mask=live & (column < 3), other=0.0)
-    tl.store(at, total, mask=live & (column < USED))
+    tl.store(x + row[:, None] * OUT + column, total + factor[:, None] * own, mask=live[:, None] & (column < USED))
 
 
 settle_keys(globals())

@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS
-from hgn.kernels.triton_compat import settle_keys
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
 from hgn.scene.symmetry import CELL_BITS
@@ -144,12 +144,14 @@ def _write_cells(table, cell, live, occupied, prefix_sum, slots, first, capacity
 @triton.jit
 def fill_tables(
     occupied, prefix_sum, geometry, slot_of_cell, neighbour, parent, octant, children, counts, needed, status,
-    LEVELS: tl.constexpr, BLOCK: tl.constexpr,
+    LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Each active slot writes its cell's neighbours, parent and children, int32, -1 where there is none.
 
     Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
+    if OVERLAP:
+        gdc_launch_dependents()  # who needs the cells' numbers alone
     level = tl.program_id(1)
     line = geometry + level * GEOMETRY_COLUMNS
     start, slots = tl.load(line), tl.load(line + 1)
@@ -289,18 +291,35 @@ def _with_column(value, number, x):
 
 
 @triton.jit
+def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
+    """Of one axis: whether a corner's coarsest cell is not that of the corner below [N, 8], a particle's share of it,
+    and its place [N] in that of the lower corners, from the middle, in edges. x is the lower corners' coordinate."""
+    ABOVE: tl.constexpr = LEVELS - 1
+    EDGE: tl.constexpr = 1 << ABOVE
+    split = ((x + (fraction > 0).to(tl.int32)) >> ABOVE) != x >> ABOVE
+    share = tl.where(split[:, None], tl.where(high, fraction[:, None], 1 - fraction[:, None]), 1.0)
+    place = ((x & EDGE - 1).to(tl.float32) + fraction - 0.5 * (EDGE - 1)) / EDGE
+    return (high == 0) | split[:, None], share, place
+
+
+@triton.jit
 def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
-    weight_of, fraction_of, motion, cell_size, capacity,
-    HISTORY: tl.constexpr, MOTION: tl.constexpr, BLOCK: tl.constexpr,
+    weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, cell_size, capacity,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, SPIN: tl.constexpr, COLUMNS: tl.constexpr,
+    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Each particle's 8 cells, their weights, and its fraction; with MOTION its parts of the finest cells' mass and
-    momentum are added to `motion` [.., 4].
+    momentum are added to `motion` [.., 4], and its coarsest cells are told: `coarsest_of` [N, 8], each once and -1
+    elsewhere, its shares of them, and its place [N, 3] in the lowest, from the middle, in edges. With SPIN the sums of
+    places and of their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS].
 
     Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
+        if OVERLAP:
+            gdc_wait()
         return
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
@@ -324,22 +343,56 @@ def prepare_particles(
     tl.store(fraction_of + row * 3 + 1, fy, mask=live)
     tl.store(fraction_of + row * 3 + 2, fz, mask=live)
     if MOTION:
-        touched = (cell >= 0) & (weight > 0)
-        tl.atomic_add(motion + cell * 4, weight, mask=touched, sem="relaxed")
-        for axis in tl.static_range(3):
-            v = tl.load(velocity + row * (3 * HISTORY) + axis, mask=live, other=0.0)
-            tl.atomic_add(motion + cell * 4 + 1 + axis, weight * v[:, None], mask=touched, sem="relaxed")
+        part = tl.arange(0, 4)[None, :]
+        # mass, and momentum behind it
+        v = tl.load(velocity + row[:, None] * (3 * HISTORY) + part - 1, mask=live[:, None] & (part > 0), other=1.0)
+        touched = ((cell >= 0) & (weight > 0))[:, :, None] & (part >= 0)[:, None, :]
+        at = motion + cell[:, :, None] * 4 + part[:, None, :]
+        tl.atomic_add(at, weight[:, :, None] * v[:, None, :], mask=touched, sem="relaxed")
+        across_x, share_x, px = _coarsest_part(x, fx, high_x, LEVELS)
+        across_y, share_y, py = _coarsest_part(y, fy, high_y, LEVELS)
+        across_z, share_z, pz = _coarsest_part(z, fz, high_z, LEVELS)
+        share = share_x * share_y * share_z
+        above = _slots_of(geometry, LEVELS - 1)
+        slot = _slot(cx >> LEVELS - 1, cy >> LEVELS - 1, cz >> LEVELS - 1, scene[:, None], above)
+        first = tl.load(prefix_sum + above[0] - 1, mask=above[0] > 0, other=0)
+        most = tl.load(geometry + (LEVELS - 1) * GEOMETRY_COLUMNS + 5)
+        coarsest = _cell(occupied, prefix_sum, slot, first, most, inside[:, None] & across_x & across_y & across_z)
+        coarsest = tl.where(share > 0, coarsest, -1)
+        tl.store(coarsest_of + row[:, None] * 8 + corner, coarsest, mask=here)
+        tl.store(share_of + row[:, None] * 8 + corner, share, mask=here)
+        tl.store(place_of + row * 3, px, mask=live)
+        tl.store(place_of + row * 3 + 1, py, mask=live)
+        tl.store(place_of + row * 3 + 2, pz, mask=live)
+        if SPIN:
+            px = px[:, None, None] - high_x[:, :, None].to(tl.float32)
+            py = py[:, None, None] - high_y[:, :, None].to(tl.float32)
+            pz = pz[:, None, None] - high_z[:, :, None].to(tl.float32)
+            part = tl.arange(0, COLUMNS)[None, None, :]
+            one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
+            other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
+            added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
+            # up to a multiple of four, which are added at once
+            adds = (coarsest >= 0)[:, :, None] & (part < 12)
+            tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
+    if OVERLAP:
+        gdc_wait()  # reads nothing of the tables that are being filled; who comes next does
     # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
     tl.store(cell_of + row[:, None] * 8 + corner, tl.maximum(cell, 0), mask=here)
     tl.store(weight_of + row[:, None] * 8 + corner, weight, mask=here)
 
 
 @triton.jit
-def sum_motion(motion, parent, geometry, counts, LEVELS: tl.constexpr, BLOCK: tl.constexpr):
+def sum_motion(
+    motion, parent, geometry, counts, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr
+):  # fmt: skip
     """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels.
 
     Reference: hgn.network.features; test: tests/kernels/test_relative.py.
     """
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     count = tl.load(counts)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -416,20 +469,20 @@ def _asinh(x):
 
 
 @triton.jit
-def _raise(disturbed, cell, own, mask):
+def _raise(disturbed, cell, own):
     """Raises every second of `disturbed` to what the particles [N] in its cells [N, 8] have, where that is more."""
     own = (own * FULLY).to(tl.int32)[:, None]
     # most are told by another already
-    mask = mask & (tl.load(disturbed + cell * 2, mask=mask, other=0) < own)
+    mask = (cell >= 0) & (tl.load(disturbed + cell * 2, mask=cell >= 0, other=FULLY) < own)
     tl.atomic_max(disturbed + cell * 2, own + 0 * cell, mask=mask, sem="relaxed")
 
 
 @triton.jit
 def prepare_relative_features(
     position, velocity, scene_of, material_of, domain, gravity, particle_count, scale, obstacle_table,
-    obstacle_cell_size, cell_of, weight_of, motion, parent, geometry, features, disturbed, reach, quiet,
+    obstacle_cell_size, cell_of, weight_of, coarsest_of, motion, parent, geometry, features, disturbed, reach, quiet,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr,
-    SYMMETRY: tl.constexpr, FEATURES: tl.constexpr, BLOCK: tl.constexpr,
+    SYMMETRY: tl.constexpr, FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
     velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
@@ -445,6 +498,8 @@ def prepare_relative_features(
     MATERIAL: tl.constexpr = WALLS + 6 + 6 * NORMALS
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
+        if OVERLAP:
+            gdc_wait()
         return
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
@@ -458,6 +513,8 @@ def prepare_relative_features(
     value -= tl.load(gravity + scene[:, None] * 3 + axis[None, :], mask=is_history, other=0.0)
     corner = tl.arange(0, 8)[None, :]
     corners = here & (corner >= 0)
+    if OVERLAP:
+        gdc_wait()
     cell = tl.load(cell_of + row[:, None] * 8 + corner, mask=corners, other=0)
     weight = tl.load(weight_of + row[:, None] * 8 + corner, mask=corners, other=0.0)
     for level in tl.static_range(LEVELS):
@@ -505,8 +562,9 @@ def prepare_relative_features(
         gate = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, gate)
     value = tl.where(is_contact, value * gate[:, None], value)
     moved = tl.where((column < CONTACT)[None, :], value / quiet, 0.0)
-    _raise(disturbed, cell, tl.minimum(gate + tl.sum(moved * moved, 1), 1.0), corners & (weight > 0))
-    _raise(disturbed + 1, cell, gate, corners & (weight > 0))
+    coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
+    _raise(disturbed, coarsest, tl.minimum(gate + tl.sum(moved * moved, 1), 1.0))
+    _raise(disturbed + 1, coarsest, gate)
     material = tl.load(material_of + row, mask=live, other=0)
     value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
     tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)

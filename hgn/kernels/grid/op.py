@@ -16,7 +16,7 @@ import triton
 from hgn.config import NetworkConfig
 from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.grid import kernel
-from hgn.kernels.triton_compat import interpreting
+from hgn.kernels.triton_compat import interpreting, overlaps
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES, SCENE_LIMIT, pack, unpack
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import OUTPUTS, QUIET
@@ -123,7 +123,8 @@ class DeviceGrid:
     For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other; and of the
     coarsest cells there are disturbed_C2, disturbed and touched by their own particles in units of FULLY, felt_C2, by
     those across their faces too, and what `balance` sums up and spreads, sum_C and table_C; where angular momentum is
-    kept moment_C, the first and second moments of what they hold.
+    kept moment_C, the first and second moments of what they hold. Of each particle there are its coarsest cells, each
+    once and -1 elsewhere, its shares of them, and its place in the lowest: coarsest_N8, share_N8, place_N3.
     """
 
     def __init__(
@@ -155,7 +156,11 @@ class DeviceGrid:
 
         self.geometry = torch.tensor(rows, dtype=torch.int32, device=device)
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
-        self.occupied, self.prefix_sum = integers(start), integers(start)
+        coarsest = self.capacities[-1] if relative else 0
+        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 2, SUMS * coarsest * keeps_spin, 2 * coarsest, start]
+        self._cleared = integers(sum(parts))  # one piece, cleared at once
+        motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)
+        self.prefix_sum = integers(start)
         self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
         self._neighbour, self._children = integers(6 * at), integers(8 * at)
         self.counts_L, self.needed_L = integers(self.levels), integers(self.levels)
@@ -164,12 +169,12 @@ class DeviceGrid:
         self.weight_N8 = torch.zeros(particles, 8, device=device)
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
         self.feature_NF = torch.zeros(particles, features, device=device)
-        coarsest = self.capacities[-1] if relative else 0
-        parts = [4 * at if relative else 4, 2 * coarsest, SUMS * coarsest, SUMS * coarsest * keeps_spin]
-        self._moved = torch.zeros(sum(parts), device=device)  # one piece, cleared at once
-        motion, disturbed, sums, moments = self._moved.split(parts)
-        self.motion_C4, self.sum_C, self.moment_C = motion.view(-1, 4), sums.view(-1, SUMS), moments.view(-1, SUMS)
-        self.disturbed_C2 = disturbed.view(torch.int32).view(-1, 2)
+        self.coarsest_N8 = integers(particles * relative, 8)
+        self.share_N8 = torch.zeros(particles * relative, 8, device=device)
+        self.place_N3 = torch.zeros(particles * relative, 3, device=device)
+        self.motion_C4, self.moment_C = motion.view(torch.float32).view(-1, 4), moments.view(torch.float32)
+        self.sum_C, self.gradient_sum_C = (x.view(torch.float32).view(-1, SUMS) for x in sums)
+        self.disturbed_C2 = disturbed.view(-1, 2)
         self.felt_C2 = torch.zeros(coarsest, 2, device=device)
         self.table_C = torch.zeros(coarsest, SUMS, device=device)
         self._at = [row[6] for row in rows]
@@ -198,7 +203,7 @@ class DeviceGrid:
         self, position: torch.Tensor, scene_N: torch.Tensor, origin_S3: torch.Tensor, count: torch.Tensor
     ) -> None:
         """Marks, numbers and tabulates the cells of all levels."""
-        self.occupied.zero_()
+        self._cleared.zero_()
         kernel.mark_cells[(triton.cdiv(self.particles, MARK_BLOCK),)](
             position=position, scene_of=scene_N, origin=origin_S3, particle_count=count, low=self.low,
             geometry=self.geometry, occupied=self.occupied, status=self.status, cell_size=self.cell_size,
@@ -209,7 +214,7 @@ class DeviceGrid:
             occupied=self.occupied, prefix_sum=self.prefix_sum, geometry=self.geometry,
             slot_of_cell=self.slot_of_cell, neighbour=self._neighbour, parent=self._parent, octant=self._octant,
             children=self._children, counts=self.counts_L, needed=self.needed_L, status=self.status,
-            LEVELS=self.levels, BLOCK=FILL_BLOCK,
+            LEVELS=self.levels, OVERLAP=overlaps(), BLOCK=FILL_BLOCK,
         )  # fmt: skip
 
     def prepare(
@@ -233,15 +238,15 @@ class DeviceGrid:
         `mean_3` and `std_3` are those of Normaliser.feature_scale; gravity counts for relative inputs alone. With
         `symmetry` the obstacles are seen under the symmetries in their rows.
         """
-        blocks = (triton.cdiv(self.particles, PARTICLE_BLOCK),)
-        if config.relative:
-            self._moved.zero_()
+        blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
         kernel.prepare_particles[blocks](
             position=position, velocity=velocity, scene_of=scene_N, origin=origin_S3, particle_count=count,
             low=self.low, geometry=self.geometry, occupied=self.occupied, prefix_sum=self.prefix_sum,
             cell_of=self.cell_N8, weight_of=self.weight_N8, fraction_of=self.fraction_N3, motion=self.motion_C4,
+            coarsest_of=self.coarsest_N8, share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C,
             cell_size=self.cell_size, capacity=self.capacities[0], HISTORY=config.velocity_history,
-            MOTION=config.relative, BLOCK=PARTICLE_BLOCK,
+            LEVELS=self.levels, MOTION=config.relative, SPIN=self.keeps_spin, COLUMNS=SUMS, OVERLAP=overlap,
+            BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
         )  # fmt: skip
         arguments = feature_arguments(
             config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
@@ -253,45 +258,49 @@ class DeviceGrid:
         if self.levels > 1:
             kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK),)](
                 motion=self.motion_C4, parent=self._parent, geometry=self.geometry, counts=self.counts_L,
-                LEVELS=self.levels, BLOCK=MARK_BLOCK,
+                LEVELS=self.levels, OVERLAP=overlap, BLOCK=MARK_BLOCK, launch_pdl=overlap,
             )  # fmt: skip
         kernel.prepare_relative_features[blocks](
             **arguments, gravity=gravity_S3, scale=std_3, cell_of=self.cell_N8, weight_of=self.weight_N8,
-            motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
+            coarsest_of=self.coarsest_N8, motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
             reach=config.contact_reach_cells * config.cell_size, disturbed=self.disturbed_C2, quiet=QUIET,
-            LEVELS=self.levels,
+            LEVELS=self.levels, OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
         """From what the decoder puts out [N, OUT] to accelerations less gravity in columns 0 to 2, in place."""
         between = coarsest_kernel.balance_bodies if self.keeps_spin else coarsest_kernel.balance_cells
-        self._through_coarsest(output, count, between, OUTPUTS, 3)
+        self._through_coarsest(output, count, self.sum_C, between, OUTPUTS, 3)
 
     def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
         """From the gradient of what `balance` leaves to that of what it was given, in place."""
-        self.sum_C.zero_()
         between = coarsest_kernel.balance_bodies_backward if self.keeps_spin else coarsest_kernel.balance_cells_backward
-        self._through_coarsest(gradient, count, between, 3, OUTPUTS)
+        self._through_coarsest(gradient, count, self.gradient_sum_C, between, 3, OUTPUTS)
 
-    def _through_coarsest(self, x: torch.Tensor, count: torch.Tensor, between: Any, taken: int, left: int) -> None:
+    def _through_coarsest(
+        self, x: torch.Tensor, count: torch.Tensor, sums: torch.Tensor, between: Any, taken: int, left: int
+    ) -> None:
         """Sums of the first columns on the coarsest cells, what these make of them, and that back to particles."""
         particles, capacity, coarsest = self.particles, self.capacities[-1], self.neighbour(self.levels - 1)
-        spin = self.keeps_spin
-        cells = {"neighbour": coarsest, "geometry": self.geometry, "counts": self.counts_L, "capacity": capacity}
-        pairs = {"cell_of": self.cell_N8, "weight_of": self.weight_N8, "parent": self._parent, "particle_count": count}
-        pairs |= {"fraction_of": self.fraction_N3, "octant": self._octant}
+        spin, forward, overlap = self.keeps_spin, taken == OUTPUTS, overlaps()
+        pairs: dict[str, Any] = {"coarsest_of": self.coarsest_N8, "share_of": self.share_N8, "place_of": self.place_N3}
+        pairs |= {"particle_count": count, "SPIN": spin}
+        cells = {"neighbour": coarsest, "counts": self.counts_L, "capacity": capacity, "LEVELS": self.levels}
         bodies = {"moments": self.moment_C} if spin else {}
-        sizes = {"LEVELS": self.levels, "OUT": x.shape[1], "BLOCK": PARTICLE_BLOCK}
-        coarsest_kernel.sum_coarsest[(triton.cdiv(max(particles, capacity), PARTICLE_BLOCK),)](
-            x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=self.sum_C,
-            moments=self.moment_C if spin else self.sum_C, USED=taken, FEEL=taken == OUTPUTS, SPIN=spin, **sizes,
+        sizes = {"OUT": x.shape[1], "OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK}
+        cells_too = max(particles, capacity) if forward else particles
+        # behind what is not a kernel in a backward pass
+        coarsest_kernel.sum_coarsest[(triton.cdiv(cells_too, PARTICLE_BLOCK),)](
+            x=x, **pairs, **cells, disturbed=self.disturbed_C2, felt=self.felt_C2, sums=sums, USED=taken,
+            FEEL=forward, **sizes, launch_pdl=overlap and forward,
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
-            sums=self.sum_C, felt=self.felt_C2, motion=self.motion_C4, **bodies, **cells, table=self.table_C, **sizes
-        )
+            sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, **bodies, **cells,
+            table=self.table_C, **sizes, launch_pdl=overlap,
+        )  # fmt: skip
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
-            x=x, table=self.table_C, **pairs, geometry=self.geometry, USED=left,
-            COLUMNS=triton.next_power_of_2(left + 1), SPIN=spin, **sizes,
+            x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,
+            launch_pdl=overlap,
         )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ from hgn.kernels.blocks import (
     vectors,
     weighted_sums,
 )
-from hgn.kernels.triton_compat import settle_keys
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 
 
 @triton.jit
@@ -65,6 +65,7 @@ def mlp_forward(
     INPUT: tl.constexpr, WIDTH: tl.constexpr, OUT: tl.constexpr, GATHER: tl.constexpr, OFFSET: tl.constexpr,
     BIAS: tl.constexpr, NORM: tl.constexpr, RESIDUAL: tl.constexpr, NEXT: tl.constexpr, FRACTION: tl.constexpr,
     SAVE: tl.constexpr, FINE: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr, LOOP: tl.constexpr,
+    OVERLAP: tl.constexpr,
 ):  # fmt: skip
     """y [R, OUT] of x [R, INPUT] as above: the encoder (paper step 0, with the products that steps 1 and 11 take),
     messages to parents (3, 5, …) and from them (7, 9, …; GATHER), the decoder (12).
@@ -74,7 +75,8 @@ def mlp_forward(
     FRACTION: the products that follow are a particle's part of its pairs: the first less what its fraction [R, 3] makes
     of the offsets' weights [3, W], the second with it.
 
-    LOOP: a program takes one tile after the other, and reads its weights once.
+    LOOP: a program takes one tile after the other, and reads its weights once. OVERLAP: it starts before the launch
+    before it has ended, and what it reads of weights ahead it reads meanwhile.
 
     Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
     """
@@ -91,18 +93,23 @@ def mlp_forward(
         bias, next_bias_0, next_bias_1 = vector(lines, 0), vector(lines, 1), vector(lines, 2)
         lines = vectors(values, second_bias_at, norm_weight_at, norm_bias_at, norm_bias_at, norm_bias_at, OUT)
         second_bias, norm_weight, norm_bias = vector(lines, 0), vector(lines, 1), vector(lines, 2)
-        first = transposed(first_weights + first_at, WIDTH, INPUT)
-        second = transposed((values if FINE else weights) + second_at, OUT, WIDTH)
-        if NEXT > 0:
-            following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
-        if NEXT > 1:
-            following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
     elif not IN_PLACE:
         bias = tl.load(values + bias_at + column)
         next_bias_0 = optional_vector(values, next_bias_at_0, WIDTH)
         next_bias_1 = optional_vector(values, next_bias_at_1, WIDTH)
         second_bias = tl.load(values + second_bias_at + outs)
         norm_weight, norm_bias = tl.load(values + norm_weight_at + outs), tl.load(values + norm_bias_at + outs)
+    RESIDENT: tl.constexpr = LOOP or (OVERLAP and OUT == WIDTH and not IN_PLACE and not FINE)  # the decoder would spill
+    if RESIDENT:
+        first = transposed(first_weights + first_at, WIDTH, INPUT)
+        second = transposed((values if FINE else weights) + second_at, OUT, WIDTH)
+        if NEXT > 0:
+            following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
+        if NEXT > 1:
+            following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     tile = tl.program_id(0)
     if LOOP:
         x_rows = _rows_of(x, tile, count, INPUT, BLOCK)
@@ -116,7 +123,7 @@ def mlp_forward(
         if FRACTION:
             part = tl.arange(0, 16)
             fractions = tl.load(fraction + row[:, None] * 3 + part[None, :], mask=live & (part < 3)[None, :], other=0.0)
-        if not LOOP:
+        if not RESIDENT:
             first = transposed(first_weights + first_at, WIDTH, INPUT)
         h = finer_product(x_tile, first, PRECISION) if FINE else product(x_tile, first, PRECISION)
         if GATHER:
@@ -133,7 +140,7 @@ def mlp_forward(
         a = leaky(h)
         if SAVE:
             tl.store(hidden + at, a, mask=live)
-        if not LOOP:
+        if not RESIDENT:
             second = transposed((values if FINE else weights) + second_at, OUT, WIDTH)
         z = finer_product(a, second, PRECISION) if FINE else product(a, second, PRECISION)
         if IN_PLACE:
@@ -151,7 +158,7 @@ def mlp_forward(
             # the next tile's, where there are registers for them
             x_rows = _rows_of(x, tile + tl.num_programs(0), count, INPUT, BLOCK)
         if NEXT > 0:
-            if not LOOP:
+            if not RESIDENT:
                 following_0 = transposed(weights + next_at_0, WIDTH, WIDTH)
             if IN_PLACE:
                 next_bias_0 = optional_vector(values, next_bias_at_0, WIDTH)
@@ -162,7 +169,7 @@ def mlp_forward(
                 later = product(z, following_0, PRECISION) + inside(next_bias_0, tile)[None, :]
             tl.store(next_0 + at, later, mask=live)
         if NEXT > 1:
-            if not LOOP:
+            if not RESIDENT:
                 following_1 = transposed(weights + next_at_1, WIDTH, WIDTH)
             if IN_PLACE:
                 next_bias_1 = optional_vector(values, next_bias_at_1, WIDTH)
@@ -247,7 +254,7 @@ def mlp_backward(
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
-def clear_rows(x, count_ptr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+def clear_rows(x, count_ptr, WIDTH: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr):
     """Zeros into the rows of x [.., W] that are in use: capacities have room for twice as many.
 
     Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
@@ -256,6 +263,8 @@ def clear_rows(x, count_ptr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     zeros = tl.zeros((BLOCK, WIDTH), x.dtype.element_ty)
     tl.store(x + row[:, None] * WIDTH + tl.arange(0, WIDTH)[None, :], zeros, mask=(row < count)[:, None])
+    if OVERLAP:
+        gdc_wait()  # nobody before it reads or writes these, but who comes next waits for all before
 
 
 @triton.jit(do_not_specialize_on_alignment=["count_ptr"])
@@ -284,9 +293,10 @@ def gather_sums(
 def gather_project(
     x, table, count_ptr, weights, values, at_0, at_1, bias_at, y, next_0, next_1, capacity,
     SUM: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr, LOOP: tl.constexpr,
+    OVERLAP: tl.constexpr,
 ):  # fmt: skip
     """y = x, or with SUM > 0 the sum of x's rows listed in table [SUM, capacity] (-1: none); and two products of y, the
-    second with a bias. LOOP as in mlp_forward.
+    second with a bias. LOOP and OVERLAP as in mlp_forward.
 
     Reference: hgn.kernels.mlp.reference; test: tests/kernels/test_kernels_alone.py.
     """
@@ -295,9 +305,13 @@ def gather_project(
         return
     column = tl.arange(0, WIDTH)
     bias = tl.load(values + bias_at + column)
-    if LOOP:
+    RESIDENT: tl.constexpr = LOOP or (OVERLAP and BLOCK <= 16)
+    if RESIDENT:
         first = transposed(weights + at_0, WIDTH, WIDTH)
         second = transposed(weights + at_1, WIDTH, WIDTH)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     tile = tl.program_id(0)
     if SUM == 0:
         rows = _rows_of(x, tile, count, WIDTH, BLOCK)
@@ -308,10 +322,10 @@ def gather_project(
         if SUM > 0:
             rows = gathered_sum(x, listed(table, row, count, capacity, SUM, False), SUM, WIDTH, BLOCK)
             tl.store(y + at, rows, mask=live)
-        if not LOOP:
+        if not RESIDENT:
             first = transposed(weights + at_0, WIDTH, WIDTH)
         tl.store(next_0 + at, product(rows, first, PRECISION), mask=live)
-        if not LOOP:
+        if not RESIDENT:
             second = transposed(weights + at_1, WIDTH, WIDTH)
         result = product(rows, second, PRECISION)
         if LOOP:

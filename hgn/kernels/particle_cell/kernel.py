@@ -25,7 +25,7 @@ from hgn.kernels.blocks import (
     transposed,
     weighted_sums,
 )
-from hgn.kernels.triton_compat import settle_keys
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 
 
 @triton.jit
@@ -85,7 +85,7 @@ def particle_cell_forward(
     by_particle, by_cell, particle, cell_of, weight_of, count_ptr, weights, values, offset_at, second_at,
     second_bias_at, norm_weight_at, norm_bias_at, hidden, normalised, rstd, out,
     TO_CELL: tl.constexpr, SAVE: tl.constexpr, WIDTH: tl.constexpr, PARTICLES: tl.constexpr,
-    PRECISION: tl.constexpr,
+    PRECISION: tl.constexpr, OVERLAP: tl.constexpr,
 ):  # fmt: skip
     """Paper step 1 (TO_CELL): out [C, W] += weight * MLP(by_particle_n + offset). Paper step 11: out [N, W] =
     particle + sum over the corners of weight * MLP(by_cell_c + by_particle_n - offset). The by_… are products with
@@ -116,6 +116,9 @@ def particle_cell_forward(
         offset_1 = tl.load(values + offset_at + WIDTH + column)
         offset_2 = tl.load(values + offset_at + 2 * WIDTH + column)
     second = transposed(weights + second_at, WIDTH, WIDTH)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     tile = tl.program_id(0)
     # read a tile ahead: they say where other things are, or are few
     cell, weight = _cells_of(tile, count, cell_of, weight_of, ROWS)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.triton_compat import settle_keys
+from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 
 DIVERGED = tl.constexpr(4)
 
@@ -16,7 +16,7 @@ DIVERGED = tl.constexpr(4)
 @triton.jit
 def integrate(
     output, position, velocity, scene_of, domain, gravity, mean, std, particle_count, status, lost, frame, path,
-    OUT: tl.constexpr, HISTORY: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
+    OUT: tl.constexpr, HISTORY: tl.constexpr, COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """v += a, x += v, and the new positions into path [T, N, 3] at `frame`; a is gravity and the restored output.
 
@@ -25,6 +25,9 @@ def integrate(
 
     Reference: hgn.runtime.simulator.Simulator on the torch backend; test: tests/kernels/test_rollout.py.
     """
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
         return
@@ -57,11 +60,13 @@ def integrate(
 
 
 @triton.jit
-def advance(status, lost, frame):
+def advance(status, lost, frame, OVERLAP: tl.constexpr):
     """Counts the frame, unless it was not taken.
 
     Reference: hgn.runtime.simulator.Simulator on the torch backend; test: tests/kernels/test_rollout.py.
     """
+    if OVERLAP:
+        gdc_wait()
     if tl.load(status) == 0:
         tl.store(frame, tl.load(frame) + 1)
         if tl.load(lost) > 0:
