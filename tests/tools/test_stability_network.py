@@ -24,7 +24,7 @@ from hgn.schema import ConfigError, from_mapping
 from tools.measures import neighbours
 from tools.solver_rollouts import solver_trials
 from tools.stability import network_motion
-from tools.stability.network import case_row, case_trials, energy_growth, initial_states, main, share_of_way
+from tools.stability.network import case_row, case_trials, energy_growth, guard_row, initial_states, main, share_of_way
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
 from tools.stability.network_motion import (
     DIRECTIONS,
@@ -261,6 +261,14 @@ def test_failures_are_told(weights: str) -> None:
     assert not row.held and row.measured == 16 and row.beyond.startswith("energy grows")
     row = row_of(simulator, case, 1e9)
     assert not row.held and row.beyond == "1e+02 % of the particles end outside of the domain"
+
+
+@pytest.mark.parametrize("inputs", ["absolute", "relative"])
+def test_the_guard_is_asked(inputs: str) -> None:
+    """A weight that explodes is noticed at the first frame, also where free flight leaves networks no answer."""
+    network = network_of(torch.float32, inputs=inputs, width=8, material_embedding=2, levels=2)
+    row = guard_row(Simulator(network, 60.0, "torch"), StabilityNetworkConfig("", scene=SceneConfig()))  # type: ignore[arg-type]
+    assert row.held, row
 
 
 def test_a_slope_against_a_closed_form() -> None:

@@ -48,6 +48,7 @@ DENSITY_BOUND = 2.0  # times as many neighbours, or as few, may there be at rest
 DRIFT_FACTOR, DRIFT_CELLS = 2.0, 1.0  # of the solver's own drift at rest, and so many of its cells, may there be
 HEIGHT_CELLS = 0.1  # that the mean height at rest may differ from the solver's
 FAR_DOMAINS = 100.0  # how far the guard's case throws particles
+ON_THE_FLOOR = 0.04  # times the height of a particle in the middle: 0.02 domain heights
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -301,7 +302,10 @@ def unrest(own: dict[str, float] | None, solvers: dict[str, float] | None) -> st
 
 
 def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
-    """A network with a weight that explodes: the runtime must stop at the first frame."""
+    """A network with a weight that explodes: the runtime must stop at the first frame.
+
+    Its particles lie on the floor: with relative inputs nothing comes of a weight in free flight.
+    """
     broken = copy.deepcopy(simulator.network)
     with torch.no_grad():
         # Not NaN: backends that are compared with each other before they run could not agree on that.
@@ -309,7 +313,9 @@ def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
         dict(broken.named_parameters())["decode.second.bias"][0] = thrown
     only = StabilityNetworkConfig(config.weights, cases=("single",), frames=4, scene=config.scene)
     scenes: Sequence[InitialState] = [
-        InitialState.of_scene(scene) for case in cases(only, broken.config) for scene in case.scenes
+        InitialState.of_scene(replace(scene, position_N3=scene.position_N3 * np.float32((1.0, ON_THE_FLOOR, 1.0))))
+        for case in cases(only, broken.config)
+        for scene in case.scenes
     ]
     sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.backend.name, simulator.backend.precision)
     trials = simulate_scenes(sabotaged, scenes, only.frames)
