@@ -313,7 +313,9 @@ def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
         dict(broken.named_parameters())["decode.second.bias"][0] = thrown
     only = StabilityNetworkConfig(config.weights, cases=("single",), frames=4, scene=config.scene)
     scenes: Sequence[InitialState] = [
-        InitialState.of_scene(replace(scene, position_N3=scene.position_N3 * np.float32((1.0, ON_THE_FLOOR, 1.0))))
+        InitialState.of_scene(
+            replace(scene, position_N3=scene.position_N3 * np.array((1.0, ON_THE_FLOOR, 1.0), np.float32))
+        )
         for case in cases(only, broken.config)
         for scene in case.scenes
     ]
