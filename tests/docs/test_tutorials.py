@@ -195,7 +195,12 @@ def test_how_to(here: Path) -> None:
 def test_gradients() -> None:
     """Gradients: of velocities and of a turned obstacle; the launch that hits a target is the closed form's; the
     bucket is filled to 90 % of what a search over angles reaches, which stays among the best here."""
-    runner = Runner(SETTINGS, {"range(-60, 61, 4)": "(-24, -16, -8)"})
+    shorter = {
+        "(scene, 21, velocity": "(scene, 7, velocity",
+        "20 / 60": "6 / 60",
+        "1.5e-4": "5e-6",
+    }  # a flight, minutes
+    runner = Runner(SETTINGS, shorter | {"range(-60, 61, 4)": "(-24, -16, -8)"})
     runner.run(ROOT / "docs/how_to/gradients.md")
     names = runner.names
     assert bool(names["turn_3"].grad.any()) and bool(names["velocity_N3"].grad.any())
