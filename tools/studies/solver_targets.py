@@ -8,12 +8,14 @@ when most particles have landed.
 from __future__ import annotations
 
 import multiprocessing
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +46,7 @@ TARGETS = {
     "scenes_256_random": None, "particles_1m": 110.0, "plain_one_scene_te_step": None, "plain_256_te_step": None,
     "dataset_800": 150.0,
 }  # fmt: skip
+GENERATOR = (sys.executable, "-m", "datagen", "+experiment=obstacles")
 COMPARED_FRAMES = 4
 FIRST_FRAME, LATER_FRAMES, FALL = 1e-6, 1e-4, 0.01  # bounds: domain units
 EXIT_RED = 1
@@ -56,6 +59,8 @@ class SolverTargetsConfig:
     cases: tuple[str, ...] = tuple(TARGETS)
     frames: int = 60  # the second half is timed; of a million particles a tenth
     scenes: Positive[int] = 800  # of the data set
+    folder: str | None = None  # a new one, in which the data set stays; null: it goes when it is timed
+    seconds: Positive[float] | None = None  # of the data set, at most; then it is stopped, and its check tells how far
     device: Processor = "auto"  # or cpu, gpu
     json: str | None = None  # also write the rows to this file; --json FILE does the same
 
@@ -64,6 +69,8 @@ class SolverTargetsConfig:
         unknown = sorted(set(self.cases) - set(TARGETS))
         require(not unknown, "cases", f"some of {', '.join(TARGETS)}", unknown)
         require(self.frames >= COMPARED_FRAMES, "frames", f"at least {COMPARED_FRAMES}", self.frames)
+        new = self.folder is None or not (Path(self.folder) / MANIFEST_NAME).exists()
+        require(new, "folder", "one without a data set, which would be gone on with", self.folder)
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -101,7 +108,7 @@ def _row(case: str, config: SolverTargetsConfig, kind: str) -> dict[str, Any]:
     plain, mpm, rate, frames = MpmConfig(device=kind), _at_their_step(kind), 1 / (SUBSTEPS * STEP_S), config.frames
     many = [_cubes()] * SIDE_BY_SIDE
     if case == "dataset_800":
-        return _dataset(config.scenes)
+        return _dataset(config)
     if case.startswith("plain"):
         return _plain(len(many) if "256" in case else 1, mpm, rate, frames)
     if case == "one_scene":
@@ -164,20 +171,33 @@ def _plain(copies: int, mpm: MpmConfig, rate: float, frames: int) -> dict[str, A
     return row | {"ms": taken / copies, "check": "green"}
 
 
-def _dataset(scenes: int) -> dict[str, Any]:
+def _dataset(config: SolverTargetsConfig) -> dict[str, Any]:
     """Seconds from the start of the command to its end, shards verified after."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "datagen", "+experiment=obstacles", f"scenes={scenes}", f"out={folder}/data"]
+    with ExitStack() as stack:
+        folder = config.folder or f"{stack.enter_context(tempfile.TemporaryDirectory())}/data"
         begin = time.perf_counter()
-        ended = subprocess.run([*command, "progress=off"], check=False).returncode
+        process = subprocess.Popen([*GENERATOR, f"scenes={config.scenes}", f"out={folder}", "progress=off"])
+        stack.callback(process.kill)
+        row: dict[str, Any] = {"scenes": config.scenes, "seconds": None}
+        try:
+            ended = process.wait(config.seconds)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGINT)  # what is published stays
+            process.wait()
+            return row | {"check": f"{_published(folder)} scenes after {config.seconds:g} s"}
         seconds = time.perf_counter() - begin
         if ended:
-            return {"scenes": scenes, "seconds": None, "check": f"ended with {ended}"}
-        data = Path(folder) / "data"
-        shards = Manifest.parse((data / MANIFEST_NAME).read_bytes(), data).shards.since(0)
+            return row | {"check": f"ended with {ended}"}
+        data = Path(folder)
+        shards = Manifest.load(data).shards.since(0)
         for shard in shards:
             verify_file(data / shard.name, shard.sha256, shard.bytes, "generate it again")
-    return {"scenes": scenes, "seconds": seconds, "check": "green" if shards else "no shards"}
+    return row | {"seconds": seconds, "check": "green" if shards else "no shards"}
+
+
+def _published(folder: str) -> int:
+    """Training scenes."""
+    return Manifest.load(folder).published("train") if (Path(folder) / MANIFEST_NAME).exists() else 0
 
 
 def _at_their_step(kind: str) -> MpmConfig:

@@ -1,11 +1,13 @@
 """python -m tools.studies.solver_targets: a row for each case; no time for what fails or differs."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
 from hgn.config import MpmConfig
+from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError
 from tools.bench.states import Workload, scene_of
 from tools.studies import solver_targets
@@ -34,6 +36,31 @@ def test_no_time_for_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "maximum_substeps_per_frame = 1" in table([{"case": "one_scene", "target": None} | row])
     monkeypatch.setattr(solver_targets, "LATER_FRAMES", -1.0)
     assert timed(scene, MpmConfig(device="cpu"), 4)["ms"] is None
+
+
+MAKES = """
+import shutil, sys, time
+data, *arguments = sys.argv[1:]
+out = dict(argument.split("=") for argument in arguments)["out"]
+shutil.copytree(data, out)
+time.sleep(60 if "slow" in out else 0)
+"""
+
+
+@pytest.mark.parametrize(("name", "seconds", "check"), [("quick", 60, "green"), ("slow", 3, "5 scenes after 3 s")])
+def test_a_data_set_that_is_kept(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, seconds: float, check: str
+) -> None:
+    """Its episodes stay where they are wanted, also where it is stopped, which has no time; it is not gone on with."""
+    monkeypatch.setattr(solver_targets, "GENERATOR", (sys.executable, "-c", MAKES, str(folder)))
+    kept, file = tmp_path / name, tmp_path / "times.json"
+    given = {"cases": ["dataset_800"], "device": "cpu", "folder": str(kept), "seconds": seconds, "json": str(file)}
+    assert main(given) == (check != "green")
+    (row,) = json.loads(file.read_text())["rows"]
+    assert row["check"] == check and (row["seconds"] is None) == (check != "green")
+    assert Manifest.load(kept).published("train") == 5
+    with pytest.raises(ConfigError, match="folder must be one without a data set"):
+        main(given)
 
 
 def test_bad_input() -> None:
