@@ -35,6 +35,7 @@ NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 SYMMETRIES = ("none", "gravity")
 NETWORK_INPUTS = ("absolute", "relative")
 KEPT_MOMENTA = ("linear", "angular")
+CONTACT_GATES = ("particle", "cell")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 TRAINING_BACKENDS = ("auto", "torch", "triton")
 PRECISIONS = ("fp32", "tf32", "fp16")
@@ -328,6 +329,9 @@ class NetworkConfig:
     # gravity are exact
     inputs: Annotated[str, one_of(*NETWORK_INPUTS)] = "absolute"
     contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
+    # what relative inputs show a particle's velocity against surfaces by: its own reach; or cell: that of all that is
+    # in its coarsest cells and across their faces, so that it is known inside a pile too
+    contact_gate: Annotated[str, one_of(*CONTACT_GATES)] = "particle"
     # what relative inputs keep where nothing touches, whatever the weights: linear momentum, or angular momentum too
     momentum: Annotated[str, one_of(*KEPT_MOMENTA)] = "linear"
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
@@ -346,6 +350,7 @@ class NetworkConfig:
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
         else:
             require(not self.keeps_spin, "momentum", "linear with inputs=absolute, which keep none", self.momentum)
+            require(not self.gates_by_cell, "contact_gate", "particle with inputs=absolute", self.contact_gate)
         if self.kind == "hgn":
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
         else:
@@ -376,6 +381,11 @@ class NetworkConfig:
     def keeps_spin(self) -> bool:
         """Whether angular momentum is kept by construction, too."""
         return self.momentum == "angular"
+
+    @property
+    def gates_by_cell(self) -> bool:
+        """Whether a particle knows its velocity against a surface that its coarsest cells alone reach."""
+        return self.contact_gate == "cell"
 
     @property
     def feature_width(self) -> int:

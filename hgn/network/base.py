@@ -58,8 +58,10 @@ class ParticleNetwork(nn.Module, ABC):
         `origin_S3` moves the grid, where the network has one.
         """
 
-    def relative_features(self, state: ParticleState, grid: GridHierarchy) -> torch.Tensor:
-        """All columns but the material's, [N, F]."""
+    def relative_features(
+        self, state: ParticleState, grid: GridHierarchy
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """All columns but the material's, [N, F], and how disturbed and how touched coarsest cells are, [C] each."""
         return relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
 
     def encode_features(self, feature_NF: torch.Tensor, material_N: torch.Tensor) -> torch.Tensor:
@@ -74,7 +76,7 @@ class ParticleNetwork(nn.Module, ABC):
         """
         if self.config.relative:
             assert grid is not None
-            return self.encode_features(self.relative_features(state, grid), state.material_N)
+            return self.encode_features(self.relative_features(state, grid)[0], state.material_N)
         velocity_NV = self.normaliser.normalise_velocity(state.velocity_NM3).flatten(1)
         maximum = self.config.wall_distance_cells * self.config.cell_size
         wall_N6 = wall_distances(state.position_N3, state.domain_S3[state.scene_N], maximum)

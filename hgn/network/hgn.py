@@ -18,7 +18,7 @@ from hgn.network.base import ParticleNetwork
 from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 from hgn.network.mlp import MLP
-from hgn.network.relative import OUTPUTS, balanced, disturbance
+from hgn.network.relative import OUTPUTS, balanced
 
 
 class MessagePassing(nn.Module):
@@ -90,10 +90,9 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         """The same on a grid, with `propagate` for steps 1 to 12."""
         if not self.config.relative:
             return propagate(self.encode_particles(state, grid), grid)
-        feature_NF = self.relative_features(state, grid)
+        feature_NF, disturbed_C, touched_C = self.relative_features(state, grid)
         output_N9 = propagate(self.encode_features(feature_NF, state.material_N), grid)
-        felt = disturbance(feature_NF, grid, self.config)
-        return balanced(output_N9, *felt, grid, self.config.keeps_spin)
+        return balanced(output_N9, disturbed_C, touched_C, grid, self.config.keeps_spin)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

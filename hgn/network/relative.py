@@ -13,6 +13,9 @@ ask:
 | 6 | walls within reach, lower x, y, z, then upper |
 | 3 + 3 | obstacle normals, at the particle and where it is flying to; only with obstacle_features |
 
+G is a particle's own `contact_gate`; or with `network.contact_gate: cell` sum_C w_pC t_C of what `disturbance` gives,
+which is nowhere less and knows a surface that is within reach of what the particle lies in.
+
 The decoder's nine numbers are an acceleration r and a stress sigma of each particle; `balanced` makes of them what is
 added to gravity. It is 0 where nothing moves against anything: what flies freely in one piece has exactly the
 acceleration g, whatever the weights. And where no surface is within reach it keeps momentum, whatever the weights: a
@@ -45,8 +48,9 @@ POINT = 1e-3  # of a coarsest cell's edge squared: a cube has it whose edge is a
 
 def relative_features(
     state: ParticleState, grid: GridHierarchy, config: NetworkConfig, scale: torch.Tensor
-) -> torch.Tensor:
-    """All columns but the embedding, [N, feature_width - material_embedding]; `scale` is s_a, frame units."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """All columns but the embedding, [N, feature_width - material_embedding], and what `disturbance` says of them;
+    `scale` is s_a, frame units."""
     velocity_N3 = state.velocity_NM3[:, 0]
     wall_N6 = wall_nearness(
         state.position_N3,
@@ -57,13 +61,19 @@ def relative_features(
     normal_N6 = None
     if config.obstacle_features:
         normal_N6 = obstacle_normals(state.position_N3, velocity_N3, state.scene_N, state.obstacles)
-    parts = [
-        torch.asinh(history(state.velocity_NM3, state.gravity_S3[state.scene_N]) / scale),
-        torch.asinh(surroundings(velocity_N3, grid) / scale),
-        contact_gate(wall_N6, normal_N6)[:, None] * torch.asinh(velocity_N3 / scale),
-        wall_N6,
-    ]
-    return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1)
+    motion_NK = torch.cat(
+        [
+            torch.asinh(history(state.velocity_NM3, state.gravity_S3[state.scene_N]) / scale),
+            torch.asinh(surroundings(velocity_N3, grid) / scale),
+        ],
+        dim=-1,
+    )
+    gate_N = contact_gate(wall_N6, normal_N6)
+    disturbed_C, touched_C = disturbance(motion_NK, gate_N, grid)
+    if config.gates_by_cell:
+        gate_N = (grid.weight_N8 * touched_C[coarsest_cells(grid)]).sum(1)
+    parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
+    return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), disturbed_C, touched_C
 
 
 def history(velocity_NH3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
@@ -124,18 +134,15 @@ def contact_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch
 
 
 def disturbance(
-    feature_NF: torch.Tensor, grid: GridHierarchy, config: NetworkConfig
+    motion_NK: torch.Tensor, touch_N: torch.Tensor, grid: GridHierarchy
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """How far what is around each coarsest cell is from free flight in one piece, and from flight, 0 to 1, [C] each.
 
-    A particle is disturbed by a surface within reach, or if a column of history or surroundings is not small against
-    QUIET (rounding leaves 0). A coarsest cell is as disturbed as the most disturbed particle in it and in the cells
-    across its faces: within a frame an impact is felt through a body. The second is of surfaces alone.
+    A particle is disturbed by a surface within reach (`contact_gate`), or if a column of history or surroundings is
+    not small against QUIET (rounding leaves 0). A coarsest cell is as disturbed as the most disturbed particle in it
+    and in the cells across its faces: within a frame an impact is felt through a body. The second is of surfaces alone.
     """
-    motion = 3 * (config.velocity_history - 1 + config.levels)
-    wall_N6, normal_NK = feature_NF[:, motion + 3 : motion + 9], feature_NF[:, motion + 9 :]
-    touch_N = contact_gate(wall_N6, normal_NK if config.obstacle_features else None)
-    own_N = (touch_N + (feature_NF[:, :motion] / QUIET).square().sum(-1)).clamp(max=1)
+    own_N = (touch_N + (motion_NK / QUIET).square().sum(-1)).clamp(max=1)
     cell_N8, coarsest = coarsest_cells(grid), grid.levels[-1]
 
     def felt(value_N: torch.Tensor) -> torch.Tensor:

@@ -14,7 +14,6 @@ from hgn.config import KEPT_MOMENTA
 from hgn.network.cell_keys import unpack
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.network.relative import disturbance, relative_features
 from hgn.runtime.parity import relative_error
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
@@ -66,8 +65,7 @@ def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict) -
     state = replace(state, velocity_NM3=state.velocity_NM3[:, : network.config.velocity_history])
     origin_S3, _ = drawn(network, state)
     found = features_of(network, state, origin_S3)
-    grid, scale = network.grid(state, origin_S3), network.normaliser.acceleration_std[0]
-    expected = relative_features(state, grid, network.config, scale).double()
+    expected = network.relative_features(state, network.grid(state, origin_S3))[0].double()
     width, materials = expected.shape[1], len(network.config.materials)
     for column in range(width):
         assert float((found[:, column] - expected[:, column]).abs().max()) < 2e-5, column
@@ -121,7 +119,7 @@ def test_what_flies_in_one_piece() -> None:
     state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=velocity_NH3)
     origin_S3, _ = drawn(network, state)
     grid = network.grid(state, origin_S3)
-    expected_C2 = torch.stack(disturbance(network.relative_features(state, grid), grid, network.config), 1)
+    expected_C2 = torch.stack(network.relative_features(state, grid)[1:], 1)
     scene_C = unpack(grid.levels[-1].key_C)[0]
     most = [float(expected_C2[scene_C == scene, 0].max()) for scene in range(3)]
     assert most[0] < 1e-3 < most[1] < 0.5 < most[2] and not expected_C2[:, 1].any()

@@ -55,7 +55,9 @@ def _one_scene(network, state, members, scene, origin_S3):
                 pairs.append((row, cell, weight, torch.tensor(cell).to(u) - u))
 
     if config.relative:
-        latent = [_relative(network, state, i, scene, row, members, pairs) for row, i in enumerate(members)]
+        columns = [_relative(network, state, i, scene, row, members, pairs) for row, i in enumerate(members)]
+        felt = _gated(config, columns, pairs)
+        latent = [[torch.tensor(line, dtype=state.position_N3.dtype)] for line in columns]
     embedding = network.embedding.weight
     latent = [
         network.encode(torch.cat([*parts, embedding[state.material_N[i]]]))
@@ -90,14 +92,11 @@ def _one_scene(network, state, members, scene, origin_S3):
     for row, cell, weight, offset in pairs:
         change[row] = change[row] + weight * network.cell_to_particle(values[cell], latent[row], -offset)
     output = [network.decode(value + delta) for value, delta in zip(latent, change, strict=True)]
-    if not config.relative:
-        return output
-    columns = [_relative(network, state, i, scene, row, members, pairs)[0].tolist() for row, i in enumerate(members)]
-    return _balanced(config, columns, pairs, output)
+    return _balanced(config, *felt, pairs, output) if config.relative else output
 
 
 def _relative(network, state, i, scene, row, members, pairs):
-    """The columns of relative inputs, one number after the other."""
+    """The columns of relative inputs, one number after the other, with no gate yet."""
     config, scale = network.config, float(network.normaliser.acceleration_std[0])
     x, gravity = state.position_N3[i].tolist(), state.gravity_S3[scene].tolist()
     v = state.velocity_NM3[i].tolist()
@@ -132,48 +131,58 @@ def _relative(network, state, i, scene, row, members, pairs):
         ahead = [_normal(state, place + state.velocity_NM3[i, 0] * (k / 4), scene) for k in (1, 2, 3, 4)]
         seen = [normal for normal in ahead if normal.any()]
         normals = [*_normal(state, place, scene).tolist(), *(seen[0].tolist() if seen else [0.0] * 3)]
-    gate = 1.0 if any(normals) else min(2 * max(walls), 1.0)
-    contact = [gate * f(v[0][a]) for a in range(3)]
-    return [torch.tensor([*history, *surroundings, *contact, *walls, *normals], dtype=state.position_N3.dtype)]
+    return [*history, *surroundings, *(f(v[0][a]) for a in range(3)), *walls, *normals]
 
 
-def _balanced(config, columns, pairs, output):
-    """Of accelerations and stresses what keeps momentum, one coarsest cell after the other (relative.balanced)."""
+def _gated(config, columns, pairs):
+    """Gates the columns of contact, and says how touched and how disturbed a coarsest cell is: functions of it."""
     motion = 3 * (config.velocity_history - 1 + config.levels)
     top = [(row, tuple(k >> config.levels - 1 for k in cell), weight) for row, cell, weight, _ in pairs]
-    # in coarsest cells
-    place = [(torch.tensor(cell) + 0.5 - offset) / 2 ** (config.levels - 1) for _, cell, _, offset in pairs]
-    disturbed, touched, mass, mean = {}, {}, {}, {}
-    for row, cell, weight in top:
-        walls, normals = columns[row][motion + 3 : motion + 9], columns[row][motion + 9 :]
-        touch = 1.0 if any(normals) else min(1.0, 2 * max(walls))
+    touch = [1.0 if any(x[motion + 9 :]) else min(1.0, 2 * max(x[motion + 3 : motion + 9])) for x in columns]
+    touched, disturbed = {}, {}
+    for row, cell, _ in top:
         moved = sum((value / 0.01) ** 2 for value in columns[row][:motion])
-        touched[cell] = max(touched.get(cell, 0.0), touch)
-        disturbed[cell] = max(disturbed.get(cell, 0.0), min(1.0, touch + moved))
-        mass[cell] = mass.get(cell, 0.0) + weight
-        mean[cell] = mean.get(cell, 0.0) + weight * output[row]
+        touched[cell] = max(touched.get(cell, 0.0), touch[row])
+        disturbed[cell] = max(disturbed.get(cell, 0.0), min(1.0, touch[row] + moved))
 
     def around(values, cell):
         sides = [tuple(k + sign * (a == b) for b, k in enumerate(cell)) for a in range(3) for sign in (1, -1)]
         return max([values[cell], *(values[side] for side in sides if side in values)])
 
+    for i, line in enumerate(columns):
+        gate = touch[i]
+        if config.contact_gate == "cell":
+            gate = sum(float(weight) * around(touched, cell) for row, cell, weight in top if row == i)
+        line[motion : motion + 3] = [gate * value for value in line[motion : motion + 3]]
+    return partial(around, touched), partial(around, disturbed)
+
+
+def _balanced(config, touched, disturbed, pairs, output):
+    """Of accelerations and stresses what keeps momentum, one coarsest cell after the other (relative.balanced)."""
+    top = [(row, tuple(k >> config.levels - 1 for k in cell), weight) for row, cell, weight, _ in pairs]
+    # in coarsest cells
+    place = [(torch.tensor(cell) + 0.5 - offset) / 2 ** (config.levels - 1) for _, cell, _, offset in pairs]
+    mass, mean = {}, {}
+    for row, cell, weight in top:
+        mass[cell] = mass.get(cell, 0.0) + weight
+        mean[cell] = mean.get(cell, 0.0) + weight * output[row]
     if config.keeps_spin:
-        return _without_turning(top, place, mass, mean, output, partial(around, touched), partial(around, disturbed))
+        return _without_turning(top, place, mass, mean, output, touched, disturbed)
     change = {}
     for cell in mass:
-        rest = -(1 - around(touched, cell)) * mean[cell][:3] / mass[cell]
+        rest = -(1 - touched(cell)) * mean[cell][:3] / mass[cell]
         for axis, sign in itertools.product(range(3), (1, -1)):
             other = tuple(k + sign * (a == axis) for a, k in enumerate(cell))
             if other not in mass:
                 continue
             stress = mean[cell] / mass[cell] + mean[other] / mass[other]  # after the acceleration: xx yy zz yz xz xy
             column = {0: (3, 8, 7), 1: (8, 4, 6), 2: (7, 6, 5)}[axis]
-            share = around(disturbed, other) * mass[other] / (mass[cell] + mass[other]) / 2
+            share = disturbed(other) * mass[other] / (mass[cell] + mass[other]) / 2
             rest = rest + share * sign * stress[list(column)]
         change[cell] = rest
     result = [torch.zeros(3, dtype=value.dtype) for value in output]
     for row, cell, weight in top:
-        result[row] = result[row] + weight * around(disturbed, cell) * (output[row][:3] + change[cell])
+        result[row] = result[row] + weight * disturbed(cell) * (output[row][:3] + change[cell])
     return result
 
 

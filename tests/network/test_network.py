@@ -48,10 +48,11 @@ def test_fcn_halves_equal_the_definition():
         ((12,), {"levels": 4, "message_passing_steps": 1, "width": 7}),
         ((15,), {"obstacle_features": False, "velocity_history": 5}),
         ((9, 4), {"inputs": "relative"}),
+        ((14, 4), {"inputs": "relative", "levels": 2, "obstacle_features": False, "contact_gate": "cell"}),
         ((1, 12), {"inputs": "relative", "levels": 1, "contact_reach_cells": 4.0}),
         ((12,), {"inputs": "relative", "obstacle_features": False}),
         ((15, 1), {"inputs": "relative", "obstacle_features": False, "momentum": "angular"}),
-        ((13, 2), {"inputs": "relative", "levels": 1, "contact_reach_cells": 4.0, "momentum": "angular"}),
+        ((13, 2), {"inputs": "relative", "levels": 1, "momentum": "angular", "contact_gate": "cell"}),
     ],
 )
 def test_network_equals_the_literal_definition(counts, changes):

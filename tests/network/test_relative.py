@@ -10,7 +10,7 @@ import torch
 from network.states import gns_of, network_of, random_grid, random_state
 from scene.test_symmetry import CUBE, matrix_of
 
-from hgn.config import NetworkConfig
+from hgn.config import CONTACT_GATES, NetworkConfig
 from hgn.network.cell_keys import unpack
 from hgn.network.features import Normaliser, ParticleState
 from hgn.network.grid import build_hierarchy
@@ -22,9 +22,7 @@ from hgn.network.relative import (
     balanced,
     coarsest_cells,
     contact_gate,
-    disturbance,
     obstacle_normals,
-    relative_features,
     wall_nearness,
 )
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -33,6 +31,7 @@ from hgn.schema import ConfigError
 
 HISTORY, SURROUNDINGS, CONTACT = slice(0, 12), slice(12, 21), slice(21, 24)  # with five velocities and three levels
 WALLS, NORMALS = slice(24, 30), slice(30, 36)
+GATES = pytest.mark.parametrize("gate", CONTACT_GATES)
 ALL_48 = scene_symmetries((0.0, 0.0, 0.0), CUBE, 1 / 64)
 
 
@@ -55,15 +54,18 @@ def in_flight(state: ParticleState, velocity: tuple[float, float, float], gravit
 
 
 def columns(network: HierarchicalGraphNetwork, state: ParticleState) -> torch.Tensor:
-    return relative_features(state, network.grid(state), network.config, network.normaliser.acceleration_std[0])
+    return network.relative_features(state, network.grid(state))[0]
 
 
 @pytest.mark.parametrize("velocity", [(5e-2, 0.0, 0.0), (0.0, 1.7e-2, 0.0), (-1e-3, 5e-3, 2e-2)])
 @pytest.mark.parametrize("counts", [(40, 17, 1), (1,)])
-def test_a_common_velocity_changes_nothing(counts: tuple[int, ...], velocity: tuple[float, float, float]) -> None:
+@GATES
+def test_a_common_velocity_changes_nothing(
+    counts: tuple[int, ...], velocity: tuple[float, float, float], gate: str
+) -> None:
     """Away from surfaces accelerations are the same to rounding with up to 3 m/s more in any direction, whatever the
     particles do among themselves; and they depend on that, but for a particle alone, which has none to push."""
-    network, state = network_of(inputs="relative"), airborne(counts)
+    network, state = network_of(inputs="relative", contact_gate=gate), airborne(counts)
     boosted = replace(state, velocity_NM3=state.velocity_NM3 + torch.tensor(velocity, dtype=torch.float64))
     torch.testing.assert_close(network(boosted), network(state), rtol=0, atol=1e-14)
     stirred = replace(state, velocity_NM3=state.velocity_NM3 * 2)
@@ -79,10 +81,11 @@ def test_another_place_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("gravity", [(0.0, -(2.0**-8), 0.0), (2.0**-9, 2.0**-10, -(2.0**-7)), (0.0, 0.0, 0.0)])
-def test_free_flight_knows_no_gravity(gravity: tuple[float, float, float]) -> None:
+@GATES
+def test_free_flight_knows_no_gravity(gravity: tuple[float, float, float], gate: str) -> None:
     """In free flight all columns of motion are exactly zero (numbers with short binary fractions), so that what is
     added to gravity is the same under any, and at rest without one."""
-    network, state = network_of(inputs="relative"), airborne()
+    network, state = network_of(inputs="relative", contact_gate=gate), airborne()
     gravity_3 = torch.tensor(gravity, dtype=torch.float64)
     flying = in_flight(state, (2.0**-5, -(2.0**-6), 2.0**-7), gravity_3)
     found = columns(network, flying)
@@ -93,10 +96,14 @@ def test_free_flight_knows_no_gravity(gravity: tuple[float, float, float]) -> No
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.0), (1.7e-1, 0.0, 0.0), (-1e-3, 5e-2, 2e-2)])
-def test_free_flight_in_one_piece_is_exact(velocity: tuple[float, float, float]) -> None:
+@GATES
+def test_free_flight_in_one_piece_is_exact(velocity: tuple[float, float, float], gate: str) -> None:
     """With any weights, velocity up to 10 m/s and gravity, what flies freely as one has the acceleration g to rounding;
     and so has a single particle, however it got there."""
-    network, gravity_3 = network_of(inputs="relative"), torch.tensor([2e-3, -5e-3, 1e-3], dtype=torch.float64)
+    network, gravity_3 = (
+        network_of(inputs="relative", contact_gate=gate),
+        torch.tensor([2e-3, -5e-3, 1e-3], dtype=torch.float64),
+    )
     state = in_flight(airborne(), velocity, gravity_3)
     torch.testing.assert_close(network(state), gravity_3.expand_as(state.position_N3), rtol=0, atol=1e-15)
 
@@ -113,7 +120,7 @@ def test_what_is_disturbed_disturbs_its_body() -> None:
     def gates(velocity_NH3: torch.Tensor) -> torch.Tensor:
         changed = replace(state, velocity_NM3=velocity_NH3)
         grid = network.grid(changed)
-        disturbed_C, touched_C = disturbance(network.relative_features(changed, grid), grid, config)
+        _, disturbed_C, touched_C = network.relative_features(changed, grid)
         assert not touched_C.any()
         return (grid.weight_N8 * disturbed_C[coarsest_cells(grid)]).sum(1)
 
@@ -147,11 +154,12 @@ ODD_BODIES = [
 @pytest.mark.parametrize(
     ("levels", "momentum"), [(1, "linear"), (3, "linear"), (1, "angular"), (2, "angular"), (3, "angular")]
 )
-def test_momentum_is_kept_where_nothing_touches(levels: int, momentum: str) -> None:
+@GATES
+def test_momentum_is_kept_where_nothing_touches(levels: int, momentum: str, gate: str) -> None:
     """With any weights, the accelerations of particles that move as they please, over many coarsest cells and alone in
     theirs, on lines, planes and in one place, sum to gravity's; their moments to 0 too where angular momentum is kept,
     and not where it is not. Near a wall they do not, nor do those of a part; and the means of cells differ."""
-    network = network_of(inputs="relative", levels=levels, momentum=momentum)
+    network = network_of(inputs="relative", levels=levels, momentum=momentum, contact_gate=gate)
     state = airborne((60, 17, 1, 40, *map(len, ODD_BODIES)))
     place_N3 = torch.where((state.scene_N == 3)[:, None], 0.35 + state.position_N3 / 2, state.position_N3)
     place_N3[118:] = torch.cat(ODD_BODIES)
@@ -168,7 +176,7 @@ def test_momentum_is_kept_where_nothing_touches(levels: int, momentum: str) -> N
             assert float(mine_N3[::2].sum(0).abs().max()) > 1e-3 * sizes
             assert momentum == "angular" or float(turn_3.abs().max()) > 1e-5 * sizes
     grid = network.grid(state)
-    disturbed_C, touched_C = disturbance(network.relative_features(state, grid), grid, network.config)
+    _, disturbed_C, touched_C = network.relative_features(state, grid)
     assert not touched_C.any()
     stressed = torch.cat([torch.zeros(len(extra_N3), 3), torch.randn(len(extra_N3), 6)], 1).double()
     pushed_N3 = balanced(stressed, disturbed_C, touched_C, grid, network.config.keeps_spin)
@@ -313,7 +321,7 @@ def test_impulses_turn_with_the_scene(symmetry: Symmetry, keeps_spin: bool) -> N
 def test_columns_turn_with_the_scene(symmetry: Symmetry) -> None:
     """Scene and gravity turned and mirrored together by what keeps a cube: columns of vectors do as they, walls change
     places; with obstacles and walls within reach. The grid's cells are their own images here."""
-    network = network_of(inputs="relative", cell_size=1 / 8, contact_reach_cells=3.0)
+    network = network_of(inputs="relative", cell_size=1 / 8, contact_reach_cells=3.0, contact_gate="cell")
     grid = random_grid(3, 40_000, extent=64)
     state = replace(random_state((60,), spread=0.95), obstacles=ObstacleCells.of([grid]))
     state = replace(state, velocity_NM3=10 * state.velocity_NM3)
@@ -352,6 +360,71 @@ def test_surfaces_beyond_reach_are_not_seen() -> None:
     assert found[1, CONTACT].any() and int(found[1, WALLS].argmax()) == 0
     along = float(torch.asinh(torch.tensor(2e-2, dtype=torch.float64) / network.normaliser.acceleration_std[0]))
     assert float(found[2, CONTACT][2]) == pytest.approx(along) and int(found[2, WALLS].argmax()) == 4
+
+
+def pile(*heights: list[float]) -> ParticleState:
+    """A scene for each list, in which particles lie one above the other, that many R = 0.035 above a floor; all slide
+    at 0.3 m/s, and nothing else moves."""
+    place_N3 = 0.035 * torch.tensor([[14.3, height, 14.2] for scene in heights for height in scene]).double()
+    zero_N, zero_3 = torch.zeros(len(place_N3), dtype=torch.long), torch.zeros(3, dtype=torch.float64)
+    scene_N = torch.repeat_interleave(torch.arange(len(heights)), torch.tensor([len(scene) for scene in heights]))
+    one_S3 = torch.ones(len(heights), 3, dtype=torch.float64)
+    state = ParticleState(place_N3, place_N3[:, None], zero_N, scene_N, one_S3, one_S3, None)
+    return in_flight(state, (5e-3, 0.0, 0.0), zero_3)
+
+
+def gates(network: HierarchicalGraphNetwork, state: ParticleState) -> torch.Tensor:
+    """G of each particle: its column of contact over what that is of."""
+    along_N = torch.asinh(state.velocity_NM3[:, 0, 0] / network.normaliser.acceleration_std[0])
+    return columns(network, state)[:, CONTACT.start] / along_N
+
+
+def test_a_pile_knows_how_it_moves() -> None:
+    """Of a pile on a floor its foot alone sees the velocity by its own reach, all within the coarsest cells above that
+    by the cells' gate; that is 0 further up, and for all without the foot: by single particles, as in flight."""
+    network = network_of(inputs="relative", contact_gate="cell")  # coarsest cells of 4 R
+    heights = [0.7, 2.1, 3.3, 5.2, 6.8, 7.4, 8.6, 12.1]
+    assert gates(network, pile(heights)).tolist() == pytest.approx([1, 1, 1, 1, 1, 1, 0, 0], abs=1e-12)
+    assert not gates(network, pile(heights[1:])).any()
+    near = network_of(inputs="relative")
+    assert gates(near, pile(heights)).tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 0, 0], abs=1e-12)
+
+
+def test_no_gate_is_less_than_the_own_one() -> None:
+    """Among walls and obstacles the cells' gate is at most 1, and nowhere below a particle's own."""
+    state = random_state((60, 9, 1), spread=0.5)
+    state.velocity_NM3[:, :, 0] = 5e-3
+    own_N, found_N = (gates(network_of(inputs="relative", contact_gate=gate), state) for gate in CONTACT_GATES)
+    assert (found_N > own_N - 1e-12).all() and (found_N < 1 + 1e-12).all()
+    assert (own_N == 0).any() and (found_N > own_N + 0.1).any()
+
+
+def test_the_gate_is_continuous() -> None:
+    """On a particle's way up a pile, from cell to cell and out of reach, smaller steps change its gate less, in
+    proportion, and no other's."""
+    network, jumps = network_of(inputs="relative", contact_gate="cell"), []
+    for steps in (200, 1600):
+        heights = torch.linspace(1.6, 11.0, steps).tolist()
+        gate_TN = gates(network, pile(*([0.7, 5.2, 9.7, height] for height in heights))).view(steps, 4)
+        assert float(gate_TN[:, :3].std(0).max()) < 1e-12
+        assert float(gate_TN[0, 3]) == pytest.approx(1) and float(gate_TN[-1, 3]) == 0
+        jumps.append(float(gate_TN.diff(dim=0).abs().max()))
+    assert jumps[0] < 0.1 and jumps[1] < jumps[0] / 6
+
+
+@GATES
+def test_gradients_of_the_columns(gate: str) -> None:
+    """Those by places and velocities are finite differences, near a floor."""
+    network, state = network_of(inputs="relative", contact_gate=gate), airborne((5,))
+    place_N3 = state.position_N3 * torch.tensor([1.0, 0.09, 1.0])
+
+    def of(place_N3: torch.Tensor, velocity_NH3: torch.Tensor) -> torch.Tensor:
+        moved = replace(state, position_N3=place_N3, velocity_NM3=velocity_NH3)
+        return columns(network, moved)
+
+    inputs = (place_N3.requires_grad_(), state.velocity_NM3.clone().requires_grad_())
+    assert of(*inputs)[:, CONTACT.start].abs().max() > 0.1
+    assert torch.autograd.gradcheck(of, inputs, eps=1e-7, atol=1e-4)
 
 
 @pytest.mark.parametrize("wall", range(6))
@@ -414,6 +487,8 @@ def test_one_scale_for_all_axes() -> None:
         ({"contact_reach_cells": 0.0}, "contact_reach_cells must be"),
         ({"kind": "gns", "levels": 1, "inputs": "relative"}, "inputs must be absolute for gns, got 'relative'"),
         ({"inputs": "relative", "momentum": "spin"}, "momentum must be one of linear, angular, got 'spin'"),
+        ({"inputs": "relative", "contact_gate": "near"}, "contact_gate must be one of particle, cell, got 'near'"),
+        ({"contact_gate": "cell"}, "contact_gate must be particle with inputs=absolute, got 'cell'"),
         ({"momentum": "angular"}, "momentum must be linear with inputs=absolute, which keep none, got 'angular'"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from ballistic_dataset import MakeConfig, MakeDataset
 from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
+from hgn.config import DatagenConfig, NetworkConfig, TrainConfig, TrainingConfig
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
 from hgn.evaluate import EvaluateConfig, one_step_rows
@@ -20,7 +21,7 @@ from hgn.network.build import build_network
 from hgn.runtime.torch_backend import Backend
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
-from hgn.training.checkpoint import DataInfo, network_of_checkpoint, read_checkpoint
+from hgn.training.checkpoint import DataInfo, network_of_checkpoint, network_of_weights, read_checkpoint
 from hgn.training.module import TrainingModule
 
 
@@ -95,6 +96,19 @@ def test_other_weights_are_refused(data: DatagenConfig, tmp_path: Path, file: An
     with pytest.raises(ConfigError, match=message):
         train.main(train_mapping(data, tmp_path / "run", init_weights=str(path)))
     assert {path.name for path in (tmp_path / "run").rglob("*")} <= {".lock"}
+
+
+def test_another_contact_gate_is_taken(tmp_path: Path) -> None:
+    """Weights that were trained with a particle's own gate begin a network with the cells': the same tensors."""
+    path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
+    wanted = NetworkConfig(**NETWORK | {"inputs": "relative", "contact_gate": "cell"})
+    config = TrainConfig(network=wanted, training=TrainingConfig(init_weights=str(path)))
+    network, (own, info) = network_of_weights(config), load_weights(path)
+    assert network.config == wanted and info.network.contact_gate == "particle"
+    theirs = own.state_dict()
+    assert all(torch.equal(tensor, theirs[name]) for name, tensor in network.state_dict().items())
+    with pytest.raises(ConfigError, match=r"network.momentum must be 'linear', as in"):
+        network_of_weights(replace(config, network=replace(wanted, momentum="angular")))
 
 
 def test_warm_up() -> None:
