@@ -428,6 +428,9 @@ class TrainingConfig:
     # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
     # all frames alike
     frame_importance: BelowOne[float] = 0.0
+    # folders of data sets that are trained on too, as far as they are published when the run starts: of the same
+    # physics, frame rate and solver cells
+    more_data: tuple[str, ...] = ()
     # episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all
     shuffle_episodes: NonNegative[int] = 0
     symmetry: SymmetryName = (

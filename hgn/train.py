@@ -32,7 +32,7 @@ from hgn.training.checkpoint import (
     read_checkpoint,
     sampler_state_of_checkpoint,
 )
-from hgn.training.dataset import PublishedEpisodes, is_complete, wait_for_episodes
+from hgn.training.dataset import PublishedEpisodes, is_complete, more_data, wait_for_episodes
 from hgn.training.distributed import default_run, first_on_machine, first_rank, layout
 from hgn.training.generator import Generator
 from hgn.training.imported import require_network_fits, settings_of_imported
@@ -56,6 +56,7 @@ def main(mapping: dict[str, Any]) -> int:
         require_network_fits(config, Manifest.load(folder))
     elif EpisodeStore.available(folder):
         require_same_dataset(Manifest.load(folder).config, config.datagen, folder)
+    others = more_data(config)
     stop = StopRequest()
     stop.listen()
     with ExitStack() as stack:
@@ -69,7 +70,7 @@ def main(mapping: dict[str, Any]) -> int:
             generator = Generator(config.datagen, run / "datagen")
             stack.callback(generator.stop)
         precompilation = precompile_kernels(config, stack)
-        store = wait_for_episodes(config, generator, stop)
+        store = wait_for_episodes(config, generator, stop, others)
         if store is None:
             print("stopped before the first episode was published; the same command goes on", file=sys.stderr)
             return stop.exit_code

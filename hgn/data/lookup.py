@@ -7,12 +7,13 @@ from itertools import islice
 from pathlib import Path
 
 from hgn.data.manifest import SPLITS
+from hgn.data.pooled import AnyStore
 from hgn.data.reader import EpisodeStore
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 
 
-def first_indices(store: EpisodeStore, count: int, published: int | None = None) -> list[int]:
+def first_indices(store: AnyStore, count: int, published: int | None = None) -> list[int]:
     """Where in the store the episodes of lowest index among the first `known` published (all of them if absent) are."""
     places = ((entry.index, place) for place, entry in enumerate(islice(store.entries, published)))
     return [place for _, place in nsmallest(count, places)]

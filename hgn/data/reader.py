@@ -14,7 +14,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 
@@ -192,7 +192,7 @@ class EpisodeStore:
 
     def _reset(self) -> None:
         self._open_shards: OrderedDict[str, _OpenShard] = OrderedDict()
-        self._episodes = _Episodes(self)
+        self._episodes = EpisodeSequence(self)
         self._fetcher = None
         self._frames: list[int] = []  # of the episodes of the data set's first shards, where they may differ
         self._measured = 0  # how many shards these are
@@ -204,7 +204,8 @@ class EpisodeStore:
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)
 
-    def _open(self, index: int) -> Episode:
+    def open(self, index: int) -> Episode:
+        """The episode at a place in publication order, below the number of them."""
         shard, entry = self._locate(index)
         while True:
             opened = self._open_shards.get(shard.name)
@@ -266,10 +267,18 @@ class _OpenShard:
         self.episodes: dict[str, Episode] = {}
 
 
-class _Episodes(Sequence[Episode]):
+class _Opens(Protocol):
+    """What an episode is opened by."""
+
+    def __len__(self) -> int: ...
+
+    def open(self, index: int) -> Episode: ...
+
+
+class EpisodeSequence(Sequence[Episode]):
     """The list of episodes of a store, opened on access."""
 
-    def __init__(self, store: EpisodeStore) -> None:
+    def __init__(self, store: _Opens) -> None:
         self._store = store
 
     @overload
@@ -280,14 +289,14 @@ class _Episodes(Sequence[Episode]):
 
     def __getitem__(self, index: int | slice) -> Episode | list[Episode]:
         if isinstance(index, slice):
-            return [self._store._open(i) for i in range(len(self))[index]]
-        return self._store._open(range(len(self))[index])
+            return [self._store.open(i) for i in range(len(self))[index]]
+        return self._store.open(range(len(self))[index])
 
     def __len__(self) -> int:
         return len(self._store)
 
     def __iter__(self) -> Iterator[Episode]:
-        return (self._store._open(i) for i in range(len(self)))
+        return (self._store.open(i) for i in range(len(self)))
 
 
 def read_episode(

@@ -20,7 +20,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from tqdm import tqdm
 
 from hgn.data.lookup import first_indices
-from hgn.data.reader import EpisodeStore
+from hgn.data.pooled import AnyStore
 from hgn.data.storage import PATIENCE_S
 from hgn.render.pictures import rollout_of_episode
 from hgn.runtime.backend import fastest_stepped
@@ -132,7 +132,7 @@ class Checkpoints(Callback):
 class Monitor(Callback):
     """Measures one-step errors on fixed scenes of both splits, and rollouts of the validation scenes."""
 
-    def __init__(self, run: Path, training: EpisodeStore, stop: StopRequest, checkpoints: Checkpoints):
+    def __init__(self, run: Path, training: AnyStore, stop: StopRequest, checkpoints: Checkpoints):
         self.run, self.stop, self.checkpoints = run, stop, checkpoints
         self.stores = {"training": training, "validation": training.of_split("validation")}
         self.last: dict[str, float] = {}

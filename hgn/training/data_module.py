@@ -18,7 +18,7 @@ from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.batch import Batch, BatchSample, UpdateSamples
 from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk, whole_episode
 from hgn.data.importance import FrameImportance
-from hgn.data.reader import EpisodeStore
+from hgn.data.pooled import AnyStore
 from hgn.data.sampler import BLOCK_EPISODES, EpisodeSampler, Sample, SamplerState
 from hgn.data.storage import without_patience
 from hgn.scene.episode import Episode
@@ -41,7 +41,7 @@ class EpisodeDataModule(LightningDataModule):
 
     def __init__(
         self,
-        store: EpisodeStore,
+        store: AnyStore,
         network: NetworkConfig,
         training: TrainingConfig,
         batches_ahead: int = BATCHES_AHEAD,
@@ -261,7 +261,7 @@ def chunk_length(training: TrainingConfig, begun: int, update: int) -> int:
     return min(until_due, until_end, UPDATES_AT_ONCE, max(1, update - begun))
 
 
-def agreed_count(store: EpisodeStore, trainer: Trainer, order: Mapping[str, int] | None = None) -> int:
+def agreed_count(store: AnyStore, trainer: Trainer, order: Mapping[str, int] | None = None) -> int:
     """How many episodes rank 0 knows; the other ranks wait until they see as many. All ranks call this.
 
     `order` is what the order of samples stands on beside the data: settings of `training`.

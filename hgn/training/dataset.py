@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Sequence
 
-from hgn.config import TrainConfig
+from hgn.config import SceneConfig, TrainConfig
+from hgn.data.identity import identity_differences, physics_settings
 from hgn.data.manifest import SPLITS, Manifest
+from hgn.data.pooled import AnyStore, PooledStore
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import UnreachableError, is_remote
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, from_stored, require
 from hgn.system.progress import bar
 from hgn.training.distributed import first_rank
 from hgn.training.generator import Generator
@@ -28,13 +31,56 @@ def is_complete(config: TrainConfig) -> bool:
     return all(manifest.published(split) >= config.dataset.scenes(split) for split in SPLITS)
 
 
-def wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: StopRequest) -> EpisodeStore | None:
-    """Waits until enough training episodes are published, showing what is awaited; none when asked to stop.
+def more_data(config: TrainConfig) -> list[EpisodeStore]:
+    """The training episodes of `training.more_data`, as far as they are published now.
+
+    Raises: ConfigError where a data set is not there, is given twice, or does not go with the others.
+    """
+    stores: list[EpisodeStore] = []
+    for i, folder in enumerate(config.training.more_data):
+        field = f"training.more_data[{i}]"
+        others = (config.dataset.folder, *config.training.more_data[:i])
+        require(folder not in others, field, "a data set that is not among the others", folder)
+        store = EpisodeStore(folder, "train")
+        require(len(store) > 0, field, "a data set with training episodes", folder)
+        _require_goes_with(config, store, field)
+        stores.append(store)
+    return stores
+
+
+def _require_goes_with(config: TrainConfig, store: EpisodeStore, field: str) -> None:
+    stored, folder, network = store.manifest.config, store.folder, config.network
+    require("imported" not in stored and not config.imported, field, "left out for imported data", folder)
+    scene = from_stored(SceneConfig, stored["scene"], "scene")
+    rate = config.dataset.frame_rate_hz
+    require(stored["frame_rate_hz"] == rate, field, f"of {rate:g} frames a second", stored["frame_rate_hz"])
+    cell_size = config.scene.cell_size
+    require(scene.cell_size == cell_size, field, f"of solver cells of {cell_size:g}", scene.cell_size)
+    known = set(scene.materials) <= set(network.materials)
+    require(known, field, f"of the materials {', '.join(network.materials)}", list(scene.materials))
+    seen = network.sees_obstacles or scene.obstacle_count == 0
+    require(seen, field, "without obstacles, which the network does not see", folder)
+    upright = scene.gravity == config.scene.gravity and not scene.zero_gravity_fraction + scene.tilted_gravity_fraction
+    require(network.relative or upright, field, "of dataset's gravity where network.inputs=absolute", folder)
+    differences = identity_differences(stored["mpm"], physics_settings(config.datagen), "mpm")
+    require(not differences, field, "of the same physics", f"{folder}, where {'; '.join(differences[:3])}")
+    if config.training.pushforward_fraction > 0:
+        least = config.training.pushforward_frames + 2
+        rule = f"of at least training.pushforward_frames + 2 = {least} frames"
+        require(min(store.frames()) >= least, field, rule, min(store.frames()))
+
+
+def wait_for_episodes(
+    config: TrainConfig, generator: Generator | None, stop: StopRequest, others: Sequence[EpisodeStore] = ()
+) -> AnyStore | None:
+    """Waits until enough training episodes are published, those of `others` among them, showing what is awaited; none
+    when asked to stop.
 
     Raises: ConfigError when they cannot come: the generator failed, or nobody makes them.
     """
     folder = config.dataset.folder
-    needed = min(config.training.minimum_episodes, config.dataset.training_scenes)
+    present = sum(map(len, others))
+    needed = max(0, min(config.training.minimum_episodes, config.dataset.training_scenes + present) - present)
     if generator is None and first_rank() and not EpisodeStore.available(folder):
         raise ConfigError(
             f"dataset.folder must hold a data set, got {folder} without one; generate it with python -m datagen "
@@ -46,7 +92,7 @@ def wait_for_episodes(config: TrainConfig, generator: Generator | None, stop: St
         if store is not None and len(store) >= needed:
             if progress is not None:
                 progress.close()
-            return store
+            return PooledStore(store, others) if others else store
         if generator is not None:
             generator.check()
             if not generator.running:

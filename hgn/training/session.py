@@ -13,7 +13,7 @@ import yaml
 
 from hgn.config import TrainConfig
 from hgn.data.manifest import Manifest
-from hgn.data.reader import EpisodeStore
+from hgn.data.pooled import AnyStore
 from hgn.data.sampler import SamplerState
 from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 def train_network(
     config: TrainConfig,
-    store: EpisodeStore,
+    store: AnyStore,
     checkpoint: tuple[Path, SamplerState] | None,
     initial: ParticleNetwork | None,
     stop: StopRequest,

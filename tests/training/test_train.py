@@ -7,6 +7,7 @@ import os
 import signal
 import zipfile
 from collections.abc import Collection
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 
@@ -21,11 +22,13 @@ from training.runs import metrics, train_mapping
 from hgn import train
 from hgn.config import TrainConfig
 from hgn.data.manifest import Manifest
+from hgn.data.reader import EpisodeStore
+from hgn.data.statistics import merge_statistics
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.files import held
 from hgn.training import callbacks
-from hgn.training.checkpoint import LAST_NAMES, read_checkpoint
+from hgn.training.checkpoint import LAST_NAMES, read_checkpoint, sampler_state_of_checkpoint
 from hgn.training.dataset import PublishedEpisodes
 from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
@@ -319,4 +322,64 @@ def test_bad_configuration(make_config, tmp_path, section, change, message):
     mapping[section] |= change
     with pytest.raises(ConfigError, match=message):
         train.main(mapping)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.fixture
+def other(make_config, make_dataset, tmp_path):
+    """The configuration of a second data set, which is there: of another seed and longer episodes."""
+    config = make_config(folder=str(tmp_path / "other"), seed=1, training_scenes=3, frames=9)
+    make_dataset(config)
+    return config
+
+
+def test_more_data(data, other, tmp_path):
+    """A run on two data sets has the episodes and the statistics of both, and goes on with both; without the second it
+    is not gone on with in the middle of an epoch."""
+    run, more = tmp_path / "run", {"more_data": [other.dataset.folder], "minimum_episodes": 8}
+    assert train.main(train_mapping(data, run, **more, maximum_updates=6)) == 0
+    assert {record["episodes"] for record in metrics(run) if "loss" in record} == {8}
+    stores = [EpisodeStore(config.dataset.folder, "train") for config in (other, data)]
+    mean = merge_statistics(store.statistics() for store in stores).velocity.mean
+    assert weights(run / "checkpoints" / "last.ckpt")["network.normaliser.velocity_mean"].tolist() == pytest.approx(
+        mean
+    )
+    with pytest.raises(ConfigError, match="data set must still hold the 8 training episodes"):
+        train.main(train_mapping(data, run))
+    assert train.main(train_mapping(data, run, **more)) == 0
+    whole = tmp_path / "whole"
+    assert train.main(train_mapping(data, whole, **more)) == 0
+    found, expected = (read_checkpoint(folder / "checkpoints" / "last.ckpt") for folder in (run, whole))
+    assert sampler_state_of_checkpoint(found) == sampler_state_of_checkpoint(expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "training", "message"),
+    [
+        ({}, {"more_data": ["nowhere"]}, r"nowhere/manifest\.json must be the manifest of a data set"),
+        ({}, {"more_data": ["DATA"]}, r"more_data\[0\] must be a data set that is not among the others"),
+        ({"dataset": {"training_scenes": 0}}, {}, r"more_data\[0\] must be a data set with training episodes"),
+        ({"dataset": {"frame_rate_hz": 30.0}}, {}, r"more_data\[0\] must be of 60 frames a second, got 30"),
+        ({"scene": {"cell_size": 1 / 32}}, {}, r"more_data\[0\] must be of solver cells of 0.015625, got 0.03125"),
+        ({"scene": {"gravity": (0.0, -1.0, 0.0)}}, {}, r"more_data\[0\] must be of dataset's gravity where"),
+        ({"mpm": {"poisson_ratio": 0.3}}, {}, r"must be of the same physics, got .*mpm.poisson_ratio is 0.3 there"),
+        (
+            {},
+            {"pushforward_fraction": 0.5, "pushforward_frames": 4, "frames": 5},
+            r"more_data\[0\] must be of at least training.pushforward_frames \+ 2 = 6 frames, got 5",
+        ),
+    ],
+)
+def test_data_that_do_not_go_together(data, make_config, make_dataset, tmp_path, changes, training, message):
+    """Are refused by what differs, before anything is started."""
+    training = dict(training)
+    dataset = {"frames": training.pop("frames", 9)} | changes.get("dataset", {})
+    config = make_config(folder=str(tmp_path / "other"), seed=1, **dataset)
+    for section in ("scene", "mpm"):
+        config = replace(config, **{section: replace(getattr(config, section), **changes.get(section, {}))})
+    make_dataset(config)
+    folders = training.pop("more_data", [config.dataset.folder])
+    folders = [data.dataset.folder if folder == "DATA" else folder for folder in folders]
+    with pytest.raises(ConfigError, match=message):
+        train.main(train_mapping(data, tmp_path / "run", more_data=folders, **training))
     assert not (tmp_path / "run").exists()
