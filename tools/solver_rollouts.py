@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import pickle
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +17,7 @@ from hgn.runtime.rollouts import RolloutResult
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.scene import Scene
+from hgn.system.files import make_folder, temporary_file
 
 TOGETHER_S = 20e-6  # frames that are reported less than this apart were computed together
 
@@ -85,6 +89,28 @@ def solver_trials(
             cause = None if good == frames else f"positions are not finite at frame {good}"
             trials.append(RolloutResult(result.position_TN3[:good], cause))
     return trials
+
+
+def kept_trials(
+    folder: Path, scenes: Sequence[Scene], config: MpmConfig, frames: int, frame_rate_hz: float
+) -> list[RolloutResult]:
+    """The same; what lies in `folder` is not simulated again, and what was simulated is kept there. A folder is for one
+    version of the solver.
+    """
+    make_folder(folder)
+    physics = replace(config, device="auto", scenes_per_launch=None)
+    keys = [hashlib.sha256(pickle.dumps((scene, physics, frames, frame_rate_hz))).hexdigest() for scene in scenes]
+    files = [folder / f"{key}.npz" for key in keys]
+    missing = [i for i, file in enumerate(files) if not file.exists()]
+    if missing:
+        trials = solver_trials([scenes[i] for i in missing], config, frames, frame_rate_hz)
+        for i, trial in zip(missing, trials, strict=True):
+            with temporary_file(files[i]) as temporary:
+                with temporary.open("wb") as file:
+                    np.savez(file, position_TN3=trial.position_TN3, cause=np.array(trial.cause or ""))
+                temporary.replace(files[i])
+    stored = [np.load(file) for file in files]
+    return [RolloutResult(item["position_TN3"], str(item["cause"]) or None) for item in stored]
 
 
 def other_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:

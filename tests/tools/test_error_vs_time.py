@@ -363,8 +363,11 @@ def test_what_nobody_foresaw_stops_one_contender(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_run_that_is_killed_leaves_whole_points(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After each contender the file holds its errors and its run times."""
+@pytest.mark.parametrize("times_last", [False, True])
+def test_a_run_that_is_killed_leaves_whole_points(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times_last: bool
+) -> None:
+    """After each contender the file holds its errors and its run times; where all run times come last, none yet."""
     weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
 
     def killed(contender, *more):
@@ -375,9 +378,14 @@ def test_a_run_that_is_killed_leaves_whole_points(data: str, tmp_path: Path, mon
     monkeypatch.setattr("tools.error_vs_time.run.score", killed)
     options = {"data": data, "weights": weights, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
     with pytest.raises(KeyboardInterrupt):
-        main(options | SHORT)
+        main(options | SHORT | {"times_last": times_last})
     rows = {row["system"]: row for row in json.loads((tmp_path / "report.json").read_text())["rows"]}
-    assert rows["hgn"]["ms"] > 0 and rows["hgn"]["one_step_mse"] > 0 and rows["hgn"]["position_mse"]["5"] > 0
+    assert rows["hgn"]["one_step_mse"] > 0 and rows["hgn"]["position_mse"]["5"] > 0
+    assert "ms" not in rows["hgn"] if times_last else rows["hgn"]["ms"] > 0
+    monkeypatch.setattr("tools.error_vs_time.run.score", score.score)
+    assert main(options | SHORT | {"times_last": times_last}) == 0
+    rows = {row["system"]: row for row in json.loads((tmp_path / "report.json").read_text())["rows"]}
+    assert rows["hgn"]["ms"] > 0 and rows["gns"]["ms"] > 0
 
 
 def test_weights_that_do_not_fit_are_told_at_once(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

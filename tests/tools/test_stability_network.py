@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,16 @@ from hgn.schema import ConfigError, from_mapping
 from tools.measures import neighbours
 from tools.solver_rollouts import solver_trials
 from tools.stability import network_motion
-from tools.stability.network import case_row, case_trials, energy_growth, guard_row, initial_states, main, share_of_way
+from tools.stability.network import (
+    case_row,
+    case_trials,
+    energy_growth,
+    guard_row,
+    initial_states,
+    main,
+    share_of_way,
+    solver_beside,
+)
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
 from tools.stability.network_motion import (
     DIRECTIONS,
@@ -342,6 +352,30 @@ def test_rest_beside_the_solver(stretch: float, shift: float, beyond: str | None
     assert row.more["solver_rest"]["drift"] == pytest.approx(1.0, rel=1e-3)
     early = RolloutResult(own.position_TN3[:3], "diverged")
     assert not case_row(simulator, case, [scene], 1.0, [own], None, [early]).held
+
+
+def test_the_solver_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its trajectories are kept for other weights, with the cause where it stopped; others are simulated anew where the
+    scene, the frames or the physics differ."""
+    asked: list[tuple[int, int]] = []
+
+    def trials(scenes: list[Scene], config: MpmConfig, frames: int, rate: float) -> list[RolloutResult]:
+        asked.append((len(scenes), frames))
+        paths = [np.stack([scene.position_N3] * frames) for scene in scenes]
+        return [RolloutResult(path[:2] if i else path, "too fast" if i else None) for i, path in enumerate(paths)]
+
+    monkeypatch.setattr("tools.solver_rollouts.solver_trials", trials)
+    config = StabilityNetworkConfig("", cases=("rest",), long_frames=5, scene=SceneConfig(group_size=0.03))
+    made, kept = list(cases(config, network_of().config)), str(tmp_path / "kept")
+    first = solver_beside(made, MpmConfig(), 60.0, kept)
+    again = solver_beside(made, MpmConfig(device="cpu"), 60.0, kept)
+    assert asked == [(3, 5)] and first.keys() == again.keys() == {case.name for case in made}
+    assert [trial.cause for name in again for trial in again[name]] == [None, "too fast", "too fast"]
+    for name, stored in again.items():
+        assert np.array_equal(stored[0].position_TN3, first[name][0].position_TN3)
+    solver_beside(made, MpmConfig(poisson_ratio=0.3), 60.0, kept)
+    solver_beside([replace(made[0], frames=6)], MpmConfig(), 60.0, kept)
+    assert asked[1:] == [(3, 5), (1, 6)]
 
 
 def test_scenes_follow_the_network() -> None:

@@ -78,17 +78,21 @@ class Run:
                 self.write()
 
     def measure(self) -> None:
-        """Scores and times every contender, in order of importance, then times all of them further in turns."""
+        """Scores and times every contender, in order of importance, or times them where all are scored; then times all
+        of them further in turns.
+        """
         order = sorted(range(len(self.contenders)), key=lambda i: self.contenders[i].importance)
-        with bar("contenders", total=len(order), unit="contender") as progress:
-            for i in order:
-                if self.is_past(BEGIN_FRACTION):
-                    if i not in self._rows and i not in self._given_up:
-                        self._leave_out(i, "the time was over")
-                else:
-                    self._attempt(i, self._measure)
-                self.write(drawn=time.monotonic() - self._drawn > DRAWN_EVERY_S)
-                progress.update()
+        steps = (self._errors, self._times) if self.config.times_last else (self._errors_and_times,)
+        with bar("contenders", total=len(steps) * len(order), unit="contender") as progress:
+            for step in steps:
+                for i in order:
+                    if self.is_past(BEGIN_FRACTION):
+                        if i not in self._rows and i not in self._given_up:
+                            self._leave_out(i, "the time was over")
+                    else:
+                        self._attempt(i, step)
+                    self.write(drawn=time.monotonic() - self._drawn > DRAWN_EVERY_S)
+                    progress.update()
         for _ in range(1, self.config.rounds):
             for i in sorted(self.watches):
                 if not self.is_past(ROUND_FRACTION):
@@ -107,10 +111,16 @@ class Run:
             draw(self.out, written["rows"], written["meta"])
             self._drawn = time.monotonic()
 
-    def _measure(self, i: int) -> None:
+    def _errors_and_times(self, i: int) -> None:
+        self._errors(i)
+        self._times(i)
+
+    def _errors(self, i: int) -> None:
         if i not in self._rows:
             self._score(i)
             self.write()
+
+    def _times(self, i: int) -> None:
         if self.contenders[i].row["system"] not in UNTIMED:
             begun = time.monotonic()
             self.watches[i] = self.timing.begun(self.contenders[i])

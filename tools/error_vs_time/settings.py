@@ -55,6 +55,9 @@ class ErrorVsTimeConfig:
     timed_frames: int = 100  # at most
     timed_seconds: Positive[float] = 0.5  # of each timed rollout, about: the slow take fewer frames, at least six
     rounds: Positive[int] = 2  # of each timed scene
+    # all errors, then all run times: where others use the device for a while; else a contender's one after the other,
+    # so that a run that is cut off has whole rows
+    times_last: bool = False
     sinkhorn_points: Positive[int] = 1024  # of each material at most
     sinkhorn_scenes: NonNegative[int] = 20  # of the test scenes
     sinkhorn_blur: Positive[float] = 0.01  # domain units

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
 from tools.measures import energies, energy_scale, neighbours, outside_domain
-from tools.solver_rollouts import FrameClock, solver_trials
+from tools.solver_rollouts import FrameClock, kept_trials, solver_trials
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
 from tools.stability.network_motion import motion_rows
 from tools.stability.row import Row, table
@@ -96,7 +97,7 @@ def main(mapping: dict[str, Any]) -> int:
         if ahead is not None:
             print(ahead.wait(), file=sys.stderr)
     meta["seconds_before_cases"] = time.monotonic() - begun
-    beside = solver_beside(made, solver, simulator.frame_rate_hz) if solver is not None else {}
+    beside = solver_beside(made, solver, simulator.frame_rate_hz, config.solver_kept) if solver is not None else {}
     late = late_kernels(backend.name)
     with bar("cases", total=len(made), unit="case") as progress:
         for case, states in zip(made, initial, strict=True):
@@ -118,12 +119,17 @@ def main(mapping: dict[str, Any]) -> int:
     return 0
 
 
-def solver_beside(made: Sequence[Case], config: MpmConfig, frame_rate_hz: float) -> dict[str, list[RolloutResult]]:
-    """The solver's trajectories of the cases that it stands beside, by name: as many at once as have one length."""
+def solver_beside(
+    made: Sequence[Case], config: MpmConfig, frame_rate_hz: float, kept: str | None = None
+) -> dict[str, list[RolloutResult]]:
+    """The solver's trajectories of the cases that it stands beside, by name: as many at once as have one length; they
+    are read and kept in a folder where one is given.
+    """
+    simulate = solver_trials if kept is None else partial(kept_trials, Path(kept))
     found: dict[str, list[RolloutResult]] = {}
     for frames in sorted({case.frames for case in made if case.beside_solver}):
         some = [case for case in made if case.beside_solver and case.frames == frames]
-        trials = iter(solver_trials([scene for case in some for scene in case.scenes], config, frames, frame_rate_hz))
+        trials = iter(simulate([scene for case in some for scene in case.scenes], config, frames, frame_rate_hz))
         found |= {case.name: [next(trials) for _ in case.scenes] for case in some}
     return found
 

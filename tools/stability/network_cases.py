@@ -43,6 +43,8 @@ class StabilityNetworkConfig:
     # also ask the solver, which needs Taichi: for slope, collision and rest; without it rest is left out
     solver: bool = True
     solver_device: Processor = "auto"  # or cpu, gpu
+    # a folder in which its trajectories of slope and rest stay, for other weights beside the same version of it
+    solver_kept: str | None = None
     particle_factor: Positive[float] = 10.0
     # times the floor area, with as many more obstacles and groups; squares
     domain_factors: tuple[int, ...] = (4, 9, 16)
