@@ -26,19 +26,22 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import numpy as np
 import torch
 
+from datagen.pool.shard import stage_episode
 from datagen.pool.writer import DatasetWriter
 from hgn.command import run_command
 from hgn.config import DatagenConfig, DatasetConfig
 from hgn.data.manifest import Manifest
 from hgn.data.storage import CACHE_VARIABLE, open_storage
+from hgn.scene.episode import Episode
+from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require_bounds
 from hgn.system.files import TEMPORARY_SUFFIX, write_json
 from hgn.system.provenance import provenance
 from hgn.training.checkpoint import LAST_NAMES, SECTION, read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
-from tools.studies.many_shards import stage_small
 
 EXIT_RED = 1
 SPLITS = (0.0, 1.0, 0.5)  # of what is not synced: nothing is there; all names are; each thing is or is not
@@ -358,6 +361,29 @@ def main(mapping: dict[str, Any]) -> int:
         options = {key: value for key, value in asdict(config).items() if key not in ("out", "json")}
         write_json(config.json, {"meta": provenance() | {"config": options}, "rows": rows})
     return EXIT_RED if any(row["faults"] for row in rows) else 0
+
+
+def stage_small(writer: DatasetWriter, number: int) -> None:
+    """An episode of two particles."""
+    task = writer.task("train", number)
+    generator = np.random.default_rng(number)
+    none = np.zeros((0, 3))
+    episode = Episode(
+        key=task.key,
+        position_TN3=(0.4 + 0.2 * generator.random((3, 2, 3))).astype(np.float32),
+        initial_velocity_N3=np.zeros((2, 3), np.float32),
+        material_N=np.zeros(2, np.uint8),
+        obstacle_grid=ObstacleGrid(1 / 64, none.astype(np.int32), none.astype(np.float32)),
+        domain_size=(1.0, 1.0, 1.0),
+        gravity=(0.0, -9.8, 0.0),
+        frame_rate_hz=writer.config.dataset.frame_rate_hz,
+        seed=task.seed,
+        material_parameters={},
+        specification={},
+        solver={"dataset": {"config_hash": writer.config_hash, "attempt": task.attempt}},
+    )
+    stage_episode(writer.folder, episode)
+    writer.add_staged("train", number)
 
 
 if __name__ == "__main__":
