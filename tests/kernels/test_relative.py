@@ -10,7 +10,7 @@ from kernels.engines import engine_of, inference_of, prepare, run_forward
 from kernels.test_network import compare, drawn, float32_state
 from network.states import network_of
 
-from hgn.config import KEPT_MOMENTA
+from hgn.config import CONTACT_GATES, KEPT_MOMENTA
 from hgn.network.cell_keys import unpack
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
@@ -56,12 +56,14 @@ def features_of(network: HierarchicalGraphNetwork, state: ParticleState, origin_
         (EVERYWHERE, False, {"velocity_history": 2}),
         ((1,), True, {"levels": 1}),
         ((7, 2), False, {"obstacle_features": False, "levels": 4, "materials": ("water", "snow", "sand")}),
+        ((150, 9), False, {"levels": 1}),
     ],
 )
-def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict) -> None:
+@pytest.mark.parametrize("gate", CONTACT_GATES)
+def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict, gate: str) -> None:
     """Each column is that of hgn.network.relative in float64, the material one-hot behind them, and zeros behind that;
     among the particles are some within a surface's reach and some beyond."""
-    network, state = relative_network(**changes), moving_state(counts, obstacles)
+    network, state = relative_network(contact_gate=gate, **changes), moving_state(counts, obstacles, 0.6)
     state = replace(state, velocity_NM3=state.velocity_NM3[:, : network.config.velocity_history])
     origin_S3, _ = drawn(network, state)
     found = features_of(network, state, origin_S3)
@@ -79,11 +81,14 @@ def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict) -
 @pytest.mark.parametrize(
     ("counts", "obstacles", "levels"), [(EVERYWHERE, True, 2), ((9, 33), False, 1), ((1,), False, 2), ((40,), False, 3)]
 )
-@pytest.mark.parametrize("momentum", KEPT_MOMENTA)
-def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels: int, momentum: str) -> None:
+@pytest.mark.parametrize(("momentum", "gate"), list(zip(KEPT_MOMENTA, CONTACT_GATES, strict=True)))
+def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels: int, momentum: str, gate: str) -> None:
     """In float32 outputs and every gradient are those of the reference network in float64 to 2e-5, among walls within
     reach and beyond, with one coarsest cell a particle and with few for all."""
-    network, state = relative_network(levels=levels, momentum=momentum), moving_state(counts, obstacles)
+    network, state = (
+        relative_network(levels=levels, momentum=momentum, contact_gate=gate),
+        moving_state(counts, obstacles),
+    )
     output, together, each = compare(network, state, "fp32", 1.0, 512)
     assert max(output, together, *each) < 2e-5
 
@@ -93,7 +98,7 @@ def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels:
 def test_momentum_is_kept_where_nothing_touches(counts: tuple[int, ...], precision: str) -> None:
     """Away from surfaces what inference adds to gravity sums to 0 in each scene, to float32's rounding; and so do its
     moments."""
-    network = relative_network(levels=2, momentum="angular")
+    network = relative_network(levels=2, momentum="angular", contact_gate="cell")
     state = moving_state(counts, obstacles=False)
     state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))
     origin_S3, _ = drawn(network, state)
@@ -135,7 +140,7 @@ def test_what_flies_in_one_piece() -> None:
 def test_a_boost_changes_nothing(precision: str) -> None:
     """Away from surfaces 3 m/s more for all, in any direction, and another gravity in free flight, leave the output of
     inference as it was to the rounding of velocities in float32."""
-    network = relative_network()
+    network = relative_network(contact_gate="cell")
     state = moving_state((23, 5), obstacles=False, spread=0.1)
     state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))
     origin_S3, _ = drawn(network, state)

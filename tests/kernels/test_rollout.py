@@ -48,13 +48,15 @@ def network(levels: int = 1, **changes: object) -> HierarchicalGraphNetwork:
     return network_of(torch.float32, width=16, levels=levels, message_passing_steps=1, **changes).to(device())
 
 
-@pytest.mark.parametrize("inputs", ["absolute", "relative"])
-def test_frames_are_those_of_the_plain_loop(inputs: str) -> None:
+@pytest.mark.parametrize(
+    "changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "momentum": "angular", "contact_gate": "cell"}]
+)
+def test_frames_are_those_of_the_plain_loop(changes: dict) -> None:
     """Two scenes at once, of different gravity, move as in the plain simulator, frame by frame, and each frame is
     announced once."""
     scenes, seen = [scene(5), scene(3, 1, (3.0, -1.0, 2.0))], []
-    expected = Simulator(network(2, inputs=inputs), 60.0, "torch").rollout(scenes, 3)
-    found = Simulator(network(2, inputs=inputs), 60.0, "triton", "fp32").rollout(scenes, 3, seen.append)
+    expected = Simulator(network(2, **changes), 60.0, "torch").rollout(scenes, 3)
+    found = Simulator(network(2, **changes), 60.0, "triton", "fp32").rollout(scenes, 3, seen.append)
     assert seen == [1, 2]
     for path_TN3, expected_TN3 in zip(found, expected, strict=True):
         assert path_TN3.shape == expected_TN3.shape and path_TN3.dtype == np.float32
@@ -102,11 +104,13 @@ def test_later_simulations_begin_anew() -> None:
     """What a simulator has captured it uses again, for a scene of fewer particles, other obstacles and other gravity
     too; the frames are bitwise those of a new simulator, after one that diverged as well."""
     first, second = scene(3), scene(2, 1, (0.0, 2.0, 0.0))
-    again = Simulator(network(inputs="relative"), 60.0, "triton", "fp32")
+    again = Simulator(network(inputs="relative", contact_gate="cell"), 60.0, "triton", "fp32")
     again.rollout([first], 2)
     kept = again.backend.idle[1]
     for one in (second, first):
-        (expected,) = Simulator(network(inputs="relative"), 60.0, "triton", "fp32").rollout([one], 2)
+        (expected,) = Simulator(network(inputs="relative", contact_gate="cell"), 60.0, "triton", "fp32").rollout(
+            [one], 2
+        )
         (found,) = again.rollout([one], 2)
         assert again.backend.idle[1] is kept
         np.testing.assert_array_equal(found, expected)
@@ -125,7 +129,7 @@ def test_scenes_that_change() -> None:
     captured is used for all of them while there is room, and captured anew where there is not."""
     paths, growing = [], []
     for backend, precision in (("torch", "fp32"), ("triton", "fp32")):
-        simulator = Simulator(network(2, inputs="relative"), 60.0, backend, precision)
+        simulator = Simulator(network(2, inputs="relative", contact_gate="cell"), 60.0, backend, precision)
         live = LiveSimulation(simulator, scene(4), room=6)
         first = live._rollout
         path = [live.step()]

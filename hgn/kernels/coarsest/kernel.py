@@ -8,7 +8,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS
+from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import OUTPUTS, POINT, THIN
 
@@ -42,20 +42,14 @@ def sum_coarsest(
 ):  # fmt: skip
     """Adds the first USED columns of the particles' rows of x [N, OUT] to their coarsest cells' sums [C, OUT], with
     their shares. With SPIN the next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL
-    felt [C, 2] is how disturbed and how touched a coarsest cell and those across its faces are at most, 0 to 1.
+    felt [C, 2] is told how disturbed coarsest cells are (`most_around`; how touched was told before).
     Programs for as many particles as for coarsest cells.
 
     Reference: hgn.network.relative.balanced and disturbance; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     if FEEL:
-        there = row < tl.load(counts + LEVELS - 1)
-        part = tl.arange(0, 2)[None, :]
-        most = tl.load(disturbed + row[:, None] * 2 + part, mask=there[:, None], other=0)
-        for slot in tl.static_range(6):
-            other = tl.load(neighbour + slot * capacity + row, mask=there, other=-1)[:, None]
-            most = tl.maximum(most, tl.load(disturbed + other * 2 + part, mask=other >= 0, other=0))
-        tl.store(felt + row[:, None] * 2 + part, most.to(tl.float32) / FULLY, mask=there[:, None])
+        most_around(disturbed, felt, 0, neighbour, row, row < tl.load(counts + LEVELS - 1), capacity)
     live = row < tl.load(particle_count)
     cell, share = _coarsest_cells(coarsest_of, share_of, row, live)
     if SPIN:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS
+from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS, most_around
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
@@ -291,6 +291,52 @@ def _with_column(value, number, x):
 
 
 @triton.jit
+def _surfaces(
+    position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
+    HISTORY: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr,
+):  # fmt: skip
+    """How near the walls are, and the normals here and ahead, columns 0 to 11 of [N, 16]; and how near any surface is,
+    from 0 beyond its reach to 1, [N]."""
+    column = tl.arange(0, 16)
+    axis, upper, walls = column % 3, (column >= 3)[None, :], live[:, None] & (column < 6)[None, :]
+    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=walls, other=0.0)
+    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=walls, other=0.0)
+    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=walls, other=0.0)
+    distance = tl.where(upper, size - place, place) + tl.minimum(tl.where(upper, -v, v), 0.0)
+    value = tl.where(walls, tl.minimum(tl.maximum(1 - distance / reach, 0.0), NEAREST), 0.0)
+    touch = tl.minimum(2 * tl.max(value, 1), 1.0)
+    if OBSTACLES:
+        # here, and at steps of the next frame's way
+        quarters = tl.arange(0, 8)[None, :]
+        asked = live[:, None] & (quarters <= STEPS)
+        at = position + row[:, None] * 3 + 0 * quarters
+        v_at = velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
+        time = quarters.to(tl.float32) / STEPS
+        x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
+        y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
+        z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
+        line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
+        normal = _normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY)
+        found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
+        ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
+        for i in tl.static_range(3):
+            value = _with_column(value, 6 + i, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
+            there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
+            value = _with_column(value, 9 + i, there)
+        touch = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, touch)
+    return value, touch
+
+
+@triton.jit
+def _raise(disturbed, cell, own):
+    """Raises every second of `disturbed` to what the particles [N] in its cells [N, 8] have, where that is more."""
+    own = (own * FULLY).to(tl.int32)[:, None]
+    # most are told by another already
+    mask = (cell >= 0) & (tl.load(disturbed + cell * 2, mask=cell >= 0, other=FULLY) < own)
+    tl.atomic_max(disturbed + cell * 2, own + 0 * cell, mask=mask, sem="relaxed")
+
+
+@triton.jit
 def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
     """Of one axis: whether a corner's coarsest cell is not that of the corner below [N, 8], a particle's share of it,
     and its place [N] in that of the lower corners, from the middle, in edges. x is the lower corners' coordinate."""
@@ -305,16 +351,22 @@ def _coarsest_part(x, fraction, high, LEVELS: tl.constexpr):
 @triton.jit
 def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
-    weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, cell_size, capacity,
+    weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
+    obstacle_cell_size, features, touch_of, disturbed, cell_size, reach, capacity,
     HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, SPIN: tl.constexpr, COLUMNS: tl.constexpr,
+    NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Each particle's 8 cells, their weights, and its fraction; with MOTION its parts of the finest cells' mass and
     momentum are added to `motion` [.., 4], and its coarsest cells are told: `coarsest_of` [N, 8], each once and -1
-    elsewhere, its shares of them, and its place [N, 3] in the lowest, from the middle, in edges. With SPIN the sums of
-    places and of their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS].
+    elsewhere, its shares of them, and its place [N, 3] in the lowest, from the middle, in edges. Surfaces need no sums:
+    their columns of the features are written here, with `touch_of` [N], how near a particle is to any, to which the
+    second numbers of its coarsest cells in `disturbed` [C, 2] are raised, over FULLY. With SPIN the sums of places and
+    of their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and
+    SYMMETRY as in prepare_features.
 
-    Reference: hgn.network.grid.build_hierarchy; test: tests/kernels/test_network.py.
+    Reference: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py,
+    tests/kernels/test_relative.py.
     """
     count = tl.load(particle_count)
     if tl.program_id(0) * BLOCK >= count:
@@ -324,6 +376,15 @@ def prepare_particles(
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < count
     scene = tl.load(scene_of + row, mask=live, other=0)
+    if MOTION:
+        surfaces, touch = _surfaces(
+            position, velocity, domain, row, live, scene, obstacle_table, obstacle_cell_size, reach,
+            HISTORY, OBSTACLES, SYMMETRY,
+        )  # fmt: skip
+        tl.store(touch_of + row, touch, mask=live)
+        column = tl.arange(0, 16)[None, :]
+        at = features + row[:, None] * FEATURES + (3 * (HISTORY + LEVELS) + column)
+        tl.store(at, surfaces, mask=live[:, None] & (column < 6 + 6 * NORMALS))
     x, y, z, fx, fy, fz, inside = _base_cell(position, origin, scene, row, live, low, geometry, cell_size)
     slots = _slots_of(geometry, 0)
     # all corners at once, [BLOCK, 8]: what a thread stores lies side by side
@@ -375,6 +436,7 @@ def prepare_particles(
             # up to a multiple of four, which are added at once
             adds = (coarsest >= 0)[:, :, None] & (part < 12)
             tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
+        _raise(disturbed + 1, coarsest, touch)
     if OVERLAP:
         gdc_wait()  # reads nothing of the tables that are being filled; who comes next does
     # cells past the capacity: the frame is void, but nothing may be read or written out of bounds
@@ -384,11 +446,13 @@ def prepare_particles(
 
 @triton.jit
 def sum_motion(
-    motion, parent, geometry, counts, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr
+    motion, parent, geometry, counts, disturbed, felt, neighbour, coarsest_capacity,
+    LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels.
+    """Adds mass and momentum of the finest cells to all cells above them, in `motion` [.., 4] of all levels, and tells
+    the coarsest in `felt` [C, 2] how touched they are (`most_around`): two programs for as many finest cells.
 
-    Reference: hgn.network.features; test: tests/kernels/test_relative.py.
+    Reference: hgn.network.relative; test: tests/kernels/test_relative.py.
     """
     if OVERLAP:
         gdc_wait()
@@ -397,6 +461,9 @@ def sum_motion(
     if tl.program_id(0) * BLOCK >= count:
         return
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    if tl.program_id(1) == 1:  # beside the sums
+        most_around(disturbed, felt, 1, neighbour, cell, cell < tl.load(counts + LEVELS - 1), coarsest_capacity)
+        return
     there = cell < count
     part = tl.arange(0, 4)[None, :]
     value = tl.load(motion + cell[:, None] * 4 + part, mask=there[:, None], other=0.0)
@@ -469,28 +536,20 @@ def _asinh(x):
 
 
 @triton.jit
-def _raise(disturbed, cell, own):
-    """Raises every second of `disturbed` to what the particles [N] in its cells [N, 8] have, where that is more."""
-    own = (own * FULLY).to(tl.int32)[:, None]
-    # most are told by another already
-    mask = (cell >= 0) & (tl.load(disturbed + cell * 2, mask=cell >= 0, other=FULLY) < own)
-    tl.atomic_max(disturbed + cell * 2, own + 0 * cell, mask=mask, sem="relaxed")
-
-
-@triton.jit
 def prepare_relative_features(
-    position, velocity, scene_of, material_of, domain, gravity, particle_count, scale, obstacle_table,
-    obstacle_cell_size, cell_of, weight_of, coarsest_of, motion, parent, geometry, features, disturbed, reach, quiet,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, OBSTACLES: tl.constexpr,
-    SYMMETRY: tl.constexpr, FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    velocity, scene_of, material_of, gravity, particle_count, scale, cell_of, weight_of, coarsest_of, share_of, motion,
+    parent, geometry, features, touch_of, disturbed, felt, quiet,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, NORMALS: tl.constexpr, BY_CELL: tl.constexpr,
+    FEATURES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Features of each particle that no boost and no shift changes, [N, FEATURES]: changes of velocity less gravity,
     velocity relative to the cells around on each level (`motion`: mass and momentum of the cells of all levels), and
-    near a surface velocity, walls, and the normals here and ahead if NORMALS; one-hot material. Differences of
-    velocity are in units of `scale`, and their asinh. `disturbed` [C, 2] of the coarsest cells is raised to how
-    disturbed and how touched their particles are, over FULLY. OBSTACLES and SYMMETRY as in prepare_features.
+    near a surface velocity, by the particle's own touch or BY_CELL by what its coarsest cells feel; behind the columns
+    of surfaces, which are there already, the one-hot material. Differences of velocity are in units of `scale`, and
+    their asinh. `disturbed` [C, 2] of the coarsest cells, whose first numbers are raised to how disturbed their
+    particles are, over FULLY.
 
-    Reference: hgn.network.features; test: tests/kernels/test_relative.py.
+    Reference: hgn.network.relative; test: tests/kernels/test_relative.py.
     """
     HISTORIES: tl.constexpr = 3 * (HISTORY - 1)
     CONTACT: tl.constexpr = HISTORIES + 3 * LEVELS
@@ -530,44 +589,22 @@ def prepare_relative_features(
             # a parent past the capacity: the frame is void, but nothing may be read out of bounds
             cell = tl.maximum(tl.load(parent + first + cell, mask=corners, other=0), 0)
     is_contact = here & ((column >= CONTACT) & (column < WALLS))[None, :]
-    is_wall = here & ((column >= WALLS) & (column < WALLS + 6))[None, :]
-    upper = (column >= WALLS + 3)[None, :]
-    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact | is_wall, other=0.0)
+    v = tl.load(velocity + row[:, None] * (3 * HISTORY) + axis[None, :], mask=is_contact, other=0.0)
     value = tl.where(is_contact, v, value)
     value = _asinh(tl.div_rn(value, tl.load(scale) + tl.zeros_like(value)))
-    place = tl.load(position + row[:, None] * 3 + axis[None, :], mask=is_wall, other=0.0)
-    size = tl.load(domain + scene[:, None] * 3 + axis[None, :], mask=is_wall, other=0.0)
-    distance = tl.where(upper, size - place, place) + tl.minimum(tl.where(upper, -v, v), 0.0)
-    near = tl.where(is_wall, tl.minimum(tl.maximum(1 - distance / reach, 0.0), NEAREST), 0.0)
-    gate = tl.minimum(2 * tl.max(near, 1), 1.0)
-    value = tl.where(is_wall, near, value)
-    if OBSTACLES:
-        # here, and at steps of the next frame's way
-        quarters = tl.arange(0, 8)[None, :]
-        asked = here & (quarters <= STEPS)
-        at = position + row[:, None] * 3 + 0 * quarters
-        v_at = velocity + row[:, None] * (3 * HISTORY) + 0 * quarters
-        time = quarters.to(tl.float32) / STEPS
-        x = tl.load(at, mask=asked, other=0.0) + tl.load(v_at, mask=asked, other=0.0) * time
-        y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
-        z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
-        line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
-        normal = _normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY)
-        found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
-        ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
-        for i in tl.static_range(3):
-            value = _with_column(value, WALLS + 6 + i, tl.sum(tl.where(quarters == 0, normal[i], 0.0), 1))
-            there = tl.sum(tl.where(quarters == ahead[:, None], normal[i], 0.0), 1)
-            value = _with_column(value, WALLS + 9 + i, there)
-        gate = tl.where(tl.max(found.to(tl.int32), 1) > 0, 1.0, gate)
+    touch = tl.load(touch_of + row, mask=live, other=0.0)
+    coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
+    gate = touch
+    if BY_CELL:
+        share = tl.load(share_of + row[:, None] * 8 + corner, mask=coarsest >= 0, other=0.0)
+        gate = tl.sum(share * tl.load(felt + coarsest * 2 + 1, mask=coarsest >= 0, other=0.0), 1)
     value = tl.where(is_contact, value * gate[:, None], value)
     moved = tl.where((column < CONTACT)[None, :], value / quiet, 0.0)
-    coarsest = tl.load(coarsest_of + row[:, None] * 8 + corner, mask=corners, other=-1)
-    _raise(disturbed, coarsest, tl.minimum(gate + tl.sum(moved * moved, 1), 1.0))
-    _raise(disturbed + 1, coarsest, gate)
+    _raise(disturbed, coarsest, tl.minimum(touch + tl.sum(moved * moved, 1), 1.0))
     material = tl.load(material_of + row, mask=live, other=0)
     value = tl.where((column[None, :] - MATERIAL) == material[:, None], 1.0, value)
-    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here)
+    own = (column < WALLS) | (column >= MATERIAL)
+    tl.store(features + row[:, None] * FEATURES + column[None, :], value, mask=here & own[None, :])
 
 
 settle_keys(globals())

@@ -124,7 +124,8 @@ class DeviceGrid:
     coarsest cells there are disturbed_C2, disturbed and touched by their own particles in units of FULLY, felt_C2, by
     those across their faces too, and what `balance` sums up and spreads, sum_C and table_C; where angular momentum is
     kept moment_C, the first and second moments of what they hold. Of each particle there are its coarsest cells, each
-    once and -1 elsewhere, its shares of them, and its place in the lowest: coarsest_N8, share_N8, place_N3.
+    once and -1 elsewhere, its shares of them, its place in the lowest, and how near it is to a surface: coarsest_N8,
+    share_N8, place_N3, touch_N.
     """
 
     def __init__(
@@ -172,6 +173,7 @@ class DeviceGrid:
         self.coarsest_N8 = integers(particles * relative, 8)
         self.share_N8 = torch.zeros(particles * relative, 8, device=device)
         self.place_N3 = torch.zeros(particles * relative, 3, device=device)
+        self.touch_N = torch.zeros(particles * relative, device=device)
         self.motion_C4, self.moment_C = motion.view(torch.float32).view(-1, 4), moments.view(torch.float32)
         self.sum_C, self.gradient_sum_C = (x.view(torch.float32).view(-1, SUMS) for x in sums)
         self.disturbed_C2 = disturbed.view(-1, 2)
@@ -239,32 +241,37 @@ class DeviceGrid:
         `symmetry` the obstacles are seen under the symmetries in their rows.
         """
         blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
-        kernel.prepare_particles[blocks](
-            position=position, velocity=velocity, scene_of=scene_N, origin=origin_S3, particle_count=count,
-            low=self.low, geometry=self.geometry, occupied=self.occupied, prefix_sum=self.prefix_sum,
-            cell_of=self.cell_N8, weight_of=self.weight_N8, fraction_of=self.fraction_N3, motion=self.motion_C4,
-            coarsest_of=self.coarsest_N8, share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C,
-            cell_size=self.cell_size, capacity=self.capacities[0], HISTORY=config.velocity_history,
-            LEVELS=self.levels, MOTION=config.relative, SPIN=self.keeps_spin, COLUMNS=SUMS, OVERLAP=overlap,
-            BLOCK=PARTICLE_BLOCK, launch_pdl=overlap,
-        )  # fmt: skip
         arguments = feature_arguments(
             config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
         )
+        surfaces = {name: value for name, value in arguments.items() if name != "material_of"}
+        kernel.prepare_particles[blocks](
+            **surfaces, origin=origin_S3, low=self.low, geometry=self.geometry, occupied=self.occupied,
+            prefix_sum=self.prefix_sum, cell_of=self.cell_N8, weight_of=self.weight_N8,
+            fraction_of=self.fraction_N3, motion=self.motion_C4, coarsest_of=self.coarsest_N8,
+            share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
+            disturbed=self.disturbed_C2, cell_size=self.cell_size,
+            reach=config.contact_reach_cells * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
+            MOTION=config.relative, SPIN=self.keeps_spin, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
+        )  # fmt: skip
         if not config.relative:
             wall_maximum = config.wall_distance_cells * config.cell_size
             kernel.prepare_features[blocks](**arguments, mean=mean_3, std=std_3, wall_maximum=wall_maximum)
             return
-        if self.levels > 1:
-            kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK),)](
-                motion=self.motion_C4, parent=self._parent, geometry=self.geometry, counts=self.counts_L,
-                LEVELS=self.levels, OVERLAP=overlap, BLOCK=MARK_BLOCK, launch_pdl=overlap,
-            )  # fmt: skip
+        kernel.sum_motion[(triton.cdiv(self.capacities[0], MARK_BLOCK), 2)](
+            motion=self.motion_C4, parent=self._parent, geometry=self.geometry, counts=self.counts_L,
+            disturbed=self.disturbed_C2, felt=self.felt_C2, neighbour=self.neighbour(self.levels - 1),
+            coarsest_capacity=self.capacities[-1], LEVELS=self.levels, OVERLAP=overlap, BLOCK=MARK_BLOCK,
+            launch_pdl=overlap,
+        )  # fmt: skip
         kernel.prepare_relative_features[blocks](
-            **arguments, gravity=gravity_S3, scale=std_3, cell_of=self.cell_N8, weight_of=self.weight_N8,
-            coarsest_of=self.coarsest_N8, motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
-            reach=config.contact_reach_cells * config.cell_size, disturbed=self.disturbed_C2, quiet=QUIET,
-            LEVELS=self.levels, OVERLAP=overlap, launch_pdl=overlap,
+            velocity=velocity, scene_of=scene_N, material_of=material_N, gravity=gravity_S3, particle_count=count,
+            scale=std_3, cell_of=self.cell_N8, weight_of=self.weight_N8, coarsest_of=self.coarsest_N8,
+            share_of=self.share_N8, motion=self.motion_C4, parent=self._parent, geometry=self.geometry,
+            features=self.feature_NF, touch_of=self.touch_N, disturbed=self.disturbed_C2, felt=self.felt_C2,
+            quiet=QUIET, HISTORY=config.velocity_history, LEVELS=self.levels, NORMALS=int(config.obstacle_features),
+            BY_CELL=config.gates_by_cell, FEATURES=self.features, OVERLAP=overlap, BLOCK=PARTICLE_BLOCK,
+            launch_pdl=overlap,
         )  # fmt: skip
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
