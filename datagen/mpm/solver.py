@@ -27,10 +27,9 @@ from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError, require
 
 GPU_THREADS = 512  # that run on a processor at once, whatever they do (see device)
-TEAM_THREADS, TEAM_BLOCKS = 256, 8  # of many scenes, which teams take one after another
-FEWEST_BLOCKS = 4  # of as many teams as there are scenes; with fewer the longest scene is waited for
+TEAM_THREADS, TEAM_BLOCKS, TEAM_RUN = 256, 4, 4  # of many scenes, which teams take one after another
 EVEN = 0.95  # of the time of a launch, that the mean scene takes at least where each has one block
-SHARED_THREADS = 128  # of a block, where each of a few scenes has TEAM_BLOCKS and more
+SHARED_THREADS, SHARED_BLOCKS = 128, 8  # of a block, where each of a few scenes has so many and more
 SHARED_PARTICLES = 8  # at least, of each of several
 LARGE_THREADS = 512  # where a scene has more particles for each processor than
 LARGE_PARTICLES = 4096
@@ -199,13 +198,13 @@ def _team(device: Device, counts: Sequence[int]) -> Team:
         return Team(LARGE_THREADS, share)
     room = 2 * device.processors  # blocks
     blocks = min(room // scenes, -(-most // SHARED_PARTICLES))
-    if blocks >= TEAM_BLOCKS:
+    if blocks >= SHARED_BLOCKS:
         # where each thread has a particle at most, it is done sooner alone
         return Team(SHARED_THREADS, blocks, 1) if most <= SHARED_THREADS * blocks else Team(SHARED_THREADS, blocks)
     rounds = -(-scenes // room)
     if scenes > EVEN * rounds * room and sum(counts) > EVEN * scenes * most:
         return Team(TEAM_THREADS)  # all are done at once
-    return Team(TEAM_THREADS, blocks if blocks >= FEWEST_BLOCKS else TEAM_BLOCKS)
+    return Team(TEAM_THREADS, max(blocks, TEAM_BLOCKS), TEAM_RUN)
 
 
 def _teams_at_once(device: Device, team: Team) -> int:

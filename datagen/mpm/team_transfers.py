@@ -238,7 +238,7 @@ def update_nodes(
         gain, mass, before = _read_node(place, velocities, begins, node)
         if local == 0:
             block[touched] = 0
-        if mass > 0.0 or begins == 1.0:
+        if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
             v = node_velocity(
                 before, gain, mass, local, 2 * entry, corner, fall, scene, scene_value, shape, contact_normal, variant
             )

@@ -23,7 +23,9 @@ def _scene() -> Scene:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize(("threads", "blocks", "run"), [(256, 1, 8), (128, 2, 8), (128, 40, 1), (512, 60, 8)])
+@pytest.mark.parametrize(
+    ("threads", "blocks", "run"), [(256, 1, 8), (128, 2, 8), (256, 4, 4), (128, 40, 1), (512, 60, 8)]
+)
 def test_teams_agree_with_one_launch_a_substep(threads: int, blocks: int, run: int) -> None:
     """Three materials on a sheet: one frame agrees to 1e-6, twelve to 1e-4 of the domain; as many substeps. With 60
     blocks of 512 threads two teams take three scenes.
