@@ -24,6 +24,9 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+if gc.isenabled():
+    gc.disable()  # until all is loaded
+
 import file_scheduling
 import interpreter
 import torch
@@ -64,6 +67,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """What is loaded by now stays: garbage collections need not look at it, half a second each."""
     gc.freeze()
+    gc.enable()
 
 
 def pytest_unconfigure() -> None:

@@ -174,6 +174,8 @@ def leave(code: object) -> NoReturn:
 if __name__ == "__main__":
     import importlib
 
+    gc.disable()  # until all is loaded
+
     from hydra.core.plugins import Plugins
 
     for name in PRELOADED:
@@ -185,6 +187,7 @@ if __name__ == "__main__":
     Plugins.instance()  # Hydra's own, of which each command would look for all
     gc.collect()
     gc.freeze()  # else each program's collections touch all that was loaded
+    gc.enable()
     request = serve(socket.socket(fileno=int(sys.argv[1])))
     try:
         run(request)

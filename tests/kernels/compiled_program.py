@@ -69,7 +69,7 @@ for precision in ("fp16", "tf32"):
 
 # where a block has 99 KB of shared memory
 triton_compat.use_target(89)
-narrow = NetworkConfig(width=64, levels=2, message_passing_steps=2)
+narrow = NetworkConfig(width=64, levels=2, message_passing_steps=1)
 for function, data in launches_of(FrameJob(((narrow, "fp16"),), ((40_000, 10_000),), 89)).values():
     print("SHARED", function.__name__, triton_compat.preload(function, data).metadata.shared, flush=True)
 

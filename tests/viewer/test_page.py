@@ -86,7 +86,7 @@ def opened(browser: Any, address: str) -> Any:
     page.set_default_timeout(300_000)
     page.goto(address)
     page.wait_for_selector("canvas")
-    until(lambda: len(np.unique(pixels(page).reshape(-1, 3), axis=0)) > 50)
+    until(lambda: len(np.unique(pixels(page) @ (65536, 256, 1))) > 50)
     return page
 
 
@@ -99,7 +99,7 @@ def until(condition: Callable[[], Any], seconds: float = 300.0) -> Any:
     end = time.monotonic() + seconds
     while not (met := condition()):
         assert time.monotonic() < end, "it did not come"
-        time.sleep(0.05)
+        time.sleep(0.1)
     return met
 
 
