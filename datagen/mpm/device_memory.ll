@@ -7,49 +7,40 @@
 target datalayout = "e-i64:64-i128:128-v16:16-v32:32-n16:32:64"
 target triple = "nvptx64-nvidia-cuda"
 
-define void @memory_load(i64* %base, i32* %entry, float* %out) alwaysinline {
+define internal float addrspace(1)* @memory_place(i64* %base, i32* %entry) alwaysinline {
   %from = load i64, i64* %base
   %index = load i32, i32* %entry
   %wide = sext i32 %index to i64
   %bytes = shl i64 %wide, 2
   %address = add i64 %from, %bytes
   %place = inttoptr i64 %address to float addrspace(1)*
+  ret float addrspace(1)* %place
+}
+
+define void @memory_load(i64* %base, i32* %entry, float* %out) alwaysinline {
+  %place = call float addrspace(1)* @memory_place(i64* %base, i32* %entry)
   %value = load float, float addrspace(1)* %place
   store float %value, float* %out
   ret void
 }
 
 define void @memory_store(i64* %base, i32* %entry, float* %in) alwaysinline {
-  %from = load i64, i64* %base
-  %index = load i32, i32* %entry
-  %wide = sext i32 %index to i64
-  %bytes = shl i64 %wide, 2
-  %address = add i64 %from, %bytes
-  %place = inttoptr i64 %address to float addrspace(1)*
+  %place = call float addrspace(1)* @memory_place(i64* %base, i32* %entry)
   %value = load float, float* %in
   store float %value, float addrspace(1)* %place
   ret void
 }
 
 define void @memory_add(i64* %base, i32* %entry, float* %in) alwaysinline {
-  %from = load i64, i64* %base
-  %index = load i32, i32* %entry
-  %wide = sext i32 %index to i64
-  %bytes = shl i64 %wide, 2
-  %address = add i64 %from, %bytes
-  %place = inttoptr i64 %address to float addrspace(1)*
+  %place = call float addrspace(1)* @memory_place(i64* %base, i32* %entry)
   %value = load float, float* %in
   %before = atomicrmw fadd float addrspace(1)* %place, float %value monotonic
   ret void
 }
 
 define void @memory_load4(i64* %base, i32* %entry, float* %x, float* %y, float* %z, float* %w) alwaysinline {
-  %from = load i64, i64* %base
-  %index = load i32, i32* %entry
-  %wide = sext i32 %index to i64
-  %bytes = shl i64 %wide, 2
-  %address = add i64 %from, %bytes
-  %place = inttoptr i64 %address to <4 x float> addrspace(1)*
+  %one = call float addrspace(1)* @memory_place(i64* %base, i32* %entry)
+  %place = bitcast float addrspace(1)* %one to <4 x float> addrspace(1)*
   %values = load <4 x float>, <4 x float> addrspace(1)* %place, align 16
   %value0 = extractelement <4 x float> %values, i32 0
   %value1 = extractelement <4 x float> %values, i32 1
@@ -63,12 +54,8 @@ define void @memory_load4(i64* %base, i32* %entry, float* %x, float* %y, float* 
 }
 
 define void @memory_store4(i64* %base, i32* %entry, float* %x, float* %y, float* %z, float* %w) alwaysinline {
-  %from = load i64, i64* %base
-  %index = load i32, i32* %entry
-  %wide = sext i32 %index to i64
-  %bytes = shl i64 %wide, 2
-  %address = add i64 %from, %bytes
-  %place = inttoptr i64 %address to <4 x float> addrspace(1)*
+  %one = call float addrspace(1)* @memory_place(i64* %base, i32* %entry)
+  %place = bitcast float addrspace(1)* %one to <4 x float> addrspace(1)*
   %value0 = load float, float* %x
   %value1 = load float, float* %y
   %value2 = load float, float* %z
