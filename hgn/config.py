@@ -34,7 +34,6 @@ GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 SYMMETRIES = ("none", "gravity")
 NETWORK_INPUTS = ("absolute", "relative")
-KEPT_MOMENTA = ("linear", "angular")
 CONTACT_GATES = ("particle", "cell")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 TRAINING_BACKENDS = ("auto", "torch", "triton")
@@ -332,8 +331,6 @@ class NetworkConfig:
     # what relative inputs show a particle's velocity against surfaces by: its own reach; or cell: that of all that is
     # in its coarsest cells and across their faces, so that it is known inside a pile too
     contact_gate: Annotated[str, one_of(*CONTACT_GATES)] = "particle"
-    # what relative inputs keep where nothing touches, whatever the weights: linear momentum, or angular momentum too
-    momentum: Annotated[str, one_of(*KEPT_MOMENTA)] = "linear"
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     dimensions: int = 3  # 2: z is that of a plane; imported data alone have it
     maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
@@ -349,7 +346,6 @@ class NetworkConfig:
             rule = "at least 2 with inputs=relative, which are of differences"
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
         else:
-            require(not self.keeps_spin, "momentum", "linear with inputs=absolute, which keep none", self.momentum)
             require(not self.gates_by_cell, "contact_gate", "particle with inputs=absolute", self.contact_gate)
         if self.kind == "hgn":
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
@@ -376,11 +372,6 @@ class NetworkConfig:
     def relative(self) -> bool:
         """Whether inputs are relative: nothing depends on a motion that all particles have in common."""
         return self.inputs == "relative"
-
-    @property
-    def keeps_spin(self) -> bool:
-        """Whether angular momentum is kept by construction, too."""
-        return self.momentum == "angular"
 
     @property
     def gates_by_cell(self) -> bool:

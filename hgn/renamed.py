@@ -49,6 +49,10 @@ BEFORE: dict[str, Any] = {
 }
 
 
+# Settings of relative inputs that left, and what they always are now.
+GONE = {"network.momentum": "angular"}
+
+
 # Prefixes of logged metrics, old to new: metrics.jsonl of earlier runs stays as it is.
 METRICS = {"trivial/": "baseline/", "one_step_gain/": "baseline_ratio/", "own_states/": "pushforward/"}
 
@@ -77,6 +81,11 @@ def current_names(mapping: Mapping[str, Any], section: str = "") -> dict[str, An
         key = KEYS.get(_join(section, old), _join(section, old))
         inner = current_names(value, key) if isinstance(value, Mapping) else current_value(key, value)
         result[key.rpartition(".")[2]] = inner
+    for key, always in GONE.items():
+        owner, _, name = key.rpartition(".")
+        # another value is that of no network of today, and refused by the key's name
+        if section == owner and (result.get(name) == always or result.get("inputs") != "relative"):
+            result.pop(name, None)
     return result
 
 
@@ -93,6 +102,12 @@ def key_remedy(key: str, value: Any) -> str | None:
     value = current_value(KEYS[key], value)
     example = f"={value}" if isinstance(value, (str, int, float)) else ""
     return f"it is called {KEYS[key]} now; write {KEYS[key]}{example}"
+
+
+def gone_remedy(key: str) -> str | None:
+    """What to do about a key that left, whose name ends as in the configuration; none for another."""
+    always = GONE.get(".".join(key.split(".")[-2:]))
+    return f"it is always {always} now; leave it out, and train other weights anew" if always else None
 
 
 def value_remedy(key: str, value: Any) -> str:

@@ -18,7 +18,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, TypeVar
 
-from hgn.renamed import KEYS, current_names, key_remedy, value_remedy
+from hgn.renamed import KEYS, current_names, gone_remedy, key_remedy, value_remedy
 
 T = TypeVar("T")
 _Path = (
@@ -78,7 +78,7 @@ def _build(cls: type[T], mapping: object, path: _Path) -> T:
         if key not in fields:
             name = _text((path, str(key)))
             renamed = KEYS.get(name, "").rpartition(".")[2] in fields
-            remedy = key_remedy(name, value) if renamed else known_keys(str(key), fields)
+            remedy = gone_remedy(name) or (key_remedy(name, value) if renamed else known_keys(str(key), fields))
             raise ConfigError(f"{name} is not a known key; {remedy}")
         values[key] = _convert(hints[key], value, (path, key))
     for name, needed in fields.items():

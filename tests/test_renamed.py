@@ -52,6 +52,11 @@ def test_old_names_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
         (RolloutConfig, {"precision": "half"}, "precision must be one of .*, got 'half'; half is called fp16 now"),
         (TrainConfig, {"training": {"precision": "highest"}}, "training.precision must .*; highest is called fp32 now"),
         (ExportConfig, {"checkpoint": "a", "out": "b", "half": True}, "write stored_precision=fp16"),
+        (
+            TrainConfig,
+            {"network": {"momentum": "linear"}},
+            "network.momentum is not a known key; it is always angular now; leave it out, and train other weights anew",
+        ),
     ],
 )
 def test_todays_table(config: type, mapping: dict[str, Any], message: str) -> None:
@@ -88,6 +93,23 @@ def test_files_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert b"breadth" in (tmp_path / "old.safetensors").read_bytes()
     for name in ("new", "old"):
         assert load_weights(tmp_path / f"{name}.safetensors")[1] == info
+
+
+def test_files_with_settings_that_left() -> None:
+    """They load where a setting said what is always so now, or nothing to a network of absolute inputs; others are
+    refused by its name."""
+    for inputs, told, loads in (
+        ("absolute", {"momentum": "linear"}, True),
+        ("relative", {}, True),
+        ("relative", {"momentum": "angular"}, True),
+        ("relative", {"momentum": "linear"}, False),
+    ):
+        stored = to_mapping(NetworkConfig(inputs=inputs)) | told
+        if loads:
+            assert from_stored(NetworkConfig, stored, "network") == NetworkConfig(inputs=inputs)
+            continue
+        with pytest.raises(ConfigError, match=r"network\.momentum is not a known key; it is always angular now"):
+            from_stored(NetworkConfig, stored, "network")
 
 
 def test_identity_keeps_its_names(monkeypatch: pytest.MonkeyPatch) -> None:

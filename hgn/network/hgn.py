@@ -92,7 +92,7 @@ class HierarchicalGraphNetwork(ParticleNetwork):
             return propagate(self.encode_particles(state, grid), grid)
         feature_NF, disturbed_C, touched_C = self.relative_features(state, grid)
         output_N9 = propagate(self.encode_features(feature_NF, state.material_N), grid)
-        return balanced(output_N9, disturbed_C, touched_C, grid, self.config.keeps_spin)
+        return balanced(output_N9, disturbed_C, touched_C, grid)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

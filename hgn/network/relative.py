@@ -19,9 +19,8 @@ which is nowhere less and knows a surface that is within reach of what the parti
 The decoder's nine numbers are an acceleration r and a stress sigma of each particle; `balanced` makes of them what is
 added to gravity. It is 0 where nothing moves against anything: what flies freely in one piece has exactly the
 acceleration g, whatever the weights. And where no surface is within reach it keeps momentum, whatever the weights: a
-coarsest cell's mean is taken out of r, and cells push each other across their faces by antisymmetric impulses alone.
-With `network.momentum: angular` so is angular momentum: a cell's rotation is taken out too, and the one of two cells
-that push each other.
+coarsest cell's mean is taken out of r, and cells push each other across their faces by antisymmetric impulses alone;
+and angular momentum, for a cell's rotation is taken out too, and the one of two cells that push each other.
 Shape legend: N particles, H velocities, L levels, C cells of a level, E directed edges, S scenes.
 """
 
@@ -167,7 +166,6 @@ def balanced(
     disturbed_C: torch.Tensor,
     touched_C: torch.Tensor,
     grid: GridHierarchy,
-    keeps_spin: bool = False,
 ) -> torch.Tensor:
     """Accelerations less gravity, normalised, [N, 3], of the decoder's output and what `disturbance` gives.
 
@@ -177,21 +175,18 @@ def balanced(
     antisymmetric, and no small mass is divided by: sum_p a_p = sum_C d_C t_C M_C R_C, which is 0 where no surface is
     within reach. (Cells exchange momentum across faces as in finite volumes; a symmetric stress makes no spin.)
 
-    With `keeps_spin` sum_p x_p x a_p is 0 there, too. y_p is a particle's place seen from the cell's centre of mass X,
-    I and L sums of w over M of its inertia and of y x r, and (q, W) = `rotation`(I, L): r_p - R counts as
-    q (r_p - R) - W x y_p. And of T on one cell and -T on another, D = X' - X apart, the rotation that both have about
-    their common centre is taken out: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T, a cell gets
-    f' (q T + W x D) - W x y_p. That is a projection: nothing grows, however small or thin a cell's contents are.
+    From this rotation is taken out, so that sum_p x_p x a_p is 0 there, too. y_p is a particle's place seen from the
+    cell's centre of mass X, I and L sums of w over M of its inertia and of y x r, and (q, W) = `rotation`(I, L):
+    r_p - R counts as q (r_p - R) - W x y_p. And of T on one cell and -T on another, D = X' - X apart, the rotation that
+    both have about their common centre is taken out: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T
+    a cell gets f' (q T + W x D) - W x y_p. That is a projection: nothing grows, however small or thin contents are.
     """
     level, cell_N8, weight_N8 = grid.levels[-1], coarsest_cells(grid), grid.weight_N8
+    place_N83 = coarsest_places(grid)
+    moment_N83 = torch.linalg.cross(place_N83, output_N9[:, None, :3].expand_as(place_N83))
+    square_N89 = (place_N83[..., :, None] * place_N83[..., None, :]).flatten(2)
     value_N8K = torch.cat([output_N9, torch.ones_like(output_N9[:, :1])], dim=-1)[:, None].expand(-1, 8, -1)
-    place_N83 = output_N9.new_zeros(0)
-    if keeps_spin:
-        place_N83 = coarsest_places(grid)
-        moment_N83 = torch.linalg.cross(place_N83, output_N9[:, None, :3].expand_as(place_N83))
-        square_N89 = (place_N83[..., :, None] * place_N83[..., None, :]).flatten(2)
-        value_N8K = torch.cat([moment_N83, place_N83, square_N89, value_N8K], dim=-1)
-    value_N8K = weight_N8[..., None] * value_N8K
+    value_N8K = weight_N8[..., None] * torch.cat([moment_N83, place_N83, square_N89, value_N8K], dim=-1)
     sum_CK = value_N8K.new_zeros(level.cell_count, value_N8K.shape[-1])
     sum_CK = sum_CK.index_add(0, cell_N8.flatten(), value_N8K.flatten(0, 1))
     mass_C = sum_CK[:, -1].clamp(min=SMALLEST_MASS)
@@ -201,34 +196,26 @@ def balanced(
     towards_E3 = DIRECTION_63.to(mean_CK)[level.direction_E]
     traction_E3 = ((stress_C33[receiver_E] + stress_C33[sender_E]) @ towards_E3[..., None]).squeeze(-1)
     share_E = 0.5 * disturbed_C[sender_E] * mass_C[sender_E] / (mass_C[sender_E] + mass_C[receiver_E])
-    own_C, free_C = disturbed_C, 1 - touched_C
-    change_C3 = -free_C[:, None] * mean_C3
-    if not keeps_spin:
-        change_C3 = change_C3.index_add(0, receiver_E, share_E[:, None] * traction_E3)
-    else:
-        centre_C3 = mean_CK[:, 3:6]
-        spread_C33 = mean_CK[:, 6:15].unflatten(1, (3, 3)) - centre_C3[:, :, None] * centre_C3[:, None, :]
-        inertia_C33 = inertia(spread_C33)
-        known_C, turn_C3 = rotation(inertia_C33, mean_CK[:, :3] - torch.linalg.cross(centre_C3, mean_C3))
-        own_C = disturbed_C * (touched_C + free_C * known_C)
-        apart_E3 = towards_E3 + centre_C3[sender_E] - centre_C3[receiver_E]
-        part_E = mass_C[receiver_E] / (mass_C[sender_E] + mass_C[receiver_E])
-        both_E = part_E * (1 - part_E)
-        inertia_E33 = both_E[:, None, None] * inertia(apart_E3[:, :, None] * apart_E3[:, None, :])
-        inertia_E33 = inertia_E33 + part_E[:, None, None] * inertia_C33[receiver_E]
-        inertia_E33 = inertia_E33 + (1 - part_E)[:, None, None] * inertia_C33[sender_E]
-        known_E, turn_E3 = rotation(inertia_E33, -both_E[:, None] * torch.linalg.cross(apart_E3, traction_E3))
-        push_E3 = known_E[:, None] * traction_E3 + torch.linalg.cross(turn_E3, apart_E3)
-        change_C3 = (free_C * known_C)[:, None] * -mean_C3
-        change_C3 = change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)
-        felt_E = 0.5 * disturbed_C[sender_E]
-        turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, felt_E[:, None] * turn_E3)
-        turn_C3 = disturbed_C[:, None] * turn_C3
-    change_C3 = disturbed_C[:, None] * change_C3
+    free_C, centre_C3 = 1 - touched_C, mean_CK[:, 3:6]
+    spread_C33 = mean_CK[:, 6:15].unflatten(1, (3, 3)) - centre_C3[:, :, None] * centre_C3[:, None, :]
+    inertia_C33 = inertia(spread_C33)
+    known_C, turn_C3 = rotation(inertia_C33, mean_CK[:, :3] - torch.linalg.cross(centre_C3, mean_C3))
+    own_C = disturbed_C * (touched_C + free_C * known_C)
+    apart_E3 = towards_E3 + centre_C3[sender_E] - centre_C3[receiver_E]
+    part_E = mass_C[receiver_E] / (mass_C[sender_E] + mass_C[receiver_E])
+    both_E = part_E * (1 - part_E)
+    inertia_E33 = both_E[:, None, None] * inertia(apart_E3[:, :, None] * apart_E3[:, None, :])
+    inertia_E33 = inertia_E33 + part_E[:, None, None] * inertia_C33[receiver_E]
+    inertia_E33 = inertia_E33 + (1 - part_E)[:, None, None] * inertia_C33[sender_E]
+    known_E, turn_E3 = rotation(inertia_E33, -both_E[:, None] * torch.linalg.cross(apart_E3, traction_E3))
+    push_E3 = known_E[:, None] * traction_E3 + torch.linalg.cross(turn_E3, apart_E3)
+    change_C3 = (free_C * known_C)[:, None] * -mean_C3
+    change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)
+    felt_E = 0.5 * disturbed_C[sender_E]
+    turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, felt_E[:, None] * turn_E3)
+    turn_C3 = disturbed_C[:, None] * turn_C3
     own_N3 = (weight_N8 * own_C[cell_N8]).sum(1)[:, None] * output_N9[:, :3]
-    change_N83 = change_C3[cell_N8]
-    if keeps_spin:
-        change_N83 = change_N83 - torch.linalg.cross(turn_C3[cell_N8], place_N83 - centre_C3[cell_N8])
+    change_N83 = change_C3[cell_N8] - torch.linalg.cross(turn_C3[cell_N8], place_N83 - centre_C3[cell_N8])
     return own_N3 + (weight_N8[..., None] * change_N83).sum(1)
 
 

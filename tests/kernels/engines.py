@@ -44,7 +44,6 @@ def engine_of(
         config.cell_size,
         where,
         config.relative,
-        config.keeps_spin,
     )
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)

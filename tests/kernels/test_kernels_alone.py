@@ -46,8 +46,7 @@ ROOM = 2048 if NATIVE else 64  # for cells on each level
 ELSEWHERE = {
     *("mark_cells", "fill_tables", "prepare_particles", "prepare_features"),
     *("sum_motion", "prepare_relative_features"),
-    *("sum_coarsest", "balance_cells", "balance_cells_backward", "add_coarsest"),
-    *("balance_bodies", "balance_bodies_backward"),
+    *("sum_coarsest", "balance", "balance_backward", "add_coarsest"),
     *("pack_cells", "find_runs", "walk_neighbours", "check_room"),
     *("draw_waves", "assemble_batch", "loss_gradient", "tell_overflow", "square_norm", "average_values"),
     *("finish_update", "adam", "momentum_directions", "step_blocks", "integrate", "advance"),

@@ -10,7 +10,7 @@ from kernels.engines import engine_of, inference_of, prepare, run_forward
 from kernels.test_network import compare, drawn, float32_state
 from network.states import network_of
 
-from hgn.config import CONTACT_GATES, KEPT_MOMENTA
+from hgn.config import CONTACT_GATES
 from hgn.network.cell_keys import unpack
 from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
@@ -81,14 +81,11 @@ def test_every_column(counts: tuple[int, ...], obstacles: bool, changes: dict, g
 @pytest.mark.parametrize(
     ("counts", "obstacles", "levels"), [(EVERYWHERE, True, 2), ((9, 33), False, 1), ((1,), False, 2), ((40,), False, 3)]
 )
-@pytest.mark.parametrize(("momentum", "gate"), list(zip(KEPT_MOMENTA, CONTACT_GATES, strict=True)))
-def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels: int, momentum: str, gate: str) -> None:
+@pytest.mark.parametrize("gate", CONTACT_GATES)
+def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels: int, gate: str) -> None:
     """In float32 outputs and every gradient are those of the reference network in float64 to 2e-5, among walls within
     reach and beyond, with one coarsest cell a particle and with few for all."""
-    network, state = (
-        relative_network(levels=levels, momentum=momentum, contact_gate=gate),
-        moving_state(counts, obstacles),
-    )
+    network, state = relative_network(levels=levels, contact_gate=gate), moving_state(counts, obstacles)
     output, together, each = compare(network, state, "fp32", 1.0, 512)
     assert max(output, together, *each) < 2e-5
 
@@ -98,7 +95,7 @@ def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels:
 def test_momentum_is_kept_where_nothing_touches(counts: tuple[int, ...], precision: str) -> None:
     """Away from surfaces what inference adds to gravity sums to 0 in each scene, to float32's rounding; and so do its
     moments."""
-    network = relative_network(levels=2, momentum="angular", contact_gate="cell")
+    network = relative_network(levels=2, contact_gate="cell")
     state = moving_state(counts, obstacles=False)
     state = replace(state, position_N3=state.position_N3 + 0.4, velocity_NM3=state.velocity_NM3.clamp(-5e-3, 5e-3))
     origin_S3, _ = drawn(network, state)

@@ -158,7 +158,8 @@ def _gated(config, columns, pairs):
 
 
 def _balanced(config, touched, disturbed, pairs, output):
-    """Of accelerations and stresses what keeps momentum, one coarsest cell after the other (relative.balanced)."""
+    """Of accelerations and stresses what keeps momenta (relative.balanced): a coarsest cell's rotation is taken out,
+    and that of two: fields over their particles, as they are."""
     top = [(row, tuple(k >> config.levels - 1 for k in cell), weight) for row, cell, weight, _ in pairs]
     # in coarsest cells
     place = [(torch.tensor(cell) + 0.5 - offset) / 2 ** (config.levels - 1) for _, cell, _, offset in pairs]
@@ -166,28 +167,6 @@ def _balanced(config, touched, disturbed, pairs, output):
     for row, cell, weight in top:
         mass[cell] = mass.get(cell, 0.0) + weight
         mean[cell] = mean.get(cell, 0.0) + weight * output[row]
-    if config.keeps_spin:
-        return _without_turning(top, place, mass, mean, output, touched, disturbed)
-    change = {}
-    for cell in mass:
-        rest = -(1 - touched(cell)) * mean[cell][:3] / mass[cell]
-        for axis, sign in itertools.product(range(3), (1, -1)):
-            other = tuple(k + sign * (a == axis) for a, k in enumerate(cell))
-            if other not in mass:
-                continue
-            stress = mean[cell] / mass[cell] + mean[other] / mass[other]  # after the acceleration: xx yy zz yz xz xy
-            column = {0: (3, 8, 7), 1: (8, 4, 6), 2: (7, 6, 5)}[axis]
-            share = disturbed(other) * mass[other] / (mass[cell] + mass[other]) / 2
-            rest = rest + share * sign * stress[list(column)]
-        change[cell] = rest
-    result = [torch.zeros(3, dtype=value.dtype) for value in output]
-    for row, cell, weight in top:
-        result[row] = result[row] + weight * disturbed(cell) * (output[row][:3] + change[cell])
-    return result
-
-
-def _without_turning(top, place, mass, mean, output, touched, disturbed):
-    """The same with each cell's rotation taken out, and each two cells': fields over their particles, as they are."""
     result = [torch.zeros(3, dtype=value.dtype) for value in output]
 
     def free(field, cells):

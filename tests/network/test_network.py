@@ -50,9 +50,8 @@ def test_fcn_halves_equal_the_definition():
         ((9, 4), {"inputs": "relative"}),
         ((14, 4), {"inputs": "relative", "levels": 2, "obstacle_features": False, "contact_gate": "cell"}),
         ((1, 12), {"inputs": "relative", "levels": 1, "contact_reach_cells": 4.0}),
-        ((12,), {"inputs": "relative", "obstacle_features": False}),
-        ((15, 1), {"inputs": "relative", "obstacle_features": False, "momentum": "angular"}),
-        ((13, 2), {"inputs": "relative", "levels": 1, "momentum": "angular", "contact_gate": "cell"}),
+        ((15, 1), {"inputs": "relative", "obstacle_features": False}),
+        ((13, 2), {"inputs": "relative", "levels": 1, "contact_gate": "cell"}),
     ],
 )
 def test_network_equals_the_literal_definition(counts, changes):

@@ -151,15 +151,13 @@ ODD_BODIES = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("levels", "momentum"), [(1, "linear"), (3, "linear"), (1, "angular"), (2, "angular"), (3, "angular")]
-)
+@pytest.mark.parametrize("levels", [1, 2, 3])
 @GATES
-def test_momentum_is_kept_where_nothing_touches(levels: int, momentum: str, gate: str) -> None:
+def test_momentum_is_kept_where_nothing_touches(levels: int, gate: str) -> None:
     """With any weights, the accelerations of particles that move as they please, over many coarsest cells and alone in
-    theirs, on lines, planes and in one place, sum to gravity's; their moments to 0 too where angular momentum is kept,
-    and not where it is not. Near a wall they do not, nor do those of a part; and the means of cells differ."""
-    network = network_of(inputs="relative", levels=levels, momentum=momentum, contact_gate=gate)
+    theirs, on lines, planes and in one place, sum to gravity's, and their moments to 0. Near a wall they do not, nor do
+    those of a part; and the means of cells differ."""
+    network = network_of(inputs="relative", levels=levels, contact_gate=gate)
     state = airborne((60, 17, 1, 40, *map(len, ODD_BODIES)))
     place_N3 = torch.where((state.scene_N == 3)[:, None], 0.35 + state.position_N3 / 2, state.position_N3)
     place_N3[118:] = torch.cat(ODD_BODIES)
@@ -170,30 +168,26 @@ def test_momentum_is_kept_where_nothing_touches(levels: int, momentum: str, gate
         mine_N3, turn_3 = extra_N3[state.scene_N == scene], moment_N3[state.scene_N == scene].sum(0)
         sizes = float(mine_N3.abs().sum())
         assert float(mine_N3.sum(0).abs().max()) < 1e-12 * sizes + 3e-16
-        if momentum == "angular":
-            assert float(turn_3.abs().max()) < 1e-11 * sizes + 3e-16
+        assert float(turn_3.abs().max()) < 1e-11 * sizes + 3e-16
         if scene < 4 and len(mine_N3) > 1:
             assert float(mine_N3[::2].sum(0).abs().max()) > 1e-3 * sizes
-            assert momentum == "angular" or float(turn_3.abs().max()) > 1e-5 * sizes
     grid = network.grid(state)
     _, disturbed_C, touched_C = network.relative_features(state, grid)
     assert not touched_C.any()
     stressed = torch.cat([torch.zeros(len(extra_N3), 3), torch.randn(len(extra_N3), 6)], 1).double()
-    pushed_N3 = balanced(stressed, disturbed_C, touched_C, grid, network.config.keeps_spin)
+    pushed_N3 = balanced(stressed, disturbed_C, touched_C, grid)
     assert float(pushed_N3.abs().max()) > 1e-2
     by_wall = replace(state, domain_S3=state.position_N3.max(0).values.expand(state.scene_count, 3))
     extra_N3 = (network(by_wall) - state.gravity_S3[state.scene_N]).detach()
     assert float(extra_N3[state.scene_N == 0].sum(0).abs().max()) > 1e-2 * float(extra_N3.abs().max())
 
 
-def pushed(
-    place_N3: torch.Tensor, output_N9: torch.Tensor, keeps_spin: bool = True, levels: int = 3, touched: float = 0.0
-) -> torch.Tensor:
+def pushed(place_N3: torch.Tensor, output_N9: torch.Tensor, levels: int = 3, touched: float = 0.0) -> torch.Tensor:
     """What `balanced` makes of outputs at such places, all disturbed: accelerations [N, 3]."""
     scene_N, origin_13 = torch.zeros(len(place_N3), dtype=torch.long), place_N3.new_zeros(1, 3)
     grid = build_hierarchy(place_N3, scene_N, origin_13, 0.035, levels)
     one_C = place_N3.new_ones(grid.levels[-1].cell_count)
-    return balanced(output_N9, one_C, touched * one_C, grid, keeps_spin)
+    return balanced(output_N9, one_C, touched * one_C, grid)
 
 
 def drawn_outputs(count: int) -> torch.Tensor:
@@ -226,13 +220,12 @@ def test_accelerations_are_continuous(way: str, levels: int) -> None:
 
 
 @pytest.mark.parametrize("touched", [0.0, 0.3, 1.0])
-@pytest.mark.parametrize("keeps_spin", [False, True])
-def test_gradients_of_the_balance(keeps_spin: bool, touched: float) -> None:
+def test_gradients_of_the_balance(touched: float) -> None:
     """Those with respect to outputs, and to places, are finite differences."""
     place_N3 = 0.42 + 0.2 * torch.rand(9, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
 
     def of(place: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-        return pushed(place, output, keeps_spin, 2, touched)
+        return pushed(place, output, 2, touched)
 
     inputs = (place_N3.requires_grad_(), drawn_outputs(9).requires_grad_())
     assert torch.autograd.gradcheck(of, inputs, eps=1e-7, atol=1e-4)
@@ -297,9 +290,8 @@ def turned_outputs(output_N9: torch.Tensor, turn_33: torch.Tensor) -> torch.Tens
     return torch.cat([output_N9[:, :3] @ turn_33.T, stress_N33[:, rows, columns]], 1)
 
 
-@pytest.mark.parametrize("keeps_spin", [False, True])
 @pytest.mark.parametrize("symmetry", ALL_48, ids=lambda s: f"{s.source}{s.mirrored}")
-def test_impulses_turn_with_the_scene(symmetry: Symmetry, keeps_spin: bool) -> None:
+def test_impulses_turn_with_the_scene(symmetry: Symmetry) -> None:
     """What `balanced` makes of outputs turned and mirrored with the scene is turned and mirrored with it."""
     network, state = network_of(inputs="relative", cell_size=1 / 8), random_state((60,), spread=0.95)
     turn_33 = torch.tensor(matrix_of(symmetry), dtype=torch.float64)
@@ -312,7 +304,7 @@ def test_impulses_turn_with_the_scene(symmetry: Symmetry, keeps_spin: bool) -> N
         grid = network.grid(scene)
         coordinate_C3 = unpack(grid.levels[-1].key_C)[1]
         distance_C = ((coordinate_C3 + 0.5) * 4 / 8 - 0.5).square().sum(1)
-        results.append(balanced(outputs, torch.exp(-distance_C), distance_C / 4, grid, keeps_spin))
+        results.append(balanced(outputs, torch.exp(-distance_C), distance_C / 4, grid))
     assert float(results[0].norm()) > 1
     torch.testing.assert_close(results[1], results[0] @ turn_33.T, rtol=0, atol=1e-12)
 
@@ -486,10 +478,8 @@ def test_one_scale_for_all_axes() -> None:
         ({"inputs": "relative", "velocity_history": 1}, "velocity_history must be at least 2 with inputs=relative"),
         ({"contact_reach_cells": 0.0}, "contact_reach_cells must be"),
         ({"kind": "gns", "levels": 1, "inputs": "relative"}, "inputs must be absolute for gns, got 'relative'"),
-        ({"inputs": "relative", "momentum": "spin"}, "momentum must be one of linear, angular, got 'spin'"),
         ({"inputs": "relative", "contact_gate": "near"}, "contact_gate must be one of particle, cell, got 'near'"),
         ({"contact_gate": "cell"}, "contact_gate must be particle with inputs=absolute, got 'cell'"),
-        ({"momentum": "angular"}, "momentum must be linear with inputs=absolute, which keep none, got 'angular'"),
     ],
 )
 def test_bad_input(changes: dict[str, object], message: str) -> None:

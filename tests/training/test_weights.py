@@ -107,8 +107,8 @@ def test_another_contact_gate_is_taken(tmp_path: Path) -> None:
     assert network.config == wanted and info.network.contact_gate == "particle"
     theirs = own.state_dict()
     assert all(torch.equal(tensor, theirs[name]) for name, tensor in network.state_dict().items())
-    with pytest.raises(ConfigError, match=r"network.momentum must be 'linear', as in"):
-        network_of_weights(replace(config, network=replace(wanted, momentum="angular")))
+    with pytest.raises(ConfigError, match=r"network.contact_reach_cells must be 1.5, as in"):
+        network_of_weights(replace(config, network=replace(wanted, contact_reach_cells=2.0)))
 
 
 def test_warm_up() -> None:

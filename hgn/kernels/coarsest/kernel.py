@@ -37,11 +37,11 @@ def _coarsest_places(place_of, row, live):
 @triton.jit
 def sum_coarsest(
     x, coarsest_of, share_of, place_of, neighbour, counts, disturbed, felt, sums, particle_count, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, FEEL: tl.constexpr, SPIN: tl.constexpr,
+    LEVELS: tl.constexpr, OUT: tl.constexpr, USED: tl.constexpr, FEEL: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds the first USED columns of the particles' rows of x [N, OUT] to their coarsest cells' sums [C, OUT], with
-    their shares. With SPIN the next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL
+    their shares. The next three columns are the moments of columns 0 to 2 about the cells' middles. With FEEL
     felt [C, 2] is told how disturbed coarsest cells are (`most_around`; how touched was told before).
     Programs for as many particles as for coarsest cells.
 
@@ -52,8 +52,7 @@ def sum_coarsest(
         most_around(disturbed, felt, 0, neighbour, row, row < tl.load(counts + LEVELS - 1), capacity)
     live = row < tl.load(particle_count)
     cell, share = _coarsest_cells(coarsest_of, share_of, row, live)
-    if SPIN:
-        px, py, pz = _coarsest_places(place_of, row, live)
+    px, py, pz = _coarsest_places(place_of, row, live)
     if OVERLAP:
         gdc_wait()
         gdc_launch_dependents()
@@ -61,82 +60,14 @@ def sum_coarsest(
     value = tl.load(x + row[:, None] * OUT + column, mask=live[:, None] & (column < USED), other=0.0)
     part = column[:, None, :]
     added = share[:, :, None] * value[:, None, :]
-    if SPIN:
-        vx, vy, vz = _three(x, row, 0, live, 1.0, OUT)
-        vx, vy, vz = vx[:, None], vy[:, None], vz[:, None]
-        added = tl.where(part == USED, (share * (py * vz - pz * vy))[:, :, None], added)
-        added = tl.where(part == USED + 1, (share * (pz * vx - px * vz))[:, :, None], added)
-        added = tl.where(part == USED + 2, (share * (px * vy - py * vx))[:, :, None], added)
+    vx, vy, vz = _three(x, row, 0, live, 1.0, OUT)
+    vx, vy, vz = vx[:, None], vy[:, None], vz[:, None]
+    added = tl.where(part == USED, (share * (py * vz - pz * vy))[:, :, None], added)
+    added = tl.where(part == USED + 1, (share * (pz * vx - px * vz))[:, :, None], added)
+    added = tl.where(part == USED + 2, (share * (px * vy - py * vx))[:, :, None], added)
     # up to a multiple of four, which are added at once
-    adds = (cell >= 0)[:, :, None] & (part < (USED + 3 * SPIN + 3) // 4 * 4)
+    adds = (cell >= 0)[:, :, None] & (part < (USED + 6) // 4 * 4)
     tl.atomic_add(sums + cell[:, :, None] * OUT + part, added, mask=adds, sem="relaxed")
-
-
-@triton.jit
-def balance_cells(
-    sums, felt, motion, neighbour, geometry, counts, table, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """What the coarsest cells add to their particles' accelerations, and how disturbed they are, in columns 0 to 3 of
-    table [C, OUT]; of the sums of what particles put out.
-
-    Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
-    """
-    if OVERLAP:
-        gdc_wait()
-        gdc_launch_dependents()
-    count = tl.load(counts + LEVELS - 1)
-    if tl.program_id(0) * BLOCK >= count:
-        return
-    cell, there, mass, inverse = _coarsest_of(motion, geometry, count, LEVELS, BLOCK)
-    disturbed, touched = _felt(felt, cell, there)
-    column = tl.arange(0, 4)[None, :]
-    used = there[:, None] & (column < 3)
-    change = -(1 - touched)[:, None] * inverse[:, None] * tl.load(sums + cell[:, None] * OUT + column, used, other=0.0)
-    for slot in tl.static_range(6):
-        axis = slot // 2
-        stress = tl.where(column == axis, 3 + axis, 9 - column - axis)  # of xx, yy, zz, yz, xz, xy behind the three
-        own = tl.load(sums + cell[:, None] * OUT + stress, mask=used, other=0.0) * inverse[:, None]
-        other, share, beside = _across(neighbour, felt, motion, geometry, cell, there, mass, slot, capacity, LEVELS)
-        theirs = tl.load(sums + other[:, None] * OUT + stress, mask=used & (other >= 0)[:, None], other=0.0)
-        change += share[:, None] * (own + theirs * beside[:, None])
-    value = tl.where(column < 3, disturbed[:, None] * change, disturbed[:, None])
-    tl.store(table + cell[:, None] * OUT + column, value, mask=there[:, None])
-
-
-@triton.jit
-def balance_cells_backward(
-    sums, felt, motion, neighbour, geometry, counts, table, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """What the coarsest cells add to the gradients of their particles' outputs, and how disturbed they are, in columns
-    0 to 9 of table [C, OUT]; of the sums of the gradients of what `balance_cells` leads to.
-
-    Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
-    """
-    if OVERLAP:
-        gdc_wait()
-        gdc_launch_dependents()
-    count = tl.load(counts + LEVELS - 1)
-    if tl.program_id(0) * BLOCK >= count:
-        return
-    cell, there, mass, inverse = _coarsest_of(motion, geometry, count, LEVELS, BLOCK)
-    disturbed, touched = _felt(felt, cell, there)
-    column = tl.arange(0, OUT)[None, :]
-    mean = there[:, None] & (column < 3)
-    value = -(1 - touched)[:, None] * tl.load(sums + cell[:, None] * OUT + column, mask=mean, other=0.0)
-    for slot in tl.static_range(6):
-        axis = slot // 2
-        # the component of the force that a column of stress makes across this face
-        part = tl.where(column == 3 + axis, axis, 9 - axis - column)
-        makes = (column == 3 + axis) | ((column >= 6) & (column < 9) & (part >= 0) & (part < 3) & (part != axis))
-        makes = there[:, None] & makes
-        own = tl.load(sums + cell[:, None] * OUT + part, mask=makes, other=0.0)
-        other, share, beside = _across(neighbour, felt, motion, geometry, cell, there, mass, slot, capacity, LEVELS)
-        theirs = tl.load(sums + other[:, None] * OUT + part, mask=makes & (other >= 0)[:, None], other=0.0)
-        value += share[:, None] * (own - mass[:, None] * beside[:, None] * theirs)
-    value = tl.where(column == 9, disturbed[:, None], (disturbed * inverse)[:, None] * value)
-    tl.store(table + cell[:, None] * OUT + column, value, mask=there[:, None])
 
 
 @triton.jit
@@ -219,13 +150,13 @@ def _pairs(
 
 
 @triton.jit
-def balance_bodies(
+def balance(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """As `balance_cells` where angular momentum is kept: what coarsest cells add to their particles' accelerations at
-    their middles in columns 0 to 2 of table [C, OUT], the factor of these particles' own in column 3, and the rate of
-    rotation that they add in columns 4 to 6.
+    """What the coarsest cells add to their particles' accelerations at their middles, of the sums of what these put
+    out, in columns 0 to 2 of table [C, OUT], the factor of these particles' own in column 3, and the rate of rotation
+    that cells add in columns 4 to 6.
 
     Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -274,13 +205,13 @@ def balance_bodies(
 
 
 @triton.jit
-def balance_bodies_backward(
+def balance_backward(
     sums, moments, felt, motion, neighbour, geometry, counts, table, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """As `balance_cells_backward` where angular momentum is kept, of the sums of the gradients and their moments: in
-    columns 0 to 8 of table [C, OUT] what coarsest cells add to the gradients of their particles' outputs at their
-    middles, in column 9 the factor of the accelerations' own, and in columns 10 to 12 the rate of rotation.
+    """The same of the sums of the gradients of what `balance` leads to, and of their moments: in columns 0 to 8 of
+    table [C, OUT] what coarsest cells add to the gradients of their particles' outputs at their middles, in column 9
+    the factor of the accelerations' own, and in columns 10 to 12 the rate of rotation.
 
     Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
@@ -364,36 +295,20 @@ def _inverse(mass):
 
 
 @triton.jit
-def _across(
-    neighbour, felt, motion, geometry, cell, there, mass, slot: tl.constexpr, capacity, LEVELS: tl.constexpr
-):  # fmt: skip
-    """Of the cells across a face: their numbers, half their share of both masses as far as they are disturbed, with the
-    sign of the direction, and one over their masses."""
-    other = tl.load(neighbour + slot * capacity + cell, mask=there, other=-1)
-    beside = _mass(motion, geometry, other, other >= 0, LEVELS)
-    disturbed = tl.load(felt + other * 2, mask=other >= 0, other=0.0)
-    half: tl.constexpr = 0.5 - slot % 2
-    share = half * disturbed * beside / tl.where(beside > 0, mass + beside, 1.0)
-    return other, share, _inverse(beside)
-
-
-@triton.jit
 def add_coarsest(
     x, table, coarsest_of, share_of, place_of, particle_count,
-    OUT: tl.constexpr, USED: tl.constexpr, COLUMNS: tl.constexpr, SPIN: tl.constexpr, OVERLAP: tl.constexpr,
-    BLOCK: tl.constexpr,
+    OUT: tl.constexpr, USED: tl.constexpr, COLUMNS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Multiplies columns 0 to 2 of the particles' rows of x [N, OUT] by column USED of the coarsest cells' table
-    [C, OUT], and adds its columns before that, each with the particles' shares; with SPIN also the rotation in columns
-    USED + 1 to USED + 3 about the cells' middles. COLUMNS: a power of two above USED.
+    [C, OUT], and adds its columns before that, each with the particles' shares, and the rotation in columns USED + 1 to
+    USED + 3 about the cells' middles. COLUMNS: a power of two above USED.
 
     Reference: hgn.network.relative.balanced; test: tests/kernels/test_relative.py.
     """
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = row < tl.load(particle_count)
     cell, share = _coarsest_cells(coarsest_of, share_of, row, live)
-    if SPIN:
-        place = _coarsest_places(place_of, row, live)
+    place = _coarsest_places(place_of, row, live)
     column = tl.arange(0, COLUMNS)[None, :]
     own = tl.load(x + row[:, None] * OUT + column, mask=live[:, None] & (column < 3), other=0.0)
     if OVERLAP:
@@ -403,10 +318,9 @@ def add_coarsest(
     found = tl.load(at, mask=(cell >= 0)[:, :, None] & (column <= USED)[:, None, :], other=0.0)
     total = tl.sum(share[:, :, None] * found, 1)
     factor = tl.sum(tl.where(column == USED, total, 0.0), 1)
-    if SPIN:
-        swing = _cross(_three(table, cell, USED + 1, cell >= 0, share, OUT), place)
-        for i in tl.static_range(3):
-            total += tl.where(column == i, tl.sum(swing[i], 1)[:, None], 0.0)
+    swing = _cross(_three(table, cell, USED + 1, cell >= 0, share, OUT), place)
+    for i in tl.static_range(3):
+        total += tl.where(column == i, tl.sum(swing[i], 1)[:, None], 0.0)
     tl.store(x + row[:, None] * OUT + column, total + factor[:, None] * own, mask=live[:, None] & (column < USED))
 
 

@@ -353,7 +353,7 @@ def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
     obstacle_cell_size, features, touch_of, disturbed, cell_size, reach, capacity,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, SPIN: tl.constexpr, COLUMNS: tl.constexpr,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -361,8 +361,8 @@ def prepare_particles(
     momentum are added to `motion` [.., 4], and its coarsest cells are told: `coarsest_of` [N, 8], each once and -1
     elsewhere, its shares of them, and its place [N, 3] in the lowest, from the middle, in edges. Surfaces need no sums:
     their columns of the features are written here, with `touch_of` [N], how near a particle is to any, to which the
-    second numbers of its coarsest cells in `disturbed` [C, 2] are raised, over FULLY. With SPIN the sums of places and
-    of their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and
+    second numbers of its coarsest cells in `disturbed` [C, 2] are raised, over FULLY. Sums of places and of
+    their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and
     SYMMETRY as in prepare_features.
 
     Reference: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py,
@@ -425,17 +425,16 @@ def prepare_particles(
         tl.store(place_of + row * 3, px, mask=live)
         tl.store(place_of + row * 3 + 1, py, mask=live)
         tl.store(place_of + row * 3 + 2, pz, mask=live)
-        if SPIN:
-            px = px[:, None, None] - high_x[:, :, None].to(tl.float32)
-            py = py[:, None, None] - high_y[:, :, None].to(tl.float32)
-            pz = pz[:, None, None] - high_z[:, :, None].to(tl.float32)
-            part = tl.arange(0, COLUMNS)[None, None, :]
-            one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
-            other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
-            added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
-            # up to a multiple of four, which are added at once
-            adds = (coarsest >= 0)[:, :, None] & (part < 12)
-            tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
+        px = px[:, None, None] - high_x[:, :, None].to(tl.float32)
+        py = py[:, None, None] - high_y[:, :, None].to(tl.float32)
+        pz = pz[:, None, None] - high_z[:, :, None].to(tl.float32)
+        part = tl.arange(0, COLUMNS)[None, None, :]
+        one = tl.where((part == 1) | (part == 4) | (part == 6), py, tl.where((part == 2) | (part == 5), pz, px))
+        other = tl.where(part == 3, px, tl.where((part == 4) | (part == 8), py, tl.where(part < 3, 1.0, pz)))
+        added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
+        # up to a multiple of four, which are added at once
+        adds = (coarsest >= 0)[:, :, None] & (part < 12)
+        tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
         _raise(disturbed + 1, coarsest, touch)
     if OVERLAP:
         gdc_wait()  # reads nothing of the tables that are being filled; who comes next does

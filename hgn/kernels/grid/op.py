@@ -122,8 +122,8 @@ class DeviceGrid:
     children of level l as views; per particle cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF.
     For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other; and of the
     coarsest cells there are disturbed_C2, disturbed and touched by their own particles in units of FULLY, felt_C2, by
-    those across their faces too, and what `balance` sums up and spreads, sum_C and table_C; where angular momentum is
-    kept moment_C, the first and second moments of what they hold. Of each particle there are its coarsest cells, each
+    those across their faces too, and what `balance` sums up and spreads, sum_C and table_C, and
+    moment_C, the first and second moments of what they hold. Of each particle there are its coarsest cells, each
     once and -1 elsewhere, its shares of them, its place in the lowest, and how near it is to a surface: coarsest_N8,
     share_N8, place_N3, touch_N.
     """
@@ -138,7 +138,6 @@ class DeviceGrid:
         cell_size: float,
         device: torch.device,
         relative: bool = False,
-        keeps_spin: bool = False,
     ) -> None:
         assert scenes < SCENE_LIMIT
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
@@ -150,7 +149,7 @@ class DeviceGrid:
             start += rows[-1][1]
             at += capacity
         assert start < 2**31, "slots are numbered in int32"
-        self.largest, self.keeps_spin = max(row[1] for row in rows), keeps_spin
+        self.largest = max(row[1] for row in rows)
 
         def integers(*shape: int) -> torch.Tensor:
             return torch.zeros(shape, dtype=torch.int32, device=device)
@@ -158,7 +157,7 @@ class DeviceGrid:
         self.geometry = torch.tensor(rows, dtype=torch.int32, device=device)
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
-        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 2, SUMS * coarsest * keeps_spin, 2 * coarsest, start]
+        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, 2 * coarsest, start]
         self._cleared = integers(sum(parts))  # one piece, cleared at once
         motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)
         self.prefix_sum = integers(start)
@@ -252,7 +251,7 @@ class DeviceGrid:
             share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
             disturbed=self.disturbed_C2, cell_size=self.cell_size,
             reach=config.contact_reach_cells * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            MOTION=config.relative, SPIN=self.keeps_spin, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
+            MOTION=config.relative, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
         if not config.relative:
             wall_maximum = config.wall_distance_cells * config.cell_size
@@ -276,24 +275,21 @@ class DeviceGrid:
 
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
         """From what the decoder puts out [N, OUT] to accelerations less gravity in columns 0 to 2, in place."""
-        between = coarsest_kernel.balance_bodies if self.keeps_spin else coarsest_kernel.balance_cells
-        self._through_coarsest(output, count, self.sum_C, between, OUTPUTS, 3)
+        self._through_coarsest(output, count, self.sum_C, coarsest_kernel.balance, OUTPUTS, 3)
 
     def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
         """From the gradient of what `balance` leaves to that of what it was given, in place."""
-        between = coarsest_kernel.balance_bodies_backward if self.keeps_spin else coarsest_kernel.balance_cells_backward
-        self._through_coarsest(gradient, count, self.gradient_sum_C, between, 3, OUTPUTS)
+        self._through_coarsest(gradient, count, self.gradient_sum_C, coarsest_kernel.balance_backward, 3, OUTPUTS)
 
     def _through_coarsest(
         self, x: torch.Tensor, count: torch.Tensor, sums: torch.Tensor, between: Any, taken: int, left: int
     ) -> None:
         """Sums of the first columns on the coarsest cells, what these make of them, and that back to particles."""
         particles, capacity, coarsest = self.particles, self.capacities[-1], self.neighbour(self.levels - 1)
-        spin, forward, overlap = self.keeps_spin, taken == OUTPUTS, overlaps()
+        forward, overlap = taken == OUTPUTS, overlaps()
         pairs: dict[str, Any] = {"coarsest_of": self.coarsest_N8, "share_of": self.share_N8, "place_of": self.place_N3}
-        pairs |= {"particle_count": count, "SPIN": spin}
+        pairs |= {"particle_count": count}
         cells = {"neighbour": coarsest, "counts": self.counts_L, "capacity": capacity, "LEVELS": self.levels}
-        bodies = {"moments": self.moment_C} if spin else {}
         sizes = {"OUT": x.shape[1], "OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK}
         cells_too = max(particles, capacity) if forward else particles
         # behind what is not a kernel in a backward pass
@@ -302,7 +298,7 @@ class DeviceGrid:
             FEEL=forward, **sizes, launch_pdl=overlap and forward,
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
-            sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, **bodies, **cells,
+            sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, moments=self.moment_C, **cells,
             table=self.table_C, **sizes, launch_pdl=overlap,
         )  # fmt: skip
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
