@@ -186,6 +186,7 @@ def test_contenders_take_turns() -> None:
         ({"rounds": 0}, "rounds must be a finite number > 0"),
         ({"gns": {"kind": "hgn"}}, "gns.kind must be gns"),
         ({"mpm_frames": 2}, "mpm_frames must be at least 4"),
+        ({"cases": ["public_gns_train"]}, "public_gns must be a folder with the public code for public_gns_train"),
     ],
 )
 def test_bad_options(change: dict[str, Any], message: str) -> None:

@@ -9,6 +9,7 @@ import functools
 import gc
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,8 +21,9 @@ from hgn.system.device import choose_device
 from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
-from tools.bench.config import CASES, BenchConfig
+from tools.bench.config import CASES, PUBLIC_GNS_CASES, BenchConfig
 from tools.bench.contenders import PASS, Frame, MpmFrame, Train, checked_workload
+from tools.bench.public_gns import PublicFrame, PublicTrain
 from tools.bench.states import TILE_PARTICLES, Workload
 from tools.bench.timing import Timed, alternate
 from tools.bench.triton_contenders import TritonFrame, TritonTrain
@@ -30,9 +32,9 @@ GPU_PARTICLES, GPU_SCENES = (TILE_PARTICLES, 40_000, 400_000), (1, 8, 32)
 CPU_PARTICLES, CPU_SCENES = (TILE_PARTICLES,), (1,)
 OUT_OF_MEMORY = "out of memory"
 EXIT_RED = 1
-FRAME_CASES = ("frame", "torch_frame", "gns_frame", "mpm_frame")
-TRAIN_CASES = ("train", "torch_train", "gns_train")
-Contender = Frame | Train | TritonFrame | TritonTrain
+FRAME_CASES = ("frame", "torch_frame", "gns_frame", "public_gns_frame", "mpm_frame")
+TRAIN_CASES = ("train", "torch_train", "gns_train", "public_gns_train")
+Contender = Frame | Train | TritonFrame | TritonTrain | PublicFrame | PublicTrain
 
 
 @dataclass
@@ -142,6 +144,8 @@ def _maker(
 ) -> tuple[Callable[..., Contender], str | None]:
     """What makes the contender from configuration, workload and device, and the backend of ours."""
     frame = case.endswith("frame")
+    if config.public_gns is not None and case in PUBLIC_GNS_CASES:
+        return functools.partial(PublicFrame if frame else PublicTrain, Path(config.public_gns)), None
     if case in ("frame", "train") and triton_unsupported_reason(device, config.network, precision) is None:
         return functools.partial(TritonFrame if frame else TritonTrain, precision), "triton"
     if case == "gns_train" and training_unsupported_reason(device, config.gns, precision) is None:
@@ -157,7 +161,11 @@ def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tu
     """Those of `cases` that are asked for and mean something; fp16 is backend triton's and our GNS's alone."""
     triton = triton_unsupported_reason(device, config.network, precision) is None
     fastest_differs = {"torch_frame": triton or device.type == "cpu", "torch_train": triton}  # from torch
-    wanted = config.cases or tuple(case for case in CASES if fastest_differs.get(case, True))
+    wanted = config.cases or tuple(
+        case
+        for case in CASES
+        if fastest_differs.get(case, True) and (config.public_gns is not None or case not in PUBLIC_GNS_CASES)
+    )
     if precision == "fp16":
         known = (("frame", "train") if triton else ()) + ("gns_frame", "gns_train")
         wanted = tuple(case for case in known if case in wanted)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from hgn.config import PRECISIONS, NetworkConfig
 from hgn.schema import OneOrMore, Positive, require, require_bounds
 
-CASES = ("frame", "train", "torch_frame", "torch_train", "gns_frame", "gns_train", "mpm_frame")
+PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
+CASES = ("frame", "train", "torch_frame", "torch_train", "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
 
 
 def _bench_gns() -> NetworkConfig:
@@ -18,8 +19,8 @@ def _bench_gns() -> NetworkConfig:
 class BenchConfig:
     """`python -m tools.bench`: what is timed."""
 
-    # of frame, train (the fastest backend), torch_frame, torch_train, gns_frame, gns_train, mpm_frame; null:
-    # all that differ here
+    # of frame, train (the fastest backend), torch_frame, torch_train, gns_frame, gns_train, public_gns_frame,
+    # public_gns_train, mpm_frame; null: all that differ here
     cases: tuple[str, ...] | None = None
     particles: tuple[OneOrMore, ...] | None = None  # of one scene; null: 4296, 40000, 400000 on a GPU, 4296 on a CPU
     # side by side, of the smallest number of particles; null: 1, 8, 32 on a GPU, 1 on a CPU
@@ -28,6 +29,7 @@ class BenchConfig:
     precisions: tuple[str, ...] | None = None
     network: NetworkConfig = field(default_factory=NetworkConfig)
     gns: NetworkConfig = field(default_factory=_bench_gns)
+    public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns, which needs PyTorch Geometric
     rounds: Positive[int] = 50  # samples of each contender
     seconds: Positive[float] = 20.0  # at most for contenders that take turns, once five rounds are done
     mpm_frames: int = 20  # of the solver in one sample
@@ -42,3 +44,6 @@ class BenchConfig:
                 require(value in known, f"{name}[{i}]", f"one of {', '.join(known)}", value)
         require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
         require(self.gns.kind == "gns", "gns.kind", "gns", self.gns.kind)
+        for case in PUBLIC_GNS_CASES:
+            given = self.public_gns is not None or case not in (self.cases or ())
+            require(given, "public_gns", f"a folder with the public code for {case}", None)

@@ -1,7 +1,8 @@
 """python -m tools.studies.solver_targets [--json FILE]: the solver's frames and data set beside what is asked of them.
 
-First a path's result is compared: the first frames with one launch a substep, a data set's shards with their checksums.
-A path whose check is red gets no time. Timed is the second half of the frames, when most particles have landed.
+First a path's result is compared: the first frames with one launch a substep, the plain prototype's fall with ours, a
+data set's shards with their checksums. A path whose check is red gets no time. Timed is the second half of the frames,
+when most particles have landed.
 """
 
 from __future__ import annotations
@@ -42,11 +43,12 @@ SIDE_BY_SIDE = 256
 # asked for: ms a frame and scene on one H100, seconds of a data set
 TARGETS = {
     "one_scene_te_step": 2.0, "one_scene": 5.0, "one_random_scene": 8.0, "scenes_256_te_step": 0.2,
-    "scenes_256_random": None, "particles_1m": 110.0, "dataset_800": 150.0,
+    "scenes_256_random": None, "particles_1m": 110.0, "plain_one_scene_te_step": None, "plain_256_te_step": None,
+    "dataset_800": 150.0,
 }  # fmt: skip
 GENERATOR = (sys.executable, "-m", "datagen", "+experiment=obstacles")
 COMPARED_FRAMES = 4
-FIRST_FRAME, LATER_FRAMES = 1e-6, 1e-4  # bounds: domain units
+FIRST_FRAME, LATER_FRAMES, FALL = 1e-6, 1e-4, 0.01  # bounds: domain units
 EXIT_RED = 1
 
 
@@ -107,6 +109,8 @@ def _row(case: str, config: SolverTargetsConfig, kind: str) -> dict[str, Any]:
     many = [_cubes()] * SIDE_BY_SIDE
     if case == "dataset_800":
         return _dataset(config)
+    if case.startswith("plain"):
+        return _plain(len(many) if "256" in case else 1, mpm, rate, frames)
     if case == "one_scene":
         return timed([_cubes()], plain, frames)
     if case in ("one_random_scene", "scenes_256_random"):
@@ -150,6 +154,21 @@ def timed(
         "substeps": float(np.mean(steps)) / (frames - 1),
         "check": "green",
     }
+
+
+def _plain(copies: int, mpm: MpmConfig, rate: float, frames: int) -> dict[str, Any]:
+    from datagen.mpm.solver import Simulated, simulate
+    from tools.studies.plain_mpm import plain_milliseconds
+
+    scene = _cubes()
+    taken, position_N3 = plain_milliseconds(scene, copies, SUBSTEPS, STEP_S, frames)
+    (ours,) = simulate([scene], mpm, frames + 1, rate)
+    assert isinstance(ours, Simulated)
+    away = float(np.linalg.norm(position_N3.mean(axis=0) - ours.position_TN3[-1].mean(axis=0)))
+    row = {"scenes": copies, "particles": copies * scene.particle_count, "substeps": SUBSTEPS}
+    if not away < FALL:
+        return row | {"ms": None, "check": f"its centre of mass is {away:.1e} from ours"}
+    return row | {"ms": taken / copies, "check": "green"}
 
 
 def _dataset(config: SolverTargetsConfig) -> dict[str, Any]:

@@ -15,15 +15,17 @@ from tools.studies.solver_targets import main, table, timed
 
 
 def test_rows_and_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows name case, milliseconds and check."""
+    """Rows name case, milliseconds and check, the plain prototype's too; what fell elsewhere than ours is red."""
     monkeypatch.setattr(solver_targets, "CUBE_SIZE", 0.03)
     file = tmp_path / "made" / "times.json"
-    given = {"cases": ["one_scene_te_step"], "frames": 6, "device": "cpu"}
+    given = {"cases": ["one_scene_te_step", "plain_one_scene_te_step"], "frames": 6, "device": "cpu"}
     assert main({**given, "json": str(file)}) == 0
     rows = json.loads(file.read_text())["rows"]
     assert [row["case"] for row in rows] == given["cases"]
     assert all(row["ms"] > 0 and row["check"] == "green" and row["substeps"] == 55 for row in rows)
     assert "| one_scene_te_step | " in table(rows)
+    monkeypatch.setattr(solver_targets, "FALL", 0.0)
+    assert main({**given, "cases": ["plain_one_scene_te_step"]}) == 1
 
 
 def test_no_time_for_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
