@@ -174,9 +174,9 @@ def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys:
 def test_what_counts_most_comes_first(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What is simulated with the reference, networks at the precision that tells most, coarse grids, then other
-    precisions, whose rollouts off backend triton are short; the report keeps its order. What fails is named with the
-    cause, the others go on, and only a fault that nobody foresaw makes the exit code 1."""
+    """What is simulated with the reference, networks at the precision that tells most, baselines, coarse grids, then
+    other precisions, whose rollouts off backend triton are short; the report keeps its order. What fails is named with
+    the cause, the others go on, and only a fault that nobody foresaw makes the exit code 1."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
     monkeypatch.setattr("tools.error_vs_time.__main__.GNS_ORDER", ("fp32", "fp16", "tf32"))
     files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("gns", "hgn")]
@@ -201,9 +201,9 @@ def test_what_counts_most_comes_first(
     options |= {"mpm_grids": [48, 64], "mpm_steps": [0.5], "precisions": ["tf32", "fp32"], "repeated_frames": 3}
     assert main(options) == 0
     assert [name.split(" (")[0] for name in order] == [
-        *["constant velocity", "ballistic motion", "mean acceleration"],
         *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
         "HGN L = 3, M = 2, cpu tf32",
+        *["constant velocity", "ballistic motion", "mean acceleration"],
         "GNS M = 3, torch fp32",
         "MPM 48³, step 0.5",
         "HGN L = 3, M = 2, cpu fp32",

@@ -64,16 +64,16 @@ class Run:
         return self.config.seconds is not None and time.monotonic() - self.begun > fraction * self.config.seconds
 
     def score_beside(self, compiling: Callable[[], bool]) -> None:
-        """Scores what is simulated already or needs no simulation, then, as long as kernels are being compiled, what
-        launches none of them: GNS at the precision that tells most.
+        """Scores what is simulated already, then, as long as kernels are being compiled, what launches none of them:
+        baselines, and GNS at the precision that tells most.
         """
         for i, contender in enumerate(self.contenders):
-            known = isinstance(contender, SolverContender) and contender.simulated
-            if known or isinstance(contender, BaselineContender):  # past the time or not: it takes a second
+            if isinstance(contender, SolverContender) and contender.simulated:
                 self._attempt(i, self._score)
         self.write()
         for i, contender in enumerate(self.contenders):
-            if contender.importance == GNS_FIRST and compiling() and not self.is_past(BEGIN_FRACTION):
+            idle = contender.importance == GNS_FIRST or isinstance(contender, BaselineContender)
+            if idle and compiling() and not self.is_past(BEGIN_FRACTION):
                 self._attempt(i, self._score)
                 self.write()
 
@@ -86,7 +86,8 @@ class Run:
         with bar("contenders", total=len(steps) * len(order), unit="contender") as progress:
             for step in steps:
                 for i in order:
-                    if self.is_past(BEGIN_FRACTION):
+                    # past the time too: by baselines all others are told
+                    if self.is_past(BEGIN_FRACTION) and not isinstance(self.contenders[i], BaselineContender):
                         if i not in self._rows and i not in self._given_up:
                             self._leave_out(i, "the time was over")
                     else:
