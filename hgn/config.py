@@ -413,8 +413,11 @@ class TrainingConfig:
     # fraction of the noise's variance that neighbours have in common, in waves of 4 to 64 cells; the paper's: 0
     noise_correlated_fraction: Fraction[float] = 0.1
     # in a frame whose rms acceleration is a below noise_std, the noise's scale is drawn down to max(a /
-    # noise_std, this), and errors count by it; 1: the same noise everywhere
+    # noise_std, this); 1: the same noise everywhere
     noise_min_scale: float = 1.0
+    # squared errors of such a frame count by 1 / scale to this power; 2: in units of the noise, so that rest is learned
+    # before slow slides; 0: all alike
+    noise_weight_power: NonNegative[float] = 2.0
     grid_jitter: bool = True
     # fraction of an episode's samples drawn by its frames' accelerations, with weights that keep the loss; 0:
     # all frames alike

@@ -25,10 +25,11 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
 
     Noise hides from a network what it errs by less: at rest its bias stays at a twentieth of the noise, and over
     thousands of frames what should lie still creeps. Where little happens, the noise's scale is drawn from a wide range
-    (as the levels of a denoiser are: Song & Ermon 2019), and errors count in units of it, so that each scale weighs the
-    same. `acceleration` is the root mean square of the target, domain units per frame squared. Where it is a fraction
+    (as the levels of a denoiser are: Song & Ermon 2019). `training.noise_weight_power` 2 counts errors in units of it,
+    so that each scale weighs the same, and what slides slowly is taken for what rests; 0 counts all alike.
+    `acceleration` is the root mean square of the target, domain units per frame squared. Where it is a fraction
     r < 1 of `noise_std`, the scale is log-uniform between max(r, training.noise_min_scale) and 1, drawn from the
-    sample's seed alone, and the weight is 1 / scale^2; elsewhere both are 1.
+    sample's seed alone, and the weight is 1 / scale^power; elsewhere both are 1.
     """
     if training.noise_min_scale == 1.0 or training.noise_std == 0.0:
         return 1.0, 1.0
@@ -36,7 +37,7 @@ def noise_scale(training: TrainingConfig, acceleration: float, seed: int) -> tup
     if not smallest < 1.0:
         return 1.0, 1.0
     scale = smallest ** (splitmix64(seed ^ SCALE_STREAM) / 2.0**64)
-    return scale, 1.0 / scale**2
+    return scale, 1.0 / scale**training.noise_weight_power
 
 
 def target_acceleration(window_FWN3: torch.Tensor) -> torch.Tensor:

@@ -10,18 +10,21 @@ from hgn.config import TrainingConfig
 from hgn.training.noise import noise_scale, target_acceleration
 
 
-@pytest.mark.parametrize(("acceleration", "smallest"), [(0.0, 0.02), (1e-5, 0.02), (1e-4, 0.1), (5e-4, 0.5)])
-def test_scales_are_log_uniform_down_to_what_happens(acceleration: float, smallest: float) -> None:
+@pytest.mark.parametrize(
+    ("acceleration", "smallest", "power"),
+    [(0.0, 0.02, 2.0), (1e-5, 0.02, 2.0), (1e-4, 0.1, 2.0), (5e-4, 0.5, 2.0), (1e-4, 0.1, 1.0), (1e-4, 0.1, 0.0)],
+)
+def test_scales_are_log_uniform_down_to_what_happens(acceleration: float, smallest: float, power: float) -> None:
     """From the larger of the least scale and the frame's own acceleration up to 1, each seed its own; errors count in
-    units of the noise."""
-    training = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02)
+    units of the noise, of its root, or all alike."""
+    training = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02, noise_weight_power=power)
     drawn = [noise_scale(training, acceleration, seed) for seed in range(4000)]
     assert drawn[7] == noise_scale(training, acceleration, 7)
     scales = np.array([scale for scale, _ in drawn])
     assert smallest <= scales.min() < smallest * 1.01 and 0.99 < scales.max() <= 1
     share = np.sort(np.log(scales) / np.log(smallest))
     assert np.abs(share - np.linspace(0, 1, len(share))).max() < 0.03
-    assert [weight for _, weight in drawn] == pytest.approx(1 / scales**2)
+    assert [weight for _, weight in drawn] == pytest.approx(1 / scales**power)
 
 
 def test_elsewhere_noise_is_as_asked() -> None:
