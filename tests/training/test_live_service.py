@@ -132,7 +132,7 @@ def test_stopped_while_its_service_is_away(
     make_dataset(make_config())
     files = fsspec.filesystem("memory")
     files.put(str(tmp_path / "data"), "/leaving", recursive=True)
-    real, opened, asked = EpisodeStore._open, [], []
+    real, opened, asked = EpisodeStore.open, [], []
 
     def gone(*arguments: object, **options: object) -> bytes:
         asked.append(1)
@@ -150,7 +150,7 @@ def test_stopped_while_its_service_is_away(
 
     config = make_config(folder="memory://leaving")
     monkeypatch.setattr(EpisodeStore, "fetch_ahead", lambda store: None)
-    monkeypatch.setattr(EpisodeStore, "_open", open_episode)
+    monkeypatch.setattr(EpisodeStore, "open", open_episode)
     try:
         assert train.main(train_mapping(config, tmp_path / "run", monitor_every=100)) == 128 + signal.SIGTERM
     finally:
