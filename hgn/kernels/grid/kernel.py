@@ -2,8 +2,6 @@
 
 All levels of all scenes lie in one array of slots: a window of cells around the domain, a border of one cell at each
 level so that neighbours need no bounds check. Shape legend: N particles, C cells of a level, L levels.
-Row of the obstacle table of a scene, int64: addresses of its hash buckets (0: no obstacle), keys and normals, the
-mask of the buckets, and the symmetry that it is seen under (hgn.scene.symmetry.Symmetry.code).
 """
 
 from __future__ import annotations
@@ -12,19 +10,13 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.geometry import FULLY, GEOMETRY_COLUMNS, most_around
+from hgn.kernels.obstacles import OBSTACLE_COLUMNS, obstacle_normals
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
-from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES
 from hgn.network.relative import STEPS_AHEAD, WALL_LIMIT
-from hgn.scene.symmetry import CELL_BITS
 
-OBSTACLE_COLUMNS = tl.constexpr(5)
 NEAREST, STEPS = tl.constexpr(WALL_LIMIT), tl.constexpr(STEPS_AHEAD)  # of relative inputs
 OVERFLOW = tl.constexpr(1)  # more active cells than capacity
 OUT_OF_WINDOW = tl.constexpr(2)  # a particle is not finite or outside the window
-CODE_BITS = tl.constexpr(3 + CELL_BITS)  # of an axis in a symmetry's code: where it comes from, whether mirrored, cells
-CODE_MASK = tl.constexpr((1 << CELL_BITS) - 1)  # of the cells
-LIMIT = tl.constexpr(COORDINATE_LIMIT)
-PRIME_X, PRIME_Y, PRIME_Z = (tl.constexpr(prime) for prime in HASH_PRIMES)
 
 
 @triton.jit
@@ -216,74 +208,6 @@ def fill_tables(
 
 
 @triton.jit
-def _find_obstacle(x, y, z, line, live):
-    """Row of the obstacle cell (x, y, z) in its scene's hash table, -1 where there is none."""
-    key = ((x + LIMIT) * (2 * LIMIT) + y + LIMIT) * (2 * LIMIT) + z + LIMIT
-    mixed = (x + LIMIT) * PRIME_X ^ (y + LIMIT) * PRIME_Y ^ (z + LIMIT) * PRIME_Z
-    place = (mixed ^ mixed >> 15) & tl.load(line + 3, mask=live, other=0)
-    bucket = tl.load(line, mask=live, other=0).to(tl.pointer_type(tl.int32))
-    entry_key = tl.load(line + 1, mask=live, other=0).to(tl.pointer_type(tl.int64))
-    start = tl.load(bucket + place, mask=live, other=0)
-    end = tl.load(bucket + place + 1, mask=live, other=0)
-    entry = tl.zeros_like(start) - 1
-    ask = live & (start < end)
-    while tl.max(ask.to(tl.int32)) > 0:
-        here = tl.load(entry_key + start, mask=ask, other=-1)
-        entry = tl.where(ask & (here == key), start, entry)
-        start += 1
-        ask = ask & (start < end)
-    return entry
-
-
-@triton.jit
-def _before_mirror(cell, symmetry, axis: tl.constexpr):
-    """A cell's coordinate, in floats, from before the symmetry mirrored this axis."""
-    part = symmetry >> CODE_BITS * axis
-    last = (part >> 3 & CODE_MASK).to(tl.float32) - 1
-    return tl.where((part >> 2 & 1) == 1, last - cell, cell)
-
-
-@triton.jit
-def _from_axis(x, y, z, symmetry, axis: tl.constexpr):
-    """That of the image's coordinates x, y, z which comes from this axis of the scene."""
-    z_or_y = tl.where((symmetry >> CODE_BITS & 3) == axis, y, z)
-    return tl.where((symmetry & 3) == axis, x, z_or_y)
-
-
-@triton.jit
-def _normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY: tl.constexpr):
-    """The obstacle normals' three parts at positions of any shape, zeros where there is none; `line` is their scenes'
-    row of the obstacle table. With SYMMETRY the positions are an image of the scene that the table is of: looked up
-    there, normals brought back."""
-    x = tl.floor(tl.div_rn(x, obstacle_cell_size))
-    y = tl.floor(tl.div_rn(y, obstacle_cell_size))
-    z = tl.floor(tl.div_rn(z, obstacle_cell_size))
-    if SYMMETRY:
-        symmetry = tl.load(line + OBSTACLE_COLUMNS - 1, mask=live, other=0)
-        ix, iy, iz = _before_mirror(x, symmetry, 0), _before_mirror(y, symmetry, 1), _before_mirror(z, symmetry, 2)
-        x = _from_axis(ix, iy, iz, symmetry, 0)
-        y = _from_axis(ix, iy, iz, symmetry, 1)
-        z = _from_axis(ix, iy, iz, symmetry, 2)
-    near = live & (tl.abs(x) < LIMIT) & (tl.abs(y) < LIMIT) & (tl.abs(z) < LIMIT)
-    x = tl.where(near, x, 0.0).to(tl.int64)
-    y = tl.where(near, y, 0.0).to(tl.int64)
-    z = tl.where(near, z, 0.0).to(tl.int64)
-    near = near & (tl.load(line, mask=near, other=0) != 0)
-    entry = _find_obstacle(x, y, z, line, near)
-    at = tl.load(line + 2, mask=near, other=0).to(tl.pointer_type(tl.float32)) + entry * 3
-    found = ()
-    for axis in tl.static_range(3):
-        if SYMMETRY:
-            part = symmetry >> CODE_BITS * axis
-            normal = tl.load(at + (part & 3), mask=entry >= 0, other=0.0)
-            normal = tl.where((part >> 2 & 1) == 1, -normal, normal)
-        else:
-            normal = tl.load(at + axis, mask=entry >= 0, other=0.0)
-        found = found + (normal,)  # noqa: RUF005 - Triton knows no unpacking here
-    return found
-
-
-@triton.jit
 def _with_column(value, number, x):
     """`value` [N, F] with the column x [N] in place of one of its own."""
     column = tl.arange(0, value.shape[1])
@@ -316,7 +240,7 @@ def _surfaces(
         y = tl.load(at + 1, mask=asked, other=0.0) + tl.load(v_at + 1, mask=asked, other=0.0) * time
         z = tl.load(at + 2, mask=asked, other=0.0) + tl.load(v_at + 2, mask=asked, other=0.0) * time
         line = obstacle_table + scene[:, None] * OBSTACLE_COLUMNS + 0 * quarters
-        normal = _normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY)
+        normal = obstacle_normals(x, y, z, line, asked, obstacle_cell_size, SYMMETRY)
         found = (normal[0] != 0) | (normal[1] != 0) | (normal[2] != 0)
         ahead = tl.min(tl.where(found & (quarters > 0), quarters, 8), 1)
         for i in tl.static_range(3):
@@ -483,7 +407,7 @@ def prepare_features(
     FEATURES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Absolute features of each particle (velocities, normal if NORMALS, walls, one-hot material), [N, FEATURES].
-    Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in _normals.
+    Without OBSTACLES nothing is looked up and the normals stay zero. SYMMETRY as in obstacle_normals.
 
     Reference: hgn.network.features; test: tests/kernels/test_network.py, tests/kernels/test_gns_update.py.
     """
@@ -509,7 +433,7 @@ def prepare_features(
         y = tl.load(position + row * 3 + 1, mask=live, other=0.0)
         z = tl.load(position + row * 3 + 2, mask=live, other=0.0)
         line = obstacle_table + scene * OBSTACLE_COLUMNS
-        normal = _normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY)
+        normal = obstacle_normals(x, y, z, line, live, obstacle_cell_size, SYMMETRY)
         for i in tl.static_range(3):
             value = _with_column(value, 3 * HISTORY + i, normal[i])
     is_wall = (column >= WALLS) & (column < WALLS + 6)

@@ -14,6 +14,7 @@ import torch
 import triton
 
 from hgn.config import NetworkConfig
+from hgn.kernels import obstacles as obstacle_lookup
 from hgn.kernels.coarsest import kernel as coarsest_kernel
 from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting, overlaps
@@ -26,7 +27,7 @@ PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
 SUMS = 16  # columns of what goes through the coarsest cells, as many as the decoder's padded output has
 MARGIN_CELLS = 4  # of a window, around what it must hold
-OBSTACLE_COLUMNS = kernel.OBSTACLE_COLUMNS.value
+OBSTACLE_COLUMNS = obstacle_lookup.OBSTACLE_COLUMNS.value
 OVERFLOW, OUT_OF_WINDOW = kernel.OVERFLOW.value, kernel.OUT_OF_WINDOW.value
 
 

@@ -13,7 +13,7 @@ import triton
 import triton.language as tl
 
 from hgn.kernels.blocks import nearest_tf32
-from hgn.kernels.grid.kernel import CODE_BITS, CODE_MASK, OBSTACLE_COLUMNS
+from hgn.kernels.obstacles import CODE_BITS, CODE_MASK, OBSTACLE_COLUMNS
 from hgn.kernels.triton_compat import settle_keys
 
 SAMPLE_COLUMNS = tl.constexpr(12)
