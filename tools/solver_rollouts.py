@@ -109,8 +109,12 @@ def kept_trials(
                 with temporary.open("wb") as file:
                     np.savez(file, position_TN3=trial.position_TN3, cause=np.array(trial.cause or ""))
                 temporary.replace(files[i])
-    stored = [np.load(file) for file in files]
-    return [RolloutResult(item["position_TN3"], str(item["cause"]) or None) for item in stored]
+    return [_kept_trial(file) for file in files]
+
+
+def _kept_trial(path: Path) -> RolloutResult:
+    with np.load(path) as stored:
+        return RolloutResult(stored["position_TN3"], str(stored["cause"]) or None)
 
 
 def other_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
