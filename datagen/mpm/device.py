@@ -77,7 +77,9 @@ def initialise(device: str = "auto", cpu_threads: int | None = None) -> Device:
             default_ip=ti.i32,
             fast_math=False,  # it reorders sums by what stands beside them, and drops tests for NaN
             gpu_max_reg=128,  # 512 threads of the largest kernels run on a processor then
-            cfg_optimization=False,  # three quarters of the time to compile, and LLVM does the same again
+            # nine tenths of the time to compile, and LLVM does the same again
+            cfg_optimization=False,
+            opt_level=0,  # expressions that stand twice
             log_level=ti.ERROR,
         )
     _started = Device("gpu", 1, _processors()) if has_gpu else Device("cpu", threads)
