@@ -35,6 +35,7 @@ NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 SYMMETRIES = ("none", "gravity")
 NETWORK_INPUTS = ("absolute", "relative")
 CONTACT_GATES = ("particle", "cell")
+CONTACT_FORCES = ("any", "normal")
 BACKENDS = ("auto", "torch", "triton", "cpu")
 TRAINING_BACKENDS = ("auto", "torch", "triton")
 PRECISIONS = ("fp32", "tf32", "fp16")
@@ -331,6 +332,9 @@ class NetworkConfig:
     # what relative inputs show a particle's velocity against surfaces by: its own reach; or cell: that of all that is
     # in its coarsest cells and across their faces, so that it is known inside a pile too
     contact_gate: Annotated[str, one_of(*CONTACT_GATES)] = "particle"
+    # what the mean force of surfaces on a coarsest cell may be: any; or normal: only along the normals of what is
+    # touched there, so that bodies slip as in solvers without friction, whatever the weights
+    contact_forces: Annotated[str, one_of(*CONTACT_FORCES)] = "any"
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     dimensions: int = 3  # 2: z is that of a plane; imported data alone have it
     maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
@@ -347,6 +351,7 @@ class NetworkConfig:
             require(self.velocity_history >= 2, "velocity_history", rule, self.velocity_history)
         else:
             require(not self.gates_by_cell, "contact_gate", "particle with inputs=absolute", self.contact_gate)
+            require(not self.slips, "contact_forces", "any with inputs=absolute", self.contact_forces)
         if self.kind == "hgn":
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
         else:
@@ -377,6 +382,11 @@ class NetworkConfig:
     def gates_by_cell(self) -> bool:
         """Whether a particle knows its velocity against a surface that its coarsest cells alone reach."""
         return self.contact_gate == "cell"
+
+    @property
+    def slips(self) -> bool:
+        """Whether surfaces push coarsest cells along their normals alone."""
+        return self.contact_forces == "normal"
 
     @property
     def feature_width(self) -> int:

@@ -14,7 +14,7 @@ from hgn.config import NetworkConfig
 from hgn.network.features import Normaliser, ParticleState, wall_distances
 from hgn.network.grid import GridHierarchy
 from hgn.network.mlp import LEAKY_SLOPE, MLP
-from hgn.network.relative import relative_features
+from hgn.network.relative import Contacts, relative_features
 
 
 class ParticleNetwork(nn.Module, ABC):
@@ -58,10 +58,8 @@ class ParticleNetwork(nn.Module, ABC):
         `origin_S3` moves the grid, where the network has one.
         """
 
-    def relative_features(
-        self, state: ParticleState, grid: GridHierarchy
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """All columns but the material's, [N, F], and how disturbed and how touched coarsest cells are, [C] each."""
+    def relative_features(self, state: ParticleState, grid: GridHierarchy) -> tuple[torch.Tensor, Contacts]:
+        """All columns but the material's, [N, F], and what the coarsest cells know of disturbances and surfaces."""
         return relative_features(state, grid, self.config, self.normaliser.acceleration_std[0])
 
     def encode_features(self, feature_NF: torch.Tensor, material_N: torch.Tensor) -> torch.Tensor:

@@ -90,9 +90,9 @@ class HierarchicalGraphNetwork(ParticleNetwork):
         """The same on a grid, with `propagate` for steps 1 to 12."""
         if not self.config.relative:
             return propagate(self.encode_particles(state, grid), grid)
-        feature_NF, disturbed_C, touched_C = self.relative_features(state, grid)
+        feature_NF, contacts = self.relative_features(state, grid)
         output_N9 = propagate(self.encode_features(feature_NF, state.material_N), grid)
-        return balanced(output_N9, disturbed_C, touched_C, grid)
+        return balanced(output_N9, contacts, grid)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

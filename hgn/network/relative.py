@@ -14,7 +14,8 @@ ask:
 | 3 + 3 | obstacle normals, at the particle and where it is flying to; only with obstacle_features |
 
 G is a particle's own `contact_gate`; or with `network.contact_gate: cell` sum_C w_pC t_C of what `disturbance` gives,
-which is nowhere less and knows a surface that is within reach of what the particle lies in.
+which is nowhere less and knows a surface that is within reach of what the particle lies in. With
+`network.contact_forces: normal` surfaces push along their normals alone (`balanced`).
 
 The decoder's nine numbers are an acceleration r and a stress sigma of each particle; `balanced` makes of them what is
 added to gravity. It is 0 where nothing moves against anything: what flies freely in one piece has exactly the
@@ -25,6 +26,8 @@ Shape legend: N particles, H velocities, L levels, C cells of a level, E directe
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -39,16 +42,28 @@ QUIET = 0.01  # s_a: changes and differences of velocity below it count by their
 OUTPUTS = 9  # of the decoder, a particle: an acceleration, and a stress xx, yy, zz, yz, xz, xy
 STRESS_33 = ((3, 8, 7), (8, 4, 6), (7, 6, 5))  # its columns
 SMALLEST_MASS = 1e-30  # a cell that rounding gave no weight has no velocity either
+# Particles that touch, and the share of those that touch in a direction, below which a surface fades away
+FEW, RARE = 0.1, 1e-3
 # What lies on a line has no rotation to take out: where the principal moments' product is below that of this share of
 # their mean, outputs fade away; and so they do where the mean itself is below …
 THIN = 0.2
 POINT = 1e-3  # of a coarsest cell's edge squared: a cube has it whose edge is a thirteenth of that
 
 
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Of coarsest cells: what `disturbance` says, 0 to 1, [C] each; and where surfaces push along normals alone, their
+    `touched_normals` [C, 3, 3]."""
+
+    disturbed_C: torch.Tensor
+    touched_C: torch.Tensor
+    normal_C33: torch.Tensor | None = None
+
+
 def relative_features(
     state: ParticleState, grid: GridHierarchy, config: NetworkConfig, scale: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """All columns but the embedding, [N, feature_width - material_embedding], and what `disturbance` says of them;
+) -> tuple[torch.Tensor, Contacts]:
+    """All columns but the embedding, [N, feature_width - material_embedding], and what the coarsest cells know of them;
     `scale` is s_a, frame units."""
     velocity_N3 = state.velocity_NM3[:, 0]
     wall_N6 = wall_nearness(
@@ -68,11 +83,13 @@ def relative_features(
         dim=-1,
     )
     gate_N = contact_gate(wall_N6, normal_N6)
-    disturbed_C, touched_C = disturbance(motion_NK, gate_N, grid)
+    contacts = Contacts(*disturbance(motion_NK, gate_N, grid))
+    if config.slips:
+        contacts = replace(contacts, normal_C33=touched_normals(surface_normals(wall_N6, normal_N6), grid))
     if config.gates_by_cell:
-        gate_N = (grid.weight_N8 * touched_C[coarsest_cells(grid)]).sum(1)
+        gate_N = (grid.weight_N8 * contacts.touched_C[coarsest_cells(grid)]).sum(1)
     parts = [motion_NK, gate_N[:, None] * torch.asinh(velocity_N3 / scale), wall_N6]
-    return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), disturbed_C, touched_C
+    return torch.cat(parts if normal_N6 is None else [*parts, normal_N6], dim=-1), contacts
 
 
 def history(velocity_NH3: torch.Tensor, gravity_N3: torch.Tensor) -> torch.Tensor:
@@ -132,6 +149,36 @@ def contact_gate(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch
     return gate_N if normal_N6 is None else torch.where(normal_N6.any(-1), 1, gate_N)
 
 
+def surface_normals(wall_N6: torch.Tensor, normal_N6: torch.Tensor | None) -> torch.Tensor:
+    """sum n n^T of the walls within reach, gated as in `contact_gate`, and of the obstacle's normal, at the particle or
+    else where it is flying to, [N, 3, 3]: no sign, so that nothing jumps where surfaces face each other."""
+    near_N6 = (2 * wall_N6).clamp(max=1)
+    normal_N33 = torch.diag_embed(near_N6[:, :3] + near_N6[:, 3:])
+    if normal_N6 is None:
+        return normal_N33
+    here_N3, ahead_N3 = normal_N6[:, :3], normal_N6[:, 3:]
+    first_N3 = torch.where(here_N3.any(-1, keepdim=True), here_N3, ahead_N3)
+    return normal_N33 + first_N3[:, :, None] * first_N3[:, None, :]
+
+
+def touched_normals(normal_N33: torch.Tensor, grid: GridHierarchy) -> torch.Tensor:
+    """S [C, 3, 3]: sums of w_pC times `surface_normals` in a coarsest cell."""
+    normal_N89 = grid.weight_N8[..., None] * normal_N33.flatten(1)[:, None]
+    sum_C9 = normal_N89.new_zeros(grid.levels[-1].cell_count, 9)
+    return sum_C9.index_add(0, coarsest_cells(grid).flatten(), normal_N89.flatten(0, 1)).unflatten(1, (3, 3))
+
+
+def slip(normal_C33: torch.Tensor) -> torch.Tensor:
+    """Q [C, 3, 3], what surfaces leave free: (1 + S / (FEW + RARE tr S))^-1 of the `touched_normals` S. On a plane it
+    is 1 along it and next to 0 along its normal, in a corner 1 along that alone, and 1 where nothing is touched."""
+    ratio_C33 = normal_C33 / (FEW + RARE * trace(normal_C33))[:, None, None]
+    return torch.linalg.inv(ratio_C33 + torch.eye(3, dtype=ratio_C33.dtype, device=ratio_C33.device))
+
+
+def trace(matrix_K33: torch.Tensor) -> torch.Tensor:
+    return matrix_K33.diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
 def disturbance(
     motion_NK: torch.Tensor, touch_N: torch.Tensor, grid: GridHierarchy
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -161,12 +208,7 @@ def coarsest_cells(grid: GridHierarchy) -> torch.Tensor:
     return cell_N8
 
 
-def balanced(
-    output_N9: torch.Tensor,
-    disturbed_C: torch.Tensor,
-    touched_C: torch.Tensor,
-    grid: GridHierarchy,
-) -> torch.Tensor:
+def balanced(output_N9: torch.Tensor, contacts: Contacts, grid: GridHierarchy) -> torch.Tensor:
     """Accelerations less gravity, normalised, [N, 3], of the decoder's output and what `disturbance` gives.
 
     With a particle's shares w_pC of the coarsest cells, their mass M, mean acceleration R and mean stress S, e from a
@@ -180,7 +222,11 @@ def balanced(
     r_p - R counts as q (r_p - R) - W x y_p. And of T on one cell and -T on another, D = X' - X apart, the rotation that
     both have about their common centre is taken out: with (q, W) of I f + I' f' + f f' (D^2 - D D^T) and of -f f' D x T
     a cell gets f' (q T + W x D) - W x y_p. That is a projection: nothing grows, however small or thin contents are.
+
+    With `touched_normals` t_C Q_C R_C, Q = `slip`, is taken out, too: what surfaces give a cell on the mean lies along
+    their normals, and bodies slide on a plane without friction, or any drive, whatever the weights.
     """
+    disturbed_C, touched_C = contacts.disturbed_C, contacts.touched_C
     level, cell_N8, weight_N8 = grid.levels[-1], coarsest_cells(grid), grid.weight_N8
     place_N83 = coarsest_places(grid)
     moment_N83 = torch.linalg.cross(place_N83, output_N9[:, None, :3].expand_as(place_N83))
@@ -210,6 +256,8 @@ def balanced(
     known_E, turn_E3 = rotation(inertia_E33, -both_E[:, None] * torch.linalg.cross(apart_E3, traction_E3))
     push_E3 = known_E[:, None] * traction_E3 + torch.linalg.cross(turn_E3, apart_E3)
     change_C3 = (free_C * known_C)[:, None] * -mean_C3
+    if contacts.normal_C33 is not None:
+        change_C3 = change_C3 - touched_C[:, None] * (slip(contacts.normal_C33) @ mean_C3[..., None]).squeeze(-1)
     change_C3 = disturbed_C[:, None] * change_C3.index_add(0, receiver_E, share_E[:, None] * push_E3)
     felt_E = 0.5 * disturbed_C[sender_E]
     turn_C3 = (free_C[:, None] * turn_C3).index_add(0, receiver_E, felt_E[:, None] * turn_E3)
@@ -233,7 +281,7 @@ def coarsest_places(grid: GridHierarchy) -> torch.Tensor:
 def inertia(spread_K33: torch.Tensor) -> torch.Tensor:
     """tr(G) - G of the second moments G of masses about their centre."""
     one_33 = torch.eye(3, dtype=spread_K33.dtype, device=spread_K33.device)
-    return spread_K33.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * one_33 - spread_K33
+    return trace(spread_K33)[:, None, None] * one_33 - spread_K33
 
 
 def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -245,6 +293,6 @@ def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.
     row = inertia_K33.unbind(1)
     adjugate_K33 = torch.stack([torch.linalg.cross(row[i - 2], row[i - 1]) for i in range(3)], 1)
     determinant_K = (row[0] * adjugate_K33[:, 0]).sum(-1).clamp(min=0)
-    mean_K = inertia_K33.diagonal(dim1=-2, dim2=-1).sum(-1) / 3
+    mean_K = trace(inertia_K33) / 3
     total_K = determinant_K + (THIN * (mean_K + POINT)) ** 3
     return determinant_K / total_K, (adjugate_K33 @ moment_K3[..., None]).squeeze(-1) / total_K[:, None]

@@ -154,10 +154,24 @@ def _gated(config, columns, pairs):
         if config.contact_gate == "cell":
             gate = sum(float(weight) * around(touched, cell) for row, cell, weight in top if row == i)
         line[motion : motion + 3] = [gate * value for value in line[motion : motion + 3]]
-    return partial(around, touched), partial(around, disturbed)
+
+    def slip(cell):
+        """What surfaces leave free of a mean force."""
+        matrix = torch.zeros(3, 3, dtype=torch.float64)
+        for row, at, weight in top:
+            surfaces = torch.tensor(columns[row][motion + 3 :], dtype=torch.float64)
+            near_6 = (2 * surfaces[:6]).clamp(max=1)
+            normals = [*surfaces[6:].view(-1, 3), torch.zeros(3, dtype=torch.float64)]
+            first_3 = next((n for n in normals if n.any()), normals[-1])
+            if at == cell:
+                matrix += float(weight) * (torch.diag(near_6[:3] + near_6[3:]) + torch.outer(first_3, first_3))
+        slips = torch.linalg.inv(torch.eye(3).double() + matrix / (0.1 + 1e-3 * matrix.trace()))
+        return slips if config.contact_forces == "normal" else 0 * slips
+
+    return partial(around, touched), partial(around, disturbed), slip
 
 
-def _balanced(config, touched, disturbed, pairs, output):
+def _balanced(config, touched, disturbed, slip, pairs, output):
     """Of accelerations and stresses what keeps momenta (relative.balanced): a coarsest cell's rotation is taken out,
     and that of two: fields over their particles, as they are."""
     top = [(row, tuple(k >> config.levels - 1 for k in cell), weight) for row, cell, weight, _ in pairs]
@@ -190,7 +204,8 @@ def _balanced(config, touched, disturbed, pairs, output):
     for cell in mass:
         own = {i: output[row][:3] for i, (row, at, _) in enumerate(top) if at == cell}
         for i, value in free(own, {cell}).items():
-            fields[i] = disturbed(cell) * (touched(cell) * own[i] + (1 - touched(cell)) * value)
+            kept = own[i] - slip(cell) @ mean[cell][:3] / mass[cell]
+            fields[i] = disturbed(cell) * (touched(cell) * kept + (1 - touched(cell)) * value)
         for axis in range(3):
             other = tuple(k + (a == axis) for a, k in enumerate(cell))
             if other in mass:

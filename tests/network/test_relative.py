@@ -10,7 +10,7 @@ import torch
 from network.states import gns_of, network_of, random_grid, random_state
 from scene.test_symmetry import CUBE, matrix_of
 
-from hgn.config import CONTACT_GATES, NetworkConfig
+from hgn.config import CONTACT_FORCES, CONTACT_GATES, NetworkConfig
 from hgn.network.cell_keys import unpack
 from hgn.network.features import Normaliser, ParticleState
 from hgn.network.grid import build_hierarchy
@@ -19,10 +19,12 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.network.relative import (
     QUIET,
     STRESS_33,
+    Contacts,
     balanced,
     coarsest_cells,
     contact_gate,
     obstacle_normals,
+    touched_normals,
     wall_nearness,
 )
 from hgn.scene.obstacle_grid import ObstacleGrid
@@ -120,9 +122,9 @@ def test_what_is_disturbed_disturbs_its_body() -> None:
     def gates(velocity_NH3: torch.Tensor) -> torch.Tensor:
         changed = replace(state, velocity_NM3=velocity_NH3)
         grid = network.grid(changed)
-        _, disturbed_C, touched_C = network.relative_features(changed, grid)
-        assert not touched_C.any()
-        return (grid.weight_N8 * disturbed_C[coarsest_cells(grid)]).sum(1)
+        contacts = network.relative_features(changed, grid)[1]
+        assert not contacts.touched_C.any()
+        return (grid.weight_N8 * contacts.disturbed_C[coarsest_cells(grid)]).sum(1)
 
     scale = float(network.normaliser.acceleration_std[0])
     for slower, full in ((3 * scale, True), (QUIET * scale / 4, False)):
@@ -172,22 +174,26 @@ def test_momentum_is_kept_where_nothing_touches(levels: int, gate: str) -> None:
         if scene < 4 and len(mine_N3) > 1:
             assert float(mine_N3[::2].sum(0).abs().max()) > 1e-3 * sizes
     grid = network.grid(state)
-    _, disturbed_C, touched_C = network.relative_features(state, grid)
-    assert not touched_C.any()
+    contacts = network.relative_features(state, grid)[1]
+    assert not contacts.touched_C.any()
     stressed = torch.cat([torch.zeros(len(extra_N3), 3), torch.randn(len(extra_N3), 6)], 1).double()
-    pushed_N3 = balanced(stressed, disturbed_C, touched_C, grid)
+    pushed_N3 = balanced(stressed, contacts, grid)
     assert float(pushed_N3.abs().max()) > 1e-2
     by_wall = replace(state, domain_S3=state.position_N3.max(0).values.expand(state.scene_count, 3))
     extra_N3 = (network(by_wall) - state.gravity_S3[state.scene_N]).detach()
     assert float(extra_N3[state.scene_N == 0].sum(0).abs().max()) > 1e-2 * float(extra_N3.abs().max())
 
 
-def pushed(place_N3: torch.Tensor, output_N9: torch.Tensor, levels: int = 3, touched: float = 0.0) -> torch.Tensor:
-    """What `balanced` makes of outputs at such places, all disturbed: accelerations [N, 3]."""
+def pushed(
+    place_N3: torch.Tensor, output_N9: torch.Tensor, levels: int = 3, touched: float = 0.0, slips: bool = False
+) -> torch.Tensor:
+    """What `balanced` makes of outputs at such places, all disturbed: accelerations [N, 3]. With `slips` surfaces are
+    as places say."""
     scene_N, origin_13 = torch.zeros(len(place_N3), dtype=torch.long), place_N3.new_zeros(1, 3)
     grid = build_hierarchy(place_N3, scene_N, origin_13, 0.035, levels)
     one_C = place_N3.new_ones(grid.levels[-1].cell_count)
-    return balanced(output_N9, one_C, touched * one_C, grid)
+    normal_C33 = touched_normals(place_N3[:, :, None] * place_N3[:, None, :], grid) if slips else None
+    return balanced(output_N9, Contacts(one_C, touched * one_C, normal_C33), grid)
 
 
 def drawn_outputs(count: int) -> torch.Tensor:
@@ -219,13 +225,13 @@ def test_accelerations_are_continuous(way: str, levels: int) -> None:
     assert jumps[0] > 1e-9 and jumps[1] < jumps[0] / 4
 
 
-@pytest.mark.parametrize("touched", [0.0, 0.3, 1.0])
-def test_gradients_of_the_balance(touched: float) -> None:
+@pytest.mark.parametrize(("touched", "slips"), [(0.0, False), (0.3, True), (1.0, False)])
+def test_gradients_of_the_balance(touched: float, slips: bool) -> None:
     """Those with respect to outputs, and to places, are finite differences."""
     place_N3 = 0.42 + 0.2 * torch.rand(9, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
 
     def of(place: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-        return pushed(place, output, 2, touched)
+        return pushed(place, output, 2, touched, slips)
 
     inputs = (place_N3.requires_grad_(), drawn_outputs(9).requires_grad_())
     assert torch.autograd.gradcheck(of, inputs, eps=1e-7, atol=1e-4)
@@ -304,7 +310,7 @@ def test_impulses_turn_with_the_scene(symmetry: Symmetry) -> None:
         grid = network.grid(scene)
         coordinate_C3 = unpack(grid.levels[-1].key_C)[1]
         distance_C = ((coordinate_C3 + 0.5) * 4 / 8 - 0.5).square().sum(1)
-        results.append(balanced(outputs, torch.exp(-distance_C), distance_C / 4, grid))
+        results.append(balanced(outputs, Contacts(torch.exp(-distance_C), distance_C / 4), grid))
     assert float(results[0].norm()) > 1
     torch.testing.assert_close(results[1], results[0] @ turn_33.T, rtol=0, atol=1e-12)
 
@@ -380,6 +386,24 @@ def test_a_pile_knows_how_it_moves() -> None:
     assert not gates(network, pile(heights[1:])).any()
     near = network_of(inputs="relative")
     assert gates(near, pile(heights)).tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 0, 0], abs=1e-12)
+
+
+@pytest.mark.parametrize("height", [0.4, 1.1, 1.49])  # R above the floor: the gate is 1, below 1, and next to 0
+@GATES
+def test_bodies_slip_on_a_plane(height: float, gate: str) -> None:
+    """With contact_forces=normal a floor pushes a body up or down alone, whatever the weights, motions and materials:
+    along it what is added to gravity sums to 0, as it does not with any force."""
+    extra = {}
+    for forces in CONTACT_FORCES:
+        network = network_of(inputs="relative", contact_gate=gate, contact_forces=forces)
+        state = airborne((40,))
+        low = state.position_N3[:, 1].min() - height * network.config.cell_size
+        state = replace(state, position_N3=state.position_N3 - low * torch.tensor([0.0, 1.0, 0.0]).double())
+        extra_N3 = (network(state) - state.gravity_S3[state.scene_N]).detach()
+        extra[forces] = extra_N3.sum(0) / extra_N3.abs().sum()
+    assert float(extra["normal"][::2].abs().max()) < 1e-12
+    if height < 1.4:
+        assert float(extra["normal"][1].abs()) > 1e-3 and float(extra["any"][::2].abs().max()) > 1e-3
 
 
 def test_no_gate_is_less_than_the_own_one() -> None:
@@ -480,6 +504,7 @@ def test_one_scale_for_all_axes() -> None:
         ({"kind": "gns", "levels": 1, "inputs": "relative"}, "inputs must be absolute for gns, got 'relative'"),
         ({"inputs": "relative", "contact_gate": "near"}, "contact_gate must be one of particle, cell, got 'near'"),
         ({"contact_gate": "cell"}, "contact_gate must be particle with inputs=absolute, got 'cell'"),
+        ({"contact_forces": "normal"}, "contact_forces must be any with inputs=absolute, got 'normal'"),
     ],
 )
 def test_bad_input(changes: dict[str, object], message: str) -> None:

@@ -71,16 +71,24 @@ def sum_coarsest(
 
 
 @triton.jit
+def _adjugate(matrix, x, y, z):
+    """The determinant of a symmetric matrix xx, yy, zz, yz, xz, xy, and its adjugate times a vector."""
+    xx, yy, zz, yz, xz, xy = matrix
+    axx, ayy, azz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    ayz, axz, axy = xy * xz - xx * yz, xy * yz - yy * xz, xz * yz - zz * xy
+    product = (axx * x + axy * y + axz * z, axy * x + ayy * y + ayz * z, axz * x + ayz * y + azz * z)
+    return xx * axx + xy * axy + xz * axz, product
+
+
+@triton.jit
 def _rotation(inertia, x, y, z):
     """How well a rotation is known, and the rate at which it turns, of moments about a centre: as
     hgn.network.relative.rotation. The inertia is xx, yy, zz, yz, xz, xy."""
-    xx, yy, zz, yz, xz, xy = inertia
-    axx, ayy, azz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-    ayz, axz, axy = xy * xz - xx * yz, xy * yz - yy * xz, xz * yz - zz * xy
-    determinant = tl.maximum(xx * axx + xy * axy + xz * axz, 0.0)
+    xx, yy, zz = inertia[0], inertia[1], inertia[2]
+    determinant, turn = _adjugate(inertia, x, y, z)
+    determinant = tl.maximum(determinant, 0.0)
     least = THINNEST * ((xx + yy + zz) / 3 + SMALLEST)
     inverse = 1 / (determinant + least * least * least)
-    turn = (axx * x + axy * y + axz * z, axy * x + ayy * y + ayz * z, axz * x + ayz * y + azz * z)
     return determinant * inverse, turn[0] * inverse, turn[1] * inverse, turn[2] * inverse
 
 
@@ -121,6 +129,19 @@ def _cross(a, b):
 
 
 @triton.jit
+def _slip(moments, cell, there, few, rare, mean, OUT: tl.constexpr):
+    """What surfaces leave free of the cells' means, as hgn.network.relative.slip, of the
+    products of normals behind the second moments."""
+    xx, yy, zz = _three(moments, cell, 9, there, 1.0, OUT)
+    yz, xz, xy = _three(moments, cell, 12, there, 1.0, OUT)
+    ratio = 1 / (few + rare * (xx + yy + zz))
+    matrix = 1 + xx * ratio, 1 + yy * ratio, 1 + zz * ratio, yz * ratio, xz * ratio, xy * ratio
+    determinant, free = _adjugate(matrix, mean[0], mean[1], mean[2])
+    inverse = 1 / determinant
+    return free[0] * inverse, free[1] * inverse, free[2] * inverse
+
+
+@triton.jit
 def _pairs(
     moments, neighbour, motion, geometry, cell, there, mass, centre, inertia, capacity,
     LEVELS: tl.constexpr, OUT: tl.constexpr,
@@ -151,8 +172,8 @@ def _pairs(
 
 @triton.jit
 def balance(
-    sums, moments, felt, motion, neighbour, geometry, counts, table, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
+    LEVELS: tl.constexpr, SLIPS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """What the coarsest cells add to their particles' accelerations at their middles, of the sums of what these put
     out, in columns 0 to 2 of table [C, OUT], the factor of these particles' own in column 3, and the rate of rotation
@@ -197,8 +218,12 @@ def balance(
     )
     lever = _cross(turn, centre)
     line = table + cell * OUT
+    if SLIPS:
+        along = _slip(moments, cell, there, few, rare, mean, OUT)
     for i in tl.static_range(3):
         pushed = tl.sum(share * (felt_by * traction[i] + swing[i]), 1) - free * known * mean[i]
+        if SLIPS:
+            pushed -= touched * along[i]
         tl.store(line + i, disturbed * pushed - lever[i], mask=there)
         tl.store(line + 4 + i, turn[i], mask=there)
     tl.store(line + 3, disturbed * (touched + free * known), mask=there)
@@ -206,8 +231,8 @@ def balance(
 
 @triton.jit
 def balance_backward(
-    sums, moments, felt, motion, neighbour, geometry, counts, table, capacity,
-    LEVELS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+    sums, moments, felt, motion, neighbour, geometry, counts, table, capacity, few, rare,
+    LEVELS: tl.constexpr, SLIPS: tl.constexpr, OUT: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The same of the sums of the gradients of what `balance` leads to, and of their moments: in columns 0 to 8 of
     table [C, OUT] what coarsest cells add to the gradients of their particles' outputs at their middles, in column 9
@@ -240,8 +265,13 @@ def balance_backward(
     turn = (factor * wx, factor * wy, factor * wz)
     lever = _cross(turn, centre)
     line = table + cell * OUT
+    if SLIPS:
+        along = _slip(moments, cell, there, few, rare, mean, OUT)
     for i in tl.static_range(3):
-        tl.store(line + i, factor * known * mean[i] - lever[i], mask=there)
+        own = factor * known * mean[i] - lever[i]
+        if SLIPS:
+            own -= disturbed * touched * along[i]
+        tl.store(line + i, own, mask=there)
         tl.store(line + 10 + i, turn[i], mask=there)
     tl.store(line + 9, disturbed * (touched + free * known), mask=there)
     their_mean = _three(sums, other, 0, other >= 0, beside, OUT)

@@ -252,6 +252,22 @@ def _surfaces(
 
 
 @triton.jit
+def _surface_normals(surfaces):
+    """Products xx, yy, zz, yz, xz, xy of the normals that `_surfaces` tells of, summed over a particle's surfaces."""
+    column = tl.arange(0, 16)[None, :]
+    near, first = (), ()
+    for i in tl.static_range(3):
+        sides = tl.where((column == i) | (column == i + 3), tl.minimum(2 * surfaces, 1.0), 0.0)
+        near = near + (tl.sum(sides, 1),)  # noqa: RUF005 - Triton knows no unpacking here
+    here = tl.sum(tl.where((column >= 6) & (column < 9), tl.abs(surfaces), 0.0), 1) > 0
+    for i in tl.static_range(3):
+        at = tl.where(here, 6 + i, 9 + i)[:, None]
+        first = first + (tl.sum(tl.where(column == at, surfaces, 0.0), 1),)  # noqa: RUF005
+    x, y, z = first
+    return near[0] + x * x, near[1] + y * y, near[2] + z * z, y * z, x * z, x * y
+
+
+@triton.jit
 def _raise(disturbed, cell, own):
     """Raises every second of `disturbed` to what the particles [N] in its cells [N, 8] have, where that is more."""
     own = (own * FULLY).to(tl.int32)[:, None]
@@ -277,7 +293,7 @@ def prepare_particles(
     position, velocity, scene_of, origin, particle_count, low, geometry, occupied, prefix_sum, cell_of,
     weight_of, fraction_of, motion, coarsest_of, share_of, place_of, moments, domain, obstacle_table,
     obstacle_cell_size, features, touch_of, disturbed, cell_size, reach, capacity,
-    HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, COLUMNS: tl.constexpr,
+    HISTORY: tl.constexpr, LEVELS: tl.constexpr, MOTION: tl.constexpr, SLIPS: tl.constexpr, COLUMNS: tl.constexpr,
     NORMALS: tl.constexpr, OBSTACLES: tl.constexpr, SYMMETRY: tl.constexpr, FEATURES: tl.constexpr,
     OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -286,8 +302,8 @@ def prepare_particles(
     elsewhere, its shares of them, and its place [N, 3] in the lowest, from the middle, in edges. Surfaces need no sums:
     their columns of the features are written here, with `touch_of` [N], how near a particle is to any, to which the
     second numbers of its coarsest cells in `disturbed` [C, 2] are raised, over FULLY. Sums of places and of
-    their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS]. OBSTACLES and
-    SYMMETRY as in prepare_features.
+    their products xx, yy, zz, yz, xz, xy are added to the coarsest cells' `moments` [C, COLUMNS], and with SLIPS those
+    of the normals of what is touched behind them. OBSTACLES and SYMMETRY as in prepare_features.
 
     Reference: hgn.network.grid.build_hierarchy and hgn.network.relative; test: tests/kernels/test_network.py,
     tests/kernels/test_relative.py.
@@ -358,6 +374,11 @@ def prepare_particles(
         added = tl.where(part < 9, share[:, :, None] * one * other, 0.0)
         # up to a multiple of four, which are added at once
         adds = (coarsest >= 0)[:, :, None] & (part < 12)
+        if SLIPS:
+            product = _surface_normals(surfaces)
+            for i in tl.static_range(6):
+                added = tl.where(part == 9 + i, share[:, :, None] * product[i][:, None, None], added)
+            adds = (coarsest >= 0)[:, :, None] & ((part < 12) | (touch > 0)[:, None, None])
         tl.atomic_add(moments + coarsest[:, :, None] * COLUMNS + part, added, mask=adds, sem="relaxed")
         _raise(disturbed + 1, coarsest, touch)
     if OVERLAP:

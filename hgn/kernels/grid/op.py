@@ -20,7 +20,7 @@ from hgn.kernels.grid import kernel
 from hgn.kernels.triton_compat import interpreting, overlaps
 from hgn.network.cell_keys import COORDINATE_LIMIT, HASH_PRIMES, SCENE_LIMIT, pack, unpack
 from hgn.network.obstacles import ObstacleCells
-from hgn.network.relative import OUTPUTS, QUIET
+from hgn.network.relative import FEW, OUTPUTS, QUIET, RARE
 
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
@@ -123,10 +123,10 @@ class DeviceGrid:
     children of level l as views; per particle cell_N8, weight_N8, fraction_N3, and the encoder's input feature_NF.
     For relative inputs motion_C4 is mass and momentum of the cells of all levels, one level after the other; and of the
     coarsest cells there are disturbed_C2, disturbed and touched by their own particles in units of FULLY, felt_C2, by
-    those across their faces too, and what `balance` sums up and spreads, sum_C and table_C, and
-    moment_C, the first and second moments of what they hold. Of each particle there are its coarsest cells, each
-    once and -1 elsewhere, its shares of them, its place in the lowest, and how near it is to a surface: coarsest_N8,
-    share_N8, place_N3, touch_N.
+    those across their faces too, and what `balance` sums up and spreads, sum_C and table_C, and moment_C, the first and
+    second moments of what they hold, and sums of products of normals. Of each particle there are its coarsest cells,
+    each once and -1 elsewhere, its shares of them, its place in the lowest, and how near it is to a surface:
+    coarsest_N8, share_N8, place_N3, touch_N.
     """
 
     def __init__(
@@ -166,6 +166,7 @@ class DeviceGrid:
         self._neighbour, self._children = integers(6 * at), integers(8 * at)
         self.counts_L, self.needed_L = integers(self.levels), integers(self.levels)
         self.status = integers(1)
+        self.slips = False  # the network last prepared for: whether surfaces push along their normals alone
         self.cell_N8 = integers(particles, 8)
         self.weight_N8 = torch.zeros(particles, 8, device=device)
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
@@ -241,6 +242,7 @@ class DeviceGrid:
         `symmetry` the obstacles are seen under the symmetries in their rows.
         """
         blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
+        self.slips = config.slips
         arguments = feature_arguments(
             config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
         )
@@ -252,7 +254,7 @@ class DeviceGrid:
             share_of=self.share_N8, place_of=self.place_N3, moments=self.moment_C, touch_of=self.touch_N,
             disturbed=self.disturbed_C2, cell_size=self.cell_size,
             reach=config.contact_reach_cells * config.cell_size, capacity=self.capacities[0], LEVELS=self.levels,
-            MOTION=config.relative, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
+            MOTION=config.relative, SLIPS=config.slips, COLUMNS=SUMS, OVERLAP=overlap, launch_pdl=overlap,
         )  # fmt: skip
         if not config.relative:
             wall_maximum = config.wall_distance_cells * config.cell_size
@@ -300,7 +302,7 @@ class DeviceGrid:
         )  # fmt: skip
         between[(triton.cdiv(capacity, PARTICLE_BLOCK),)](
             sums=sums, felt=self.felt_C2, motion=self.motion_C4, geometry=self.geometry, moments=self.moment_C, **cells,
-            table=self.table_C, **sizes, launch_pdl=overlap,
+            table=self.table_C, few=FEW, rare=RARE, SLIPS=self.slips, **sizes, launch_pdl=overlap,
         )  # fmt: skip
         coarsest_kernel.add_coarsest[(triton.cdiv(particles, PARTICLE_BLOCK),)](
             x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,
