@@ -85,7 +85,6 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_readme(here: Path) -> None:
     """README: a random scene, the main job, the program; what a tutorial runs word for word is not run twice."""
-    (here / "ramp.obj").write_text((ROOT / "conf/example/ramp.obj").read_text())
     scene = dict.fromkeys(lines_of(TUTORIALS / "scene.md"), "tutorials/scene.md")
     runner = Runner(SETTINGS, {"frames=300": "frames=2"}, INSTALLS | scene)
     runner.run(ROOT / "README.md")
