@@ -172,11 +172,19 @@ def slip(normal_C33: torch.Tensor) -> torch.Tensor:
     """Q [C, 3, 3], what surfaces leave free: (1 + S / (FEW + RARE tr S))^-1 of the `touched_normals` S. On a plane it
     is 1 along it and next to 0 along its normal, in a corner 1 along that alone, and 1 where nothing is touched."""
     ratio_C33 = normal_C33 / (FEW + RARE * trace(normal_C33))[:, None, None]
-    return torch.linalg.inv(ratio_C33 + torch.eye(3, dtype=ratio_C33.dtype, device=ratio_C33.device))
+    determinant_C, adjugate_C33 = adjugate(ratio_C33 + torch.eye(3, dtype=ratio_C33.dtype, device=ratio_C33.device))
+    return adjugate_C33 / determinant_C[:, None, None]
 
 
 def trace(matrix_K33: torch.Tensor) -> torch.Tensor:
     return matrix_K33.diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
+def adjugate(matrix_K33: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Determinants [K] and adjugates [K, 3, 3] of symmetric matrices."""
+    row = matrix_K33.unbind(1)
+    adjugate_K33 = torch.stack([torch.linalg.cross(row[i - 2], row[i - 1]) for i in range(3)], 1)
+    return (row[0] * adjugate_K33[:, 0]).sum(-1), adjugate_K33
 
 
 def disturbance(
@@ -290,9 +298,8 @@ def rotation(inertia_K33: torch.Tensor, moment_K3: torch.Tensor) -> tuple[torch.
     q = det I / (det I + m), W = adj(I) L / (det I + m), where m = (THIN (tr I / 3 + POINT))^3: both polynomials over
     what is never 0, so that nothing jumps, and what is q times a field less W is without any angular momentum.
     """
-    row = inertia_K33.unbind(1)
-    adjugate_K33 = torch.stack([torch.linalg.cross(row[i - 2], row[i - 1]) for i in range(3)], 1)
-    determinant_K = (row[0] * adjugate_K33[:, 0]).sum(-1).clamp(min=0)
+    determinant_K, adjugate_K33 = adjugate(inertia_K33)
+    determinant_K = determinant_K.clamp(min=0)
     mean_K = trace(inertia_K33) / 3
     total_K = determinant_K + (THIN * (mean_K + POINT)) ** 3
     return determinant_K / total_K, (adjugate_K33 @ moment_K3[..., None]).squeeze(-1) / total_K[:, None]

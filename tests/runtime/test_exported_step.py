@@ -33,7 +33,7 @@ FRAMES = 4
 NETWORKS = {
     "absolute": {},
     "relative": {"inputs": "relative"},
-    "cell_gate": {"inputs": "relative", "contact_gate": "cell"},
+    "contacts": {"inputs": "relative", "contact_gate": "cell", "contact_forces": "normal"},
 }
 SIZES = [(particles, obstacles) for particles in (1, 216, 4_096, 30_000) for obstacles in (True, False)]
 SCENE = str(config_directory() / "example/own_mesh.yaml")
