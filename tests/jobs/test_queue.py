@@ -25,7 +25,6 @@ from hgn.schema import from_mapping
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 
 JOBS = Path(__file__).resolve().parents[2] / "jobs"
-UNSET = ("CUDA_VISIBLE_DEVICES", "SCENES", "SHARE", "REPORT_SECONDS")
 # the arguments of each call, as a line of JSON; succeeds
 PYTHON = f"""#!{sys.executable}
 import json, sys

@@ -7,10 +7,9 @@ import copy
 import pytest
 import torch
 from kernels.engines import device
-from kernels.test_update import CELL_SIZE, episode, parameters_of, plain_updates
+from kernels.test_update import CELL_SIZE, episode, one_with_obstacles, parameters_of, plain_updates
 from network.states import gns_of
 
-from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.update.op import UpdateSettings
 from hgn.network.gns import GraphNetworkSimulator
@@ -70,16 +69,8 @@ def test_wrong_kernels_are_refused() -> None:
     """Before the first update outputs and gradients are compared with the reference network's on the noisy batch, under
     symmetries: they agree to rounding, and what computes another network is refused with the remedy."""
     network = gns_of(message_passing_steps=1, cell_size=0.1)
-    made, grids = episode(1, 5, True)
-    still, _ = episode(2, 3, False)
+    samples, episodes = one_with_obstacles()
     updates = updates_of(network, 2, noise_std=1e-3)
-    none = torch.zeros(0, 3)
-    cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
-    episodes = [
-        EpisodeTensors(each.position_TN3, each.material_N, *obstacles, each.domain_size, (0.0, 0.0, 0.0))
-        for each, obstacles in ((made, cells), (still, (none.int(), none)))
-    ]
-    samples = [(made, 1, 3), (still, 0, 4)]
     updates.predict(samples)
     assert max(require_parity(updates, episodes)) < (1e-3 if PRECISION == "fp32" else 0.1)
     updates.values.mul_(1.3)

@@ -43,6 +43,19 @@ def episode(seed: int, particles: int, obstacles: bool, spread: float = 0.12) ->
     return made, [grid] if obstacles else []
 
 
+def one_with_obstacles() -> tuple[list[tuple[DeviceEpisode, int, int]], list[EpisodeTensors]]:
+    """A sample of each of two episodes, one among obstacles, and the same episodes as the parity check takes them."""
+    made, grids = episode(1, 5, True)
+    still, _ = episode(2, 3, False)
+    none = torch.zeros(0, 3)
+    cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
+    episodes = [
+        EpisodeTensors(each.position_TN3, each.material_N, *obstacles, each.domain_size, (0.0, 0.0, 0.0))
+        for each, obstacles in ((made, cells), (still, (none.int(), none)))
+    ]
+    return [(made, 1, 3), (still, 0, 4)], episodes
+
+
 def plain_updates(
     network: HierarchicalGraphNetwork,
     chunk: list,
@@ -237,16 +250,8 @@ def test_wrong_kernels_are_refused() -> None:
     """Before the first update outputs and gradients are compared with the reference's on the noisy, jittered batch:
     they agree to rounding, and kernels that compute another network are refused with the remedy."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
-    made, grids = episode(1, 5, True)
-    still, _ = episode(2, 3, False)
+    samples, episodes = one_with_obstacles()
     updates = updates_of(network, 2, (64,), noise_std=1e-3, grid_jitter=True)
-    none = torch.zeros(0, 3)
-    cells = torch.from_numpy(grids[0].cell_K3), torch.from_numpy(grids[0].normal_K3)
-    episodes = [
-        EpisodeTensors(each.position_TN3, each.material_N, *obstacles, each.domain_size, (0.0, 0.0, 0.0))
-        for each, obstacles in ((made, cells), (still, (none.int(), none)))
-    ]
-    samples = [(made, 1, 3), (still, 0, 4)]
     updates.predict(samples)
     assert max(require_parity(updates, episodes)) < 1e-3
     updates.values.mul_(1.3)
