@@ -5,7 +5,7 @@ longest scene, whatever runs beside it; each is simulated once, and scenes get t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,7 +34,7 @@ class SolverLaunches:
         self.config, self.cell_size, self.frame_rate_hz, self.frames = config, cell_size, frame_rate_hz, frames
         self._settings: list[Setting] = []
         self._known: dict[tuple[Setting, str], RolloutResult] = {}
-        self._colliders: dict[str, Any] = {}
+        self._colliders: dict[str, Future[Any]] = {}
 
     def add(self, setting: Setting) -> Setting:
         if setting not in self._settings:
@@ -44,6 +44,15 @@ class SolverLaunches:
     def knows(self, setting: Setting) -> bool:
         """Whether scenes were simulated with it."""
         return any(known == setting for known, _ in self._known)
+
+    def collide(self, episodes: Sequence[Episode], threads: Executor) -> None:
+        """Builds the colliders of the scenes on those threads."""
+        from datagen.mpm.collider import build_collider
+
+        for episode in episodes:
+            if episode.key not in self._colliders:
+                scene = solver_scene(episode, self.cell_size)
+                self._colliders[episode.key] = threads.submit(build_collider, scene, self.config.collider_band_cells)
 
     def trials(
         self, setting: Setting, episodes: Sequence[Episode], on_frame: Callable[[int], None] | None = None
@@ -65,7 +74,8 @@ class SolverLaunches:
     def _simulate(
         self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: Callable[[int], None] | None
     ) -> list[RolloutResult]:
-        self._collide([episode for _, episode in pairs])
+        with ThreadPoolExecutor(available_cpus()) as threads:
+            self.collide([episode for _, episode in pairs], threads)
         # a scene's steps are its own; where all are alike the config says so
         alike = replace(self.config, stability_fraction=pairs[0][0].step)
         return solver_trials(
@@ -74,7 +84,7 @@ class SolverLaunches:
             frames,
             self.frame_rate_hz,
             on_frame,
-            [self._colliders[episode.key] for _, episode in pairs],
+            [self._colliders[episode.key].result() for _, episode in pairs],
             [setting.step for setting, _ in pairs],
         )
 
@@ -84,14 +94,3 @@ class SolverLaunches:
             draw = np.random.default_rng(scene.seed).uniform
             scene.position_N3[:] += draw(-setting.perturbation, setting.perturbation, scene.position_N3.shape)
         return scene
-
-    def _collide(self, episodes: Sequence[Episode]) -> None:
-        from datagen.mpm.collider import build_collider
-
-        missing = {episode.key: episode for episode in episodes if episode.key not in self._colliders}
-        with ThreadPoolExecutor(available_cpus()) as threads:
-            built = threads.map(
-                lambda e: build_collider(solver_scene(e, self.cell_size), self.config.collider_band_cells),
-                missing.values(),
-            )
-            self._colliders |= dict(zip(missing, built, strict=True))

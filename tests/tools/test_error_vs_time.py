@@ -19,12 +19,13 @@ from datagen.mpm.solver import SceneFailure, Simulated
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.weights import WeightsInfo, save_weights, shipped_weights
 from hgn.schema import ConfigError, from_mapping
-from tools.error_vs_time import score
+from tools.error_vs_time import plot, score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.timing import Timing
 
 CPU = torch.device("cpu")
+RESULTS = Path(__file__).resolve().parents[2] / "results"
 
 
 def fake_simulate(scenes, config, frames, frame_rate_hz, on_frame=None, colliders=None, stability_fractions=None):
@@ -109,6 +110,19 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert all(
         name in printed for name in ("HGN L = 3, M = 2", "GNS M = 3, torch fp32", "MPM 32³, step 1", "chaos floor")
     )
+
+
+def test_labels_of_the_figures_lie_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No label of a panel reaches into the next one's, nor out of the figure."""
+    report = json.loads((RESULTS / "error_vs_time" / "obstacles.json").read_text())
+    figures: list[Any] = []
+    monkeypatch.setattr("tools.error_vs_time.plot.as_png", lambda figure, dpi: figures.append(figure) or b"")
+    plot.draw_pareto(report["rows"], report["meta"], batched=True)
+    (figure,) = figures
+    figure.draw_without_rendering()
+    spans = [panel.xaxis.label.get_window_extent() for panel in figure.axes]
+    edges = [0.0, *(edge for span in spans for edge in (span.x0, span.x1)), figure.bbox.width]
+    assert len(spans) == 3 and edges == sorted(edges)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -297,8 +311,8 @@ SHORT |= {"sinkhorn_points": 8, "batch_scenes": 2, "timed_batches": [2], "mpm_ti
 
 
 def test_a_report_goes_on_where_it_was_cut_off(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows of an earlier report are neither simulated nor scored again; those without a run time are. Without data they
-    are drawn again and nothing else."""
+    """Rows of an earlier report are neither simulated nor scored again; those without a run time get one, and where and
+    when. Without data they are drawn again and nothing else."""
     simulated: list[set[float]] = []
 
     def noted(scenes, config, *more, stability_fractions, **others):
@@ -324,8 +338,11 @@ def test_a_report_goes_on_where_it_was_cut_off(data: str, tmp_path: Path, monkey
 
     monkeypatch.setattr("tools.error_vs_time.run.score", counted)
     assert main(options | {"out": str(second), "earlier": [f"{first}.json"]}) == 0
-    assert scored == ["gns"] and simulated == [{0.25}]
+    assert scored == [] and simulated == [{0.25}]
     again = json.loads(Path(f"{second}.json").read_text())["rows"]
+    (timed,) = (row for row in again if "timed" in row)
+    assert timed["system"] == "gns" and timed["ms"] > 0 and timed["timed"].keys() == {"device", "commit", "date"}
+    assert timed["by_scene"] == rows["gns"]["by_scene"]
     assert sorted(row["system"] for row in again) == sorted(row["system"] for row in report["rows"])
     assert main({"out": str(tmp_path / "drawn"), "earlier": [f"{second}.json"]}) == 0
     assert json.loads((tmp_path / "drawn.json").read_text())["rows"] == again

@@ -11,6 +11,7 @@ import functools
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from hgn.scene.material import MATERIALS
 from hgn.schema import ConfigError, from_mapping, from_stored, require, to_mapping
 from hgn.system.device import choose_device
 from hgn.system.files import write_json
+from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
 from tools.error_vs_time.contenders import (
@@ -109,8 +111,12 @@ def main(mapping: dict[str, Any]) -> int:
             "convention": CONVENTION,
             "seconds_before_scoring": time.monotonic() - begun,
         }
-        run = Run(config, [*networks, *baselines, *solvers], references, device, meta, begun, known)
-        run.score_beside(lambda: precompilation is not None and precompilation.running)
+        untimed = [row for report in earlier for row in report.untimed]
+        run = Run(config, [*networks, *baselines, *solvers], references, device, meta, begun, known, untimed)
+        with ThreadPoolExecutor(available_cpus()) as threads:
+            for solver in solvers:
+                solver.launches.collide(references, threads)
+            run.score_beside(lambda: precompilation is not None and precompilation.running)
         if precompilation is not None:
             print(precompilation.wait(lambda: run.is_past(COMPILING_FRACTION)), file=sys.stderr)
     run.meta["seconds_before_timing"] = time.monotonic() - begun
@@ -254,7 +260,7 @@ def solver_contenders(
     launches: Callable[[int], SolverLaunches],
     own_grid: int,
     known: Sequence[Mapping[str, Any]] = (),
-) -> list[Contender]:
+) -> list[SolverContender]:
     """The solver at its settings, and how far the reference departs from itself: the chaos floor. What is among the
     `known` rows is neither simulated nor given.
     """
@@ -271,7 +277,7 @@ def solver_contenders(
 
     settings = [(grid, step) for grid in config.mpm_grids for step in config.mpm_steps]
     points = {pair: solver(*pair) for pair in settings if wanted(solver_row(*pair))}
-    contenders: list[Contender] = list(points.values())
+    contenders = list(points.values())
     perturbed = {"system": "chaos", "floor": f"perturbed by {config.perturbation:g}"}
     if config.perturbation and wanted(perturbed):
         contenders.append(solver(own_grid, step, config.perturbation).named(**perturbed))

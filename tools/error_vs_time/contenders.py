@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -203,16 +204,17 @@ class BaselineContender:
     def trials(
         self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
     ) -> list[RolloutResult]:
-        trials = []
-        for episode in episodes:
-            time_T11 = np.arange(frames)[:, None, None]
+        time_T11 = np.arange(frames)[:, None, None]
+
+        def trial(episode: Episode) -> RolloutResult:
             velocity_N3 = episode.initial_velocity_N3 / episode.frame_rate_hz
-            acceleration_3 = self.acceleration(episode)
             # As the networks integrate: the velocity first, and the history before frame 0 falls freely.
             velocity_N3 = velocity_N3 - 0.5 * np.asarray(episode.gravity) / episode.frame_rate_hz**2
-            path_TN3 = velocity_N3 * time_T11 + acceleration_3 * (0.5 * time_T11 * (time_T11 + 1))
-            trials.append(RolloutResult((episode.position_TN3[0] + path_TN3).astype(np.float32)))
-        return trials
+            path_TN3 = velocity_N3 * time_T11 + self.acceleration(episode) * (0.5 * time_T11 * (time_T11 + 1))
+            return RolloutResult((episode.position_TN3[0] + path_TN3).astype(np.float32))
+
+        with ThreadPoolExecutor(torch.get_num_threads()) as threads:
+            return list(threads.map(trial, episodes))
 
     def release(self) -> None:
         """Nothing is kept on the device."""

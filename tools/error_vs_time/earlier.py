@@ -17,11 +17,12 @@ IDENTITY = ("system", "weights", "backend", "precision", "updates", "grid", "ste
 
 @dataclass(frozen=True)
 class Earlier:
-    """A report's meta and those rows that are whole: with run times, where there are any to take."""
+    """A report's meta, those rows that are whole (with run times, where there are any to take), and those without."""
 
     field: str
     meta: dict[str, Any]
     rows: list[dict[str, Any]]
+    untimed: list[dict[str, Any]]
 
     @staticmethod
     def read(file: str, field: str) -> Earlier:
@@ -30,6 +31,7 @@ class Earlier:
             report = json.loads(Path(file).read_text(encoding="utf-8"))
             meta, rows = report["meta"], [current_names(row) for row in report["rows"]]
             whole = [row for row in rows if row["system"] in UNTIMED or row.get("ms") is not None]
+            untimed = [row for row in rows if row not in whole]
             wanted = all("curve" in row for row in rows) and {"episodes", "frames", "reference"} <= meta.keys()
         except FileNotFoundError:
             raise ConfigError(f"{field} must be an existing file, got {file}; leave it out to begin anew") from None
@@ -39,7 +41,7 @@ class Earlier:
             raise ConfigError(
                 f"{field} must be JSON that python -m tools.error_vs_time wrote, got {file}; leave it out to begin anew"
             )
-        return Earlier(field, meta, whole)
+        return Earlier(field, meta, whole, untimed)
 
     def require_same(self, episodes: Sequence[str], frames: int, reference: str) -> None:
         """Raises: ConfigError where the report is on other scenes, fewer frames, or was scored by something else."""
@@ -51,6 +53,10 @@ class Earlier:
             )
 
 
+def same_row(row: Mapping[str, Any], known: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """The first row of a contender of those settings, if any."""
+    return next((other for other in known if all(row.get(name) == other.get(name) for name in IDENTITY)), None)
+
+
 def is_among(row: Mapping[str, Any], known: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a contender of those settings is among the rows."""
-    return any(all(row.get(name) == other.get(name) for name in IDENTITY) for other in known)
+    return same_row(row, known) is not None

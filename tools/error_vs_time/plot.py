@@ -24,6 +24,7 @@ PRECISION_NAMES = {"fp32": "fp32", "tf32": "TF32", "fp16": "fp16"}
 STEP_MARKERS = ("^", "v", "<", ">")  # the largest step first
 FLOOR_COLOR, BASELINE_COLOR = "#2b8a3e", "#868e96"
 FLOOR_LINES, BASELINE_LINES = ("-", "--"), (":", "--", "-.")
+TICKS = (1, 2, 5)  # of each decade of the run times
 TEXT, SMALL, TINY = 10.5, 9.5, 7.5  # points
 FIGURE_WIDTH, PANEL_HEIGHT = 16.2, 4.9  # inches
 NEAR_FLOOR, FAR_ABOVE = 30, 8  # what is still shown: times below the least error, above the best that learns nothing
@@ -51,7 +52,7 @@ def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = Fa
     how = f"up to {scenes} scenes side by side, as each has it best" if batched else "one scene"
     for panel, frame in zip(grid[0], shown, strict=True):
         _pareto(panel, rows, frame, "ms_batched" if batched else "ms", looks)
-        panel.set_xlabel(f"milliseconds a frame{' and scene' if batched else ''} ({how})", fontsize=TEXT)
+        panel.set_xlabel(f"milliseconds a frame{' and scene' if batched else ''}", fontsize=TEXT)
     footer = _footer(figure, meta)
     most = max(len(column) for column in columns)
     figure.legend(
@@ -102,6 +103,8 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
 
 
 def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks: Mapping[str, Any]) -> None:
+    from matplotlib.ticker import LogLocator
+
     times = [row[key] for row in rows if row.get(key) is not None] or [1.0]
     limits = _limits(rows, frame)
     groups: dict[str, list[Row]] = {}
@@ -121,6 +124,7 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks:
             _point(panel, row, frame, key, look, limits[1])
     panel.set_xscale("log")
     panel.set_xlim(min(times) / 1.8, max(times) * 1.8)
+    panel.xaxis.set_major_locator(LogLocator(subs=TICKS))
     panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
     panel.xaxis.set_minor_formatter("")
     panel.set_yscale("log")

@@ -19,6 +19,7 @@ from hgn.schema import ConfigError
 from hgn.system.files import write_atomically, write_json
 from hgn.system.progress import bar
 from tools.error_vs_time.contenders import GNS_FIRST, BaselineContender, Contender, SolverContender
+from tools.error_vs_time.earlier import same_row
 from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, report, score
@@ -42,15 +43,20 @@ class Run:
         meta: dict[str, Any],
         begun: float,
         earlier: Sequence[dict[str, Any]] = (),
+        untimed: Sequence[dict[str, Any]] = (),
     ) -> None:
-        """`begun` is by time.monotonic(); `earlier` are rows of reports before this one, which come first."""
+        """`begun` is by time.monotonic(); `earlier` are rows of reports before this one, which come first; `untimed`
+        those that lack their run times alone: they get `timed`, where and when that was.
+        """
         self.config, self.contenders, self.references, self.device = config, contenders, references, device
         self.begun, self.earlier = begun, list(earlier)
         self.meta = meta | {"not_run": [], "not_timed": []}
         self.failed = 0  # contenders, by a fault of the program or the machine
         self.timing = Timing(references, config, device)
         self.watches: dict[int, Stopwatch] = {}
-        self._rows: dict[int, dict[str, Any]] = {}
+        of_contenders = {i: same_row(contender.row, untimed) for i, contender in enumerate(contenders)}
+        self._rows: dict[int, dict[str, Any]] = {i: dict(row) for i, row in of_contenders.items() if row is not None}
+        self._scored_before = set(self._rows)
         self._given_up: set[int] = set()
         self._drawn = time.monotonic()
         self.out, self.file = config.out, config.json or f"{config.out}.json"
@@ -69,13 +75,12 @@ class Run:
         """
         for i, contender in enumerate(self.contenders):
             if isinstance(contender, SolverContender) and contender.simulated:
-                self._attempt(i, self._score)
+                self._attempt(i, self._errors)
         self.write()
         for i, contender in enumerate(self.contenders):
             idle = contender.importance == GNS_FIRST or isinstance(contender, BaselineContender)
             if idle and compiling() and not self.is_past(BEGIN_FRACTION):
-                self._attempt(i, self._score)
-                self.write()
+                self._attempt(i, self._errors)
 
     def measure(self) -> None:
         """Scores and times every contender, in order of importance, or times them where all are scored; then times all
@@ -127,6 +132,8 @@ class Run:
             self.watches[i] = self.timing.begun(self.contenders[i])
             self._time(i)
             self._rows[i]["timing_s"] = time.monotonic() - begun
+            if i in self._scored_before:
+                self._rows[i]["timed"] = {name: self.meta[name] for name in ("device", "commit", "date")}
 
     def _score(self, i: int) -> None:
         begun = time.monotonic()
