@@ -16,13 +16,23 @@ from PIL import Image
 
 import datagen.mpm.solver
 from datagen.mpm.solver import SceneFailure, Simulated
+from hgn.config import MpmConfig
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.weights import WeightsInfo, save_weights, shipped_weights
 from hgn.schema import ConfigError, from_mapping
 from tools.error_vs_time import plot, score
 from tools.error_vs_time.__main__ import fitting_weights, main, network_contenders
+from tools.error_vs_time.contenders import (
+    COARSE_GRIDS,
+    SAME_GRID,
+    BaselineContender,
+    NetworkContender,
+    SolverContender,
+)
+from tools.error_vs_time.run import Run
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.timing import Timing
+from tools.solver_launches import Setting, SolverLaunches
 
 CPU = torch.device("cpu")
 RESULTS = Path(__file__).resolve().parents[2] / "results"
@@ -304,6 +314,27 @@ def test_bad_options(change: dict[str, Any], message: str) -> None:
     """Each wrong option is named before anything is simulated."""
     with pytest.raises(ConfigError, match=message):
         from_mapping(ErrorVsTimeConfig, {"data": "d", "out": "o"} | change)
+
+
+def test_what_launches_none_of_the_kernels_is_scored_beside_their_compilation(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Baselines, then coarse grids, as long as it lasts; neither networks nor the data's own grid."""
+    order: list[str] = []
+    monkeypatch.setattr(
+        "tools.error_vs_time.run.score", lambda contender, *_: order.append(score.label(contender.row)) or contender.row
+    )
+    launches = [SolverLaunches(MpmConfig(), 1 / grid, 60.0, 4) for grid in (64, 32, 48, 40)]
+    solvers = [
+        SolverContender(launch, Setting(1.0), 4, SAME_GRID if i == 0 else COARSE_GRIDS)
+        for i, launch in enumerate(launches)
+    ]
+    config = ErrorVsTimeConfig(out=str(tmp_path / "report"), data=data)
+    network = NetworkContender(weights_file(tmp_path / "hgn.safetensors", "hgn"), "fp32", "auto", CPU, 60.0)
+    baseline = BaselineContender("nothing moves", lambda _: np.zeros(3), CPU)
+    run = Run(config, [network, *solvers, baseline], EpisodeStore(data, "test").episodes, CPU, {}, 0.0)
+    run.score_beside(lambda: len(order) < 3)
+    assert order == ["nothing moves", "MPM 32³, step 1", "MPM 48³, step 1"] and run.failed == 0
 
 
 SHORT = {"split": "validation", "device": "cpu", "frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1}

@@ -18,7 +18,7 @@ from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 from hgn.system.files import write_atomically, write_json
 from hgn.system.progress import bar
-from tools.error_vs_time.contenders import GNS_FIRST, BaselineContender, Contender, SolverContender
+from tools.error_vs_time.contenders import COARSE_GRIDS, GNS_FIRST, BaselineContender, Contender, SolverContender
 from tools.error_vs_time.earlier import same_row
 from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
@@ -28,6 +28,7 @@ from tools.error_vs_time.timing import Stopwatch, Timing
 
 # of the seconds given: until when a contender, and a further round of run times, may be begun
 BEGIN_FRACTION, ROUND_FRACTION = 0.85, 0.95
+BESIDE = (GNS_FIRST, COARSE_GRIDS)  # what is scored while kernels are compiled, with baselines
 DRAWN_EVERY_S = 60.0  # which takes some seconds each time
 
 
@@ -71,15 +72,15 @@ class Run:
 
     def score_beside(self, compiling: Callable[[], bool]) -> None:
         """Scores what is simulated already, then, as long as kernels are being compiled, what launches none of them:
-        baselines, and GNS at the precision that tells most.
+        baselines, GNS at the precision that tells most, and the solver on coarse grids.
         """
         for i, contender in enumerate(self.contenders):
             if isinstance(contender, SolverContender) and contender.simulated:
                 self._attempt(i, self._errors)
         self.write()
-        for i, contender in enumerate(self.contenders):
-            idle = contender.importance == GNS_FIRST or isinstance(contender, BaselineContender)
-            if idle and compiling() and not self.is_past(BEGIN_FRACTION):
+        idle = [i for i, c in enumerate(self.contenders) if c.importance in BESIDE or isinstance(c, BaselineContender)]
+        for i in sorted(idle, key=lambda i: self.contenders[i].importance):
+            if compiling() and not self.is_past(BEGIN_FRACTION):
                 self._attempt(i, self._errors)
 
     def measure(self) -> None:
