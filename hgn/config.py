@@ -47,7 +47,7 @@ MaterialName = Annotated[
 Processor = Annotated[str, one_of("auto", "cpu", "gpu")]
 BackendName = Annotated[str, one_of(*BACKENDS)]
 Precision = Annotated[str, one_of(*PRECISIONS)]
-SandFrictionLaw = Annotated[str, one_of("matsuoka_nakai", "compression", "plane_strain")]
+SandFrictionLaw = Annotated[str, one_of("matsuoka_nakai", "mohr_coulomb", "compression", "plane_strain")]
 SandVolumeCorrection = Annotated[str, one_of("tampubolon", "taichi_elements")]
 WaterEquation = Annotated[str, one_of("linear", "stiffening")]
 WaterVolumeUpdate = Annotated[str, one_of("trace", "taichi_elements")]
@@ -141,14 +141,15 @@ class MpmConfig:
     youngs_modulus_pa: Positive[float] = 1e6
     poisson_ratio: float = 0.2
     density_kg_m3: Positive[float] = 1000.0
-    sand_friction_angle_deg: NonNegative[float] = 31.0
-    # matsuoka_nakai: 31 degrees in triaxial compression and extension, 34.8 in plane strain, as sand has; or a cone
-    # (Drucker-Prager) that has the angle in triaxial compression alone (Taichi Elements, with 45) or in plane_strain
-    sand_friction_law: SandFrictionLaw = "matsuoka_nakai"  # or compression, plane_strain
+    sand_friction_angle_deg: NonNegative[float] = 33.0  # of quartz sand at its critical state (Bolton 1986)
+    # mohr_coulomb: the angle on every path; matsuoka_nakai: in triaxial compression and extension, more in plane strain
+    # (34.8 for 31); or a cone (Drucker-Prager) that has it in triaxial compression alone (Taichi Elements, with 45) or
+    # in plane_strain
+    sand_friction_law: SandFrictionLaw = "mohr_coulomb"  # or matsuoka_nakai, compression, plane_strain
     sand_volume_correction: SandVolumeCorrection = "tampubolon"  # or taichi_elements
     # of grains that make friction grow with the rate of flow, mu(I) (Jop, Forterre and Pouliquen 2006), which tall
-    # columns show; 0: the same friction at any rate
-    sand_grain_diameter_m: NonNegative[float] = 0.0
+    # columns show: those judged are 200 of these in radius; 0: the same friction at any rate
+    sand_grain_diameter_m: NonNegative[float] = 0.0025
     snow_hardening: NonNegative[float] = 10.0
     snow_critical_compression: NonNegative[float] = 0.025
     snow_critical_stretch: NonNegative[float] = 0.0045
@@ -200,7 +201,8 @@ class MpmConfig:
         require(self.wall_cells >= 2, "wall_cells", "at least 2, the reach of a particle", self.wall_cells)
         if self.sand_volume_correction == "taichi_elements":  # whose strains have no deviator to speak of
             rule = "compression or plane_strain with sand_volume_correction=taichi_elements"
-            require(self.sand_friction_law != "matsuoka_nakai", "sand_friction_law", rule, self.sand_friction_law)
+            cone = self.sand_friction_law in ("compression", "plane_strain")
+            require(cone, "sand_friction_law", rule, self.sand_friction_law)
 
 
 def _spread(number: int, fraction: float) -> bool:

@@ -91,7 +91,8 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
     """Return mapping of the principal log strains: new ones, and the new volume correction.
 
     Stress yields where |s| > alpha (-tr tau), s its deviator: alpha is constant (Drucker and Prager), or such that
-    I1 I2 = (9 - sin² phi) / (1 - sin² phi) I3 for the invariants of tau (Matsuoka and Nakai 1974). The deviator shrinks
+    I1 I2 = (9 - sin² phi) / (1 - sin² phi) I3 for the invariants of tau (Matsuoka and Nakai 1974), or that the largest
+    and the least principal stress differ by sin phi of their sum (Mohr and Coulomb). The deviator shrinks
     and keeps its direction: no plastic flow changes the volume. With grains alpha grows with the inertial number
     I = rate d sqrt(rho_grain / p) of the plastic shear of this step (Jop, Forterre and Pouliquen 2006).
 
@@ -122,6 +123,12 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
             root = ti.sqrt(a / 3.0)
             cosine = ti.min(ti.max(-half_b / (root * root * root), -1.0), 1.0)
             alpha = 1.0 / (6.0 * root * ti.cos(ti.acos(cosine) / 3.0))
+        elif sine < 0.0:
+            # with principal stresses |s| n - p: |s| (n1 - n3) = (2 p + |s| n2) sin phi, n1 the largest, n3 the least
+            direction = deviator / size
+            largest, least = direction.max(), direction.min()
+            # what is less than 0.8 has a deviator of rounding alone
+            alpha = -2.0 / 3.0 * sine / ti.max(largest - least - sine * (largest + least), 0.5)
         bearing = -(3.0 * bulk + 2.0 * shear) / (2.0 * shear) * trace * alpha
         excess = ti.max(size - bearing, 0.0)
         if ti.static(bool(variant & VARIANT.rate_of_sand)):

@@ -31,7 +31,8 @@ class Constant(NamedTuple):
     water_smallest_volume: int = 8
     smallest_singular_value: int = 9
     mass: int = 10  # of a particle, in units of the config's
-    sand_sine: int = 11  # of the friction angle, where sand yields as Matsuoka and Nakai have it; else 0
+    # of the friction angle: > 0 where sand yields as Matsuoka and Nakai have it, < 0 as Mohr and Coulomb; 0: a cone
+    sand_sine: int = 11
     water_tension: int = 12  # share of the tension that stretched water bears
     viscosity: int = 13  # of water, Pa s
     grain: int = 14  # of sand, d sqrt(2 rho_grain), sqrt(kg / m): see constitutive
@@ -195,9 +196,9 @@ def lame_parameters(config: MpmConfig) -> tuple[float, float]:
 
 
 def sand_sine(config: MpmConfig) -> float:
-    """Sine of the friction angle of Matsuoka and Nakai's law; 0 where the law is a cone."""
+    """Sine of the friction angle of Matsuoka and Nakai's law, minus that of Mohr and Coulomb's; 0 for a cone."""
     sine = float(np.sin(np.deg2rad(config.sand_friction_angle_deg)))
-    return sine if config.sand_friction_law == "matsuoka_nakai" else 0.0
+    return {"matsuoka_nakai": sine, "mohr_coulomb": -sine}.get(config.sand_friction_law, 0.0)
 
 
 def sand_alpha(config: MpmConfig) -> float:

@@ -74,15 +74,18 @@ def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solver_validation, "REST_S", 3.0)
     cpu = MpmConfig(device="cpu")
     rows = [row for part in ("rest", "dam_breaks") for row in getattr(solver_validation, part)(cpu)]
-    rows += solver_validation.columns(cpu, (1.0,), (0.0, 50.0)) + solver_validation.column_laws(cpu)
+    rows += solver_validation.columns(cpu, (1.0,)) + solver_validation.columns(cpu, (1.0,), (0.0, 50.0))
+    rows += solver_validation.column_laws(cpu)
     assert [row.case.split(",")[0] for row in rows] == [
-        "level of water at rest", *["dam break"] * 3, *["sand column"] * 6
+        "level of water at rest", *["dam break"] * 3, *["sand column"] * 8
     ]  # fmt: skip
     assert rows[1].held and rows[2].held
     assert [row.more["published"] for row in rows[4:6]] == [pytest.approx([1.013, 1.24], rel=1e-3), [0.74, 0.88]]
     assert [row.predicted for row in rows[4:6]] == pytest.approx([1.013, 0.74], rel=1e-3)  # both are below
-    assert rows[6].case.endswith("50 grains, run-out") and rows[6].predicted == rows[4].predicted
-    assert rows[5].measured < rows[9].measured  # so few cells tell heights apart, not run-outs
+    assert rows[4].case.endswith("mohr coulomb, 33 degrees, 4 cells in radius, 200 grains, run-out")  # the default sand
+    assert rows[6].case.endswith("radius, run-out") and rows[8].case.endswith("50 grains, run-out")
+    assert rows[8].predicted == rows[4].predicted
+    assert rows[5].measured < rows[11].measured  # so few cells tell heights apart, not run-outs
 
 
 def test_grids(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,17 +104,23 @@ def test_grids(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(0.1 < value < 0.3 for value in block.more["series"])  # of a side: it has spread by then
 
 
-def test_rows_of_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Slopes rest where sand shears along them, tan = 2 sin / sqrt(3 + sin²), or still move and do not hold; the quartz
-    sand's angle of repose is a row of its own.
+@pytest.mark.parametrize(
+    ("law", "own", "shears"),
+    [("mohr_coulomb", 33.0, (18.9, 28.6, 32.7)), ("matsuoka_nakai", 31.0, (21.2, 29.7, 34.8))],
+)
+def test_rows_of_slopes(law: str, own: float, shears: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slopes rest where sand shears along them, tan = sin by Mohr and Coulomb, 2 sin / sqrt(3 + sin²) by Matsuoka and
+    Nakai, or still move and do not hold; the quartz sand's angle of repose is a row of its own.
     """
 
     def rests(angle: float, start: float, *_: object) -> tuple[float, float, float]:
-        return start, start if start < angle else {20.0: 22.2, 31.0: 30.8, 40.0: 32.9}[angle], 0.05 * (angle == 20)
+        return start, start if start < angle else {20.0: 20.5, own: 30.8, 40.0: 32.9}[angle], 0.05 * (angle == 20)
 
     monkeypatch.setattr(solver_validation, "repose", rests)
-    rows = solver_validation.reposes(MpmConfig(device="cpu"))
-    assert [row.predicted for row in rows] == pytest.approx([17, 21.2, 28, 29.7, 31, 37, 34.8], abs=0.05)
+    base = MpmConfig(device="cpu", sand_friction_law=law, sand_friction_angle_deg=own)
+    rows = solver_validation.reposes(base)
+    asked = [17, shears[0], own - 3, shears[1], 31, 37, shears[2]]
+    assert [row.predicted for row in rows] == pytest.approx(asked, abs=0.05)
     assert [row.held for row in rows] == [True, False, *[True] * 5]
     assert rows[4].case.endswith("as quartz sand has it")
 

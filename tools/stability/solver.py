@@ -27,7 +27,6 @@ from tools.stability.solver_loads import convergence, impacts, long_run, stiffne
 from tools.stability.solver_steps import Point, draw, largest_steps
 from tools.stability.solver_validation import (
     COLUMN_ASPECTS,
-    COLUMN_GRAINS,
     column_laws,
     columns,
     dam_breaks,
@@ -57,9 +56,9 @@ class StabilitySolverConfig:
     # are what 32 to 128 cells a side give; 32 want a GPU
     grid_cells: tuple[int, ...] = (8, 12, 16)
     column_aspects: tuple[Positive[float], ...] = COLUMN_ASPECTS  # height over radius, of the case column
-    column_cells: int = 0  # in radius, where that is more than the 24 that columns are wide and high at least
-    # in radius, which make friction grow with the rate of flow; 0: friction does not
-    column_grains: tuple[NonNegative[float], ...] = COLUMN_GRAINS
+    column_cells: int = 0  # in radius, where that is more than 24, or 72 below an aspect of 1
+    # in radius, which make friction grow with the rate of flow; 0: friction does not; null: the default sand's, 200
+    column_grains: tuple[NonNegative[float], ...] | None = None
     leak_band_cells: float | None = None  # mpm.collider_band_cells for the table of leaks; null: the solver's own
     picture: str | None = None  # also draw stable and unstable steps against the formula, as PNG
     json: str | None = None  # also write the rows to this file; --json FILE does the same

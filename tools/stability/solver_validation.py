@@ -54,24 +54,25 @@ IMPACT_SIDE, IMPACT_DROP, IMPACT_SPEED = 0.125, 0.125, 4.5  # m; sides above the
 
 # quarters of round columns on a rough floor beside what Lube et al. 2004 and Lajeunesse et al. 2004 found, which lie up
 # to a third apart: between them a column is as right as experiments can tell
-COLUMN_RADIUS = 0.5  # m; the tallest column's own weight presses it by 2 %
-COLUMN_CELLS = 24  # in radius, and at least in height: a front lacks its last two to two and a half cells
+COLUMN_RADIUS = 0.5  # m, 200 of the default sand's grains; the tallest column's own weight presses it by 2 %
+COLUMN_CELLS = 24  # in radius: a front lacks its last two to two and a half cells
+LOW_COLUMN_CELLS = 72  # in radius of columns that are wider than high, which run out by less than their radius
 COLUMN_DEPTH = 1 / 64  # of the radius: where sand is as deep, there is its edge
 COLUMN_WITHIN = 0.1
 COLUMN_ASPECTS = (0.5, 1.0, 1.5, 2.5, 4.0)
-COLUMN_GRAINS = (0.0, 100.0, 200.0)  # in radius, where friction grows with the rate of flow; 0: where it does not
 COLUMN_ROOM = 1.6  # times the radius expected
 COLUMN_TOP_CELLS = 2.5  # around the axis, where the height is taken
 LUBE_ANGLE_DEG = 31.0  # at which the quartz sand of Lube et al. 2004 rests
-SAND_LAWS = (  # beside the config's own, and what they are for
-    ("plane_strain", LUBE_ANGLE_DEG), ("compression", LUBE_ANGLE_DEG), ("compression", 45.0),
+SAND_LAWS = (  # beside the default; their friction does not grow with the rate of flow
+    ("matsuoka_nakai", LUBE_ANGLE_DEG), ("plane_strain", LUBE_ANGLE_DEG), ("compression", LUBE_ANGLE_DEG),
+    ("compression", 45.0),
 )  # fmt: skip
 OTHER_ASPECTS = (0.5, 1.5, 4.0)  # at which the other laws are shown
 TIMES = 4.0  # of sqrt(height / g) until all stands; the experiments took about 3
 STRAY = 1e-3  # of the particles: fewer may reach the walls of their room
 
 # a slope of sand on a rough platform that ends: it stands, or runs off and leaves one that does
-REPOSE_ANGLES_DEG = (20.0, LUBE_ANGLE_DEG, 40.0)
+REPOSE_OTHERS_DEG = (20.0, 40.0)  # friction angles beside the default sand's
 REPOSE_WITHIN_DEG = 3.0  # at so much less than the friction angle a slope stands; steeper ones come to rest so near
 REPOSE_STEEPER_DEG = 4.0  # what runs off a much steeper one takes more along than a poured heap would
 STANDS_DEG = 1.0  # of change
@@ -181,15 +182,19 @@ def impact(kind: int, cells: int) -> Scene:
 
 
 def columns(
-    base: MpmConfig, aspects: Sequence[float] = COLUMN_ASPECTS, grains: Sequence[float] = COLUMN_GRAINS, cells: int = 0
+    base: MpmConfig,
+    aspects: Sequence[float] = COLUMN_ASPECTS,
+    grains: Sequence[float] | None = None,
+    cells: int = 0,
 ) -> list[Row]:
-    """Run-out and height of collapsed columns by the config's own law, with so many grains in radius (0: friction does
-    not grow with the rate of flow), and `cells` in radius where that is more than the least.
+    """Run-out and height of collapsed columns by the config's own law, grains and all, or with so many grains in radius
+    (0: friction does not grow with the rate of flow), and `cells` in radius where that is more than the least.
     """
     own = base.sand_friction_law, base.sand_friction_angle_deg
-    configs = [
-        dataclasses.replace(base, sand_grain_diameter_m=COLUMN_RADIUS / many if many else 0.0) for many in grains
-    ]
+    diameters = (
+        [base.sand_grain_diameter_m] if grains is None else [COLUMN_RADIUS / many if many else 0.0 for many in grains]
+    )
+    configs = [dataclasses.replace(base, sand_grain_diameter_m=diameter) for diameter in diameters]
     return [
         row
         for config in configs
@@ -210,8 +215,8 @@ def column_laws(base: MpmConfig) -> list[Row]:
 
 
 def least_cells(aspect: float) -> int:
-    """In radius, so that the column is COLUMN_CELLS wide and high."""
-    return max(COLUMN_CELLS, math.ceil(COLUMN_CELLS / aspect))
+    """In radius, so that the column's front is found."""
+    return LOW_COLUMN_CELLS if aspect < 1 else COLUMN_CELLS
 
 
 def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cells: int) -> list[Row]:
@@ -275,11 +280,11 @@ def heights(aspect: float) -> tuple[float, float]:
 
 def reposes(base: MpmConfig) -> list[Row]:
     """Slopes of sand below its friction angle, which stand, and above it, which come to rest: near the angle to which
-    sand shears on along the slope, in plane strain without a change of volume; sand like that of Lube et al. also near
-    the angle of repose that they found.
+    sand shears on along the slope, in plane strain without a change of volume; the config's own sand also near the
+    angle of repose that Lube et al. found.
     """
-    rows = []
-    for angle in REPOSE_ANGLES_DEG:
+    rows, own = [], base.sand_friction_angle_deg
+    for angle in sorted({own, *REPOSE_OTHERS_DEG}):
         for start in (angle - REPOSE_WITHIN_DEG, angle + REPOSE_STEEPER_DEG):
             before, after, speed = repose(angle, start, base, REPOSE_CELLS)
             beyond = f"{after - before:+.1f} degrees; at the end {speed:.2g} m/s rms"
@@ -289,7 +294,7 @@ def reposes(base: MpmConfig) -> list[Row]:
                 continue
             shears = math.degrees(math.atan(shear_strength(_sand(base, base.sand_friction_law, angle))))
             asked = [(f"angle of repose, friction {angle:g} degrees", shears)]
-            if angle == LUBE_ANGLE_DEG:
+            if angle == own:
                 asked.append((f"angle of repose, friction {angle:g} degrees, as quartz sand has it", LUBE_ANGLE_DEG))
             for name, expected in asked:
                 held = abs(after - expected) <= REPOSE_WITHIN_DEG and speed < AT_REST
@@ -394,6 +399,8 @@ def _sand(base: MpmConfig, law: str, angle_deg: float) -> MpmConfig:
 def shear_strength(config: MpmConfig) -> float:
     """The shear that sand bears in simple shear, over the pressure: its yield where the middle stress is the mean."""
     sine = sand_sine(config)
+    if sine < 0:  # Mohr and Coulomb
+        return -sine
     return 2 * sine / math.sqrt(3 + sine**2) if sine else 3 * sand_alpha(config) / math.sqrt(2)
 
 

@@ -204,8 +204,9 @@ def _at_their_step(kind: str) -> MpmConfig:
     """As conf/mpm/taichi_elements.yaml, at the step that Taichi Elements takes."""
     return MpmConfig(
         device=kind, time_step="fixed", fixed_time_step_s=STEP_S, sand_volume_correction="taichi_elements",
-        sand_friction_law="compression", sand_friction_angle_deg=45.0, time_integration="symplectic_euler",
-        water_volume_update="taichi_elements", water_density_relaxation_s=None, snow_maximum_hardening=100.0,
+        sand_friction_law="compression", sand_friction_angle_deg=45.0, sand_grain_diameter_m=0.0,
+        time_integration="symplectic_euler", water_volume_update="taichi_elements", water_density_relaxation_s=None,
+        snow_maximum_hardening=100.0,
     )  # fmt: skip
 
 
