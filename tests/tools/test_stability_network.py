@@ -34,6 +34,7 @@ from tools.stability.network import (
     main,
     share_of_way,
     solver_beside,
+    solver_of,
 )
 from tools.stability.network_cases import Case, StabilityNetworkConfig, cases
 from tools.stability.network_motion import (
@@ -391,6 +392,14 @@ def test_scenes_follow_the_network() -> None:
     ]
     assert all(not scene.obstacles for case in made for scene in case.scenes)
     assert not any((scene.material_N == 1).any() for case in made for scene in case.scenes)
+
+
+def test_the_solver_has_the_law_that_is_named() -> None:
+    """Weights are held beside sand as in their data, which need not be what new data have."""
+    options = {"weights": "w", "solver_device": "cpu", "mpm": {"sand_friction_law": "compression"}}
+    asked = solver_of(from_mapping(StabilityNetworkConfig, options))
+    assert asked == MpmConfig(device="cpu", sand_friction_law="compression") != MpmConfig(device="cpu")
+    assert solver_of(from_mapping(StabilityNetworkConfig, options | {"solver": False})) is None
 
 
 @pytest.mark.parametrize(

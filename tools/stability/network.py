@@ -74,7 +74,7 @@ def main(mapping: dict[str, Any]) -> int:
             drawn = time.monotonic()
 
     made = list(cases(config, network.config))
-    solver = MpmConfig(device=config.solver_device) if config.solver else None
+    solver = solver_of(config)
     with ThreadPoolExecutor(available_cpus()) as threads, ExitStack() as stack:
         # What the runtime makes of obstacles takes seconds where there are many: the largest cases first.
         order = sorted(range(len(made)), key=lambda i: -sum(len(scene.obstacles) for scene in made[i].scenes))
@@ -117,6 +117,11 @@ def main(mapping: dict[str, Any]) -> int:
     print(table(rows))
     keep(done=True)
     return 0
+
+
+def solver_of(config: StabilityNetworkConfig) -> MpmConfig | None:
+    """The solver that is asked, on its device; none where none is."""
+    return replace(config.mpm, device=config.solver_device) if config.solver else None
 
 
 def solver_beside(

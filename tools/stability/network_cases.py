@@ -12,7 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
-from hgn.config import BackendName, NetworkConfig, Precision, Processor, SceneConfig
+from hgn.config import BackendName, MpmConfig, NetworkConfig, Precision, Processor, SceneConfig
 from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation
@@ -43,6 +43,8 @@ class StabilityNetworkConfig:
     # also ask the solver, which needs Taichi: for slope, collision and rest; without it rest is left out
     solver: bool = True
     solver_device: Processor = "auto"  # or cpu, gpu
+    # that solver; sand should be what it was in the data that the weights were trained on (their cards say)
+    mpm: MpmConfig = field(default_factory=MpmConfig)
     # a folder in which its trajectories of slope and rest stay, for other weights beside the same version of it
     solver_kept: str | None = None
     particle_factor: Positive[float] = 10.0
