@@ -1,17 +1,13 @@
 """Data sets made with the ballistic stand-in for the solver, and the process put right after every test."""
 
-from __future__ import annotations
-
 import gc
 import importlib.util
 import os
 import shutil
 import signal
 import sys
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -41,41 +37,39 @@ sys.path.insert(0, str(Path(__file__).parent / "datagen"))  # spawned workers fi
 
 import ballistic_dataset
 import ballistic_solver
-from ballistic_dataset import MakeConfig, MakeDataset, Stage
 
-from datagen.pool.worker import Backend
 from hgn.config import DatagenConfig, DatasetConfig
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     """All processes of these tests share a warm interpreter; the first that asks for it has it started."""
     if not hasattr(config, "workerinput"):
         config.add_cleanup(warm_server.WarmServer().stop)
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+def pytest_xdist_make_scheduler(config, log):
     """Asked for where several processes run the tests (pytest-xdist)."""
     return file_scheduling.FileScheduling(config, log)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Long files first, for begun last, one of them would run alone."""
     items.sort(key=lambda item: file_scheduling.place_of(item.nodeid))
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish():
     """What is loaded by now stays: garbage collections need not look at it, half a second each."""
     gc.freeze()
     gc.enable()
 
 
-def pytest_unconfigure() -> None:
+def pytest_unconfigure():
     gc.unfreeze()  # else Triton tells of all that it still holds
 
 
 @pytest.fixture(autouse=True)
-def keep_signal_handlers() -> Iterator[None]:
+def keep_signal_handlers():
     """Commands that a test runs in this process leave theirs behind."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
     yield
@@ -84,7 +78,7 @@ def keep_signal_handlers() -> Iterator[None]:
 
 
 @pytest.fixture
-def backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Backend:
+def backend(tmp_path, monkeypatch):
     folder = tmp_path / "control"
     folder.mkdir()
     monkeypatch.setenv(ballistic_solver.FOLDER_VARIABLE, str(folder))
@@ -92,35 +86,35 @@ def backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Backend:
 
 
 @pytest.fixture
-def control(backend: Backend, tmp_path: Path) -> Path:
+def control(backend, tmp_path):
     """The folder whose files steer the stand-in."""
     return tmp_path / "control"
 
 
-def small_config(folder: Path, **changes: Any) -> DatagenConfig:
+def small_config(folder, **changes):
     values = {"training_scenes": 5, "validation_scenes": 2, "test_scenes": 1, "frames": 6, "workers": 1}
     return DatagenConfig(dataset=DatasetConfig(**({"folder": str(folder)} | values | changes)))
 
 
 @pytest.fixture
-def make_config(tmp_path: Path) -> MakeConfig:
+def make_config(tmp_path):
     return partial(small_config, folder=tmp_path / "data")
 
 
 @pytest.fixture
-def stage(backend: Backend) -> Stage:
+def stage(backend):
     """Simulates one episode in this process and stages it; the writer claims what comes before it too."""
     return ballistic_dataset.stage
 
 
 @pytest.fixture
-def make_dataset(backend: Backend) -> MakeDataset:
+def make_dataset(backend):
     """Makes a whole data set without any worker process."""
     return ballistic_dataset.make_dataset
 
 
 @pytest.fixture(scope="session")
-def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_dataset(tmp_path_factory):
     """What tests that do not make one themselves get a copy of."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(ballistic_solver.FOLDER_VARIABLE, str(tmp_path_factory.mktemp("control")))
@@ -128,7 +122,7 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def data(make_config: MakeConfig, small_dataset: Path) -> DatagenConfig:
+def data(make_config, small_dataset):
     """The configuration of a small data set, which is there."""
     config = make_config()
     shutil.copytree(small_dataset, config.dataset.folder)
@@ -136,12 +130,12 @@ def data(make_config: MakeConfig, small_dataset: Path) -> DatagenConfig:
 
 
 @pytest.fixture
-def folder(data: DatagenConfig) -> Path:
+def folder(data):
     """Its folder."""
     return Path(data.dataset.folder)
 
 
 @pytest.fixture(scope="session")
-def warm_python() -> Path:
+def warm_python():
     """An interpreter that has the training stack loaded, see warm_server.py."""
     return Path(os.environ[warm_server.VARIABLE]) / "python"

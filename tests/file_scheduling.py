@@ -3,8 +3,6 @@
 A file's fixtures are made once then, and the solver's kernels compiled once.
 """
 
-from __future__ import annotations
-
 from xdist.scheduler import LoadScopeScheduling
 
 LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them would run alone
@@ -23,7 +21,7 @@ GENERATING = ("training/test_generator", "end_to_end/test_datagen", "docs/test_t
 PLACES = {name: number for number, name in enumerate(LONGEST_FILES)}
 
 
-def group_of(nodeid: str) -> str:
+def group_of(nodeid):
     """What runs in one process: a file, all that simulate, or all that generate the same kind of scene; teams apart,
     whose kernels nothing else takes."""
     path = nodeid.split("::", 1)[0].removeprefix("tests/").removesuffix(".py")
@@ -32,7 +30,7 @@ def group_of(nodeid: str) -> str:
     return "generator" if path in GENERATING else path
 
 
-def place_of(nodeid: str) -> int:
+def place_of(nodeid):
     """Where its group stands in the order of the run."""
     return PLACES.get(group_of(nodeid), len(PLACES))
 
@@ -40,10 +38,10 @@ def place_of(nodeid: str) -> int:
 class FileScheduling(LoadScopeScheduling):
     """Hands out groups as the tests are ordered; `--dist loadgroup` hands out single tests with pytest 9.2."""
 
-    def _split_scope(self, nodeid: str) -> str:
+    def _split_scope(self, nodeid):
         return group_of(nodeid)
 
-    def schedule(self) -> None:
+    def schedule(self):
         """Groups stay in the tests' order, which xdist sorts by their number otherwise."""
         self.config.option.loadscopereorder = False
         super().schedule()

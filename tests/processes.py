@@ -1,25 +1,22 @@
 """Processes that tests start, and waiting for them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 TESTS = Path(__file__).parent
 PATIENCE_S = 600.0  # what hangs ends after it; no test expects a time
 
 
-def wait_until(condition: Callable[[], object], seconds: float = PATIENCE_S) -> None:
+def wait_until(condition, seconds=PATIENCE_S):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.02)
 
 
-def run_compiled(python: Path, folder: Path, program: str, *arguments: str) -> str:
+def run_compiled(python, folder, program, *arguments):
     """Runs a program of the tests with Triton compiling into `folder`, not interpreting; what it printed."""
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     environment |= {"TRITON_CACHE_DIR": str(folder), "PYTHONPATH": str(TESTS.parent)}
@@ -29,7 +26,7 @@ def run_compiled(python: Path, folder: Path, program: str, *arguments: str) -> s
     return done.stdout.strip()
 
 
-def processes_of_session(session: int) -> list[int]:
+def processes_of_session(session):
     """The processes of a session that are still running (Linux)."""
     running = []
     for path in Path("/proc").glob("[0-9]*/stat"):

@@ -1,12 +1,9 @@
 """What all commands share: their configuration is what Hydra's own entry point hands over, and a reader may leave."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,7 +19,7 @@ from hgn.schema import ConfigError
         ("stability_network", ["cases=[long]"]),
     ],
 )
-def test_composed_once(command: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_composed_once(command, arguments, monkeypatch):
     """An option of Hydra's makes it compose in its own way, with the same result."""
     monkeypatch.setattr("sys.argv", [command, *arguments])
     once = _compose(command)
@@ -53,7 +50,7 @@ def test_names_that_hydra_refuses(given: str, meant: str, monkeypatch: pytest.Mo
     assert composed["data"] == meant and composed["weights"] is None and composed["mpm_steps"] == [0.1]
 
 
-def test_names_in_lists(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_in_lists(monkeypatch):
     """Each by itself; what is no name is refused as ever."""
     monkeypatch.setattr("sys.argv", ["compare", "trees=[a, dé mo (1),3]", "out=ü", "+new=[x&y]"])
     (composed,) = _compose("compare")
@@ -71,7 +68,7 @@ def test_names_in_lists(monkeypatch: pytest.MonkeyPatch) -> None:
         ["hgn.export", "checkpoint="],  # an error, to where nobody reads
     ],
 )
-def test_a_reader_that_leaves(warm_python: Path, arguments: list[str]) -> None:
+def test_a_reader_that_leaves(warm_python, arguments):
     """As in `… | head`: the command ends with an exit code of its own, and without a traceback."""
     read, write = os.pipe()
     os.close(read)
@@ -81,7 +78,7 @@ def test_a_reader_that_leaves(warm_python: Path, arguments: list[str]) -> None:
     assert ended.returncode == EXIT_UNREAD and not ended.stderr
 
 
-def test_nothing_is_open() -> None:
+def test_nothing_is_open():
     """A command that is started without standard output and error does its work."""
     program = "import sys; from hgn.command import run_command; from hgn.system.progress import bar"
     program += "; sys.argv[1:] = []; run_command(lambda mapping: bar('x', total=1, unit='y').close(), 'bench')"
@@ -89,10 +86,10 @@ def test_nothing_is_open() -> None:
     assert subprocess.run(command, check=False).returncode == 0
 
 
-def test_other_broken_pipes_are_faults(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_broken_pipes_are_faults(monkeypatch):
     """Of a process or a server that the command talks to: nothing is hidden."""
 
-    def talks(mapping: dict[str, Any]) -> None:
+    def talks(mapping):
         raise BrokenPipeError("the server")
 
     with Path(os.devnull).open("w") as out:

@@ -1,7 +1,5 @@
 """What the commands compose to: defaults stand once, in the dataclasses, and experiments say what differs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from hgn.schema import field_comments
 RESOLVED = yaml.safe_load((Path(__file__).parent / "resolved.yaml").read_text())
 
 
-def flat(mapping: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+def flat(mapping, path=""):
     result: dict[str, Any] = {}
     for key, value in mapping.items():
         result |= flat(value, f"{path}{key}.") if isinstance(value, Mapping) else {f"{path}{key}": value}
@@ -26,7 +24,7 @@ def flat(mapping: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("line", RESOLVED)
-def test_resolved(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resolved(line, monkeypatch):
     """Each experiment composes to the stored values; a key that is younger than they has its default."""
     command, *arguments = line.split()
     monkeypatch.setattr("sys.argv", [command, *arguments])
@@ -36,7 +34,7 @@ def test_resolved(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {key: values.get(key) for key in expected} == expected
 
 
-def test_no_value_is_typed_twice() -> None:
+def test_no_value_is_typed_twice():
     """A group's or command's file does not repeat what the files and the dataclass that it begins with say."""
     for folder in ("scene", "mpm", "dataset", "network", "training", "command"):
         for file in (config_directory() / folder).glob("*.yaml"):
@@ -46,7 +44,7 @@ def test_no_value_is_typed_twice() -> None:
             assert not repeated, f"{folder}/{file.name}: {repeated}"
 
 
-def beginning(file: Path) -> dict[str, Any]:
+def beginning(file):
     """What a file's `defaults` give before its own keys."""
     from hgn.hydra_compat import dataclass_of
     from hgn.schema import default_mapping
@@ -60,7 +58,7 @@ def beginning(file: Path) -> dict[str, Any]:
     return values
 
 
-def test_help_shows_comments(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_shows_comments(monkeypatch):
     """Each key of the training has its value and the dataclass's own comment beside it."""
     monkeypatch.setattr("sys.argv", ["train", "training.batch_scenes=3"])
     (composed,) = _compose("train")

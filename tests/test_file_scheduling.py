@@ -1,10 +1,7 @@
 """Which process runs which tests."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
-import pytest
 from file_scheduling import FileScheduling, place_of
 from xdist.remote import Producer
 
@@ -12,19 +9,19 @@ from xdist.remote import Producer
 class Process:
     """What pytest-xdist's scheduler asks of a process."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name):
         self.gateway = SimpleNamespace(id=name)
         self.shutting_down = False
         self.numbers: list[int] = []
 
-    def send_runtest_some(self, numbers: list[int]) -> None:
+    def send_runtest_some(self, numbers):
         self.numbers += numbers
 
-    def shutdown(self) -> None:
+    def shutdown(self):
         self.shutting_down = True
 
 
-def test_one_process_runs_a_file(pytestconfig: pytest.Config) -> None:
+def test_one_process_runs_a_file(pytestconfig):
     """A file's tests stay together; all that simulate are one group; long files begin first."""
     files = ("scene/test_a", "datagen/mpm/test_b", "tools/test_c", "tools/test_stability_d", "viewer/test_page")
     tests = [f"tests/{file}.py::test_{number}[a@b::c]" for number in range(4) for file in files]

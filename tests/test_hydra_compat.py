@@ -1,16 +1,12 @@
 """What hgn.hydra_compat takes for granted of Hydra."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from hgn.hydra_compat import compose
 from hgn.schema import ConfigError
 
 
-def test_canary(tmp_path: Path) -> None:
+def test_canary(tmp_path):
     """Dataclasses are bases under their dotted names, in groups too; what its grammar refuses is quoted, what it does
     not find is added; its own entry point composes the same; a key that must be given is named."""
     (tmp_path / "scene").mkdir()

@@ -1,9 +1,6 @@
 """hgn.renamed: old names are answered with today's, and files of before load."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,7 +16,7 @@ from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError, from_mapping, from_stored, to_mapping
 
 
-def test_old_names_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_names_are_answered(monkeypatch):
     """An old key or value is refused in one line that says what it is called now."""
     monkeypatch.setitem(KEYS, "training.rate", "training.learning_rate")
     monkeypatch.setitem(VALUES, "symmetry", {"upright": "gravity"})
@@ -66,7 +63,7 @@ def test_todays_table(config: type, mapping: dict[str, Any], message: str) -> No
     assert "\n" not in str(caught.value)
 
 
-def test_data_of_before_settings() -> None:
+def test_data_of_before_settings():
     """A data set from before a setting of the solver was made without what it sets, whatever new data have."""
     stored = to_mapping(MpmConfig(sand_friction_angle_deg=45.0))
     for key in ("transfer_speed_m_s", "time_integration", "water_density_relaxation_s", "sand_grain_diameter_m"):
@@ -78,7 +75,7 @@ def test_data_of_before_settings() -> None:
     assert from_stored(MpmConfig, to_mapping(MpmConfig()), "mpm") == MpmConfig()
 
 
-def test_files_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_of_before(tmp_path, monkeypatch):
     """A stored section is read with the names that it was written with; of weights, too."""
     monkeypatch.setitem(KEYS, "network.breadth", "network.width")
     config = NetworkConfig(width=8, levels=2)
@@ -95,7 +92,7 @@ def test_files_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert load_weights(tmp_path / f"{name}.safetensors")[1] == info
 
 
-def test_files_with_settings_that_left() -> None:
+def test_files_with_settings_that_left():
     """They load where a setting said what is always so now, or nothing to a network of absolute inputs; others are
     refused by its name."""
     for inputs, told, loads in (
@@ -112,7 +109,7 @@ def test_files_with_settings_that_left() -> None:
             from_stored(NetworkConfig, stored, "network")
 
 
-def test_identity_keeps_its_names(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identity_keeps_its_names(monkeypatch):
     """A data set is identified by the keys that it was generated with, whatever they are called today."""
     config = replace(DatagenConfig(), scene=SceneConfig(obstacle_count=3))
     before = dataset_identity(config)

@@ -13,7 +13,7 @@ import sys
 FORWARDED = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP, signal.SIGQUIT)
 
 
-def main(path: str, arguments: list[str]) -> None:
+def main(path, arguments):
     waiting: list[int] = []
     for number in FORWARDED:
         signal.signal(number, lambda number, _: waiting.append(number))

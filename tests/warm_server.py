@@ -5,8 +5,6 @@ loads them once and forks, before any thread or device exists, for each request 
 the interpreter: same arguments, folder, environment, network, standard streams, signals and exit status.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes
@@ -24,7 +22,6 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
-from typing import Any, NoReturn
 
 PRELOADED = (
     *("lightning.pytorch", "lightning.pytorch.loggers", "tensorboard.compat.proto.summary_pb2", "hydra", "h5py"),
@@ -39,7 +36,7 @@ VARIABLE = "HGN_TESTS_WARM"  # the folder with the interpreter, `python`, in the
 class WarmServer:
     """Makes the interpreter, whose first caller has the server started."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self._folder = tempfile.TemporaryDirectory(prefix="hgn-tests-")
         folder, here = Path(self._folder.name), Path(__file__).parent
         os.environ[VARIABLE] = str(folder)
@@ -54,7 +51,7 @@ class WarmServer:
         self._thread = threading.Thread(target=self._start_when_asked)
         self._thread.start()
 
-    def _start_when_asked(self) -> None:
+    def _start_when_asked(self):
         environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
         environment |= {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
         if self._listener in select.select([self._listener, self._wake], [], [])[0]:
@@ -63,7 +60,7 @@ class WarmServer:
             self._server = subprocess.Popen(command, env=environment, pass_fds=[number])
         self._listener.close()  # where the server has ended, its clients are refused
 
-    def stop(self) -> None:
+    def stop(self):
         self._ended.close()
         self._thread.join()
         self._wake.close()
@@ -73,7 +70,7 @@ class WarmServer:
         self._folder.cleanup()
 
 
-def serve(listener: socket.socket) -> dict[str, Any]:
+def serve(listener):
     """Forks for each request; returns a request in the child alone."""
     wake_read, wake_write = os.pipe()
     os.set_blocking(wake_write, False)
@@ -123,7 +120,7 @@ def serve(listener: socket.socket) -> dict[str, Any]:
                 selector.unregister(key.fileobj)
 
 
-def enter_network(path: str) -> None:
+def enter_network(path):
     """Of the process whose network namespace is at that path."""
     if not Path(path).samefile("/proc/self/ns/net"):
         with Path(path).open() as namespace:
@@ -131,7 +128,7 @@ def enter_network(path: str) -> None:
                 raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), path)
 
 
-def run(request: dict[str, Any]) -> None:
+def run(request):
     """What the interpreter does with its arguments."""
     for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGQUIT):
         signal.signal(number, signal.SIG_DFL)
@@ -156,11 +153,11 @@ def run(request: dict[str, Any]) -> None:
         runpy.run_path(arguments[0], run_name="__main__")
 
 
-def leave(code: object) -> NoReturn:
+def leave(code):
     """Ends as the interpreter does, but for taking all modules apart, which takes a second."""
     if code is not None and not isinstance(code, int):
         print(code, file=sys.stderr)
-    threading._shutdown()  # type: ignore[attr-defined]
+    threading._shutdown()
     atexit._run_exitfuncs()
     status = code & 0xFF if isinstance(code, int) else int(code is not None)
     for stream in (sys.stdout, sys.stderr):

@@ -1,7 +1,5 @@
 """Work in blocks on several threads."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -13,7 +11,7 @@ def test_each_block_is_worked_on_once(threads):
     """Whatever the number of threads, without gradients, in the caller's inference mode."""
     done, weight = torch.zeros(100, dtype=torch.int64), torch.ones(1, requires_grad=True)
 
-    def work(block: int) -> None:
+    def work(block):
         assert torch.is_inference_mode_enabled() and not (weight * 2).requires_grad
         done[block] += 1
 
@@ -26,7 +24,7 @@ def test_each_block_is_worked_on_once(threads):
 def test_an_error_in_a_block_is_raised(threads):
     """By whichever thread; the threads work on afterwards."""
 
-    def work(block: int) -> None:
+    def work(block):
         if block == 7:
             raise ValueError("block 7")
 

@@ -1,7 +1,5 @@
 """Rows through an MLP in PyTorch and compiled, against the MLP itself in float64."""
 
-from __future__ import annotations
-
 import subprocess
 
 import pytest
@@ -18,7 +16,7 @@ TOLERANCE = {"rtol": 1e-5, "atol": 2e-5}
 TABLE = 50
 
 
-def fcn_of(width: int) -> MLP:
+def fcn_of(width):
     torch.manual_seed(width)
     network = MLP((width, width, 3), width, width)
     assert network.norm is not None
@@ -27,14 +25,14 @@ def fcn_of(width: int) -> MLP:
     return network.requires_grad_(False)
 
 
-def hidden_of(rows: int, width: int, each: int, value: bool) -> Hidden:
+def hidden_of(rows, width, each, value):
     """`each` 0: the rows of the table in their order."""
     table_KW = torch.randn(TABLE if each else rows, width)
     chosen = torch.randint(TABLE, (rows * each,)) if each else None
     return Hidden(table_KW, chosen, max(each, 1), 1, torch.randn(rows, width) if value else None)
 
 
-def expected_outputs(network: MLP, hidden: Hidden) -> torch.Tensor:
+def expected_outputs(network, hidden):
     table_KW = hidden.table_KW.double()
     rows_RW = table_KW if hidden.chosen is None else table_KW[hidden.chosen].unflatten(0, (-1, hidden.each)).sum(1)
     wide = MLP(network.parts, network.second.in_features, network.second.out_features).double().requires_grad_(False)
@@ -44,7 +42,7 @@ def expected_outputs(network: MLP, hidden: Hidden) -> torch.Tensor:
     return wide.finish(rows_RW.clone())
 
 
-def segments_of(rows: int, weighted: bool) -> tuple[Segments, torch.Tensor]:
+def segments_of(rows, weighted):
     """Runs of rows with empty ones between, at the start and at the end; and each row's run."""
     segment_R = torch.randint(1, 2 + rows // 3, (rows,)).sort()[0]
     count = 4 + rows // 3
@@ -80,7 +78,7 @@ def test_outputs_and_sums(kind, width, rows, each, value):
     computed, hidden = kind(network), hidden_of(rows, width, each, value)
     expected_RW = expected_outputs(network, hidden)
 
-    def again() -> Hidden:
+    def again():
         """The table may be overwritten."""
         return hidden._replace(table_KW=hidden.table_KW.clone())
 

@@ -1,12 +1,9 @@
 """Trajectories in the formats of other programs, written with other libraries than they are read with."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -18,13 +15,13 @@ Splits = Mapping[str, Sequence[Simulation]]
 KINEMATIC = {"lagrangebench": 1}  # types of the boundary; of all others 3
 
 
-def metadata(dimensions: int = 3, **changes: Any) -> dict[str, Any]:
+def metadata(dimensions=3, **changes):
     """Of this project's own data."""
     bounds = [[0.0, 1.0]] * dimensions
     return {"bounds": bounds, "dim": dimensions, "dt": 1 / 60, "default_connectivity_radius": 0.035} | changes
 
 
-def write(folder: Path, name: str, splits: Splits, info: Mapping[str, Any]) -> Path:
+def write(folder, name, splits, info):
     """A folder in a format; `plain_h5` and `geoelements_list` are the other kinds of plain and geoelements."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "metadata.json").write_text(json.dumps(info))
@@ -33,14 +30,14 @@ def write(folder: Path, name: str, splits: Splits, info: Mapping[str, Any]) -> P
     return folder
 
 
-def _joined(name: str, position_TND: np.ndarray, type_N: np.ndarray, boundary_PD: np.ndarray) -> Any:
+def _joined(name, position_TND, type_N, boundary_PD):
     """The boundary's particles first, as one trajectory with the others."""
     still = np.repeat(boundary_PD[None], len(position_TND), axis=0)
     kinds = np.full(len(boundary_PD), KINEMATIC.get(name, 3))
     return np.concatenate([still, position_TND], axis=1, dtype=np.float32), np.concatenate([kinds, type_N])
 
 
-def sequence_example(position_TND: np.ndarray, type_N: np.ndarray, key: int) -> bytes:
+def sequence_example(position_TND, type_N, key):
     """A serialised tf.SequenceExample as DeepMind's: a bytes value a frame."""
     message = _message_class()()
     message.context.feature["key"].int64_list.value.append(key)
@@ -52,7 +49,7 @@ def sequence_example(position_TND: np.ndarray, type_N: np.ndarray, key: int) -> 
     return data
 
 
-def _deepmind(folder: Path, split: str, joined: Sequence[Any], _: Sequence[Simulation]) -> None:
+def _deepmind(folder, split, joined, _):
     with (folder / f"{split}.tfrecord").open("wb") as file:
         writer = RecordWriter(file)
         for key, (position_TND, type_N) in enumerate(joined):
@@ -62,13 +59,13 @@ def _deepmind(folder: Path, split: str, joined: Sequence[Any], _: Sequence[Simul
     path.write_text(json.dumps(json.loads(path.read_text()) | {"sequence_length": len(joined[0][0]) - 1}))
 
 
-def _geoelements(folder: Path, split: str, joined: Sequence[Any], _: Sequence[Simulation]) -> None:
+def _geoelements(folder, split, joined, _):
     data = np.empty(len(joined), object)
     data[:] = [(position, types.astype(np.int64)) for position, types in joined]
     np.savez_compressed(folder / f"{split}.npz", gns_data=data)
 
 
-def _geoelements_list(folder: Path, split: str, joined: Sequence[Any], _: Sequence[Simulation]) -> None:
+def _geoelements_list(folder, split, joined, _):
     members = {}
     for number, (position, types) in enumerate(joined):
         entry = np.empty(3, object)
@@ -77,21 +74,21 @@ def _geoelements_list(folder: Path, split: str, joined: Sequence[Any], _: Sequen
     np.savez(folder / f"{split}.npz", **members)
 
 
-def _hdf5(folder: Path, split: str, joined: Sequence[Any], _: Sequence[Simulation]) -> None:
+def _hdf5(folder, split, joined, _):
     with h5py.File(folder / f"{split}.h5", "w") as file:
         for number, (position, types) in enumerate(joined):
             file[f"{number:05d}/position"] = position
             file[f"{number:05d}/particle_type"] = types.astype(np.int32)
 
 
-def _plain(folder: Path, split: str, joined: Sequence[Any], _: Sequence[Simulation]) -> None:
+def _plain(folder, split, joined, _):
     members = {}
     for number, (position, types) in enumerate(joined):
         members |= {f"{number:05d}/position": position, f"{number:05d}/particle_type": types}
     np.savez(folder / f"{split}.npz", **members)
 
 
-def _neuralmpm(folder: Path, split: str, _: Sequence[Any], simulations: Sequence[Simulation]) -> None:
+def _neuralmpm(folder, split, _, simulations):
     (folder / split).mkdir()
     for number, (position, types, boundary) in enumerate(simulations):
         with h5py.File(folder / split / f"sim_{number}.h5", "w") as file:
@@ -114,14 +111,14 @@ _WRITERS = {
 class Hostile:
     """An object whose pickle runs code where it is loaded in the usual way."""
 
-    def __init__(self, mark: Path) -> None:
+    def __init__(self, mark):
         self.mark = mark
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self):
         return Path.touch, (self.mark,)
 
 
-def pickled_npz(path: Path, content: Any) -> None:
+def pickled_npz(path, content):
     """An archive whose one array is the pickle of anything."""
     data = np.empty(1, object)
     data[0] = content
@@ -129,12 +126,12 @@ def pickled_npz(path: Path, content: Any) -> None:
     np.savez(path, gns_data=data)
 
 
-def _message_class() -> Any:
+def _message_class():
     """tf.SequenceExample from its published definition (tensorflow/core/example/{example,feature}.proto)."""
     field = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="example.proto", package="tensorflow", syntax="proto3")
 
-    def message(name: str, *fields: tuple[str, int, Any, str], entry: str = "") -> None:
+    def message(name, *fields, entry=""):
         proto = file.message_type.add(name=name)
         if entry:
             pair = proto.nested_type.add(name=f"{entry.title().replace('_', '')}Entry")

@@ -4,17 +4,12 @@ Files at /[datasets/]USER/NAME/resolve/REVISION/PATH with ranges, ETag and X-Rep
 files at /api/{models,datasets}/USER/NAME; private ones ask for a token; every second answer may be an error.
 """
 
-from __future__ import annotations
-
 import hashlib
 import http.server
 import json
 import re
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -24,7 +19,7 @@ TOKEN = "hf_of_the_test"
 class Hub(http.server.ThreadingHTTPServer):
     """`failures` answers of those to come are errors of a server that is overloaded; `asked` are the paths."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.folder, self.failures, self.asked = folder, 0, list[str]()
         self.url = f"http://127.0.0.1:{self.server_port}"
@@ -34,16 +29,16 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     server: Hub
     protocol_version = "HTTP/1.1"
 
-    def log_message(self, *_: Any) -> None:
+    def log_message(self, *_):
         pass
 
-    def do_HEAD(self) -> None:
+    def do_HEAD(self):
         self._answer(with_body=False)
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         self._answer(with_body=True)
 
-    def _answer(self, with_body: bool) -> None:
+    def _answer(self, with_body):
         path = unquote(self.path.partition("?")[0])
         self.server.asked.append(path)
         if self.server.failures:
@@ -79,7 +74,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         headers["Content-Range"] = f"bytes {start}-{stop - 1}/{len(data)}"
         return self._send(206, data[start:stop], with_body, headers)
 
-    def _send(self, status: int, data: bytes, with_body: bool, headers: dict[str, str] | None = None) -> None:
+    def _send(self, status, data, with_body, headers=None):
         self.send_response(status)
         for name, value in (headers or {}).items():
             self.send_header(name, value)
@@ -90,7 +85,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[Hub]:
+def served(folder):
     """The repositories of a folder, while it is entered."""
     with Hub(folder) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))

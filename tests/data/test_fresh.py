@@ -1,10 +1,7 @@
 """Fresh test sets: the seed is drawn once weights are frozen, and reports say so."""
 
-from __future__ import annotations
-
 import json
 import re
-from pathlib import Path
 
 import pytest
 
@@ -16,13 +13,13 @@ from hgn.schema import ConfigError
 
 
 @pytest.fixture
-def weights(tmp_path: Path) -> Path:
+def weights(tmp_path):
     path = tmp_path / "own.safetensors"
     path.write_bytes(b"frozen")
     return path
 
 
-def test_the_seed_is_drawn_once(weights: Path, tmp_path: Path) -> None:
+def test_the_seed_is_drawn_once(weights, tmp_path):
     """A folder keeps its seed, its time and the hashes through further starts; another folder has another seed."""
     mapping = {"out": str(tmp_path / "fresh"), "frozen": [str(weights)], "dataset": {"training_scenes": 0}}
     first, again = datagen_config(mapping), datagen_config(mapping)
@@ -35,7 +32,7 @@ def test_the_seed_is_drawn_once(weights: Path, tmp_path: Path) -> None:
     assert read_fresh(tmp_path / "plain") is None and not (tmp_path / "plain").exists()
 
 
-def test_what_reports_say_of_a_set(weights: Path, tmp_path: Path) -> None:
+def test_what_reports_say_of_a_set(weights, tmp_path):
     """Seed and time of a fresh set, and which weights are younger or others than those frozen; none of a chosen set."""
     folder = tmp_path / "fresh"
     fresh = draw_fresh(folder, [str(weights)])
@@ -54,7 +51,7 @@ def test_what_reports_say_of_a_set(weights: Path, tmp_path: Path) -> None:
         read_fresh(folder)
 
 
-def test_what_is_no_fresh_set_is_refused(weights: Path, tmp_path: Path, folder: Path) -> None:
+def test_what_is_no_fresh_set_is_refused(weights, tmp_path, folder):
     """A data set that is there, weights that changed since, files that are not there, a seed that is given, a URL."""
     assert Manifest.load(folder).complete
     with pytest.raises(ConfigError, match=r"frozen must be left out: .* holds a data set whose seed was chosen before"):

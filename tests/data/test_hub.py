@@ -1,19 +1,14 @@
 """Weights and data sets of the Hugging Face Hub, from a stand-in that speaks its protocol."""
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from data.hub_server import TOKEN, Hub, served
+from data.hub_server import TOKEN, served
 from network.states import network_of
 
 from hgn import card
-from hgn.config import DatagenConfig
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.schema import ConfigError
@@ -22,7 +17,7 @@ from hgn.system.hub import HubPlace, hub_weights
 
 
 @pytest.fixture
-def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+def hub(tmp_path, monkeypatch):
     network = network_of(torch.float32)
     info = WeightsInfo(network.config, 60.0, 1 / 64)
     for place in (
@@ -93,12 +88,7 @@ def test_a_server_that_fails_is_asked_again(hub, monkeypatch):
         hub_weights("hf://one/two/a.safetensors", patience_s=0.05)
 
 
-def test_a_data_set_is_read_from_a_repository(
-    hub: Hub,
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_data_set_is_read_from_a_repository(hub, make_config, make_dataset, monkeypatch):
     """dataset.folder=hf://datasets/…: the episodes are the folder's, with errors on the way, in a folder of it too."""
     config = make_config()
     folder = make_dataset(config)

@@ -1,11 +1,7 @@
 """Trajectories of other programs: this project's own episodes in each format are the same data after the import."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -16,7 +12,7 @@ from data.foreign_writers import Hostile, metadata, pickled_npz, sequence_exampl
 from training.runs import metrics, train_mapping
 
 from hgn import evaluate, import_trajectories, train
-from hgn.config import DatagenConfig, NetworkConfig
+from hgn.config import NetworkConfig
 from hgn.data.batch import make_batch
 from hgn.data.foreign.boundary import boundary_grid
 from hgn.data.foreign.episodes import flat_plane
@@ -45,11 +41,11 @@ PARTICLES = {"kind": "gns_particles", "levels": 1, "obstacle_features": False}
 NOTHING = np.zeros((0, 3), np.float32)
 
 
-def options(out: Path, source: Path, **changes: Any) -> dict[str, Any]:
+def options(out, source, **changes):
     return {"from": str(source), "out": str(out), "materials": NAMES, "gravity": list(GRAVITY)} | changes
 
 
-def own_simulations(data: DatagenConfig, boundary_P3: np.ndarray = NOTHING) -> dict[str, list[Any]]:
+def own_simulations(data, boundary_P3=NOTHING):
     """The episodes of a data set with the frames before their first, which no foreign format can leave out."""
     return {
         name: [
@@ -61,7 +57,7 @@ def own_simulations(data: DatagenConfig, boundary_P3: np.ndarray = NOTHING) -> d
 
 
 @pytest.fixture
-def data(make_config: Callable[..., DatagenConfig], make_dataset: Callable[[DatagenConfig], Path]) -> DatagenConfig:
+def data(make_config, make_dataset):
     config = make_config()
     make_dataset(config)
     return config
@@ -108,27 +104,27 @@ def test_training_losses_are_the_same(name, data, tmp_path):
     assert losses[0] == losses[1] and len(losses[0]) == 3
 
 
-def edit(path: Path, change: Callable[[bytearray], None]) -> None:
+def edit(path, change):
     data = bytearray(path.read_bytes())
     change(data)
     path.write_bytes(data)
 
 
-def flip(place: int) -> Callable[[Path], None]:
+def flip(place):
     """Changes a byte of train.tfrecord."""
 
-    def change(folder: Path) -> None:
+    def change(folder):
         edit(folder / "train.tfrecord", lambda data: data.__setitem__(place, data[place] ^ 1))
 
     return change
 
 
-def cut(name: str, size: int) -> Callable[[Path], None]:
+def cut(name, size):
     return lambda folder: edit(folder / name, lambda data: data.__delitem__(slice(size, None)))
 
 
-def meta(**changes: Any) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
+def meta(**changes):
+    def change(folder):
         path = folder / "metadata.json"
         kept = json.loads(path.read_text()) | changes
         path.write_text(json.dumps({key: value for key, value in kept.items() if value is not None}))
@@ -136,10 +132,10 @@ def meta(**changes: Any) -> Callable[[Path], None]:
     return change
 
 
-def hdf5(name: str, key: str, value: Any = None) -> Callable[[Path], None]:
+def hdf5(name, key, value=None):
     """Puts another array in the place of one, or takes it away."""
 
-    def change(folder: Path) -> None:
+    def change(folder):
         with h5py.File(folder / name, "a") as file:
             old = file[key][()]
             del file[key]
@@ -149,8 +145,8 @@ def hdf5(name: str, key: str, value: Any = None) -> Callable[[Path], None]:
     return change
 
 
-def npz(key: str, value: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
+def npz(key, value):
+    def change(folder):
         with np.load(folder / "train.npz") as archive:
             members = dict(archive)
         members[key] = value(members[key])
@@ -159,27 +155,27 @@ def npz(key: str, value: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path],
     return change
 
 
-def with_nan(array: np.ndarray) -> np.ndarray:
+def with_nan(array):
     array = array.copy()
     array[3, 1, 1] = np.nan
     return array
 
 
-def moving(array: np.ndarray) -> np.ndarray:
+def moving(array):
     return array + 0.01 * np.arange(len(array), dtype=np.float32)[:, None, None]
 
 
-def claimed(folder: Path) -> None:
+def claimed(folder):
     """A file of few bytes that says of itself that it holds 7 TiB."""
     with h5py.File(folder / "train.h5", "a") as file:
         del file["00000/position"]
         file.create_dataset("00000/position", (10**6, 10**6, 2), "f4", chunks=(1, 1000, 2))
 
 
-def cells(cell: Any, length: float = 1.0) -> Callable[[Path], None]:
+def cells(cell, length=1.0):
     """Obstacle cells of the plain layout."""
 
-    def change(folder: Path) -> None:
+    def change(folder):
         meta(obstacle_cell_size=1 / 64)(folder)
         normal = np.tile(np.array([[0, length, 0]], np.float32), (len(cell), 1))
         path = folder / "train.npz"
@@ -190,7 +186,7 @@ def cells(cell: Any, length: float = 1.0) -> Callable[[Path], None]:
     return change
 
 
-def at_the_side(folder: Path) -> None:
+def at_the_side(folder):
     meta(periodic_boundary_conditions=[True] * 3)(folder)
     hdf5("train.h5", "00000/position", lambda a: a - np.array([0.48, 0, 0], np.float32))(folder)
 
@@ -198,7 +194,7 @@ def at_the_side(folder: Path) -> None:
 WALK = np.zeros((9, 2, 3))
 
 
-def pickled(content: Callable[[Path], Any]) -> Callable[[Path], None]:
+def pickled(content):
     return lambda folder: pickled_npz(folder / "train.npz", content(folder))
 
 
@@ -321,7 +317,7 @@ def test_gravity_that_the_metadata_contradict_is_refused(tmp_path):
         assert episode.gravity == pytest.approx(expected, abs=2e-3)
 
 
-def flights(*gravities: tuple[float, ...]) -> dict[str, list[Any]]:
+def flights(*gravities):
     time_T11 = np.arange(20)[:, None, None] / 60
     start = np.random.default_rng(1).uniform(0.4, 0.6, (10, 3))
     paths = [(start + 0.5 * np.array(gravity) * time_T11**2).astype(np.float32) for gravity in gravities]
@@ -335,7 +331,7 @@ def test_each_simulation_may_have_its_own_gravity(name, tmp_path):
     source = write(tmp_path / "foreign", name, flights(*own), metadata())
     key = "grav" if name == "neuralmpm" else "gravity"
 
-    def tell(factor: float) -> None:
+    def tell(factor):
         for number, gravity in enumerate(own):
             path, place = (
                 (f"train/sim_{number}.h5", key) if name == "neuralmpm" else ("train.h5", f"0000{number}/{key}")
@@ -371,7 +367,7 @@ def test_what_published_files_have(tmp_path):
     assert np.array_equal(first, 2.0 * np.arange(10)) and np.array_equal(second, first + 1)
 
 
-def flat_simulations(count: int = 24) -> dict[str, list[Any]]:
+def flat_simulations(count=24):
     """Falling particles of a box from 0.1 to 0.9, with a floor of particles."""
     time_T11 = 0.0025 * np.arange(30)[:, None, None]
     start = np.random.default_rng(2).uniform(0.4, 0.6, (count, 2))
@@ -382,14 +378,14 @@ def flat_simulations(count: int = 24) -> dict[str, list[Any]]:
 
 
 @pytest.fixture
-def flat(tmp_path: Path) -> Path:
+def flat(tmp_path):
     info = metadata(2, bounds=[[0.1, 0.9], [0.1, 0.9]], dt=0.0025, default_connectivity_radius=0.015)
     source = write(tmp_path / "foreign", "deepmind", flat_simulations(), info)
     assert import_trajectories.main({"from": str(source), "out": str(tmp_path / "flat")}) == 0
     return tmp_path / "flat"
 
 
-def network_of(manifest: Manifest, **changes: Any) -> NetworkConfig:
+def network_of(manifest, **changes):
     own = manifest.config["imported"]
     sizes: dict[str, Any] = {"width": 8, "message_passing_steps": 1, "material_embedding": 2}
     return NetworkConfig(

@@ -1,16 +1,13 @@
 """Frames drawn by importance: the distribution, and weights that keep every expectation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scene.test_episode import make_episode
 
 from hgn.data.importance import FrameImportance
-from hgn.scene.episode import Episode
 
 
-def moving(position_TN3: np.ndarray, speed: float = 0.0) -> Episode:
+def moving(position_TN3, speed=0.0):
     """An episode without gravity that begins at this speed, in domain units per frame."""
     _, particles, _ = position_TN3.shape
     return make_episode(
@@ -22,14 +19,14 @@ def moving(position_TN3: np.ndarray, speed: float = 0.0) -> Episode:
     )
 
 
-def stopped(frames: int, at: int) -> Episode:
+def stopped(frames, at):
     """Particles that fly evenly, and are stopped at one frame."""
     time = np.minimum(np.arange(frames), at)[:, None, None]
     return moving(np.random.default_rng(0).random((1, 40, 3)) + 0.01 * time, 0.01)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9])
-def test_what_happens_is_drawn_more_often(share: float) -> None:
+def test_what_happens_is_drawn_more_often(share):
     """A stop at frame n is the acceleration v^{n+1} - v^n: that frame gets the share and its even part of the rest;
     weights times chances are 1/F, so sums over what is drawn expect the even mean."""
     frames, at = 21, 7
@@ -44,7 +41,7 @@ def test_what_happens_is_drawn_more_often(share: float) -> None:
     assert weights == pytest.approx([1 / (20 * chance[at])] * len(weights))
 
 
-def test_one_epoch_covers_the_distribution() -> None:
+def test_one_epoch_covers_the_distribution():
     """Slots are strata: in every epoch a frame comes as often as its chance says, to within one."""
     importance = FrameImportance.of(stopped(31, 12), 0.6)
     chance = np.diff(importance.cumulative_F, prepend=0.0)
@@ -53,7 +50,7 @@ def test_one_epoch_covers_the_distribution() -> None:
         assert (np.abs(np.bincount(drawn, minlength=30) - 30 * chance) < 2).all()
 
 
-def test_where_nothing_happens_all_frames_are_alike() -> None:
+def test_where_nothing_happens_all_frames_are_alike():
     """Resting particles, and an episode of two frames, which has one to draw."""
     still = np.ones((5, 3, 3), np.float32)
     importance = FrameImportance.of(moving(still), 0.5)

@@ -1,25 +1,21 @@
 """The index of a data set: what a publication, a claim and a reader's start cost does not grow with the data set."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset, Stage
 from written_files import first_release, hashes
 
 import hgn.data.index
 import hgn.data.reader
 from datagen.pool.writer import DatasetWriter
-from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.data.index import EpisodeEntry, Index, ListedIndex, ShardEntry, begin, extend
 from hgn.data.manifest import Manifest
@@ -33,25 +29,25 @@ MANY = 10_000
 class Count:
     """Lines of ours that are run, and bytes that are read from and written to files, while it is entered."""
 
-    def __enter__(self) -> Count:
+    def __enter__(self):
         self.lines, self._before = 0, self._bytes()
         sys.settrace(self._trace)
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error):
         sys.settrace(None)
         self.read, self.written = (b - a for a, b in zip(self._before, self._bytes(), strict=True))
 
-    def _trace(self, frame: Any, event: str, argument: object) -> Any:
+    def _trace(self, frame, event, argument):
         self.lines += event == "line"
         return self._trace if f"{os.sep}data" in frame.f_code.co_filename else None
 
-    def _bytes(self) -> tuple[int, int]:
+    def _bytes(self):
         numbers = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
         return int(numbers["rchar"]), int(numbers["wchar"])
 
 
-def shard(number: int) -> ShardEntry:
+def shard(number):
     """The entry of a training shard of one episode and no bytes."""
     members = {f"{name}.npy": (512, 10_000_000) for name in ("position", "material")}
     entry = EpisodeEntry(f"train-{number:06d}", number, 2**62 + number, 0, 4296 + number % 1000, 6, members)
@@ -60,7 +56,7 @@ def shard(number: int) -> ShardEntry:
     return ShardEntry(name, "train", number, number + 1, f"{number:064x}", 0, (entry,), statistics)
 
 
-def listed(config: DatagenConfig, count: int) -> Path:
+def listed(config, count):
     """A folder that lists so many shards, which are not there."""
     folder, identity = Path(config.dataset.folder), dataset_identity(config)
     folder.mkdir(parents=True)
@@ -71,9 +67,7 @@ def listed(config: DatagenConfig, count: int) -> Path:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts bytes in /proc")
-def test_costs_do_not_grow(
-    make_config: MakeConfig, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_costs_do_not_grow(make_config, stage, tmp_path, monkeypatch):
     """A claim, a publication and a look at what is new cost the same in an empty data set and behind 10,000 shards; a
     reader of these starts after reading a hundredth of their index."""
     monkeypatch.setattr(DatasetWriter, "_is_present", lambda self, shard: True)
@@ -106,12 +100,12 @@ def test_costs_do_not_grow(
 
 
 @pytest.fixture
-def small_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_segments(monkeypatch):
     monkeypatch.setattr(hgn.data.index, "SEGMENT_SHARDS", 3)
     monkeypatch.setattr(hgn.data.index, "_SEGMENTS_HELD", 2)
 
 
-def test_every_way_to_read(tmp_path: Path, small_segments: None) -> None:
+def test_every_way_to_read(tmp_path, small_segments):
     """However it was appended to and from wherever it is read, an index has the shards in their order; each episode is
     found; what was known is a beginning of what came later, and of nothing else."""
     shards = [shard(i) for i in range(11)]
@@ -137,7 +131,7 @@ def test_every_way_to_read(tmp_path: Path, small_segments: None) -> None:
     assert whole.locate("train", 10)[0] == shards[10]
 
 
-def test_what_was_not_published_is_written_over(tmp_path: Path, small_segments: None) -> None:
+def test_what_was_not_published_is_written_over(tmp_path, small_segments):
     """Lines behind what the head says, of a writer that ended before it wrote the head, do not count."""
     index = extend(tmp_path, begin(tmp_path), [shard(0), shard(1)])
     extend(tmp_path, index, [shard(7), shard(8)])
@@ -145,7 +139,7 @@ def test_what_was_not_published_is_written_over(tmp_path: Path, small_segments: 
     assert [entry.first for entry in Index(tmp_path, index.state, index.totals)] == [0, 1, 2, 3]
 
 
-def test_a_list_that_is_written_anew_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_list_that_is_written_anew_again(tmp_path, monkeypatch):
     """Writers that end before the head of a list written anew, several of them, leave what the head lists."""
     manifest = Manifest(identity_hash({}), {}, {"train": 2}, 2, ListedIndex([shard(0), shard(1)]))
     manifest.save(tmp_path)
@@ -159,7 +153,7 @@ def test_a_list_that_is_written_anew_again(tmp_path: Path, monkeypatch: pytest.M
     assert len(manifest.save(tmp_path).shards) == 2 and len({*(tmp_path / "index").glob("*-000000.jsonl")}) <= 3
 
 
-def test_first_releases_manifest_is_gone_on_with(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_first_releases_manifest_is_gone_on_with(make_config, make_dataset):
     """A manifest that lists the shards itself reads like one with an index; the next publication writes that."""
     folder = make_dataset(make_config(training_scenes=3))
     indexed = Manifest.load(folder)
@@ -176,8 +170,8 @@ def test_first_releases_manifest_is_gone_on_with(make_config: MakeConfig, make_d
 Edit = Callable[[Any], None]
 
 
-def edits() -> Iterator[tuple[Edit, str]]:
-    def statistics(value: float) -> Edit:
+def edits():
+    def statistics(value):
         return lambda content: content["shards"][0]["statistics"]["velocity"].update(mean=[value, 0, 0])
 
     yield lambda content: content["shards"].append(content["shards"][0]), "must be listed once, got its episodes twice"
@@ -189,9 +183,7 @@ def edits() -> Iterator[tuple[Edit, str]]:
 
 
 @pytest.mark.parametrize(("edit", "message"), list(edits()))
-def test_manifest_that_contradicts_itself(
-    make_config: MakeConfig, make_dataset: MakeDataset, edit: Edit, message: str
-) -> None:
+def test_manifest_that_contradicts_itself(make_config, make_dataset, edit, message):
     """A shard listed twice, an episode left out, numbers that are none, a hash that is another configuration's."""
     folder = make_dataset(make_config())
     content = first_release(folder)
@@ -210,9 +202,7 @@ def test_manifest_that_contradicts_itself(
         (r"}\n", " \n", "must be JSON"),
     ],
 )
-def test_index_that_was_altered(
-    make_config: MakeConfig, make_dataset: MakeDataset, pattern: str, text: str, message: str
-) -> None:
+def test_index_that_was_altered(make_config, make_dataset, pattern, text, message):
     """Lines that do not add up to what the manifest says are refused; what is behind them is not read."""
     folder = make_dataset(make_config())
     path = folder / "index" / "1-000000.jsonl"
@@ -225,7 +215,7 @@ def test_index_that_was_altered(
         store.episodes[0]
 
 
-def test_maps_are_bounded(make_config: MakeConfig, make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_are_bounded(make_config, make_dataset, monkeypatch):
     """Many shards need few open files; one that is cut while it is mapped is an error, not the end of the process."""
     monkeypatch.setattr(hgn.data.reader, "MAPPED_SHARDS", 2)
     folder = make_dataset(make_config())

@@ -1,7 +1,5 @@
 """The manifest and the identity of a data set."""
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import errno
@@ -9,7 +7,6 @@ import json
 from pathlib import Path
 
 import pytest
-from ballistic_dataset import MakeConfig
 from written_files import first_release
 
 from datagen.pool.writer import DatasetWriter
@@ -21,7 +18,7 @@ from hgn.data.statistics import Moments, Statistics
 from hgn.schema import ConfigError
 
 
-def make_manifest() -> Manifest:
+def make_manifest():
     entry = EpisodeEntry("train-000000", 0, 2**62, 1, 4296, 300, {"position.npy": (512, 15_465_728)})
     moments = Moments(7, (0.1, -0.2, 1e-300), (1 / 3, 0.0, 2.0))
     shard = ShardEntry("train-000000-000001.tar", "train", 0, 1, "ab" * 32, 999, (entry,), Statistics(moments))
@@ -35,7 +32,7 @@ def make_manifest() -> Manifest:
     )
 
 
-def test_roundtrip(tmp_path: Path) -> None:
+def test_roundtrip(tmp_path):
     """Saving and loading returns every field, floats bitwise."""
     make_manifest().save(tmp_path)
     assert Manifest.load(tmp_path) == make_manifest()
@@ -43,7 +40,7 @@ def test_roundtrip(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"manifest.json", "index"}
 
 
-def test_counts() -> None:
+def test_counts():
     """A manifest knows what is published of what is requested."""
     manifest = make_manifest()
     assert (manifest.published("train"), manifest.published("validation")) == (1, 0)
@@ -53,7 +50,7 @@ def test_counts() -> None:
     assert manifest.statistics("test") == Statistics()
 
 
-def test_missing_manifest(tmp_path: Path) -> None:
+def test_missing_manifest(tmp_path):
     """A folder without a data set is named together with the command that makes one."""
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(ConfigError, match=r"manifest\.json must be the manifest .* generate one with"):
@@ -61,7 +58,7 @@ def test_missing_manifest(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe"])
-def test_garbled_manifest(tmp_path: Path, content: bytes) -> None:
+def test_garbled_manifest(tmp_path, content):
     """A manifest that is no JSON is refused with the remedy."""
     (tmp_path / "manifest.json").write_bytes(content)
     with pytest.raises(
@@ -70,7 +67,7 @@ def test_garbled_manifest(tmp_path: Path, content: bytes) -> None:
         Manifest.load(tmp_path)
 
 
-def test_wrong_manifest(tmp_path: Path) -> None:
+def test_wrong_manifest(tmp_path):
     """Another schema, an unknown key or a wrong type is refused by name."""
     make_manifest().save(tmp_path)
     path, good = tmp_path / "manifest.json", first_release(tmp_path)
@@ -85,7 +82,7 @@ def test_wrong_manifest(tmp_path: Path) -> None:
             Manifest.load(tmp_path)
 
 
-def test_identity_survives_json(make_config: MakeConfig) -> None:
+def test_identity_survives_json(make_config):
     """The identity in a manifest hashes to the manifest's hash, in any key order."""
     identity = dataset_identity(make_config())
     reread = json.loads(json.dumps(dict(reversed(identity.items()))))
@@ -93,7 +90,7 @@ def test_identity_survives_json(make_config: MakeConfig) -> None:
     assert identity_differences(reread, identity) == []
 
 
-def test_differences_are_named() -> None:
+def test_differences_are_named():
     """Keys on one side only count as differences too."""
     lines = identity_differences({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 1, "c": 4}, "e": 5})
     assert lines == [
@@ -103,14 +100,12 @@ def test_differences_are_named() -> None:
     ]
 
 
-def test_manifest_that_is_replaced_while_it_is_read(
-    make_config: MakeConfig, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_manifest_that_is_replaced_while_it_is_read(make_config, folder, monkeypatch):
     """On NFS a file that another machine has replaced is lost to whoever had opened it: reader, writer and service read
     the one in its place."""
     real, lost = Path.read_bytes, 0
 
-    def read_bytes(path: Path) -> bytes:
+    def read_bytes(path):
         nonlocal lost
         if path.name == "manifest.json" and (lost := lost + 1) % 3:
             raise OSError(errno.ESTALE, "Stale file handle")

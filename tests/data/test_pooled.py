@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset
 
-from hgn.config import DatagenConfig
 from hgn.data.pooled import PooledStore
 from hgn.data.reader import EpisodeStore
 from hgn.data.sampler import EpisodeSampler
@@ -15,7 +13,7 @@ from hgn.data.statistics import merge_statistics
 
 
 @pytest.fixture
-def configs(make_config: MakeConfig) -> list[DatagenConfig]:
+def configs(make_config):
     """Of three data sets, of other seeds and lengths."""
     parts = [{"training_scenes": 3}, {"training_scenes": 2, "frames": 9}, {"training_scenes": 4, "frames": 5}]
     made = [make_config(seed=i, **part) for i, part in enumerate(parts)]
@@ -23,14 +21,14 @@ def configs(make_config: MakeConfig) -> list[DatagenConfig]:
     return [replace(c, dataset=replace(c.dataset, folder=f)) for c, f in zip(made, folders, strict=True)]
 
 
-def test_the_sets_follow_each_other(configs: list[DatagenConfig], make_dataset: MakeDataset) -> None:
+def test_the_sets_follow_each_other(configs, make_dataset):
     """Places, lengths, sizes and statistics are those of the sets one behind the other; the last one grows, and what
     was there keeps its place."""
     stores = [EpisodeStore(make_dataset(config), "train") for config in configs]
     pooled = pickle.loads(pickle.dumps(PooledStore(stores[2], stores[:2])))
     expected = [episode for store in (stores[0], stores[1], stores[2]) for episode in store.episodes]
 
-    def require_same(pooled: PooledStore, count: int) -> None:
+    def require_same(pooled, count):
         assert len(pooled) == len(pooled.episodes) == len(list(pooled.entries)) == count
         for found, episode in zip(pooled.episodes, expected, strict=False):
             assert found.seed == episode.seed and np.array_equal(found.position_TN3, episode.position_TN3)
@@ -49,7 +47,7 @@ def test_the_sets_follow_each_other(configs: list[DatagenConfig], make_dataset: 
     assert pooled.digest(9) == before != pooled.digest(13)
 
 
-def test_an_order_over_all(configs: list[DatagenConfig], make_dataset: MakeDataset) -> None:
+def test_an_order_over_all(configs, make_dataset):
     """An epoch holds every sample of all sets once, also where the set that grows has no episode yet."""
     first, second = (EpisodeStore(make_dataset(config), "train") for config in configs[:2])
     empty = replace(configs[2], dataset=replace(configs[2].dataset, training_scenes=0))
@@ -60,9 +58,7 @@ def test_an_order_over_all(configs: list[DatagenConfig], make_dataset: MakeDatas
     assert len(drawn) == 31
 
 
-def test_what_is_fetched(
-    configs: list[DatagenConfig], make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_fetched(configs, make_dataset, monkeypatch):
     """Each set is asked for its own episodes, in the order that they are needed in."""
     stores = [EpisodeStore(make_dataset(config), "train") for config in configs]
     pooled, asked = PooledStore(stores[2], stores[:2]), []

@@ -1,16 +1,12 @@
 """Reading published episodes: memory-mapped, verified, and growing with the data set."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset
 from written_files import first_release
 
 import hgn.data.storage
@@ -23,7 +19,7 @@ from hgn.data.shard import locate_members
 from hgn.schema import ConfigError
 
 
-def test_positions_are_read_only_memory_maps(folder: Path) -> None:
+def test_positions_are_read_only_memory_maps(folder):
     """Positions stay on disk until used; everything else is loaded."""
     store = EpisodeStore(folder, "train")
     assert len(store) == 5 and [entry.key for entry in store.entries] == [f"train-{i:06d}" for i in range(5)]
@@ -38,7 +34,7 @@ def test_positions_are_read_only_memory_maps(folder: Path) -> None:
         store.episodes[5]
 
 
-def test_one_map_a_shard(folder: Path) -> None:
+def test_one_map_a_shard(folder):
     """A thousand episodes do not need a thousand open files: a shard is mapped once."""
     store = EpisodeStore(folder, "train")
     _ = list(store.episodes)
@@ -46,7 +42,7 @@ def test_one_map_a_shard(folder: Path) -> None:
     assert store.episodes[2] is store.episodes[2]
 
 
-def test_store_travels_to_workers(folder: Path) -> None:
+def test_store_travels_to_workers(folder):
     """A pickled store holds no episode data and opens the same episodes on the other side."""
     store = EpisodeStore(folder, "train")
     _ = list(store.episodes)
@@ -56,7 +52,7 @@ def test_store_travels_to_workers(folder: Path) -> None:
     assert np.array_equal(there.episodes[3].position_TN3, store.episodes[3].position_TN3)
 
 
-def test_store_grows_with_the_dataset(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_store_grows_with_the_dataset(make_config, make_dataset):
     """Refreshing appends new episodes and keeps the places of those that were there."""
     folder = make_dataset(make_config(training_scenes=3))
     train, test = EpisodeStore(folder, "train"), EpisodeStore(folder, "test")
@@ -69,14 +65,14 @@ def test_store_grows_with_the_dataset(make_config: MakeConfig, make_dataset: Mak
     assert train.statistics() == Manifest.load(folder).statistics("train")
 
 
-def test_store_opens_before_the_first_episode(make_config: MakeConfig) -> None:
+def test_store_opens_before_the_first_episode(make_config):
     """A data set that is being made can be opened while it holds nothing yet."""
     with DatasetWriter(make_config()) as writer:
         assert EpisodeStore.available(writer.folder)
         assert len(EpisodeStore(writer.folder, "train").episodes) == 0
 
 
-def test_frames_of_episodes(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_frames_of_episodes(make_config, make_dataset):
     """The number of frames is known of each episode, also where some are longer and the data set grows."""
     make_dataset(make_config(training_scenes=3, long_fraction=0.4, long_frames=9))
     store = EpisodeStore(make_config().dataset.folder, "train")
@@ -86,20 +82,20 @@ def test_frames_of_episodes(make_config: MakeConfig, make_dataset: MakeDataset) 
     assert store.frames() == [episode.frame_count for episode in store.episodes] == [6, 6, 9, 6, 9]
 
 
-def test_no_dataset(tmp_path: Path) -> None:
+def test_no_dataset(tmp_path):
     """A folder without a manifest is told apart, and opening it names the remedy."""
     assert not EpisodeStore.available(tmp_path) and not EpisodeStore.available(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match=r"manifest\.json must be the manifest of a data set"):
         EpisodeStore(tmp_path, "train")
 
 
-def test_unknown_split(folder: Path) -> None:
+def test_unknown_split(folder):
     """Only the three splits exist."""
     with pytest.raises(ConfigError, match="split must be one of train, validation, test, got 'dev'"):
         EpisodeStore(folder, "dev")
 
 
-def test_shard_cut_at_a_member_boundary_is_refused(folder: Path) -> None:
+def test_shard_cut_at_a_member_boundary_is_refused(folder):
     """A tar that lost its last episode still reads as a tar, and is refused by its size."""
     shard = folder / "train-000002-000004.tar"
     size = shard.stat().st_size
@@ -111,7 +107,7 @@ def test_shard_cut_at_a_member_boundary_is_refused(folder: Path) -> None:
         store.episodes[2]
 
 
-def test_altered_byte_is_refused(folder: Path) -> None:
+def test_altered_byte_is_refused(folder):
     """One flipped bit anywhere in a shard is found on first use."""
     shard = folder / "train-000000-000001.tar"
     content = bytearray(shard.read_bytes())
@@ -121,14 +117,14 @@ def test_altered_byte_is_refused(folder: Path) -> None:
         EpisodeStore(folder, "train").episodes[0]
 
 
-def test_missing_shard_is_named(folder: Path) -> None:
+def test_missing_shard_is_named(folder):
     """A shard that was deleted is named with the remedy."""
     (folder / "train-000000-000001.tar").unlink()
     with pytest.raises(ConfigError, match=r"train-000000-000001\.tar is listed .* but missing; run the generator"):
         EpisodeStore(folder, "train").episodes[0]
 
 
-def test_shards_are_hashed_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shards_are_hashed_once(folder, monkeypatch):
     """A process verifies a shard once, however many stores open it."""
     hashed: list[str] = []
     real = hgn.data.storage.file_sha256
@@ -146,7 +142,7 @@ def test_shards_are_hashed_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -
         ({"members": {"position.npy": [0, 2000]}}, "json is missing"),
     ],
 )
-def test_manifest_that_does_not_fit_its_shard(folder: Path, changes: dict[str, object], message: str) -> None:
+def test_manifest_that_does_not_fit_its_shard(folder, changes, message):
     """Offsets or facts that the shard contradicts are refused, never read out of range."""
     path, mapping = folder / "manifest.json", first_release(folder)
     mapping["shards"][0]["episodes"][0] |= changes
@@ -155,9 +151,7 @@ def test_manifest_that_does_not_fit_its_shard(folder: Path, changes: dict[str, o
         EpisodeStore(folder, "train").episodes[0]
 
 
-def test_refresh_refuses_another_dataset(
-    folder: Path, make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_refresh_refuses_another_dataset(folder, make_config, make_dataset, tmp_path):
     """A folder whose data set was replaced, or lost shards, is not read on as if nothing had happened."""
     store = EpisodeStore(folder, "train")
     manifest = Manifest.load(folder)

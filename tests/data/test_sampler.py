@@ -1,7 +1,5 @@
 """The deterministic order of samples, and its exact resume."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -131,7 +129,7 @@ def test_windows(frames: list[int], window: int, world_size: int, cut: int):
     two samples of an episode lie no more than those of a window's episodes; what comes next is known in its order."""
     total = sum(frames) - len(frames)
 
-    def ranks(state: SamplerState | None = None) -> list[EpisodeSampler]:
+    def ranks(state=None):
         orders = range(world_size)
         return [EpisodeSampler(3, 1, lambda _: frames, state, rank, world_size, window=window) for rank in orders]
 

@@ -1,7 +1,5 @@
 """Statistics merge to what a direct computation gives."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,7 +25,7 @@ def test_merged_moments_equal_direct_ones(sizes: list[int], offset: float) -> No
         assert merged == Moments() and merged.std == (0.0, 0.0, 0.0)
 
 
-def test_episode_statistics_equal_direct_ones() -> None:
+def test_episode_statistics_equal_direct_ones():
     """Velocity and acceleration are first and second differences in frame units, over all episodes."""
     generator = np.random.default_rng(0)
     episodes = [generator.random((frames, n, 3)).astype(np.float32) for frames, n in ((5, 7), (2, 3), (9, 1))]
@@ -40,7 +38,7 @@ def test_episode_statistics_equal_direct_ones() -> None:
         np.testing.assert_allclose(moments.std, values.std(axis=0), rtol=1e-12, atol=1e-14)
 
 
-def test_too_short_or_empty_episodes_count_nothing() -> None:
+def test_too_short_or_empty_episodes_count_nothing():
     """One frame has no velocity, two have no acceleration, and an empty scene has neither."""
     assert episode_statistics(np.zeros((1, 4, 3), np.float32)) == Statistics()
     assert episode_statistics(np.zeros((2, 4, 3), np.float32)).acceleration == Moments()

@@ -1,7 +1,5 @@
 """Data sets at a URL: the same episodes as in a folder, whatever the network, the server and the cache do."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import errno
@@ -16,15 +14,12 @@ import socket
 import sys
 import threading
 import urllib.request
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import fsspec
 import numpy as np
 import pytest
 import uvicorn
-from ballistic_dataset import MakeConfig, MakeDataset
 from processes import PATIENCE_S
 from written_files import first_release
 
@@ -32,7 +27,7 @@ import hgn.data.storage
 from datagen.service.server import make_app, make_server
 from datagen.service.supervisor import PoolState
 from hgn.command import run_command
-from hgn.data.manifest import Manifest, ShardEntry
+from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import (
     CACHE_VARIABLE,
@@ -52,14 +47,14 @@ TOKEN = "correct-horse-battery"
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache(tmp_path, monkeypatch):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
     monkeypatch.setattr(hgn.data.storage, "_FIRST_PAUSE_S", 0.01)
     return tmp_path / "cache" / "shards"
 
 
-def in_memory(folder: Path, name: str) -> str:
+def in_memory(folder, name):
     """A copy of a data set in fsspec's memory."""
     files = fsspec.filesystem("memory")
     for path in (*folder.glob("*.tar"), folder / "manifest.json", *folder.glob("index/*")):
@@ -68,11 +63,11 @@ def in_memory(folder: Path, name: str) -> str:
 
 
 @pytest.fixture
-def serve(folder: Path) -> Iterator[Callable[..., str]]:
+def serve(folder):
     """Starts the service's server, without a pool, on a port of its own: its URL."""
     running: list[tuple[uvicorn.Server, threading.Thread]] = []
 
-    def start(token: str | None = None, port: int = 0) -> str:
+    def start(token=None, port=0):
         listener = socket.create_server(("127.0.0.1", port))
         app = make_app(folder, token, PoolState)
         server = make_server(app, connections=16)
@@ -81,23 +76,23 @@ def serve(folder: Path) -> Iterator[Callable[..., str]]:
         running.append((server, thread))
         return f"http://127.0.0.1:{listener.getsockname()[1]}"
 
-    def stop() -> None:
+    def stop():
         while running:
             server, thread = running.pop()
             server.should_exit = True
             thread.join()
 
-    start.stop = stop  # type: ignore[attr-defined]
+    start.stop = stop
     yield start
     stop()
 
 
-def same_episodes(one: EpisodeStore, other: EpisodeStore) -> bool:
+def same_episodes(one, other):
     pairs = zip(one.episodes, other.episodes, strict=True)
     return all(a.key == b.key and np.array_equal(a.position_TN3, b.position_TN3) for a, b in pairs)
 
 
-def test_url_or_folder() -> None:
+def test_url_or_folder():
     """URLs are told from folders by their protocol; file:// is a folder."""
     assert is_remote("http://host:1") and is_remote("s3://bucket/data") and is_remote("memory://x")
     assert not is_remote("data/obstacles") and not is_remote(Path("/data")) and not is_remote("file:///data")
@@ -105,7 +100,7 @@ def test_url_or_folder() -> None:
         open_storage("gopher://host")
 
 
-def test_service_gives_what_the_folder_holds(folder: Path, serve: Callable[..., str], cache: Path) -> None:
+def test_service_gives_what_the_folder_holds(folder, serve, cache):
     """Over HTTP the same episodes come, memory-mapped from a cache that names shards by their sha256."""
     store = EpisodeStore(serve(), "train")
     assert same_episodes(store, EpisodeStore(folder, "train"))
@@ -114,12 +109,12 @@ def test_service_gives_what_the_folder_holds(folder: Path, serve: Callable[..., 
     assert {path.name for path in cache.iterdir()} == names
 
 
-def test_manifest_is_sent_once(folder: Path, serve: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_manifest_is_sent_once(folder, serve, monkeypatch):
     """Polling a manifest that has not changed costs no more than asking."""
     monkeypatch.setattr("datagen.service.server._FRESH_S", -1.0)  # each poll looks
     url, sizes = serve(), []
     store = EpisodeStore(url, "train")
-    files = open_storage(url)._files  # type: ignore[attr-defined]
+    files = open_storage(url)._files
     real = files.cat_file
     monkeypatch.setattr(files, "cat_file", lambda *a, **k: sizes.append(len(data := real(*a, **k))) or data)
     assert not store.refresh()
@@ -129,9 +124,7 @@ def test_manifest_is_sent_once(folder: Path, serve: Callable[..., str], monkeypa
     assert sizes[0] == 0 and sizes[1] > 1000
 
 
-def test_growing_data_set(
-    make_config: MakeConfig, make_dataset: MakeDataset, serve: Callable[..., str], folder: Path
-) -> None:
+def test_growing_data_set(make_config, make_dataset, serve, folder):
     """A data set that grows behind its URL is seen to grow; shards that are known stay where they are."""
     store = EpisodeStore(serve(), "train")
     first = store.episodes[0]
@@ -141,7 +134,7 @@ def test_growing_data_set(
     assert same_episodes(store, EpisodeStore(folder, "train"))
 
 
-def test_same_names_do_not_collide(make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_same_names_do_not_collide(make_config, make_dataset, tmp_path):
     """Two data sets whose shards have the same names, in one cache, are kept apart."""
     folders = [make_dataset(make_config(folder=str(tmp_path / name), frames=n)) for name, n in (("a", 4), ("b", 7))]
     stores = [EpisodeStore(in_memory(folder, f"collide{i}"), "train") for i, folder in enumerate(folders)]
@@ -151,12 +144,12 @@ def test_same_names_do_not_collide(make_config: MakeConfig, make_dataset: MakeDa
         assert same_episodes(store, EpisodeStore(folder, "train"))
 
 
-def _read(url: str, barrier: object, results: object) -> None:
-    barrier.wait()  # type: ignore[attr-defined]
-    results.put([episode.key for episode in EpisodeStore(url, "train").episodes])  # type: ignore[attr-defined]
+def _read(url, barrier, results):
+    barrier.wait()
+    results.put([episode.key for episode in EpisodeStore(url, "train").episodes])
 
 
-def test_ranks_share_the_cache(folder: Path, serve: Callable[..., str], cache: Path) -> None:
+def test_ranks_share_the_cache(folder, serve, cache):
     """Processes of one machine that want the same shards at once each get them whole; each is fetched once."""
     url = serve()
     context = multiprocessing.get_context("spawn")
@@ -179,9 +172,7 @@ def test_ranks_share_the_cache(folder: Path, serve: Callable[..., str], cache: P
 
 
 @pytest.mark.parametrize("left", [b"", b"prefix", b"garbage", b"too long"])
-def test_fetching_goes_on_where_it_ended(
-    folder: Path, cache: Path, left: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fetching_goes_on_where_it_ended(folder, cache, left, monkeypatch):
     """What a killed process had fetched is kept, unless it is not what it should be."""
     monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 1000)
     url = in_memory(folder, f"resume-{left.decode().replace(' ', '-')}")
@@ -193,7 +184,7 @@ def test_fetching_goes_on_where_it_ended(
         {b"prefix": content[:5000], b"garbage": b"?" * 5000, b"too long": content + b"?"}.get(left, b"")
     )
     reads: list[int] = []
-    files = open_storage(url)._files  # type: ignore[attr-defined]
+    files = open_storage(url)._files
     real = files.cat_file
     monkeypatch.setattr(files, "cat_file", lambda *a, **k: reads.append(k["start"]) or real(*a, **k))
     path = open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
@@ -202,7 +193,7 @@ def test_fetching_goes_on_where_it_ended(
     assert (0 in reads) == (left != b"prefix")
 
 
-def test_damaged_cache_is_mended(folder: Path, cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_cache_is_mended(folder, cache, capsys):
     """A shard that changed on this machine's disk is fetched again."""
     url = in_memory(folder, "mended")
     entry = Manifest.load(url).shards[0]
@@ -213,7 +204,7 @@ def test_damaged_cache_is_mended(folder: Path, cache: Path, capsys: pytest.Captu
     assert "it was altered; it is fetched again" in capsys.readouterr().err
 
 
-def test_altered_or_cut_shards_are_refused(folder: Path, cache: Path) -> None:
+def test_altered_or_cut_shards_are_refused(folder, cache):
     """A shard that is not what the manifest says is refused, and never gets into the cache."""
     url, files = in_memory(folder, "altered"), fsspec.filesystem("memory")
     first, second, *_ = Manifest.load(url).shards_of("train")
@@ -231,7 +222,7 @@ def test_altered_or_cut_shards_are_refused(folder: Path, cache: Path) -> None:
     assert list(cache.iterdir()) == []
 
 
-def test_times_that_were_set_back(folder: Path) -> None:
+def test_times_that_were_set_back(folder):
     """A file whose bytes changed while its size and modification time stayed is hashed again."""
     path = folder / "train-000000-000001.tar"
     status, sha256 = path.stat(), file_sha256(path)
@@ -245,13 +236,13 @@ def test_times_that_were_set_back(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("attack", ["gzip bomb", "endless", "long range"])
-def test_answers_are_bounded(monkeypatch: pytest.MonkeyPatch, attack: str) -> None:
+def test_answers_are_bounded(monkeypatch, attack):
     """A server cannot fill the memory: a packed answer stays packed, and one that is longer than was asked for, or
     than any, is cut."""
     monkeypatch.setattr("hgn.data.bounded_http.LARGEST_BYTES", 100_000)
 
     class Attack(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
+        def do_GET(self):
             self.send_response(206 if attack == "long range" else 200)
             if attack == "gzip bomb":
                 self.send_header("Content-Encoding", "gzip")
@@ -262,7 +253,7 @@ def test_answers_are_bounded(monkeypatch: pytest.MonkeyPatch, attack: str) -> No
                 for _ in range(0 if attack == "gzip bomb" else 1000):
                     self.wfile.write(bytes(10_000))
 
-        def log_message(self, *arguments: object) -> None:
+        def log_message(self, *arguments):
             pass
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Attack) as server:
@@ -279,21 +270,21 @@ def test_answers_are_bounded(monkeypatch: pytest.MonkeyPatch, attack: str) -> No
             server.shutdown()
 
 
-def test_proxy_that_remembers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_proxy_that_remembers(monkeypatch):
     """A proxy that has an older, shorter file of the index is asked again until it has the one that the manifest is
     about."""
     monkeypatch.setattr("hgn.data.storage._FIRST_PAUSE_S", 0.01)
     answers = iter([(416, b""), (206, b"56"), (206, b"5678")])
 
     class Proxy(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
+        def do_GET(self):
             status, content = next(answers)
             self.send_response(status)
             self.send_header("Content-Length", str(len(content)))
             self.end_headers()
             self.wfile.write(content)
 
-        def log_message(self, *arguments: object) -> None:
+        def log_message(self, *arguments):
             pass
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Proxy) as server:
@@ -305,7 +296,7 @@ def test_proxy_that_remembers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("full", ["limit", "disk"])
-def test_full_cache(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
+def test_full_cache(folder, cache, monkeypatch, full):
     """A data set that is larger than the cache's limit, or its disk, is read all the same, again and again: shards that
     were brought first make room, and what had them open lets them go. Nothing is thrown out for what is only fetched
     ahead."""
@@ -315,7 +306,7 @@ def test_full_cache(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, 
     else:
         real = hgn.data.storage._Remote._fill
 
-        def fill(self: Any, file: Any, name: str, size: int, patience_s: float) -> str:
+        def fill(self, file, name, size, patience_s):
             if sum(path.stat().st_size for path in cache.glob("*.tar")) + size > room:
                 raise OSError(errno.ENOSPC, "No space left on device")
             return real(self, file, name, size, patience_s)
@@ -342,12 +333,12 @@ def test_full_cache(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, 
         store.episodes[0]
 
 
-def test_clock_that_was_set_back(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clock_that_was_set_back(folder, cache, monkeypatch):
     """What was brought first makes room, also when this machine's clock stood in the future then."""
     url = in_memory(folder, "clock")
     first, second, third, *_ = sorted(Manifest.load(url).shards, key=lambda shard: -shard.bytes)
 
-    def bring(entry: ShardEntry) -> Path:
+    def bring(entry):
         return open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
 
     os.utime(bring(first), (2**33, 2**33))
@@ -358,7 +349,7 @@ def test_clock_that_was_set_back(folder: Path, cache: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("patience_s", [0.0, 0.2, 1e6])
-def test_who_fetches_was_stopped(folder: Path, cache: Path, patience_s: float) -> None:
+def test_who_fetches_was_stopped(folder, cache, patience_s):
     """A process that was stopped while it fetched a shard is not waited for without end, and not at all by a training
     that ends."""
     url = in_memory(folder, "stopped")
@@ -372,7 +363,7 @@ def test_who_fetches_was_stopped(folder: Path, cache: Path, patience_s: float) -
             open_storage(url).shard(entry.name, entry.sha256, entry.bytes, patience_s)
 
 
-def test_link_in_the_cache(folder: Path, cache: Path, tmp_path: Path) -> None:
+def test_link_in_the_cache(folder, cache, tmp_path):
     """A partial file that is a link to another file is refused; that file stays as it is."""
     url = in_memory(folder, "linked")
     entry = Manifest.load(url).shards[0]
@@ -394,7 +385,7 @@ def test_link_in_the_cache(folder: Path, cache: Path, tmp_path: Path) -> None:
         ("split", "../train", r"shards\[0\]\.split must be one of"),
     ],
 )
-def test_manifest_cannot_name_other_files(folder: Path, key: str, value: object, message: str) -> None:
+def test_manifest_cannot_name_other_files(folder, key, value, message):
     """Names and hashes of a manifest become paths: what could lead elsewhere is refused."""
     mapping = first_release(folder)
     mapping["shards"][0][key] = value
@@ -403,12 +394,12 @@ def test_manifest_cannot_name_other_files(folder: Path, key: str, value: object,
         Manifest.load(in_memory(folder, "evil"))
 
 
-def test_server_without_ranges(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_server_without_ranges(folder, monkeypatch):
     """A plain file server that knows no ranges will do."""
     monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 4000)
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *arguments: object) -> None:
+        def log_message(self, *arguments):
             pass
 
     handler = functools.partial(Quiet, directory=str(folder))
@@ -419,7 +410,7 @@ def test_server_without_ranges(folder: Path, monkeypatch: pytest.MonkeyPatch) ->
         server.shutdown()
 
 
-def test_no_data_set_there(serve: Callable[..., str]) -> None:
+def test_no_data_set_there(serve):
     """A URL without a manifest is told apart from one that does not answer."""
     fsspec.filesystem("memory").pipe("/empty/readme", b"")
     assert not EpisodeStore.available("memory://empty")
@@ -428,7 +419,7 @@ def test_no_data_set_there(serve: Callable[..., str]) -> None:
     assert not EpisodeStore.available(serve() + "/elsewhere")
 
 
-def test_token(folder: Path, serve: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_token(folder, serve, monkeypatch):
     """The token of the environment opens the service; without it, or with another one, the message names it."""
     url = serve(TOKEN)
     for token in (None, "another-token-of-ours"):
@@ -442,18 +433,18 @@ def test_token(folder: Path, serve: Callable[..., str], monkeypatch: pytest.Monk
     assert same_episodes(EpisodeStore(url, "train"), EpisodeStore(folder, "train"))
 
 
-def test_server_that_comes_back(folder: Path, serve: Callable[..., str]) -> None:
+def test_server_that_comes_back(folder, serve):
     """A reader waits for a service that is started again, and meanwhile goes on with what it has."""
     url = serve()
     store = EpisodeStore(url, "train")
     _ = store.episodes[0]
-    serve.stop()  # type: ignore[attr-defined]
+    serve.stop()
     assert not store.refresh() and store.episodes[0].key == "train-000000"
     threading.Timer(0.5, serve, kwargs={"port": int(url.rpartition(":")[2])}).start()
     assert same_episodes(store, EpisodeStore(folder, "train"))
 
 
-def test_server_that_stays_away() -> None:
+def test_server_that_stays_away():
     """After its patience a reader ends with an error that names the URL and the cause."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
@@ -461,7 +452,7 @@ def test_server_that_stays_away() -> None:
         Manifest.load(url, patience_s=0.05)
 
 
-def test_command_without_its_server(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_without_its_server(monkeypatch, capsys):
     """A command whose server stays away ends with one line that says what to do, and exit code 1."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
@@ -473,21 +464,19 @@ def test_command_without_its_server(monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert error.endswith(f"{url}/manifest.json; see that its server runs and run the same command again to go on\n")
 
 
-def test_server_that_is_away_is_not_asked_at_once_again(
-    folder: Path, serve: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_server_that_is_away_is_not_asked_at_once_again(folder, serve, monkeypatch):
     """Looking for news at a machine that is off costs one wait in a while, and a split is read without it."""
     url = serve()
     store = EpisodeStore(url, "train")
     _ = store.of_split("validation").episodes[:]
-    serve.stop()  # type: ignore[attr-defined]
+    serve.stop()
     assert not store.refresh()
-    files = open_storage(url)._files  # type: ignore[attr-defined]
+    files = open_storage(url)._files
     monkeypatch.setattr(files, "cat_file", lambda *a, **k: pytest.fail("it was asked"))
     assert not store.refresh() and same_episodes(store.of_split("validation"), EpisodeStore(folder, "validation"))
 
 
-def test_what_is_within_reach(folder: Path, serve: Callable[..., str], cache: Path) -> None:
+def test_what_is_within_reach(folder, serve, cache):
     """Who would rather go on than wait asks first: a server that is away, or a shard that another process is fetching,
     is no; what is here, or comes at once, is yes."""
     url = serve()
@@ -497,17 +486,17 @@ def test_what_is_within_reach(folder: Path, serve: Callable[..., str], cache: Pa
     with (cache / f".{third.sha256}.tar.partial").open("wb") as partial:
         fcntl.flock(partial, fcntl.LOCK_EX)
         assert not store.within_reach([2], patience_s=0)
-    serve.stop()  # type: ignore[attr-defined]
+    serve.stop()
     assert store.within_reach([0, 1], patience_s=0) and not store.within_reach([1, 4], patience_s=0)
     assert EpisodeStore(folder, "train").within_reach(range(5), patience_s=0)
 
 
-def test_full_disk(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk(folder, cache, monkeypatch):
     """Where the cache is full the error names it, and what was fetched does not stay in the way."""
     url = in_memory(folder, "full")
     store = EpisodeStore(url, "train")
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
@@ -518,7 +507,7 @@ def test_full_disk(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -
     assert store.episodes[0].key == "train-000000"
 
 
-def test_damage_at_the_service(folder: Path, serve: Callable[..., str]) -> None:
+def test_damage_at_the_service(folder, serve):
     """A reader that asks for a damaged shard is told so at once, and by whom."""
     store = EpisodeStore(serve(), "train")
     shard = folder / store.manifest.shards[0].name
@@ -527,7 +516,7 @@ def test_damage_at_the_service(folder: Path, serve: Callable[..., str]) -> None:
         store.episodes[0]
 
 
-def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cache_folder(monkeypatch, tmp_path):
     """HGN_CACHE names the cache; otherwise it is where programs of this machine keep theirs."""
     assert cache_folder() == tmp_path / "cache" / "shards"
     monkeypatch.delenv(CACHE_VARIABLE)
@@ -535,7 +524,7 @@ def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert cache_folder() == tmp_path / "hgn" / "shards"
 
 
-def test_a_cache_that_cannot_be(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_that_cannot_be(folder, tmp_path, monkeypatch):
     """It is said what to name, as in a container whose user has no home of its own."""
     (tmp_path / "file").touch()
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
@@ -543,10 +532,10 @@ def test_a_cache_that_cannot_be(folder: Path, tmp_path: Path, monkeypatch: pytes
         EpisodeStore(in_memory(folder, "uncached"), "train").episodes[0]
 
 
-def test_a_cache_without_locks(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_without_locks(folder, cache, monkeypatch):
     """As on Lustre without -o flock: another folder is asked for, and what stands in the way is named."""
 
-    def lustre(*arguments: object) -> None:
+    def lustre(*arguments):
         raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
 
     store = EpisodeStore(in_memory(folder, "unlocked"), "train")
@@ -558,12 +547,12 @@ def test_a_cache_without_locks(folder: Path, cache: Path, monkeypatch: pytest.Mo
     assert store.episodes[0].key == "train-000000"
 
 
-def test_no_folder_for_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_folder_for_shards(monkeypatch):
     """A user without a home, as in some containers, is told what to name."""
     for name in (CACHE_VARIABLE, "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
 
-    def homeless() -> Path:
+    def homeless():
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.setattr(Path, "home", homeless)

@@ -1,7 +1,5 @@
 """Whole data sets of the ballistic stand-in, made in this process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +15,7 @@ MakeDataset = Callable[[DatagenConfig], Path]
 Stage = Callable[[DatasetWriter, str, int], None]
 
 
-def stage(writer: DatasetWriter, split: str, index: int) -> None:
+def stage(writer, split, index):
     """Simulates one episode in this process and stages it; the writer claims what comes before it too."""
     while (split, index) not in writer.remaining():
         assert writer.claim_next()
@@ -30,7 +28,7 @@ def stage(writer: DatasetWriter, split: str, index: int) -> None:
     writer.add_staged(split, index)
 
 
-def make_dataset(config: DatagenConfig) -> Path:
+def make_dataset(config):
     """Makes a whole data set, or what is missing of it, without any worker process."""
     with DatasetWriter(config) as writer:
         while writer.claim_next():

@@ -1,7 +1,5 @@
 """`python -m datagen.service` with the ballistic stand-in for scenes and solver; run with this folder on the path."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from ballistic_solver import BALLISTIC

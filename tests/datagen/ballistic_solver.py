@@ -5,13 +5,10 @@ was simulated; files named `kill-<seed>`, `fail-<seed>` and `late-<seed>` there 
 seed, or its scene come late; in a folder `ending` each process that ends in order leaves a file.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import signal
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from datagen.pool.worker import Backend
-from hgn.config import MpmConfig, SceneConfig
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 
 FOLDER_VARIABLE = "BALLISTIC_FOLDER"
@@ -44,11 +40,11 @@ class SceneFailure:
     cause: str
 
 
-def control(name: str) -> Path:
+def control(name):
     return Path(os.environ[FOLDER_VARIABLE]) / name
 
 
-def generate_scene(config: SceneConfig, seed: int) -> Scene:
+def generate_scene(config, seed):
     if control(f"refuse-{seed}").exists():
         raise ConfigError("no room for the obstacles")
     if control(f"late-{seed}").exists():
@@ -65,9 +61,7 @@ def generate_scene(config: SceneConfig, seed: int) -> Scene:
     )
 
 
-def build_obstacle_grid(
-    obstacles: Sequence[Obstacle], cell_size: float, seed: int, domain_size: tuple[float, float, float]
-) -> ObstacleGrid:
+def build_obstacle_grid(obstacles, cell_size, seed, domain_size):
     if control(f"gridless-{seed}").exists():
         raise ConfigError("a surface too large")
     kill = control(f"kill-grid-{seed}")
@@ -77,19 +71,11 @@ def build_obstacle_grid(
     return ObstacleGrid(cell_size, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
 
 
-def warm_up(scene: SceneConfig, config: MpmConfig, scenes: int) -> None:
+def warm_up(scene, config, scenes):
     pass
 
 
-def simulate(
-    scenes: Sequence[Scene],
-    config: MpmConfig,
-    frames: int,
-    frame_rate_hz: float,
-    on_frame: Callable[[int], None] | None = None,
-    cpu_threads: int | None = None,
-    colliders: Sequence[object] | None = None,
-) -> list[Simulated | SceneFailure]:
+def simulate(scenes, config, frames, frame_rate_hz, on_frame=None, cpu_threads=None, colliders=None):
     results: list[Simulated | SceneFailure] = []
     for scene in scenes:
         with control("simulated.log").open("a") as log:

@@ -3,16 +3,12 @@
 Run as `python crash_program.py FOLDER KILLS`, with this folder on the path and BALLISTIC_FOLDER set.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import sys
 import tarfile
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 from ballistic_dataset import make_dataset
 
@@ -36,10 +32,10 @@ TRACED = (OURS, OURS | {tarfile.__file__}, LISTING)
 class Lines:
     """Counts the lines of some files that are run, and kills the process before the given one."""
 
-    def __init__(self, files: set[str | None], last: int | None) -> None:
+    def __init__(self, files, last):
         self.files, self.count, self.last = files, 0, last
 
-    def __call__(self, frame: FrameType, event: str, argument: Any) -> Any:
+    def __call__(self, frame, event, argument):
         if frame.f_code.co_filename not in self.files:
             return None
         if event == "line":
@@ -49,7 +45,7 @@ class Lines:
         return self
 
 
-def run(folder: Path, files: set[str | None] | None = None, last: int | None = None) -> tuple[int, int]:
+def run(folder, files=None, last=None):
     """Makes what is missing in a process of its own, which ends before line `last` of `files`: wait status, lines."""
     reader, writer = os.pipe()
     child = os.fork()
@@ -69,17 +65,17 @@ def run(folder: Path, files: set[str | None] | None = None, last: int | None = N
     return status, lines
 
 
-def config(folder: Path) -> DatagenConfig:
+def config(folder):
     return DatagenConfig(
         dataset=DatasetConfig(folder=str(folder), training_scenes=3, validation_scenes=1, test_scenes=0, frames=2)
     )
 
 
-def shards(folder: Path) -> dict[str, str]:
+def shards(folder):
     return {path.name: file_sha256(path) for path in folder.rglob("*.tar")}
 
 
-def main(folder: Path, kills: int) -> None:
+def main(folder, kills):
     lines = [run(folder / f"peaceful-{i}", files)[1] for i, files in enumerate(TRACED)]
     peaceful = folder / "peaceful-0"
     expected = {path.name for path in peaceful.rglob("*")}

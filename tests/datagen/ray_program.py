@@ -4,8 +4,6 @@ data set made in one process; prints it as JSON.
 Run as `python ray_program.py FOLDER`, with this folder on the path and BALLISTIC_FOLDER set.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace
@@ -28,19 +26,19 @@ STORE_BYTES = 80 * 2**20
 class Killer(Progress):
     """Kills a node once three episodes are there."""
 
-    def __init__(self, cluster: Cluster, node: object) -> None:
+    def __init__(self, cluster, node):
         self.cluster, self.node, self.episodes, self.messages = cluster, node, 0, []
 
-    def episode(self, key: str) -> None:
+    def episode(self, key):
         self.episodes += 1
         if self.episodes == 3:
             self.cluster.remove_node(self.node, allow_graceful=False)
 
-    def message(self, text: str) -> None:
+    def message(self, text):
         self.messages.append(text)
 
 
-def main(folder: str) -> None:
+def main(folder):
     cluster = Cluster(
         initialize_head=True,
         head_node_args={"num_cpus": 2, "object_store_memory": STORE_BYTES, "include_dashboard": False},

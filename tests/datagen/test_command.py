@@ -1,7 +1,5 @@
 """The command: one line for each fault, exit codes, Ctrl-C, and progress for people and machines."""
 
-from __future__ import annotations
-
 import errno
 import io
 import json
@@ -13,7 +11,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from ballistic_dataset import MakeConfig, MakeDataset
 from docs.pages import run_module
 from processes import PATIENCE_S, processes_of_session, wait_until
 
@@ -28,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["scenes=3", "dataset.validation_scenes=1", "dataset.test_scenes=0", "dataset.frames=5", "dataset.workers=1"]
 
 
-def start(*arguments: str, **options: object) -> subprocess.Popen[str]:
+def start(*arguments, **options):
     path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
     return subprocess.Popen(
         [sys.executable, "-m", "ballistic_command", *arguments],
@@ -37,11 +34,11 @@ def start(*arguments: str, **options: object) -> subprocess.Popen[str]:
         text=True,
         env=os.environ | {"PYTHONPATH": path},
         start_new_session=True,
-        **options,  # type: ignore[call-overload]
+        **options,
     )
 
 
-def run(*arguments: str, **options: object) -> tuple[int, str, str]:
+def run(*arguments, **options):
     process = start(*arguments, **options)
     output, errors = process.communicate(timeout=PATIENCE_S)
     return process.returncode, output, errors
@@ -61,13 +58,7 @@ BAD_INPUT = [
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD_INPUT)
-def test_bad_input_is_one_line(
-    arguments: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_bad_input_is_one_line(arguments, message, tmp_path, monkeypatch, capsys):
     """Whatever is wrong with the input, one line says field, rule and value; the exit code is 2; nothing is made."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["datagen", *arguments])
@@ -80,7 +71,7 @@ def test_bad_input_is_one_line(
     assert sys.argv == ["datagen", *arguments] and "HYDRA_FULL_ERROR" not in os.environ
 
 
-def test_no_key_is_taken_for_a_config_group() -> None:
+def test_no_key_is_taken_for_a_config_group():
     """A key with the name of a folder beside its file could not be set; `scene=file` and `scenes=3` can."""
     conf = config_directory()
     for path in (*conf.glob("*.yaml"), *conf.glob("command/*.yaml")):
@@ -103,16 +94,10 @@ def test_no_key_is_taken_for_a_config_group() -> None:
         (KeyboardInterrupt(), 130, "error: interrupted\n"),
     ],
 )
-def test_faults_end_in_one_line(
-    error: BaseException,
-    code: int,
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_faults_end_in_one_line(error, code, message, monkeypatch, capsys):
     """Faults that a person can mend print one line and no traceback; the exit code tells whose fault it is."""
 
-    def fail(mapping: dict[str, object]) -> int:
+    def fail(mapping):
         raise error
 
     monkeypatch.setattr(sys, "argv", ["datagen"])
@@ -122,10 +107,10 @@ def test_faults_end_in_one_line(
     assert capsys.readouterr().err.startswith(message)
 
 
-def test_faults_of_ours_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_faults_of_ours_keep_their_traceback(monkeypatch):
     """What no person can mend is not dressed up as if they could."""
 
-    def fail(mapping: dict[str, object]) -> int:
+    def fail(mapping):
         raise FileNotFoundError(errno.ENOENT, "No such file", "x")
 
     monkeypatch.setattr(sys, "argv", ["datagen"])
@@ -133,13 +118,11 @@ def test_faults_of_ours_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) ->
         run_command(fail, "datagen")
 
 
-def test_help_and_config_print(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_help_and_config_print(tmp_path, monkeypatch, capfd):
     """Hydra's own options work and start nothing."""
     monkeypatch.chdir(tmp_path)
 
-    def printed(*arguments: str) -> str:
+    def printed(*arguments):
         assert run_module("datagen", arguments) == 0
         return capfd.readouterr().out
 
@@ -152,7 +135,7 @@ def test_help_and_config_print(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_makes_completes_and_leaves_alone(backend: object, tmp_path: Path) -> None:
+def test_makes_completes_and_leaves_alone(backend, tmp_path):
     """The command makes a data set from any working folder, says when it is complete, and then changes nothing."""
     code, output, errors = run(*SMALL, "out=made", cwd=tmp_path)
     assert code == 0 and output == "", errors
@@ -167,7 +150,7 @@ def test_makes_completes_and_leaves_alone(backend: object, tmp_path: Path) -> No
     assert code == 2 and errors.startswith("error: made holds another data set: scene.group_shapes is")
 
 
-def test_resolved_config_file(backend: object, tmp_path: Path) -> None:
+def test_resolved_config_file(backend, tmp_path):
     """A resolved config in any folder, as the trainer writes one, serves instead of conf/."""
     dataset = DatasetConfig(
         folder=str(tmp_path / "made"), training_scenes=1, validation_scenes=0, test_scenes=0, frames=4, workers=1
@@ -180,7 +163,7 @@ def test_resolved_config_file(backend: object, tmp_path: Path) -> None:
     assert not (tmp_path / "outputs").exists()
 
 
-def test_json_progress(backend: object, tmp_path: Path) -> None:
+def test_json_progress(backend, tmp_path):
     """With progress=json standard output is one JSON object a line, and standard error is empty."""
     code, output, errors = run(*SMALL, "out=made", "progress=json", cwd=tmp_path)
     assert (code, errors) == (0, "")
@@ -192,9 +175,7 @@ def test_json_progress(backend: object, tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
-def test_stopping_leaves_a_resumable_folder(
-    backend: object, control: Path, tmp_path: Path, number: int, code: int
-) -> None:
+def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path, number, code):
     """Ctrl-C, SIGTERM and even SIGKILL keep every staged episode and leave no process; the same command goes on."""
     (control / "slow").touch()
     process = start(*SMALL, "out=made", cwd=tmp_path)
@@ -218,13 +199,7 @@ def test_stopping_leaves_a_resumable_folder(
     assert len(set(seeds)) == 4 and len(seeds) <= 5  # at most the one in flight twice
 
 
-def test_two_generators_at_once(
-    backend: object,
-    control: Path,
-    tmp_path: Path,
-    make_config: MakeConfig,
-    make_dataset: MakeDataset,
-) -> None:
+def test_two_generators_at_once(backend, control, tmp_path, make_config, make_dataset):
     """The same command twice on one folder, at once: each scene is simulated and each shard published once, both end
     with the whole data set, and it is bitwise the one that a single generator makes."""
     whole = make_dataset(make_config(training_scenes=4, validation_scenes=2, test_scenes=0, frames=5))
@@ -242,11 +217,11 @@ def test_two_generators_at_once(
 
 
 class Terminal(io.StringIO):
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
 
-def test_bar_moves_within_an_episode() -> None:
+def test_bar_moves_within_an_episode():
     """On a terminal the bar counts frames of running scenes, and a failed launch takes its frames back."""
     stream = Terminal()
     bar = BarProgress(stream)
@@ -262,7 +237,7 @@ def test_bar_moves_within_an_episode() -> None:
     assert "hello\n" in stream.getvalue() and "episodes 2/3" in stream.getvalue()
 
 
-def test_lines_are_sparse_without_a_terminal() -> None:
+def test_lines_are_sparse_without_a_terminal():
     """In a log file progress is a few plain lines, whatever the number of frames."""
     stream = io.StringIO()
     bar = BarProgress(stream)
@@ -274,7 +249,7 @@ def test_lines_are_sparse_without_a_terminal() -> None:
     assert stream.getvalue() == "episodes 0/2, frames 0/200\npublished train-000000-000001.tar (1 episode)\n"
 
 
-def test_json_lines_name_their_event() -> None:
+def test_json_lines_name_their_event():
     """Each line is one object with its event and time."""
     stream = io.StringIO()
     JsonProgress(stream).message("hello")

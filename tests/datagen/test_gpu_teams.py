@@ -1,7 +1,5 @@
 """On a GPU: teams of one block and of several give what one launch a substep gives, also where not all fit."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -15,7 +13,7 @@ SHEET = Obstacle(
 )  # fmt: skip
 
 
-def _scene() -> Scene:
+def _scene():
     position = np.random.default_rng(0).uniform((0.3, 0.35, 0.3), (0.5, 0.55, 0.5), (3000, 3)).astype(np.float32)
     kinds = (np.arange(3000) % 3).astype(np.uint8)
     return Scene(position, np.tile(np.float32((0, -2, 0)), (3000, 1)), kinds, (SHEET,), cell_size=1 / 32)
@@ -26,7 +24,7 @@ def _scene() -> Scene:
 @pytest.mark.parametrize(
     ("threads", "blocks", "run"), [(256, 1, 8), (128, 2, 8), (256, 4, 4), (128, 40, 1), (512, 60, 8)]
 )
-def test_teams_agree_with_one_launch_a_substep(threads: int, blocks: int, run: int) -> None:
+def test_teams_agree_with_one_launch_a_substep(threads, blocks, run):
     """Three materials on a sheet: one frame agrees to 1e-6, twelve to 1e-4 of the domain; as many substeps. With 60
     blocks of 512 threads two teams take three scenes.
     """
@@ -39,7 +37,7 @@ def test_teams_agree_with_one_launch_a_substep(threads: int, blocks: int, run: i
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_blocks_that_do_not_fit_end_in_one_launch_a_substep(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_that_do_not_fit_end_in_one_launch_a_substep(monkeypatch):
     """4,000 blocks of 512 threads that wait for each other are more than any GPU runs at once: a warning, no hang, and
     the right result, apart from the order of sums.
     """
@@ -53,7 +51,7 @@ def test_blocks_that_do_not_fit_end_in_one_launch_a_substep(monkeypatch: pytest.
     _require_alike(expected, found)
 
 
-def _require_alike(expected: list[Any], found: list[Any]) -> None:
+def _require_alike(expected, found):
     from datagen.mpm.solver import Simulated
 
     for one, other in zip(found, expected, strict=True):

@@ -1,16 +1,12 @@
 """/healthz at a port of its own."""
 
-from __future__ import annotations
-
 import asyncio
 import http.client
 import json
 import os
 import signal
 import socket
-from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 from processes import wait_until
@@ -22,14 +18,14 @@ from datagen.service.supervisor import PoolState
 
 
 @pytest.fixture
-def page() -> Iterator[tuple[HealthPage, int]]:
+def page():
     listener = socket.create_server(("127.0.0.1", 0))
     port = listener.getsockname()[1]
     with HealthPage(listener) as page:
         yield page, port
 
 
-def ask(port: int) -> tuple[int, dict[str, str]]:
+def ask(port):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     connection.request("GET", "/healthz")
     answer = connection.getresponse()
@@ -38,7 +34,7 @@ def ask(port: int) -> tuple[int, dict[str, str]]:
     return answer.status, content
 
 
-def test_it_waits_for_nobody(page: tuple[HealthPage, int]) -> None:
+def test_it_waits_for_nobody(page):
     """What was told last is answered by another process, and beside connections that ask nothing."""
     assert page[0]._process.pid != os.getpid()
     told, port = page
@@ -51,7 +47,7 @@ def test_it_waits_for_nobody(page: tuple[HealthPage, int]) -> None:
         assert ask(port)[0] == 200
 
 
-def test_a_process_that_is_stopped_holds_nobody_up(page: tuple[HealthPage, int]) -> None:
+def test_a_process_that_is_stopped_holds_nobody_up(page):
     """Telling does not wait; what was told last is answered once the process goes on."""
     told, port = page
     assert ask(port)[0] == 503
@@ -65,9 +61,7 @@ def test_a_process_that_is_stopped_holds_nobody_up(page: tuple[HealthPage, int])
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_process_that_is_gone_is_replaced(
-    page: tuple[HealthPage, int], monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
+def test_a_process_that_is_gone_is_replaced(page, monkeypatch, number):
     """A process that was killed, or takes nothing for long, is replaced: who asks meanwhile is answered then."""
     monkeypatch.setattr(health, "SILENCE_S", 0.0)
     told, port = page
@@ -75,7 +69,7 @@ def test_a_process_that_is_gone_is_replaced(
     first = told._process
     os.kill(first.pid, number)
 
-    def tell() -> bool:
+    def tell():
         told.tell(200, {"status": f"ok {1000 * 'x'}"})
         return told._process is not first
 
@@ -85,7 +79,7 @@ def test_a_process_that_is_gone_is_replaced(
     assert first.returncode == -signal.SIGKILL
 
 
-def test_silence_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silence_is_told(monkeypatch):
     """A service that says nothing for long is not well, whatever it said last."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with ours, theirs:
@@ -98,15 +92,15 @@ def test_silence_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         assert page._page().startswith(b"HTTP/1.1 503") and b"has not moved for 0 s" in page._page()
 
 
-def test_what_is_told(tmp_path: Path, folder: Path) -> None:
+def test_what_is_told(tmp_path, folder):
     """A service whose manifest can be read is well, one without is not."""
 
     class Told(list[int]):
-        def tell(self, status: int, content: object) -> None:
+        def tell(self, status, content):
             self.append(status)
 
-    async def tell(place: Path, told: Told) -> None:
-        await telling(told, make_app(place, None, PoolState))()  # type: ignore[arg-type]
+    async def tell(place, told):
+        await telling(told, make_app(place, None, PoolState))()
         while not told:
             await asyncio.sleep(0.01)
 

@@ -1,19 +1,14 @@
 """SIGKILL of anything, at any moment, costs time and nothing else; `python -m tools.studies.kills` is longer."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset
 from processes import PATIENCE_S
 
-from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError
 from tools.studies.kills import TARGETS, KillsConfig, differences, equal_shards, generate_with_kills
@@ -22,11 +17,11 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
-def command(control: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[DatagenConfig], list[str]]:
+def command(control, tmp_path, monkeypatch):
     """The command line of the ballistic service for a configuration; its data set goes to `killed`."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(Path(__file__).parent)]))
 
-    def make(config: DatagenConfig) -> list[str]:
+    def make(config):
         keys = ("training_scenes", "validation_scenes", "test_scenes", "frames", "workers", "maximum_attempts")
         overrides = [f"dataset.{key}={getattr(config.dataset, key)}" for key in keys]
         folder = f"out={tmp_path / 'killed'}"
@@ -36,13 +31,7 @@ def command(control: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> C
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the processes in /proc")
-def test_nothing_is_lost(
-    make_config: MakeConfig,
-    make_dataset: MakeDataset,
-    command: Callable[[DatagenConfig], list[str]],
-    control: Path,
-    tmp_path: Path,
-) -> None:
+def test_nothing_is_lost(make_config, make_dataset, command, control, tmp_path):
     """A generation whose worker, pool, service and all of these are killed makes the data set of one in peace, bitwise,
     and leaves no temporary file."""
     config = make_config(training_scenes=6, maximum_attempts=100)
@@ -55,7 +44,7 @@ def test_nothing_is_lost(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the processes in /proc")
-def test_faults_are_seen(make_config: MakeConfig, make_dataset: MakeDataset, command: Callable, tmp_path: Path) -> None:
+def test_faults_are_seen(make_config, make_dataset, command, tmp_path):
     """A comparison that could not fail would prove nothing: each kind of harm is named."""
     peaceful = make_dataset(make_config(folder=str(tmp_path / "peaceful")))
     other = make_dataset(make_config(folder=str(tmp_path / "other"), seed=1))
@@ -76,7 +65,7 @@ def test_faults_are_seen(make_config: MakeConfig, make_dataset: MakeDataset, com
         )
 
 
-def test_killed_at_any_instruction(control: Path, tmp_path: Path) -> None:
+def test_killed_at_any_instruction(control, tmp_path):
     """Ended before any line that touches the folder, with half-written, staged or not yet listed files in it, a
     generator has lost nothing: the next one completes the same data set, bitwise, and removes what was half-written."""
     path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])

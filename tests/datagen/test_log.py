@@ -1,7 +1,5 @@
 """The service's log beside a reader that does not read."""
 
-from __future__ import annotations
-
 import os
 import threading
 
@@ -10,7 +8,7 @@ from processes import wait_until
 from datagen.service.log import UnhurriedLog
 
 
-def test_who_writes_waits_for_nobody() -> None:
+def test_who_writes_waits_for_nobody():
     """What a reader takes comes in its order; where it stops reading lines are left out, which it is told later; when
     it has gone nothing more comes, and nobody is held up."""
     source, sink = os.pipe()

@@ -1,7 +1,5 @@
 """Keys, seeds, shard ranges and the order of work."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,18 +17,18 @@ COUNTS = st.integers(0, 60)
 SPLITS = st.sampled_from(["train", "validation", "test"])
 
 
-def boundaries(split: str, count: int, size: int) -> list[int]:
+def boundaries(split, count, size):
     return [shard.stop for shard in shard_ranges(split, count, size)]
 
 
-def test_training_shards_double_up_to_their_size() -> None:
+def test_training_shards_double_up_to_their_size():
     """Training can start after one episode; later shards are of full size, the last is cut to the count."""
     assert boundaries("train", 30, 8) == [1, 2, 4, 8, 16, 24, 30]
     assert boundaries("train", 12, 3) == [1, 2, 4, 7, 10, 12]
     assert boundaries("train", 3, 1) == [1, 2, 3]
 
 
-def test_first_validation_and_test_shards_are_single_episodes() -> None:
+def test_first_validation_and_test_shards_are_single_episodes():
     """Five single episodes, then full shards."""
     for split in ("validation", "test"):
         assert boundaries(split, 20, 8) == [1, 2, 3, 4, 5, 13, 20]
@@ -53,14 +51,14 @@ def test_growth_makes_just_what_is_missing(split: str, before: int, after: int, 
     assert len({shard.name for shard in (*present, *missing)}) == len(present) + len(missing)
 
 
-def test_missing_ranges_split_around_holes() -> None:
+def test_missing_ranges_split_around_holes():
     """Only the episodes that are not there are planned, as one shard a gap."""
     published = {"train": [0, 0, 1, 0, 0, 1], "test": [1] * 8}
     gaps = [(shard.first, shard.stop) for shard in missing_ranges([ShardRange("train", 0, 8)], published)]
     assert gaps == [(0, 2), (3, 5), (6, 8)]
 
 
-def generation_order(requested: dict[str, int]) -> list[tuple[str, int]]:
+def generation_order(requested):
     items = [(split, index) for split, count in requested.items() for index in range(count)]
     return sorted(items, key=lambda item: generation_place(*item))
 
@@ -74,7 +72,7 @@ def test_generation_order_holds_each_episode_once(train: int, validation: int, t
     assert [name for name, _ in order[train + validation :]] == ["test"] * test
 
 
-def test_generation_starts_with_training_then_validation() -> None:
+def test_generation_starts_with_training_then_validation():
     """A trainer can train after one episode and validate after two."""
     order = generation_order({"train": 4, "validation": 2, "test": 1})
     assert order == [
@@ -88,7 +86,7 @@ def test_generation_starts_with_training_then_validation() -> None:
     ]
 
 
-def test_seeds_are_stable_and_distinct() -> None:
+def test_seeds_are_stable_and_distinct():
     """Seeds are 63-bit, the same for ever, and differ in data set, split, index and attempt."""
     assert scene_seed(0, "train", 0, 0) == 9049802857590921173
     seeds = {
@@ -109,12 +107,12 @@ def test_shard_names_parse_back(split: str, first: int, size: int) -> None:
     assert parse_shard_name(shard.name) == shard
 
 
-def test_foreign_names_are_no_shards() -> None:
+def test_foreign_names_are_no_shards():
     """Files of other people in the folder are left alone."""
     for name in ("train-0-1.tar", "train-000001-000001.tar", "extra-000000-000001.tar", "train-000000-000001.tar.gz"):
         assert parse_shard_name(name) is None
 
 
-def test_keys_have_no_dot() -> None:
+def test_keys_have_no_dot():
     """WebDataset cuts sample names at the first dot."""
     assert episode_key("train", 12) == "train-000012"

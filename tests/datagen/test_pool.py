@@ -1,16 +1,12 @@
 """The pool: whatever happens to its workers, the data set comes out whole, and no process is left behind."""
 
-from __future__ import annotations
-
 import multiprocessing
 import shutil
 import tarfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset
 
 from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import LocalWorkerFactory, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
@@ -26,27 +22,27 @@ ONE = WorkerPlan(solvers=1, threads=1, makers=1, scenes_per_launch=1, first_laun
 
 
 class Recorder(Progress):
-    def __init__(self) -> None:
+    def __init__(self):
         self.messages: list[str] = []
         self.shards: list[str] = []
         self.episodes: list[str] = []
         self.launches: list[int] = []
 
-    def frame(self, worker: int, frame: int, scenes: int) -> None:
+    def frame(self, worker, frame, scenes):
         if scenes:
             self.launches.append(scenes)
 
-    def episode(self, key: str) -> None:
+    def episode(self, key):
         self.episodes.append(key)
 
-    def shard(self, name: str, episodes: int, revision: int) -> None:
+    def shard(self, name, episodes, revision):
         self.shards.append(name)
 
-    def message(self, text: str) -> None:
+    def message(self, text):
         self.messages.append(text)
 
 
-def generate(config: DatagenConfig, backend: Backend, plan: WorkerPlan = ONE, **options: Any) -> Recorder:
+def generate(config, backend, plan=ONE, **options):
     recorder = Recorder()
     try:
         with DatasetWriter(config, recorder.message) as writer:
@@ -56,11 +52,11 @@ def generate(config: DatagenConfig, backend: Backend, plan: WorkerPlan = ONE, **
     return recorder
 
 
-def simulated(control: Path) -> list[int]:
+def simulated(control):
     return [int(line) for line in (control / "simulated.log").read_text().split()]
 
 
-def test_whole_dataset(make_config: MakeConfig, make_dataset: MakeDataset, backend: Backend, tmp_path: Path) -> None:
+def test_whole_dataset(make_config, make_dataset, backend, tmp_path):
     """Two solvers in processes of their own make the same shards, bitwise, as one loop in this process; they end in
     order, for only then Taichi writes what it compiled to its cache."""
     config = make_config()
@@ -77,7 +73,7 @@ def test_whole_dataset(make_config: MakeConfig, make_dataset: MakeDataset, backe
     assert {path.suffix for path in Path(config.dataset.folder).iterdir()} == {".tar", ".json", ""}
 
 
-def test_long_episodes(make_config: MakeConfig, backend: Backend) -> None:
+def test_long_episodes(make_config, backend):
     """A third of each split's episodes, evenly spread, have long_frames; a launch of both kinds becomes two."""
     config = make_config(training_scenes=9, validation_scenes=3, test_scenes=0, long_fraction=0.34, long_frames=11)
     generate(config, backend, WorkerPlan(1, None, 2, 4, 4))
@@ -92,7 +88,7 @@ def test_long_episodes(make_config: MakeConfig, backend: Backend) -> None:
         np.testing.assert_allclose(moved_N3, np.tile(0.5 * time_s**2 * down, (len(moved_N3), 1)), atol=1e-6)
 
 
-def test_batches(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_batches(make_config, backend, control):
     """A solver that takes several scenes a launch starts with a small launch and fills the later ones."""
     config = make_config(training_scenes=9, validation_scenes=0, test_scenes=0)
     recorder = generate(config, backend, WorkerPlan(1, None, 2, 4, 2))
@@ -100,7 +96,7 @@ def test_batches(make_config: MakeConfig, backend: Backend, control: Path) -> No
     assert sorted(simulated(control)) == sorted(scene_seed(0, "train", i, 0) for i in range(9))
 
 
-def test_scenes_are_spread_over_solvers(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_scenes_are_spread_over_solvers(make_config, backend, control):
     """Each of three solvers gets a launch of the same size, though those on a GPU ask for more as soon as they have
     one, and some take long to start.
     """
@@ -108,16 +104,16 @@ def test_scenes_are_spread_over_solvers(make_config: MakeConfig, backend: Backen
     batches: dict[int, list[int]] = {}
 
     class WorkerFactory(LocalWorkerFactory):
-        def start_solver(self, number: int) -> Worker:
+        def start_solver(self, number):
             worker = super().start_solver(number)
             give = worker.give
 
-            def recorded(message: Any) -> None:
+            def recorded(message):
                 batches.setdefault(number, []).append(len(message))
                 give(message)
                 worker.idle = True  # asks for more before any other has started
 
-            worker.give = recorded  # type: ignore[method-assign]
+            worker.give = recorded
             return worker
 
     for first, expected in ((9, {0: [4], 1: [4], 2: [3]}), (1, {0: [1, 3], 1: [1, 3], 2: [1, 2]})):
@@ -129,7 +125,7 @@ def test_scenes_are_spread_over_solvers(make_config: MakeConfig, backend: Backen
         assert batches == expected
 
 
-def test_first_launch_waits_for_the_first_scenes(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_first_launch_waits_for_the_first_scenes(make_config, backend, control):
     """A scene that is quick to make does not overtake the first ones: training waits for the first shard."""
     config = make_config(training_scenes=7, validation_scenes=0, test_scenes=0)
     first, second = (scene_seed(0, "train", i, 0) for i in range(2))
@@ -138,7 +134,7 @@ def test_first_launch_waits_for_the_first_scenes(make_config: MakeConfig, backen
     assert simulated(control)[:2] == [first, second]
 
 
-def test_killed_worker_is_replaced(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_killed_worker_is_replaced(make_config, backend, control):
     """A worker that is killed once costs a retry of the same seed, nothing else."""
     config = make_config(training_scenes=3, validation_scenes=0, test_scenes=0)
     seed = scene_seed(0, "train", 1, 0)
@@ -152,7 +148,7 @@ def test_killed_worker_is_replaced(make_config: MakeConfig, backend: Backend, co
     assert simulated(control).count(seed) == 2
 
 
-def test_scene_that_kills_its_worker_is_quarantined(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_scene_that_kills_its_worker_is_quarantined(make_config, backend, control):
     """In a batch only the guilty scene, found by halves, is quarantined after maximum_attempts alone; the next seed
     replaces it."""
     config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0, maximum_attempts=2)
@@ -168,9 +164,7 @@ def test_scene_that_kills_its_worker_is_quarantined(make_config: MakeConfig, bac
 
 
 @pytest.mark.parametrize(("sign", "cause"), [("fail", "diverged in frame 3"), ("refuse", "no room for the obstacles")])
-def test_scene_that_fails_is_quarantined(
-    make_config: MakeConfig, backend: Backend, control: Path, sign: str, cause: str
-) -> None:
+def test_scene_that_fails_is_quarantined(make_config, backend, control, sign, cause):
     """A scene that cannot be made or simulated is replaced at once: trying the same seed again would not help."""
     config = make_config(training_scenes=2, validation_scenes=0, test_scenes=0)
     seed = scene_seed(0, "train", 0, 0)
@@ -184,7 +178,7 @@ def test_scene_that_fails_is_quarantined(
     assert recorder.messages == [f"train-000000 (seed {seed}) could not be simulated: {cause}; trying another seed"]
 
 
-def test_stop_keeps_what_is_staged(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_stop_keeps_what_is_staged(make_config, backend, control):
     """A run that is asked to stop ends, and the next one simulates only what is left."""
     config = make_config()
     recorder = Recorder()
@@ -200,7 +194,7 @@ def test_stop_keeps_what_is_staged(make_config: MakeConfig, backend: Backend, co
     assert len(simulated(control)) <= 9
 
 
-def test_workers_that_die_while_stopping(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_workers_that_die_while_stopping(make_config, backend, control):
     """A signal to the whole process group ends workers as well: then none is replaced, and nothing is said of it."""
     config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
     (control / f"kill-{scene_seed(0, 'train', 0, 0)}").write_text("1")
@@ -211,20 +205,20 @@ def test_workers_that_die_while_stopping(make_config: MakeConfig, backend: Backe
     assert recorder.messages == [] and len(simulated(control)) == 1
 
 
-def test_fault_in_the_solver_ends_the_run(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_fault_in_the_solver_ends_the_run(make_config, backend, control):
     """An exception that no scene is to blame for is not retried: it ends the run with the worker's traceback."""
     (control / "raise").touch()
     with pytest.raises(RuntimeError, match=r"(?s)a worker failed:\nTraceback .*a fault in the solver"):
         generate(make_config(), backend)
 
 
-def test_missing_solver_ends_the_run(make_config: MakeConfig, backend: Backend) -> None:
+def test_missing_solver_ends_the_run(make_config, backend):
     """A solver that cannot be imported ends the run."""
     with pytest.raises(RuntimeError, match="ModuleNotFoundError"):
         generate(make_config(), Backend(backend.generate_scene, backend.build_obstacle_grid, "no_such_module:simulate"))
 
 
-def test_full_disk_in_a_worker_reaches_the_parent(make_config: MakeConfig, backend: Backend, tmp_path: Path) -> None:
+def test_full_disk_in_a_worker_reaches_the_parent(make_config, backend, tmp_path):
     """An OSError while staging ends the run as that OSError."""
     config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
     with DatasetWriter(config) as writer:
@@ -237,7 +231,7 @@ def test_full_disk_in_a_worker_reaches_the_parent(make_config: MakeConfig, backe
         staging.mkdir()
 
 
-def test_every_scene_fails(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_every_scene_fails(make_config, backend, control):
     """When no seed works the run ends with the cause and what to change."""
     for attempt in range(20):
         (control / f"refuse-{scene_seed(0, 'train', 0, attempt)}").touch()
@@ -245,7 +239,7 @@ def test_every_scene_fails(make_config: MakeConfig, backend: Backend, control: P
         generate(make_config(training_scenes=1, validation_scenes=0, test_scenes=0), backend)
 
 
-def test_worker_plans() -> None:
+def test_worker_plans():
     """One solver for two cores; one for each GPU, with full launches and makers in front; settings win."""
     default = DatagenConfig()
     assert plan_workers(default, (), 8, 2**36) == WorkerPlan(4, 2, 1, 1, 1)
@@ -266,14 +260,14 @@ def test_worker_plans() -> None:
     assert plan_workers(alone, ("4", "5"), 8, 2**40).solvers == 1
 
 
-def test_hidden_gpus_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hidden_gpus_are_not_used(monkeypatch):
     """CUDA_VISIBLE_DEVICES takes GPUs away, as everywhere else."""
     for value in ("", "-1"):
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", value)
         assert visible_gpus() == ()
 
 
-def test_positions_start_at_the_scene(make_config: MakeConfig, backend: Backend) -> None:
+def test_positions_start_at_the_scene(make_config, backend):
     """Episodes hold what the solver returned, with seed, counters and physics beside."""
     config = make_config(training_scenes=1, validation_scenes=0, test_scenes=0)
     generate(config, backend)
@@ -283,7 +277,7 @@ def test_positions_start_at_the_scene(make_config: MakeConfig, backend: Backend)
     assert np.isfinite(episode.position_TN3).all() and episode.frame_count == 6
 
 
-def test_grids_follow(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_grids_follow(make_config, backend, control):
     """A scene whose grid cannot be built is replaced, also when it was simulated meanwhile; a maker that dies of one
     grid is replaced and builds it.
     """
@@ -298,7 +292,7 @@ def test_grids_follow(make_config: MakeConfig, backend: Backend, control: Path) 
     assert len(recorder.messages) == 2
 
 
-def test_tars_are_those_of_tarfile(make_config: MakeConfig, backend: Backend, tmp_path: Path) -> None:
+def test_tars_are_those_of_tarfile(make_config, backend, tmp_path):
     """Shards are bitwise what Python's own module makes of their members."""
     config = make_config(training_scenes=4, validation_scenes=0, test_scenes=0)
     generate(config, backend)
@@ -315,18 +309,18 @@ def test_tars_are_those_of_tarfile(make_config: MakeConfig, backend: Backend, tm
 class StoppedWorker(LocalWorker):
     """One that says nothing."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         Worker.__init__(self)
         self.killed, self.idle = False, True
 
-    def tell(self, message: object) -> None:
+    def tell(self, message):
         pass
 
-    def kill(self) -> None:
+    def kill(self):
         self.killed = True
 
 
-def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stopped_solver_is_replaced(make_config, monkeypatch):
     """A solver that has work and says nothing for too long (SIGSTOP, a device that hangs) is ended; one without work
     is left alone, and so are all when the pool was stopped, too. Its scene is tried again by another."""
     now, passes = [1000.0], iter([250, 250, 10_000, 250, 250, 250, 250])
@@ -334,14 +328,14 @@ def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest
     solvers: list[StoppedWorker] = []
 
     class Workers:
-        def start_maker(self) -> Worker:
+        def start_maker(self):
             return StoppedWorker()
 
-        def start_solver(self, number: int) -> Worker:
+        def start_solver(self, number):
             solvers.append(StoppedWorker())
             return solvers[-1]
 
-        def receive(self, workers: Any, timeout: float) -> Any:
+        def receive(self, workers, timeout):
             if len(solvers) > 1:
                 raise TimeoutError("the test ends")
             now[0] += next(passes)
@@ -350,6 +344,6 @@ def test_stopped_solver_is_replaced(make_config: MakeConfig, monkeypatch: pytest
 
     config, recorder = make_config(training_scenes=1, validation_scenes=0, test_scenes=0), Recorder()
     with DatasetWriter(config) as writer, pytest.raises(TimeoutError):
-        Pool(config, writer, recorder, ONE, Workers()).run()  # type: ignore[arg-type]
+        Pool(config, writer, recorder, ONE, Workers()).run()
     assert recorder.messages[0].startswith("a worker died (it said nothing for 600 s); it is replaced")
     assert solvers[0].killed and solvers[0].heard_at > 1000 and list(passes) == [250]

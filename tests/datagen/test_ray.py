@@ -1,7 +1,5 @@
 """Generation on a Ray cluster. Skipped where the optional extra `ray` is not installed."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -9,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from ballistic_dataset import MakeConfig
 from processes import PATIENCE_S
 
 from datagen.pool.pool import WorkerPlan
@@ -21,10 +18,7 @@ from hgn.schema import ConfigError
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_lost_node(
-    control: Path,
-    tmp_path: Path,
-) -> None:
+def test_lost_node(control, tmp_path):
     """Two nodes generate; one is killed midway; the set completes, bitwise the one that a single process makes, and no
     scene is blamed."""
     pytest.importorskip("ray")
@@ -45,14 +39,14 @@ def test_lost_node(
     assert report["differences"] == [] and report["shards_bitwise_equal"] == report["shards"] == 7
 
 
-def test_no_cluster(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_cluster(make_config, monkeypatch):
     """Without Ray, or without a cluster, the message says what to do."""
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"needs Ray, which is not installed; pip install 'hgn\[ray\]'"):
         RayWorkerFactory(make_config(pool="ray"), Backend())
 
 
-def test_cluster_plans() -> None:
+def test_cluster_plans():
     """A solver for two cores of a node, or for a GPU; settings win."""
     default = DatagenConfig()
     assert plan_cluster(default, [{"CPU": 4.0}, {"CPU": 3.0}, {}]) == WorkerPlan(3, 2, 3, 1, 1)

@@ -1,7 +1,5 @@
 """Files that the kernel sends: whole, in ranges, one after the other on a connection, or not at all."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import http.client
@@ -12,18 +10,15 @@ import sys
 import threading
 from asyncio.selector_events import _SelectorSocketTransport
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, closing
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import uvicorn
 from processes import wait_until
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
@@ -34,7 +29,7 @@ SIZE = 5_000_001
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def file(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(hashlib.shake_128(b"file").digest(SIZE))
     return path
@@ -44,14 +39,14 @@ Port = Callable[..., tuple[int, uvicorn.Server]]
 
 
 @pytest.fixture
-def serve(file: Path) -> Iterator[Port]:
-    async def answer(request: Request) -> Response:
+def serve(file):
+    async def answer(request):
         assert EXTENSION in request.scope["extensions"]
         return FileRange(file, SIZE, {"etag": '"tag"'}, "application/octet-stream")
 
     begun: list[tuple[uvicorn.Server, threading.Thread]] = []
 
-    def serve(**limits: Any) -> tuple[int, uvicorn.Server]:
+    def serve(**limits):
         listener = socket.create_server(("127.0.0.1", 0))
         routes = [Route("/file", answer), Route("/page", lambda request: Response(bytes(2**24)))]
         app = Starlette(routes=routes, middleware=[Middleware(Guard, token=None, counters=Counter())])
@@ -67,7 +62,7 @@ def serve(file: Path) -> Iterator[Port]:
 
 
 @pytest.fixture
-def port(serve: Port) -> int:
+def port(serve):
     return serve(connections=8)[0]
 
 
@@ -78,14 +73,14 @@ class LoopOfUvloop(asyncio.SelectorEventLoop):
 
 
 @pytest.fixture
-def uvloop(monkeypatch: pytest.MonkeyPatch) -> None:
+def uvloop(monkeypatch):
     """Installed, as with Uvicorn's own extras: Uvicorn takes it where nobody asks for a loop."""
     monkeypatch.setitem(sys.modules, "uvloop", SimpleNamespace(new_event_loop=LoopOfUvloop))
     monkeypatch.delitem(sys.modules, "uvicorn.loops.uvloop", raising=False)
 
 
 @pytest.mark.usefixtures("uvloop")
-def test_uvloop_is_left_alone(port: int, file: Path) -> None:
+def test_uvloop_is_left_alone(port, file):
     """Where it is installed files come all the same."""
     connection = http.client.HTTPConnection("127.0.0.1", port)
     connection.request("GET", "/file")
@@ -94,7 +89,7 @@ def test_uvloop_is_left_alone(port: int, file: Path) -> None:
     connection.close()
 
 
-def test_ranges_on_one_connection(port: int, file: Path) -> None:
+def test_ranges_on_one_connection(port, file):
     """Many answers come over one connection, each with just the bytes that were asked for."""
     content, connection = file.read_bytes(), http.client.HTTPConnection("127.0.0.1", port)
     for asked, status, start, stop in (
@@ -122,7 +117,7 @@ def test_ranges_on_one_connection(port: int, file: Path) -> None:
     connection.close()
 
 
-def test_reader_that_leaves(port: int, file: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_reader_that_leaves(port, file, caplog):
     """A reader that goes away amidst an answer costs nothing but that answer, and no line in the log."""
     caplog.set_level(logging.WARNING)
     for _ in range(3):
@@ -136,7 +131,7 @@ def test_reader_that_leaves(port: int, file: Path, caplog: pytest.LogCaptureFixt
     assert not caplog.records
 
 
-def test_file_that_became_shorter(port: int, file: Path) -> None:
+def test_file_that_became_shorter(port, file):
     """A file that was cut after it was checked ends the connection: what came is not taken for the whole."""
     file.write_bytes(file.read_bytes()[: SIZE // 2])
     connection = http.client.HTTPConnection("127.0.0.1", port)
@@ -150,7 +145,7 @@ HALF = b"GET /file HTTP/1.1\r\n"
 EIGHT = {"connections": 1000, "open_files": 256 + 64 + 16}  # by the limit of open files
 
 
-def waiting(port: int, sent: bytes) -> socket.socket:
+def waiting(port, sent):
     connection = socket.create_connection(("127.0.0.1", port))
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     connection.sendall(sent)
@@ -158,7 +153,7 @@ def waiting(port: int, sent: bytes) -> socket.socket:
 
 
 @pytest.mark.parametrize("sent", [b"", HALF])
-def test_who_only_waits_keeps_nobody_out(serve: Port, sent: bytes, file: Path) -> None:
+def test_who_only_waits_keeps_nobody_out(serve, sent, file):
     """More connections than the limit that send nothing, or half a request, make room for one that asks."""
     port, server = serve(**EIGHT)
     with ExitStack() as stack:
@@ -171,7 +166,7 @@ def test_who_only_waits_keeps_nobody_out(serve: Port, sent: bytes, file: Path) -
 
 
 @pytest.mark.parametrize("taken", [0, 1])
-def test_waiting_comes_to_an_end(serve: Port, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
+def test_waiting_comes_to_an_end(serve, monkeypatch, taken):
     """Connections that send nothing, half a request, or never read their answer, or a byte of it now and then, are
     cut."""
     real, left = _SelectorSocketTransport.get_write_buffer_size, itertools.count(2**23, -taken)
@@ -187,7 +182,7 @@ def test_waiting_comes_to_an_end(serve: Port, monkeypatch: pytest.MonkeyPatch, t
         wait_until(lambda: not server.server_state.connections)
 
 
-def test_bodies_are_refused(port: int) -> None:
+def test_bodies_are_refused(port):
     """A request with a body, perhaps without an end, is answered and its connection closed."""
     with socket.create_connection(("127.0.0.1", port)) as endless:
         endless.sendall(b"GET /file HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n")

@@ -1,7 +1,5 @@
 """The service: what it serves, to whom, and what becomes of it when something is at fault."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import multiprocessing
@@ -15,7 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,14 +21,12 @@ from typing import Any
 from urllib.parse import unquote
 
 import pytest
-from ballistic_dataset import MakeConfig
 from processes import processes_of_session, wait_until
 
 import datagen.service.server
 import datagen.service.supervisor
 import hgn.data.storage
 from datagen.pool.progress import Progress
-from datagen.pool.worker import Backend
 from datagen.service.__main__ import main
 from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState, Supervisor
@@ -46,21 +42,21 @@ SHARD = "/train-000002-000004.tar"
 
 
 @pytest.fixture(autouse=True)
-def no_long_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_long_pauses(monkeypatch):
     monkeypatch.setattr(datagen.service.supervisor, "_FIRST_PAUSE_S", 0.1)
 
 
 Answer = tuple[int, dict[str, str], bytes]
 
 
-async def request(app: Any, path: str, method: str = "GET", **headers: str) -> Answer:
+async def request(app, path, method="GET", **headers):
     """Sends a request to a service, without a network: status, headers, body."""
     sent: list[dict[str, Any]] = []
 
-    async def receive() -> dict[str, Any]:
+    async def receive():
         return {"type": "http.request", "body": b"", "more_body": False}
 
-    async def send(message: Any) -> None:
+    async def send(message):
         sent.append(message)
 
     path, _, query = path.partition("?")
@@ -80,17 +76,17 @@ async def request(app: Any, path: str, method: str = "GET", **headers: str) -> A
 
 
 @pytest.fixture
-def ask(folder: Path) -> Ask:
+def ask(folder):
     """Sends a request to a service of `folder` that has just begun."""
 
-    def ask(path: str, method: str = "GET", token: str | None = None, **headers: str) -> Answer:
+    def ask(path, method="GET", token=None, **headers):
         app = make_app(folder, token, lambda: PoolState("running", 2, 3, 8, 6, {0: (4, 2)}))
         return asyncio.run(request(app, path, method, **headers))
 
     return ask
 
 
-def test_manifest_and_its_etag(ask: Ask, folder: Path) -> None:
+def test_manifest_and_its_etag(ask, folder):
     """The manifest is served as it is; whoever has it already is told so in a few bytes."""
     status, headers, body = ask("/manifest.json")
     assert status == 200 and body == (folder / "manifest.json").read_bytes()
@@ -99,7 +95,7 @@ def test_manifest_and_its_etag(ask: Ask, folder: Path) -> None:
     assert ask("/manifest.json", method="HEAD")[1] == headers
 
 
-def test_index_and_what_is_new(ask: Ask, folder: Path) -> None:
+def test_index_and_what_is_new(ask, folder):
     """The index's files come as far as the manifest says, whole or in part; and its shards from any number on."""
     path = folder / "index" / "1-000000.jsonl"
     content = path.read_bytes()
@@ -114,20 +110,20 @@ def test_index_and_what_is_new(ask: Ask, folder: Path) -> None:
     assert ask("/index?since=-1")[::2] == (400, b"since must be a number of shards, got '-1'\n")
 
 
-def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_ask_at_once(folder, monkeypatch):
     """After a publication the manifest is read once, each line of the index once, and what is new is written once; a
     shard that many want is hashed once; and who asks whether the service lives waits for none of these."""
     work: Counter[str] = Counter()
     hash_may_end = threading.Event()
 
-    def counted(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+    def counted(name, real):
         return lambda *arguments: (work.update([name]), real(*arguments))[1]
 
-    def slow(path: Path) -> str:
+    def slow(path):
         assert hash_may_end.wait(60)
         return file_sha256(path)
 
-    def slowly(*arguments: Any, real: Callable[..., Any] = Manifest.parse) -> Manifest:
+    def slowly(*arguments, real=Manifest.parse):
         time.sleep(0.1)  # for others to begin, were they let
         return real(*arguments)
 
@@ -136,7 +132,7 @@ def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(hgn.data.storage, "file_sha256", counted("hash", slow))
     monkeypatch.setattr(datagen.service.server, "to_mapping", counted("told", to_mapping))
 
-    async def crowd() -> list[Answer]:
+    async def crowd():
         app = make_app(folder, None, PoolState)
         await asyncio.gather(*(request(app, path) for path in 16 * ["/manifest.json", "/progress", "/index?since=4"]))
         readers = [asyncio.create_task(request(app, SHARD)) for _ in range(60)]
@@ -151,7 +147,7 @@ def test_many_ask_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert work == {"parse": 1, "line": 7, "told": 3, "hash": 1}
 
 
-def test_shards_with_ranges(ask: Ask, folder: Path) -> None:
+def test_shards_with_ranges(ask, folder):
     """A shard comes whole or in part; its ETag is its sha256; a range beyond the end is refused."""
     content = (folder / SHARD[1:]).read_bytes()
     status, headers, body = ask(SHARD)
@@ -184,7 +180,7 @@ def test_shards_with_ranges(ask: Ask, folder: Path) -> None:
         "/",
     ],
 )
-def test_nothing_else_is_served(ask: Ask, folder: Path, path: str) -> None:
+def test_nothing_else_is_served(ask, folder, path):
     """Whatever is not in the manifest does not exist: locks, staged and half-written files, paths that lead out."""
     (folder.parent / "outside.txt").write_text("secret")
     (folder / "train-000090-000091.tar").write_bytes(b"not listed")
@@ -192,13 +188,13 @@ def test_nothing_else_is_served(ask: Ask, folder: Path, path: str) -> None:
     assert ask(path)[0] == 404
 
 
-def test_read_only(ask: Ask) -> None:
+def test_read_only(ask):
     """No method but GET and HEAD does anything."""
     for method in ("POST", "PUT", "DELETE", "PATCH"):
         assert ask(SHARD, method=method)[0] == 405
 
 
-def test_token(ask: Ask) -> None:
+def test_token(ask):
     """With a token every path but /healthz asks for it; a wrong one, or a part of it, is refused."""
     for headers in (
         {},
@@ -213,7 +209,7 @@ def test_token(ask: Ask) -> None:
     assert ask("/healthz", token=TOKEN)[0] == 200
 
 
-def test_damage_is_not_served(ask: Ask, folder: Path) -> None:
+def test_damage_is_not_served(ask, folder):
     """A shard that was altered, cut or taken away, and a manifest of another version, are answered with an error."""
     shard = folder / SHARD[1:]
     content = bytearray(shard.read_bytes())
@@ -233,7 +229,7 @@ def test_damage_is_not_served(ask: Ask, folder: Path) -> None:
     assert ask("/manifest.json")[::2] == (503, b"the data set has no manifest yet; ask again in a moment\n")
 
 
-def test_progress_and_metrics(ask: Ask) -> None:
+def test_progress_and_metrics(ask):
     """Both tell what is published and what the pool is at; the metrics parse as Prometheus text."""
     progress = json.loads(ask("/progress")[2])
     assert progress["episodes"]["train"] == {"requested": 5, "published": 5} and progress["complete"]
@@ -253,24 +249,24 @@ def test_progress_and_metrics(ask: Ask) -> None:
 
 
 class Recorder(Progress):
-    def __init__(self) -> None:
+    def __init__(self):
         self.messages: list[str] = []
         self.episodes: list[str] = []
 
-    def episode(self, key: str) -> None:
+    def episode(self, key):
         self.episodes.append(key)
 
-    def message(self, text: str) -> None:
+    def message(self, text):
         self.messages.append(text)
 
 
-def children(process: int) -> list[int]:
+def children(process):
     tasks = Path(f"/proc/{process}/task").glob("*/children")
     return [int(child) for path in tasks for child in path.read_text().split()]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the pool in /proc")
-def test_pool_that_dies_is_started_again(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_pool_that_dies_is_started_again(make_config, backend, control):
     """The service outlives its pool: a killed one is started again and completes the data set."""
     (control / "slow").touch()
     recorder = Recorder()
@@ -289,7 +285,7 @@ def test_pool_that_dies_is_started_again(make_config: MakeConfig, backend: Backe
     assert Manifest.load(config.dataset.folder).complete
 
 
-def test_pool_that_says_nothing_is_started_again(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pool_that_says_nothing_is_started_again(make_config, monkeypatch):
     """A pool that was stopped, or hangs (in a folder that does not answer, say), is ended and started again."""
     monkeypatch.setattr(datagen.service.supervisor, "_LOOK_S", 0.01)
     started: list[Any] = []
@@ -297,20 +293,20 @@ def test_pool_that_says_nothing_is_started_again(make_config: MakeConfig, monkey
     class Process:
         exitcode = None
 
-        def __init__(self, args: tuple[Any, ...], **options: Any) -> None:
+        def __init__(self, args, **options):
             self.connection = Connection(os.dup(args[0].fileno()))
             started.append(self)
 
-        def start(self) -> None:
+        def start(self):
             if len(started) > 1:
                 self.connection.send(("complete",))
                 self.connection.close()
 
-        def kill(self) -> None:
+        def kill(self):
             self.exitcode = -signal.SIGKILL
             self.connection.close()
 
-        def join(self) -> None:
+        def join(self):
             pass
 
     context = SimpleNamespace(Pipe=multiprocessing.Pipe, Process=Process)
@@ -321,7 +317,7 @@ def test_pool_that_says_nothing_is_started_again(make_config: MakeConfig, monkey
     assert len(started) == 2 and "the pool ended (it said nothing for 0 s); it is started" in recorder.messages[0]
 
 
-def test_full_disk_is_waited_for(make_config: MakeConfig, backend: Backend, tmp_path: Path) -> None:
+def test_full_disk_is_waited_for(make_config, backend, tmp_path):
     """A pool that the machine is in the way of ends, and begins again by itself when it is not."""
     blocked = tmp_path / "blocked"
     blocked.write_text("in the way")
@@ -335,7 +331,7 @@ def test_full_disk_is_waited_for(make_config: MakeConfig, backend: Backend, tmp_
     assert Manifest.load(blocked / "data").complete and supervisor.state.error == ""
 
 
-def test_stopping_ends_the_pool_in_order(make_config: MakeConfig, backend: Backend, control: Path) -> None:
+def test_stopping_ends_the_pool_in_order(make_config, backend, control):
     """Leaving the supervisor ends the pool as Ctrl-C would: what is staged is kept and nothing is half-written."""
     (control / "slow").touch()
     recorder = Recorder()
@@ -347,12 +343,12 @@ def test_stopping_ends_the_pool_in_order(make_config: MakeConfig, backend: Backe
 
 
 @pytest.mark.parametrize("error", [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space left"), KeyError("fault")])
-def test_log_that_nobody_reads(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+def test_log_that_nobody_reads(make_config, monkeypatch, error):
     """Whoever reads the log may leave, and its disk may be full: generation goes on. A fault of ours ends the service,
     and what is said of the generator is true."""
 
     class Log(Progress):
-        def message(self, text: str) -> None:
+        def message(self, text):
             raise error
 
     outcomes = iter([("died", "SIGKILL"), ("complete", "")])
@@ -368,7 +364,7 @@ def test_log_that_nobody_reads(make_config: MakeConfig, monkeypatch: pytest.Monk
         assert supervisor.state.status == "failed" and ended == ["the pool's supervisor failed: KeyError('fault')"]
 
 
-def run_service(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
+def run_service(arguments, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["service", *arguments])
     with pytest.raises(SystemExit) as exit_:
         run_command(main, "service")
@@ -376,14 +372,12 @@ def run_service(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
 
 
 @pytest.fixture
-def taken_port() -> Iterator[int]:
+def taken_port():
     with socket.create_server(("127.0.0.1", 0)) as listener:
         yield listener.getsockname()[1]
 
 
-def test_bad_input_is_one_line(
-    taken_port: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_bad_input_is_one_line(taken_port, monkeypatch, capsys, tmp_path):
     """A port in use, an open door and a folder that is none end the service before it makes anything."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
@@ -407,9 +401,7 @@ def test_bad_input_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_another_data_set_is_not_served(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
-) -> None:
+def test_another_data_set_is_not_served(folder, monkeypatch, capsys, tmp_path):
     """A folder with another data set, or one of another version, ends the service with exit code 2."""
     assert run_service([f"out={folder}", "port=0", "dataset.seed=7"], monkeypatch) == 2
     assert "holds another data set: frames is 6 there" in capsys.readouterr().err
@@ -419,9 +411,7 @@ def test_another_data_set_is_not_served(
     assert "schema_version must be 1, got 99" in capsys.readouterr().err
 
 
-def test_generator_that_cannot_begin_ends_the_service(
-    monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
-) -> None:
+def test_generator_that_cannot_begin_ends_the_service(monkeypatch, capsys, tmp_path):
     """What only the pool finds out, a file that is no shard say, ends the service too."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "made").mkdir()
@@ -431,7 +421,7 @@ def test_generator_that_cannot_begin_ends_the_service(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
-def test_stopping_leaves_a_resumable_folder(backend: Backend, control: Path, tmp_path: Path) -> None:
+def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
     """SIGTERM ends the service with 143, and its pool in order: no process stays behind, nothing is half-written. All
     that beside a log that takes nothing, for nobody reads it.
 

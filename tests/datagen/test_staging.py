@@ -1,17 +1,13 @@
 """Locks, staged episodes and quarantine: whatever interrupts a writer, the next goes on to the same shards."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset, Stage
 from written_files import claim_all, hashes, snapshot
 
 import datagen.pool.shard
@@ -31,21 +27,15 @@ class InterruptionError(Exception):
 
 @pytest.mark.parametrize("call", [1, 2, 3, 4, 5, 8, 13, 18, 23])
 def test_resume_after_a_crash_makes_the_same_shards(
-    make_config: MakeConfig,
-    make_dataset: MakeDataset,
-    stage: Stage,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    control: Path,
-    call: int,
-) -> None:
+    make_config, make_dataset, stage, monkeypatch, tmp_path, control, call
+):
     """Wherever a run stops, running again gives bitwise the same shards and simulates no staged episode twice."""
     whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
     (control / "simulated.log").unlink()
     config = make_config(folder=str(tmp_path / "cut"))
     calls = 0
 
-    def crash(path: Path) -> None:
+    def crash(path):
         nonlocal calls
         calls += 1
         if calls == call:
@@ -53,7 +43,7 @@ def test_resume_after_a_crash_makes_the_same_shards(
 
     stage_parts = datagen.pool.shard.stage_parts
 
-    def stage_and_crash(folder: Path, key: str, parts: Iterable[bytes]) -> None:
+    def stage_and_crash(folder, key, parts):
         stage_parts(folder, key, parts)
         crash(folder)
 
@@ -73,9 +63,7 @@ def test_resume_after_a_crash_makes_the_same_shards(
     assert len(seeds) == len(set(seeds)) == 8
 
 
-def test_growth_keeps_what_is_there(
-    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, control: Path
-) -> None:
+def test_growth_keeps_what_is_there(make_config, make_dataset, tmp_path, control):
     """Asking for more scenes later adds just those; shards that were published keep their bytes and places."""
     small, large = (make_config(training_scenes=count, folder=str(tmp_path / "grown")) for count in (3, 9))
     folder = make_dataset(small)
@@ -101,7 +89,7 @@ def test_growth_keeps_what_is_there(
 
 
 @pytest.mark.parametrize("count", [5, 3])
-def test_complete_folder_stays_untouched(make_config: MakeConfig, folder: Path, count: int) -> None:
+def test_complete_folder_stays_untouched(make_config, folder, count):
     """Asking again for what is there, or for less of it, changes no file."""
     before = snapshot(folder)
     with DatasetWriter(make_config(training_scenes=count)) as writer:
@@ -109,7 +97,7 @@ def test_complete_folder_stays_untouched(make_config: MakeConfig, folder: Path, 
     assert snapshot(folder) == before
 
 
-def test_asking_for_less_ends_an_unfinished_dataset(make_config: MakeConfig, stage: Stage) -> None:
+def test_asking_for_less_ends_an_unfinished_dataset(make_config, stage):
     """A folder begun for five episodes and asked for one is complete when that one is there."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 0)
@@ -126,9 +114,7 @@ OTHER_CONFIGS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "message"), OTHER_CONFIGS)
-def test_other_settings_are_refused(
-    make_config: MakeConfig, make_dataset: MakeDataset, changes: dict[str, Any], message: str
-) -> None:
+def test_other_settings_are_refused(make_config, make_dataset, changes, message):
     """A folder takes no episodes of another distribution, and the message names the keys and the remedy."""
     config = make_config()
     folder = make_dataset(config)
@@ -142,16 +128,14 @@ def test_other_settings_are_refused(
 
 
 @pytest.mark.parametrize("changes", [{"seed": 1}, {"frames": 7}, {"frame_rate_hz": 30.0}])
-def test_other_dataset_settings_are_refused(
-    make_config: MakeConfig, make_dataset: MakeDataset, changes: dict[str, Any]
-) -> None:
+def test_other_dataset_settings_are_refused(make_config, make_dataset, changes):
     """Seed, length and frame rate belong to the data set's identity."""
     make_dataset(make_config())
     with pytest.raises(ConfigError, match=next(iter(changes))), DatasetWriter(make_config(**changes)):
         pass
 
 
-def test_where_and_how_fast_is_no_identity(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_where_and_how_fast_is_no_identity(make_config, make_dataset):
     """Device, launch size, workers, attempts and shard size may change between runs of one data set."""
     config = make_config()
     make_dataset(config)
@@ -161,7 +145,7 @@ def test_where_and_how_fast_is_no_identity(make_config: MakeConfig, make_dataset
         assert writer.complete
 
 
-def test_data_of_another_schema_is_refused(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_data_of_another_schema_is_refused(make_config, make_dataset):
     """A manifest of another version is refused with the remedy, and stays as it is."""
     folder = make_dataset(make_config())
     mapping = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}
@@ -170,9 +154,7 @@ def test_data_of_another_schema_is_refused(make_config: MakeConfig, make_dataset
         make_dataset(make_config())
 
 
-def test_generators_share_a_folder(
-    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, tmp_path: Path, control: Path
-) -> None:
+def test_generators_share_a_folder(make_config, make_dataset, stage, tmp_path, control):
     """Each of two generators makes the shards that it claims; what one leaves behind the other makes; each sees what
     the other published."""
     whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
@@ -200,7 +182,7 @@ def test_generators_share_a_folder(
     assert len(seeds) == len(set(seeds)) == 8
 
 
-def test_first_writer_wins(make_config: MakeConfig, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_writer_wins(make_config, stage, monkeypatch):
     """Where locks do not hold, two generators make a shard; the second copy is dropped, and it is listed once."""
     monkeypatch.setattr("datagen.pool.locks.ShardLocks.take", lambda self, shard: True)
     messages: list[str] = []
@@ -216,9 +198,7 @@ def test_first_writer_wins(make_config: MakeConfig, stage: Stage, monkeypatch: p
     assert len(Manifest.load(writer.folder).shards) == 1
 
 
-def test_array_tasks_make_one_dataset(
-    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, control: Path
-) -> None:
+def test_array_tasks_make_one_dataset(make_config, make_dataset, tmp_path, control):
     """Three tasks of an array make all shards once between them, each knowing nothing of the others."""
     whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
     (control / "simulated.log").unlink()
@@ -231,14 +211,12 @@ def test_array_tasks_make_one_dataset(
 
 
 @pytest.mark.parametrize("seconds", [0, 2**33])
-def test_no_clock_is_asked(
-    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, tmp_path: Path, seconds: int
-) -> None:
+def test_no_clock_is_asked(make_config, make_dataset, stage, tmp_path, seconds):
     """Machines whose clocks stand in 1970 or far in the future, beside others', make the same data set: no time of a
     file says whether it is whole, left behind or new."""
     whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
 
-    def turn_back(folder: Path) -> None:
+    def turn_back(folder):
         for path in (*folder.rglob("*"), folder):
             os.utime(path, (seconds, seconds))
 
@@ -262,9 +240,7 @@ def test_no_clock_is_asked(
 
 
 @pytest.mark.parametrize("damage", ["cut", "zeroed", "a bit", "no seal"])
-def test_broken_staged_file_is_made_again(
-    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, damage: str, tmp_path: Path
-) -> None:
+def test_broken_staged_file_is_made_again(make_config, make_dataset, stage, damage, tmp_path):
     """A staged file that is not what was written (positions that are zeros read like any others) is dropped and its
     episode made again; so the shards are those of a run in peace."""
     with DatasetWriter(make_config()) as writer:
@@ -283,7 +259,7 @@ def test_broken_staged_file_is_made_again(
     assert hashes(make_dataset(make_config())) == hashes(make_dataset(make_config(folder=str(tmp_path / "peace"))))
 
 
-def test_staged_file_that_changes_later_is_not_published(make_config: MakeConfig, stage: Stage) -> None:
+def test_staged_file_that_changes_later_is_not_published(make_config, stage):
     """What was checked when it was claimed is checked again as it is packed."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 0)
@@ -296,16 +272,16 @@ def test_staged_file_that_changes_later_is_not_published(make_config: MakeConfig
     assert not list(writer.folder.glob("*.tar"))
 
 
-def test_what_is_staged_is_on_the_disk(make_config: MakeConfig, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_staged_is_on_the_disk(make_config, stage, monkeypatch):
     """No file of the folder gets its name before its bytes are on the disk."""
     synced: set[int] = set()
     real_sync, real_replace = os.fsync, Path.replace
 
-    def sync(descriptor: int) -> None:
+    def sync(descriptor):
         synced.add(os.fstat(descriptor).st_ino)
         real_sync(descriptor)
 
-    def replace(path: Path, target: Path) -> Path:
+    def replace(path, target):
         assert path.stat().st_ino in synced, target
         return real_replace(path, target)
 
@@ -316,14 +292,14 @@ def test_what_is_staged_is_on_the_disk(make_config: MakeConfig, stage: Stage, mo
         assert writer.publish_next()
 
 
-def test_locks_that_exclude_nobody(make_config: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_locks_that_exclude_nobody(make_config, monkeypatch):
     """A file system that grants every lock to everybody is refused: generators would sweep each other's files."""
     monkeypatch.setattr("datagen.pool.locks.fcntl.fcntl", lambda *arguments: 0)
     with pytest.raises(ConfigError, match=r"must lie on a file system whose locks exclude others.*-o flock"):
         DatasetWriter(make_config()).__enter__()
 
 
-def test_quarantined_seed_is_replaced(make_config: MakeConfig, stage: Stage) -> None:
+def test_quarantined_seed_is_replaced(make_config, stage):
     """The next attempt's seed takes the place, the manifest keeps seed and cause, and a later run goes on there."""
     config = make_config()
     with DatasetWriter(config) as writer:
@@ -344,7 +320,7 @@ def test_quarantined_seed_is_replaced(make_config: MakeConfig, stage: Stage) -> 
     assert (entry.attempt, entry.seed) == (1, replacement.seed)
 
 
-def test_scenes_that_never_work_end_in_an_error(make_config: MakeConfig) -> None:
+def test_scenes_that_never_work_end_in_an_error(make_config):
     """A distribution none of whose scenes can be simulated ends with the cause, not in an endless loop."""
     with DatasetWriter(make_config()) as writer:
         task = writer.task("train", 0)

@@ -1,18 +1,14 @@
 """Data sets in object stores: what is listed there is there whole, whatever becomes of the copying."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal
 import sys
 import threading
 from pathlib import Path
-from typing import Any
 
 import fsspec
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset
 
 import hgn.data.storage
 from datagen.upload import main
@@ -24,7 +20,7 @@ from hgn.schema import ConfigError
 
 
 @pytest.fixture(autouse=True)
-def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def store(tmp_path, monkeypatch):
     """fsspec's memory as the object store, empty; and a cache of our own."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setattr(hgn.data.storage, "_FIRST_PAUSE_S", 0.01)
@@ -33,11 +29,11 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return files
 
 
-def keys(folder: Path | str) -> list[str]:
+def keys(folder):
     return [episode.key for episode in EpisodeStore(folder, "train").episodes]
 
 
-def test_copy_is_the_data_set(make_config: MakeConfig, make_dataset: MakeDataset, capsys: Any) -> None:
+def test_copy_is_the_data_set(make_config, make_dataset, capsys):
     """The copy reads like the folder; what comes later is added to it, and what is there is not sent again."""
     folder = make_dataset(make_config(training_scenes=2))
     assert main({"data": str(folder), "to": "memory://bucket/set"}) == 0
@@ -56,12 +52,12 @@ def test_copy_is_the_data_set(make_config: MakeConfig, make_dataset: MakeDataset
     }
 
 
-def test_copying_that_is_cut_off(folder: Path, monkeypatch: pytest.MonkeyPatch, store: Any) -> None:
+def test_copying_that_is_cut_off(folder, monkeypatch, store):
     """Whatever copying ends at, nothing is listed that is not there; and the same command completes it."""
     real = type(store).put_file
     sent = 0
 
-    def cut(self: Any, path: str, target: str, **options: Any) -> None:
+    def cut(self, path, target, **options):
         nonlocal sent
         sent += 1
         if sent == 4:
@@ -78,9 +74,7 @@ def test_copying_that_is_cut_off(folder: Path, monkeypatch: pytest.MonkeyPatch, 
     assert keys("memory://cut") == keys(folder)
 
 
-def test_following_a_data_set_that_grows(
-    make_config: MakeConfig, make_dataset: MakeDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_following_a_data_set_that_grows(make_config, make_dataset, monkeypatch):
     """With follow=true copying goes on until the data set is complete, or a signal ends it."""
     monkeypatch.setattr("datagen.upload._LOOK_S", 0.01)
     config = make_config()
@@ -96,9 +90,7 @@ def test_following_a_data_set_that_grows(
     growing.join()
 
 
-def test_what_is_refused(
-    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_refused(make_config, make_dataset, tmp_path, monkeypatch):
     """Another data set at the URL, one made anew, an altered shard, and places that cannot be written to."""
     folder = make_dataset(make_config())
     main({"data": str(folder), "to": "memory://there"})

@@ -1,26 +1,20 @@
 """Shards and manifest: the same input gives the same bytes, and no interruption leaves anything half-written."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import io
 import os
 import subprocess
 import tarfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event, Lock, current_thread
-from typing import Any
 
 import ballistic_solver
 import numpy as np
 import pytest
 import webdataset
-from ballistic_dataset import MakeConfig, MakeDataset, Stage
 from written_files import claim_all, hashes
 
-from datagen.pool.plan import ShardRange
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
@@ -31,7 +25,7 @@ from hgn.schema import ConfigError
 from tools.studies.kills import verified_shards
 
 
-def test_dataset_is_complete_and_in_order(folder: Path) -> None:
+def test_dataset_is_complete_and_in_order(folder):
     """Every episode is published in shards of growing size; the manifest's last revision lists them all."""
     manifest = Manifest.load(folder)
     assert manifest.complete and manifest.revision == len(manifest.shards)
@@ -47,14 +41,14 @@ def test_dataset_is_complete_and_in_order(folder: Path) -> None:
     assert {path.name for path in folder.iterdir()} == {*hashes(folder), "manifest.json", "index", ".lock"}
 
 
-def test_same_input_gives_same_bytes(make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path) -> None:
+def test_same_input_gives_same_bytes(make_config, make_dataset, tmp_path):
     """Two folders made from one config are bitwise equal, manifest included."""
     folders = [make_dataset(make_config(folder=str(tmp_path / name))) for name in ("one", "other")]
     assert hashes(folders[0]) == hashes(folders[1])
     assert (folders[0] / "manifest.json").read_bytes() == (folders[1] / "manifest.json").read_bytes()
 
 
-def test_headers_tell_nothing_of_the_machine(folder: Path) -> None:
+def test_headers_tell_nothing_of_the_machine(folder):
     """Tar headers hold no time, owner or umask."""
     with tarfile.open(folder / "train-000002-000004.tar") as tar:
         for info in tar:
@@ -63,7 +57,7 @@ def test_headers_tell_nothing_of_the_machine(folder: Path) -> None:
 
 # WebDataset leaves the file it iterated over to the garbage collector
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
-def test_plain_tar_and_webdataset_read_shards(folder: Path) -> None:
+def test_plain_tar_and_webdataset_read_shards(folder):
     """Any tar program and a plain WebDataset pipeline read a shard without this project."""
     shard = folder / "train-000002-000004.tar"
     names = subprocess.run(["tar", "-tf", shard], capture_output=True, text=True, check=True).stdout.split()
@@ -87,7 +81,7 @@ def test_plain_tar_and_webdataset_read_shards(folder: Path) -> None:
         assert sample["json"]["seed"] == episode.seed
 
 
-def test_offsets_lead_to_the_data(folder: Path) -> None:
+def test_offsets_lead_to_the_data(folder):
     """The manifest's offsets hold a whole .npy file each, so a window of frames can be read alone."""
     for shard in Manifest.load(folder).shards:
         content = (folder / shard.name).read_bytes()
@@ -97,7 +91,7 @@ def test_offsets_lead_to_the_data(folder: Path) -> None:
             assert position.shape == (entry.frames, entry.particles, 3)
 
 
-def test_manifest_statistics_equal_direct_ones(folder: Path) -> None:
+def test_manifest_statistics_equal_direct_ones(folder):
     """Statistics over all shards of a split equal those computed from all its episodes at once."""
     statistics = Manifest.load(folder).statistics("train")
     positions = [np.asarray(episode.position_TN3, np.float64) for episode in EpisodeStore(folder, "train").episodes]
@@ -109,7 +103,7 @@ def test_manifest_statistics_equal_direct_ones(folder: Path) -> None:
     assert Manifest.load(folder).statistics("test").velocity != Moments()
 
 
-def test_manifest_is_rebuilt_from_the_shards(make_config: MakeConfig, folder: Path) -> None:
+def test_manifest_is_rebuilt_from_the_shards(make_config, folder):
     """A lost manifest costs nothing: published shards are verified and listed again."""
     before = {shard.name: shard for shard in Manifest.load(folder).shards}
     (folder / "manifest.json").unlink()
@@ -118,7 +112,7 @@ def test_manifest_is_rebuilt_from_the_shards(make_config: MakeConfig, folder: Pa
     assert {shard.name: shard for shard in Manifest.load(folder).shards} == before
 
 
-def test_shards_of_another_dataset_are_not_adopted(make_config: MakeConfig, folder: Path) -> None:
+def test_shards_of_another_dataset_are_not_adopted(make_config, folder):
     """Without a manifest a shard of other settings is still recognised and refused."""
     (folder / "manifest.json").unlink()
     config = dataclasses.replace(make_config(), scene=SceneConfig(obstacle_count=3))
@@ -126,7 +120,7 @@ def test_shards_of_another_dataset_are_not_adopted(make_config: MakeConfig, fold
         pass
 
 
-def test_missing_shard_is_made_again(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_missing_shard_is_made_again(make_config, make_dataset):
     """A shard that was deleted, the remedy for an altered one, is made again and listed."""
     folder = make_dataset(make_config())
     before = hashes(folder)
@@ -139,7 +133,7 @@ def test_missing_shard_is_made_again(make_config: MakeConfig, make_dataset: Make
     assert hashes(folder) == before
 
 
-def test_unlisted_shard_that_was_cut_is_refused(make_config: MakeConfig, folder: Path) -> None:
+def test_unlisted_shard_that_was_cut_is_refused(make_config, folder):
     """A shard is adopted only when it holds its whole range; a cut at a member boundary does not pass."""
     shard = folder / "train-000002-000004.tar"
     located = locate_members(shard)
@@ -154,13 +148,13 @@ def test_unlisted_shard_that_was_cut_is_refused(make_config: MakeConfig, folder:
 
 
 @pytest.fixture
-def full_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
+def full_disk(monkeypatch):
     """After the given number of further syncs the disk is full."""
     real = os.fsync
     left = -1
     counting = Lock()
 
-    def fsync(descriptor: int) -> None:
+    def fsync(descriptor):
         nonlocal left
         with counting:
             left -= 1
@@ -169,7 +163,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real(descriptor)
 
-    def fill(after: int) -> None:
+    def fill(after):
         nonlocal left
         left = after
 
@@ -179,9 +173,7 @@ def full_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]
 
 
 @pytest.mark.parametrize("after", range(5))
-def test_full_disk_leaves_nothing_half_written(
-    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, full_disk: Callable[[int], None], after: int
-) -> None:
+def test_full_disk_leaves_nothing_half_written(make_config, make_dataset, stage, full_disk, after):
     """A full disk at any step keeps what was there and leaves no partial file; with space the run goes on."""
     with DatasetWriter(make_config()) as writer:
         stage(writer, "train", 0)
@@ -202,13 +194,13 @@ def test_full_disk_leaves_nothing_half_written(
     assert Manifest.load(writer.folder).complete
 
 
-def test_dataset_without_some_splits(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_dataset_without_some_splits(make_config, make_dataset):
     """Splits may be empty."""
     folder = make_dataset(make_config(validation_scenes=0, test_scenes=0, training_scenes=1))
     assert Manifest.load(folder).complete and len(EpisodeStore(folder, "test")) == 0
 
 
-def test_partial_files_are_removed(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_partial_files_are_removed(make_config, make_dataset):
     """What a killed run was writing is removed by the next."""
     config = make_config()
     folder = Path(config.dataset.folder)
@@ -219,13 +211,13 @@ def test_partial_files_are_removed(make_config: MakeConfig, make_dataset: MakeDa
     assert not list(folder.rglob("*.partial"))
 
 
-def test_default_dataset_is_the_papers() -> None:
+def test_default_dataset_is_the_papers():
     """800 training, 5 validation and 20 test scenes."""
     assert [DatasetConfig().scenes(split) for split in ("train", "validation", "test")] == [800, 5, 20]
     assert ballistic_solver.simulate([], MpmConfig(), 2, 60.0) == []
 
 
-def test_packing_is_not_waited_for(make_config: MakeConfig, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packing_is_not_waited_for(make_config, stage, monkeypatch):
     """A pool goes on listening to its workers while shards are packed, and publishes what is packed first."""
     with DatasetWriter(make_config(validation_scenes=0, test_scenes=0)) as writer:
         shards = list(iter(writer.claim_next, None))
@@ -233,7 +225,7 @@ def test_packing_is_not_waited_for(make_config: MakeConfig, stage: Stage, monkey
             stage(writer, split, index)
         going_on = Event()
 
-        def pack(shard: ShardRange, own: Callable[[ShardRange], Any] = writer._pack) -> Any:
+        def pack(shard, own=writer._pack):
             assert shard != shards[0] or going_on.wait(60)
             return own(shard)
 
@@ -248,9 +240,7 @@ def test_packing_is_not_waited_for(make_config: MakeConfig, stage: Stage, monkey
         assert published[-1] == shards[0].name and writer.complete and not writer.packing
 
 
-def test_shards_that_wait_are_packed_together(
-    make_config: MakeConfig, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shards_that_wait_are_packed_together(make_config, stage, tmp_path, monkeypatch):
     """Where several shards are ready they are packed side by side, published in order, and are the same files."""
     with DatasetWriter(make_config()) as writer:
         while writer.claim_next():
@@ -277,9 +267,7 @@ def test_shards_that_wait_are_packed_together(
 
 
 @pytest.mark.parametrize("after", range(0, 12, 2))
-def test_full_disk_while_several_are_packed(
-    make_config: MakeConfig, make_dataset: MakeDataset, stage: Stage, full_disk: Callable[[int], None], after: int
-) -> None:
+def test_full_disk_while_several_are_packed(make_config, make_dataset, stage, full_disk, after):
     """A full disk in any of several packers ends the run with its message and no partial file; then it goes on."""
     with (
         pytest.raises(OSError, match=r"No space left on device: .*data"),
@@ -297,9 +285,7 @@ def test_full_disk_while_several_are_packed(
     assert Manifest.load(writer.folder).complete
 
 
-def test_a_disk_that_fails(
-    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fails(make_config, make_dataset, tmp_path, monkeypatch):
     """Wherever the disk cannot keep what was written (EIO), the generation ends with that error, what is published is
     whole, and the next one goes on; at the end the data set is the one of a sound disk, bitwise."""
     expected = hashes(make_dataset(make_config(training_scenes=3, folder=str(tmp_path / "sound"))))
@@ -308,7 +294,7 @@ def test_a_disk_that_fails(
     while True:
         left = [failures % 7]
 
-        def fsync(descriptor: int, left: list[int] = left) -> None:
+        def fsync(descriptor, left=left):
             left[0] -= 1
             if left[0] == -1:
                 raise OSError(errno.EIO, "Input/output error")

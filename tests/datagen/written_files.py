@@ -1,22 +1,17 @@
 """What the tests of the writer share: the bytes of shards, every file of a data set, and all claims."""
 
-from __future__ import annotations
-
 import hashlib
 import json
-from pathlib import Path
-from typing import Any
 
-from datagen.pool.writer import DatasetWriter
 from hgn.data.manifest import Manifest
 from hgn.schema import to_mapping
 
 
-def hashes(folder: Path) -> dict[str, str]:
+def hashes(folder):
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("*.tar"))}
 
 
-def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
+def snapshot(folder):
     return {
         str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
         for path in sorted(folder.rglob("*"))
@@ -24,7 +19,7 @@ def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
     }
 
 
-def first_release(folder: Path) -> dict[str, Any]:
+def first_release(folder):
     """Writes the manifest as the first release had it, and returns its content."""
     manifest = Manifest.load(folder)
     mapping = {name: value for name, value in vars(manifest).items() if name != "shards"}
@@ -33,7 +28,7 @@ def first_release(folder: Path) -> dict[str, Any]:
     return mapping
 
 
-def claim_all(writer: DatasetWriter) -> list[tuple[str, int]]:
+def claim_all(writer):
     while writer.claim_next():
         pass
     return writer.remaining()

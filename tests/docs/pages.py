@@ -1,7 +1,5 @@
 """The Markdown pages of the project: their fenced blocks, prose lines and links, and a runner for the blocks."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy
@@ -9,7 +7,7 @@ import shlex
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,18 +28,18 @@ class Block:
     content: str
     file: str | None
 
-    def __str__(self) -> str:
+    def __str__(self):
         return f"{self.page}:{self.line}"
 
 
-def markdown_files() -> list[Path]:
+def markdown_files():
     """All Markdown files that are part of the project."""
     found = [*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))]
     made = {"_build", "_generated"}
     return sorted(page for page in found if not made & set(page.relative_to(ROOT).parts))
 
 
-def blocks_of(page: Path) -> list[Block]:
+def blocks_of(page):
     """The fenced blocks of a page, in order."""
     blocks: list[Block] = []
     opened: tuple[int, str, str, str | None] | None = None
@@ -64,7 +62,7 @@ def blocks_of(page: Path) -> list[Block]:
     return blocks
 
 
-def prose_lines(page: Path) -> Iterator[tuple[int, str]]:
+def prose_lines(page):
     """Number and text of the lines outside fenced blocks."""
     fence = ""
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
@@ -77,14 +75,14 @@ def prose_lines(page: Path) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def shell_lines(block: Block) -> list[str]:
+def shell_lines(block):
     """The commands of a shell block, continued lines joined, comments left out."""
     lines = block.content.replace("\\\n", " ").splitlines()
     bare = [re.sub(r"(^|\s)#.*", "", line).strip() for line in lines]
     return [line for line in bare if line]
 
 
-def make_targets() -> set[str]:
+def make_targets():
     """What `make` can be asked for."""
     return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
@@ -105,7 +103,7 @@ class Runner:
     background: list[subprocess.Popen[str]] = field(default_factory=list)
     ran: list[str] = field(default_factory=list)
 
-    def run(self, page: Path) -> None:
+    def run(self, page):
         """Runs every block; a language that it does not know is an error."""
         replaced: set[str] = set()
         for block in blocks_of(page):
@@ -126,7 +124,7 @@ class Runner:
                 assert block.language == "yaml" and block.file is not None, f"{block}: {block.language} is not run"
         assert replaced == set(self.smaller), set(self.smaller) - replaced
 
-    def run_first(self, page: Path, module: str) -> None:
+    def run_first(self, page, module):
         """Writes the files of a page and runs its first command of a module, no other."""
         for block in blocks_of(page):
             self._write(block)
@@ -136,12 +134,12 @@ class Runner:
                     return
 
     @staticmethod
-    def _write(block: Block) -> None:
+    def _write(block):
         if block.file is not None:
             Path(block.file).parent.mkdir(parents=True, exist_ok=True)
             Path(block.file).write_text(block.content, encoding="utf-8")
 
-    def _shell(self, line: str, block: Block) -> None:
+    def _shell(self, line, block):
         self.ran.append(line)
         if line in self.elsewhere:
             return
@@ -166,11 +164,11 @@ class Runner:
             assert run_module(words[2], arguments) == 0, f"{block}: {line}"
 
 
-def _environment() -> dict[str, str]:
+def _environment():
     return dict(os.environ, PYTHONPATH=os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
 
 
-def run_module(module: str, arguments: Sequence[str]) -> int:
+def run_module(module, arguments):
     """`python -m MODULE ARGUMENTS` in this process; returns the exit code."""
     before = sys.argv
     sys.argv = [module, *arguments]

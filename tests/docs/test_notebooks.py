@@ -1,9 +1,6 @@
 """Notebooks are their pages, and run in a kernel."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import nbclient
 import nbformat
@@ -18,7 +15,7 @@ SMALLER |= {"range(120)": "range(2)", "frame == 60": "frame == 0"}
 
 
 @pytest.mark.parametrize("name", list(NOTEBOOKS))
-def test_notebook_is_its_page(name: str) -> None:
+def test_notebook_is_its_page(name):
     """What is stored is what `python -m tools.notebooks` writes today, and a valid notebook."""
     path = DOCS / "notebooks" / f"{name}.ipynb"
     assert path.read_text(encoding="utf-8") == notebook(DOCS / NOTEBOOKS[name]), "run python -m tools.notebooks"
@@ -26,7 +23,7 @@ def test_notebook_is_its_page(name: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_quick_start_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quick_start_runs(tmp_path, monkeypatch):
     """Every cell in a kernel of its own, with two frames; test_tutorials runs the other pages' blocks."""
     content = nbformat.read(DOCS / "notebooks/quick_start.ipynb", as_version=4)
     for cell in content.cells:

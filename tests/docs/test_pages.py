@@ -1,15 +1,12 @@
 """What holds of every Markdown page: width, links, paths; and of README and CHANGELOG, whose form is fixed."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 import re
 import shlex
-from pathlib import Path
 
 import pytest
-from docs.pages import ROOT, Block, blocks_of, markdown_files, prose_lines, shell_lines
+from docs.pages import ROOT, blocks_of, markdown_files, prose_lines, shell_lines
 from hydra import compose, initialize_config_dir
 
 from hgn import config
@@ -32,7 +29,7 @@ TESTS_IN = re.compile(r"`(tests/[\w/]+\.py)`\s+\(((?:`\w+`(?:,\s+)?)+)\)")
 PATH = re.compile(r"`((?:hgn|datagen|tools|tests|conf|jobs|docs|results)/[\w./-]*\w/?)`")
 
 
-def anchors(page: Path) -> set[str]:
+def anchors(page):
     """The anchors of a page's headings, as GitHub and MyST make them."""
     found: set[str] = set()
     for _, line in prose_lines(page):
@@ -44,20 +41,20 @@ def anchors(page: Path) -> set[str]:
     return found
 
 
-def counted(line: str) -> str:
+def counted(line):
     """A line without what may be long: addresses, and the targets of links."""
     return ADDRESS.sub("", re.sub(r"\]\([^)]*\)", "]", line))
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_no_line_is_wide(page: Path) -> None:
+def test_no_line_is_wide(page):
     """No line of prose is wider than 100 columns; tables, addresses and blocks of code are left out."""
     wide = [number for number, line in prose_lines(page) if not line.startswith("|") and len(counted(line)) > COLUMNS]
     assert not wide, f"{page.relative_to(ROOT)}: lines {wide}"
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere(page):
     """Each link to a file of the project, and each anchor in it, is there."""
     for number, line in prose_lines(page):
         for target in LINK.findall(CODE.sub("", line)):
@@ -71,14 +68,14 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", OWN_PAGES)
-def test_paths_exist(page: Path) -> None:
+def test_paths_exist(page):
     """Each path of the checkout that a page names in code is there."""
     for number, line in prose_lines(page):
         for path in PATH.findall(line):
             assert (ROOT / path).exists(), f"{page.relative_to(ROOT)}:{number}: {path}"
 
 
-def test_names_exist() -> None:
+def test_names_exist():
     """What a page says to be in a file is there: "`NAME` in `FILE`", and names in brackets behind a file of tests."""
     checked = 0
     for page in OWN_PAGES:
@@ -96,7 +93,7 @@ def test_names_exist() -> None:
         assert all(f"def {name}(" in sources for name in re.findall(r"`(\w+)`", kernels)), row
 
 
-def test_settings_exist() -> None:
+def test_settings_exist():
     """Each setting that README and docs/ name by its group is a field of it."""
     groups = {
         "scene": config.SceneConfig,
@@ -116,7 +113,7 @@ def test_settings_exist() -> None:
     assert checked > 20
 
 
-def commands() -> list[tuple[str, str]]:
+def commands():
     """Each `python -m` line of README and docs/, in blocks and in code within lines, with its place."""
     found = []
     for page in OWN_PAGES:
@@ -128,11 +125,11 @@ def commands() -> list[tuple[str, str]]:
     return found
 
 
-def _commands_of(block: Block) -> list[str]:
+def _commands_of(block):
     return [line for line in shell_lines(block) if line.startswith("python -m ")] if block.language == "bash" else []
 
 
-def test_commands_compose() -> None:
+def test_commands_compose():
     """Each command that a page shows is there, and each setting that it is given exists."""
     assert len(commands()) > 20
     for place, line in commands():
@@ -153,7 +150,7 @@ def test_commands_compose() -> None:
             compose(name, arguments)
 
 
-def test_readme_is_short() -> None:
+def test_readme_is_short():
     """At most 130 lines, none over 100 columns (tables too), and at most twelve commands in its table."""
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= README_LINES
@@ -161,7 +158,7 @@ def test_readme_is_short() -> None:
     assert sum(line.startswith("| `python -m ") for line in lines) <= README_COMMANDS
 
 
-def test_changelog_form() -> None:
+def test_changelog_form():
     """Releases, in them Added, Changed and Fixed, in those entries of at most two lines."""
     lines = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()
     releases = [line for line in lines if line.startswith("## ")]
@@ -177,7 +174,7 @@ def test_changelog_form() -> None:
             assert re.match(r"### (Added|Changed|Fixed)", line), f"CHANGELOG.md:{number}"
 
 
-def test_every_command_is_listed() -> None:
+def test_every_command_is_listed():
     """The reference of commands names each module that can be run, and no other."""
     spec = importlib.util.spec_from_file_location("reference_pages", ROOT / "docs" / "_ext" / "reference_pages.py")
     assert spec is not None and spec.loader is not None
@@ -195,7 +192,7 @@ def test_every_command_is_listed() -> None:
     assert "| `seed` | `NonNegative[int]` | `0` |" in text and "domain units per frame |" in text
 
 
-def test_scene_files_are_described_whole() -> None:
+def test_scene_files_are_described_whole():
     """The page on scene files has each field that the file and its entries may have, and each shape."""
     text = (ROOT / "docs" / "how_to" / "scene_files.md").read_text()
     rows = {cell for line in text.splitlines() if line.startswith("| `") for cell in CODE.findall(line.split("|")[1])}

@@ -1,12 +1,9 @@
 """Every block of the README, of getting started and of the tutorials runs as it stands, with small settings."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -59,13 +56,13 @@ INSTALLS = {
 }
 
 
-def lines_of(page: Path) -> list[str]:
+def lines_of(page):
     """The commands of a page's shell blocks."""
     return [line for block in blocks_of(page) if block.language == "bash" for line in shell_lines(block)]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A folder with a mesh and a data set of three scenes, made as the command makes it."""
     path = tmp_path_factory.mktemp("tutorials")
     (mesh,) = [block for block in blocks_of(TUTORIALS / "train.md") if block.file == "rock.obj"]
@@ -77,13 +74,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(folder, monkeypatch):
     """The same folder, as the current one."""
     monkeypatch.chdir(folder)
     return folder
 
 
-def test_readme(here: Path) -> None:
+def test_readme(here):
     """README: a random scene, the main job, the program; what a tutorial runs word for word is not run twice."""
     scene = dict.fromkeys(lines_of(TUTORIALS / "scene.md"), "tutorials/scene.md")
     runner = Runner(SETTINGS, {"frames=300": "frames=2"}, INSTALLS | scene)
@@ -92,12 +89,12 @@ def test_readme(here: Path) -> None:
     assert (here / "rollout/random_0.vtkhdf").is_file() and set(scene) <= set(runner.ran)
 
 
-def test_getting_started(here: Path) -> None:
+def test_getting_started(here):
     """Getting started: what is installed, a first simulation, help."""
     Runner(SETTINGS, elsewhere=INSTALLS).run(ROOT / "docs" / "getting_started.md")
 
 
-def test_scene(here: Path) -> None:
+def test_scene(here):
     """A scene of one's own: network and solver simulate it, pictures and the distance between them."""
     runner = Runner(SETTINGS)
     runner.run(TUTORIALS / "scene.md")
@@ -105,7 +102,7 @@ def test_scene(here: Path) -> None:
     assert list((here / "pictures").glob("*.png"))
 
 
-def test_train(here: Path) -> None:
+def test_train(here):
     """Training on scenes of one's own: an experiment file, a run that goes on, export, errors, other weights."""
     Runner(SETTINGS | {"hgn.train": [*SETTINGS["hgn.train"], "training.maximum_updates=2"]}).run_first(
         TUTORIALS / "train.md", "hgn.train"
@@ -118,7 +115,7 @@ def test_train(here: Path) -> None:
     assert all((here / "runs/mine" / name).exists() for name in files)
 
 
-def test_program(here: Path) -> None:
+def test_program(here):
     """Weights in a program: a scene file as a whole, frame by frame from particles and a mesh, one that changes."""
     fewer = {
         "frames=300": "frames=2",
@@ -133,7 +130,7 @@ def test_program(here: Path) -> None:
 
 
 @pytest.fixture
-def port(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+def port(monkeypatch):
     """A free one, at which the tutorial's program looks too."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -143,7 +140,7 @@ def port(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     yield number
 
 
-def test_serve(here: Path, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_serve(here, port, monkeypatch):
     """A data set served over HTTP with a token, and two trainings that read it."""
     monkeypatch.setenv("HGN_CACHE", str(here / "cache"))
     settings = SETTINGS | {
@@ -163,7 +160,7 @@ def test_serve(here: Path, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(list((here / "cache").rglob("*.tar"))) == len(list((here / "data/mine").glob("*.tar")))
 
 
-def test_network(here: Path) -> None:
+def test_network(here):
     """The network: built, looked into, changed by settings and by a subclass with gradients."""
     runner = Runner(SETTINGS)
     runner.run(TUTORIALS / "network.md")
@@ -174,7 +171,7 @@ def test_network(here: Path) -> None:
     assert (runner.names["changed"].speed.weight.grad != 0).any()
 
 
-def test_how_to(here: Path) -> None:
+def test_how_to(here):
     """How-to pages: the check of a data set's shards, which sees a flipped bit, and the scene file's example."""
     (check,) = [block for block in blocks_of(ROOT / "docs/how_to/verify_shards.md") if block.language == "python"]
     code = check.content.replace("data/obstacles", "data/mine")
@@ -191,7 +188,7 @@ def test_how_to(here: Path) -> None:
     assert len(load_scene("funnel.yaml").obstacles) == 5
 
 
-def test_gradients() -> None:
+def test_gradients():
     """Gradients: of velocities and of a turned obstacle; the launch that hits a target is the closed form's; the
     bucket is filled to 90 % of what a tilt by 16 degrees reaches, near the best of the search."""
     shorter = {

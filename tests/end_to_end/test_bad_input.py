@@ -1,20 +1,17 @@
 """Bad input to the commands: one line that says what is wrong, a non-zero exit code, and nothing touched."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from ballistic_dataset import MakeConfig, MakeDataset
 from network.states import network_of
 from processes import PATIENCE_S
 from training.runs import train_arguments, train_mapping
@@ -51,42 +48,36 @@ class Place:
     folder: Path
     config: DatagenConfig
 
-    def path(self, name: str) -> Path:
+    def path(self, name):
         return self.folder / name
 
-    def shard(self, split: str) -> Path:
+    def shard(self, split):
         return sorted(self.path("data").glob(f"{split}-*.tar"))[0]
 
-    def edit(self, name: str, old: str, new: str) -> None:
+    def edit(self, name, old, new):
         text = self.path(name).read_text()
         assert old in text
         self.path(name).write_text(text.replace(old, new))
 
-    def edit_manifest(self, **values: object) -> None:
+    def edit_manifest(self, **values):
         path = self.path("data/manifest.json")
         path.write_text(json.dumps(json.loads(path.read_text()) | values))
 
-    def scene(self, text: str) -> None:
+    def scene(self, text):
         self.path("scene.yaml").write_text(text)
 
-    def train(self, *arguments: str, run: str = "run") -> list[str]:
+    def train(self, *arguments, run="run"):
         return ["+experiment=obstacles", *train_arguments(self.config, self.path(run)), *arguments]
 
 
 @pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def original(tmp_path_factory):
     """Where the first test keeps what all begin with."""
     return tmp_path_factory.mktemp("original") / "place"
 
 
 @pytest.fixture
-def place(
-    original: Path,
-    make_config: MakeConfig,
-    make_dataset: MakeDataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> Iterator[Place]:
+def place(original, make_config, make_dataset, tmp_path, monkeypatch):
     config = make_config()
     made = Place(tmp_path, config)
     if original.exists():
@@ -101,7 +92,7 @@ def place(
     yield made
 
 
-def content(folder: Path) -> dict[str, bytes]:
+def content(folder):
     """Every file below a folder."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -109,7 +100,7 @@ def content(folder: Path) -> dict[str, bytes]:
 Capture = pytest.CaptureFixture[str]
 
 
-def refused(command: str, arguments: list[str], capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
+def refused(command, arguments, capsys, monkeypatch):
     """Runs a command as its module would; returns the exit code and the one error line."""
     monkeypatch.setattr(sys, "argv", [command, *arguments])
     capsys.readouterr()
@@ -122,7 +113,7 @@ def refused(command: str, arguments: list[str], capsys: Capture, monkeypatch: py
     return int(str(raised.value.code)), errors[0]
 
 
-def check(place: Place, command: str, arguments: list[str], message: str, capsys: Capture, patch: Any) -> None:
+def check(place, command, arguments, message, capsys, patch):
     """The command is refused with that message and leaves every file as it was; no half-written one is left."""
     before = content(place.folder)
     code, line = refused(command, arguments, capsys, patch)
@@ -208,7 +199,7 @@ def test_values(
         ),
     ],
 )
-def test_scenes(place: Place, text: str, message: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenes(place, text, message, capsys, monkeypatch):
     """A scene file that cannot be simulated is refused with the entry that is wrong in it, meshes included; every other
     rule of scene files is in tests/scene/test_scene_file.py."""
     place.path("empty.obj").write_text("")
@@ -219,11 +210,11 @@ def test_scenes(place: Place, text: str, message: str, capsys: Capture, monkeypa
     assert not place.path("made").exists()
 
 
-def truncate(path: Path) -> None:
+def truncate(path):
     path.write_bytes(path.read_bytes()[:-700])
 
 
-def alter(path: Path) -> None:
+def alter(path):
     data = bytearray(path.read_bytes())
     data[700] ^= 1
     path.write_bytes(data)
@@ -239,14 +230,7 @@ def alter(path: Path) -> None:
     ],
     ids=["truncated", "altered", "missing"],
 )
-def test_damaged_shards(
-    place: Place,
-    command: str,
-    damage: Callable[[Path], None],
-    message: str,
-    capsys: Capture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_damaged_shards(place, command, damage, message, capsys, monkeypatch):
     """Training and evaluation stop at a damaged shard and name it; a cut tar is never read as fewer episodes."""
     split = "train" if command == "train" else "validation"
     for shard in place.path("data").glob(f"{split}-*.tar"):
@@ -265,14 +249,7 @@ def test_damaged_shards(
         ({"invented": 1}, "invented is not a known key"),
     ],
 )
-def test_data_of_another_schema(
-    place: Place,
-    command: str,
-    change: dict[str, object],
-    message: str,
-    capsys: Capture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_data_of_another_schema(place, command, change, message, capsys, monkeypatch):
     """A manifest of another version, or one that makes no sense, is refused before any shard is opened."""
     place.edit_manifest(**change)
     arguments = place.train(run="other") if command == "train" else EVALUATE
@@ -289,15 +266,13 @@ def test_data_of_another_schema(
         (["dataset.frames=7"], "holds another data set: frames is 6 there, 7 is asked for"),
     ],
 )
-def test_checkpoint_of_another_configuration(
-    place: Place, arguments: list[str], message: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_checkpoint_of_another_configuration(place, arguments, message, capsys, monkeypatch):
     """A run is not gone on with under another network, noise or data set."""
     check(place, "train", place.train(*arguments), message, capsys, monkeypatch)
 
 
 @pytest.mark.parametrize("command", ["train", "export"])
-def test_damaged_checkpoint(place: Place, command: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_checkpoint(place, command, capsys, monkeypatch):
     """A cut checkpoint is named; weights that were exported earlier stay."""
     truncate(place.path("run/checkpoints/last.ckpt"))
     arguments = (
@@ -306,7 +281,7 @@ def test_damaged_checkpoint(place: Place, command: str, capsys: Capture, monkeyp
     check(place, command, arguments, "checkpoint must be a whole checkpoint file, got", capsys, monkeypatch)
 
 
-def test_checkpoint_of_another_project(place: Place, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checkpoint_of_another_project(place, capsys, monkeypatch):
     """A file of torch.save that is no checkpoint of ours is refused."""
     torch.save({"state_dict": {}}, place.path("foreign.ckpt"))
     message = "checkpoint must be one of python -m hgn.train, got foreign.ckpt"
@@ -315,9 +290,7 @@ def test_checkpoint_of_another_project(place: Place, capsys: Capture, monkeypatc
 
 @pytest.mark.parametrize(("command", "arguments"), [("rollout", ROLLOUT), ("evaluate", EVALUATE)])
 @pytest.mark.parametrize("case", ["another network", "truncated", "frame rate", "material"])
-def test_weights(
-    place: Place, command: str, arguments: list[str], case: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights(place, command, arguments, case, capsys, monkeypatch):
     """Weights that are cut, or of another network, frame rate or materials than what they are used on, are refused."""
     path = place.path("weights.safetensors")
     if case == "truncated":
@@ -341,7 +314,7 @@ def test_weights(
     assert not place.path("made").exists()
 
 
-def test_diverging_weights(place: Place, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_diverging_weights(place, capsys, monkeypatch):
     """A rollout that flies apart says at which frame, and leaves an earlier rollout as it was."""
     network = network_of(torch.float32)
     network.normaliser.set("acceleration", torch.full((3,), 5.0), torch.ones(3), 0.0)
@@ -352,7 +325,7 @@ def test_diverging_weights(place: Place, capsys: Capture, monkeypatch: pytest.Mo
     check(place, "rollout", ROLLOUT, message, capsys, monkeypatch)
 
 
-def test_diverging_scenes_are_told(place: Place, capsys: Capture) -> None:
+def test_diverging_scenes_are_told(place, capsys):
     """An evaluation keeps what each scene came to, and says which one diverged first, and why."""
     network = network_of(torch.float32)
     network.normaliser.set("acceleration", torch.full((3,), 0.4), torch.ones(3), 0.0)
@@ -377,9 +350,7 @@ def test_diverging_scenes_are_told(place: Place, capsys: Capture) -> None:
         ("train", ["run=scene.yaml"]),
     ],
 )
-def test_output_that_is_in_the_way(
-    place: Place, command: str, arguments: list[str], capsys: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_output_that_is_in_the_way(place, command, arguments, capsys, monkeypatch):
     """An output path that leads through a file, or is a folder where a file is to be, is named."""
     before = content(place.folder)
     if command == "train":
@@ -389,7 +360,7 @@ def test_output_that_is_in_the_way(
     assert content(place.folder) == before
 
 
-def test_errors_file_makes_its_folder(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_file_makes_its_folder(place, monkeypatch):
     """The folder of json=… is made, as those of the other outputs are: an evaluation is not lost at its end."""
     monkeypatch.setattr(sys, "argv", ["evaluate", *EVALUATE])
     with pytest.raises(SystemExit) as raised:
@@ -416,7 +387,7 @@ def test_errors_file_makes_its_folder(place: Place, monkeypatch: pytest.MonkeyPa
         ("hgn.evaluate", EVALUATE, "error: data/validation-000000-000001.tar must have "),
     ],
 )
-def test_as_processes(place: Place, warm_python: Path, module: str, arguments: list[str], message: str) -> None:
+def test_as_processes(place, warm_python, module, arguments, message):
     """Started as a person would, each command ends with exit code 2 and that one line on standard error alone."""
     place.scene(SCENE.replace("[0.5, 0.8, 0.5]", "[0.5, 0.45, 0.5]"))
     for shard in place.path("data").glob("validation-*.tar"):

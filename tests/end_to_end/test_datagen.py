@@ -1,7 +1,5 @@
 """`python -m datagen` as a person runs it: real scenes, the real solver, Ctrl-C, and the same command again."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -24,14 +22,14 @@ COMMAND = [
 ]
 
 
-def start(folder: Path) -> subprocess.Popen[str]:
+def start(folder):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.Popen(
         COMMAND, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
 
 
-def test_interrupted_dataset_is_completed(tmp_path: Path) -> None:
+def test_interrupted_dataset_is_completed(tmp_path):
     """Ctrl-C after the first shard keeps it, bitwise; the same command makes the rest; a third run changes nothing."""
     process = start(tmp_path)
     folder = tmp_path / "made"

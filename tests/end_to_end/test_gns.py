@@ -1,10 +1,7 @@
 """The baselines through the same commands: trained, exported, simulated, evaluated; and refused where they differ."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +10,7 @@ from network.states import random_grid
 from training.runs import train_mapping
 
 from hgn import evaluate, rollout, train
-from hgn.config import DatagenConfig, NetworkConfig
+from hgn.config import NetworkConfig
 from hgn.data.batch import make_batch
 from hgn.data.reader import EpisodeStore
 from hgn.export import export
@@ -25,7 +22,7 @@ GNS = {"levels": 1, "message_passing_steps": 2, "width": 8, "material_embedding"
 
 
 @pytest.mark.parametrize("kind", ["gns", "gns_particles"])
-def test_every_command_takes_a_baseline(data: DatagenConfig, tmp_path: Path, kind: str) -> None:
+def test_every_command_takes_a_baseline(data, tmp_path, kind):
     """A baseline is trained, resumed, exported, simulated and evaluated, in fp16, by the HGN's commands."""
     network = GNS | {"kind": kind, "obstacle_features": kind == "gns"}
     run = tmp_path / "run"
@@ -47,7 +44,7 @@ def test_every_command_takes_a_baseline(data: DatagenConfig, tmp_path: Path, kin
 
 
 @pytest.mark.parametrize("spacing_cells", [0.25, 0.5])
-def test_training_and_rollout_see_the_same_surface(spacing_cells: float, data: DatagenConfig) -> None:
+def test_training_and_rollout_see_the_same_surface(spacing_cells, data):
     """A batch and a simulation's start hold the same surface points, as far apart as asked, in the obstacles'
     cells; without obstacles there are none."""
     plain = EpisodeStore(data.dataset.folder, "train").episodes[0]
@@ -65,7 +62,7 @@ def test_training_and_rollout_see_the_same_surface(spacing_cells: float, data: D
 
 
 @pytest.mark.parametrize("experiment", ["gns", "gns_particles"])
-def test_experiments_name_the_papers_baselines(experiment: str) -> None:
+def test_experiments_name_the_papers_baselines(experiment):
     """The experiments compose to ten steps, R = 0.035, on the main data set."""
     from hgn.config import TrainConfig, config_directory
     from hgn.hydra_compat import compose

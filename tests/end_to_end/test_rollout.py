@@ -1,7 +1,5 @@
 """python -m hgn.rollout where little is said: shipped weights, random scenes, examples by name, pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -19,7 +17,7 @@ MAXIMUM_BYTES = 8_000_000
 
 
 @pytest.fixture
-def weights(tmp_path: Path) -> str:
+def weights(tmp_path):
     """A small network that predicts no acceleration."""
     config = NetworkConfig(width=8, levels=2, message_passing_steps=1)
     network = build_network(config)
@@ -29,7 +27,7 @@ def weights(tmp_path: Path) -> str:
     return str(tmp_path / "still.safetensors")
 
 
-def test_shipped_weights_are_whole() -> None:
+def test_shipped_weights_are_whole():
     """Each shipped file loads, is small enough to ship, and has a card that names it."""
     assert "obstacles" in shipped_weights()
     for name, path in shipped_weights().items():
@@ -39,7 +37,7 @@ def test_shipped_weights_are_whole() -> None:
         assert f"{name}.safetensors" in path.with_suffix(".md").read_text()
 
 
-def test_names_and_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_and_paths(tmp_path, monkeypatch):
     """A path stays a path, whether there is such a file or not; an unknown name lists what is shipped."""
     monkeypatch.chdir(tmp_path)
     Path("mine").touch()
@@ -51,7 +49,7 @@ def test_names_and_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         find_weights("sand")
 
 
-def test_nothing_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_said(tmp_path, monkeypatch, capsys):
     """Without out, it draws: three files in rollout/, named by the scene, a random one with the shipped network."""
     monkeypatch.chdir(tmp_path)
     assert rollout.main({"frames": 2}) == 0
@@ -62,7 +60,7 @@ def test_nothing_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert all(Path(name).stat().st_size > 1000 for name in names)
 
 
-def test_a_network_without_obstacles_gets_none(tmp_path: Path) -> None:
+def test_a_network_without_obstacles_gets_none(tmp_path):
     """Its random scene is one of the second data set's: four cubes and nothing else."""
     config = NetworkConfig(width=8, levels=2, message_passing_steps=1, obstacle_features=False)
     file, out = tmp_path / "free.safetensors", str(tmp_path / "a.vtkhdf")
@@ -72,7 +70,7 @@ def test_a_network_without_obstacles_gets_none(tmp_path: Path) -> None:
     assert not made.obstacles and made.position_TN3.shape[1] == 4296
 
 
-def test_scenes(tmp_path: Path, weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenes(tmp_path, weights, monkeypatch):
     """Seeds draw different scenes, an example has its name, a file of that name wins; with out nothing is drawn unless
     asked."""
     monkeypatch.chdir(tmp_path)
@@ -89,7 +87,7 @@ def test_scenes(tmp_path: Path, weights: str, monkeypatch: pytest.MonkeyPatch) -
     assert not read_rollout("c.vtkhdf").obstacles
 
 
-def test_what_may_surprise_is_said(tmp_path: Path, weights: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_may_surprise_is_said(tmp_path, weights, capsys):
     """A network knows one water; a scene file's constants are the solver's, and a line says so. Another says which of
     its meshes is no solid."""
     (tmp_path / "open.obj").write_text("v 0.2 0.2 0.2\nv 0.4 0.2 0.2\nv 0.2 0.2 0.4\nf 1 2 3\n")
@@ -103,7 +101,7 @@ def test_what_may_surprise_is_said(tmp_path: Path, weights: str, capsys: pytest.
     assert "a sheet, not a solid, for it is not watertight: open.obj" in said and "square" not in said
 
 
-def test_what_is_faster_than_the_data_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
     """Where the weights know how fast groups of their data began, a faster one is simulated and a line gives both."""
     config = NetworkConfig(width=8, levels=2, message_passing_steps=1)
     file, scene = tmp_path / "still.safetensors", tmp_path / "fast.yaml"

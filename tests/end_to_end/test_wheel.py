@@ -1,7 +1,5 @@
 """The wheel: installed without the checkout, every command runs from any folder."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -18,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(tmp_path_factory):
     """Built from the checkout with what is installed, without a network."""
     folder = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
@@ -29,7 +27,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def python(wheel, tmp_path_factory):
     """The interpreter of a fresh environment with the wheel, which sees the present dependencies but no checkout."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False)
@@ -43,7 +41,7 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return interpreter
 
 
-def run(python: Path, folder: Path, *arguments: str) -> str:
+def run(python, folder, *arguments):
     """Standard output of a command that must succeed and leave the folder empty."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run(
@@ -54,7 +52,7 @@ def run(python: Path, folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
-def test_configs_travel_inside(wheel: Path) -> None:
+def test_configs_travel_inside(wheel):
     """All of conf/, the shipped weights and what the user's machine compiles are inside, byte for byte; tests, job
     files and caches are not."""
     with zipfile.ZipFile(wheel) as archive:
@@ -70,7 +68,7 @@ def test_configs_travel_inside(wheel: Path) -> None:
     assert not [name for name in names if "__pycache__" in name or "test" in name]
 
 
-def test_package_is_the_installed_one(python: Path, tmp_path: Path) -> None:
+def test_package_is_the_installed_one(python, tmp_path):
     """The configs are found inside the installed package."""
     code = "import hgn.config; print(hgn.config.config_directory())"
     directory = Path(run(python, tmp_path, "-c", code).strip())
@@ -78,13 +76,13 @@ def test_package_is_the_installed_one(python: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("module", "key"), [("hgn.train", "training"), ("datagen", "mpm")])
-def test_commands_compose_their_config(python: Path, tmp_path: Path, module: str, key: str) -> None:
+def test_commands_compose_their_config(python, tmp_path, module, key):
     """`--cfg job` with an experiment prints the composed configuration, from an empty folder."""
     composed = yaml.safe_load(run(python, tmp_path, "-m", module, "+experiment=small", "--cfg", "job"))
     assert composed["name"] == "small" and key in composed
 
 
-def test_shipped_weights_simulate(python: Path, tmp_path: Path) -> None:
+def test_shipped_weights_simulate(python, tmp_path):
     """A random scene with shipped weights, from an empty folder."""
     (here := tmp_path / "here").mkdir()
     out = tmp_path / "rollout.vtkhdf"
@@ -92,7 +90,7 @@ def test_shipped_weights_simulate(python: Path, tmp_path: Path) -> None:
     assert out.stat().st_size > 10_000
 
 
-def test_command_helps(python: Path, tmp_path: Path) -> None:
+def test_command_helps(python, tmp_path):
     """`--help` says what a command does and shows its keys with their comments, from an empty folder."""
     text = run(python, tmp_path, "-m", "hgn.rollout", "--help")
     assert "weights: obstacles" in text and "# a f" in text and text.strip("`\n").startswith("python -m hgn.rollout")

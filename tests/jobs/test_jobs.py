@@ -1,7 +1,5 @@
 """The launch files: they are valid, start what they say, and go on after the time limit."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -17,7 +15,6 @@ import yaml
 from processes import PATIENCE_S
 from training.runs import metrics, train_arguments
 
-from hgn.config import DatagenConfig
 from hgn.data.manifest import Manifest
 from hgn.training.checkpoint import read_checkpoint
 
@@ -61,7 +58,7 @@ SCANCEL = """#!/usr/bin/env bash
 """
 
 
-def start(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.Popen[str]:
+def start(script, *arguments, cwd, **variables):
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "TORCH"))}
     environment = kept | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | variables
     return subprocess.Popen(
@@ -74,20 +71,20 @@ def start(script: str, *arguments: str, cwd: Path, **variables: str) -> subproce
     )
 
 
-def run(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+def run(script, *arguments, cwd, **variables):
     process = start(script, *arguments, cwd=cwd, **variables)
     output, errors = process.communicate(timeout=PATIENCE_S)
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
-def write_program(folder: Path, name: str, text: str) -> None:
+def write_program(folder, name, text):
     folder.mkdir(exist_ok=True)
     (folder / name).write_text(text)
     (folder / name).chmod(0o755)
 
 
 @pytest.fixture
-def slurm(tmp_path: Path) -> dict[str, str]:
+def slurm(tmp_path):
     """The environment of a Slurm job on one node with two tasks, with stand-ins for srun, scontrol and scancel."""
     programs = tmp_path / "programs"
     for name, text in (("srun", SRUN), ("scontrol", SCONTROL), ("scancel", SCANCEL)):
@@ -114,13 +111,13 @@ def slurm(tmp_path: Path) -> dict[str, str]:
 
 
 @pytest.fixture
-def warm(warm_python: Path) -> dict[str, str]:
+def warm(warm_python):
     """The environment in which scripts, torchrun among them, start trainings that need not load anything."""
     return {"PYTHON": str(warm_python), "PYTHON_EXEC": str(warm_python)}
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
-def test_scripts_are_valid(script: Path) -> None:
+def test_scripts_are_valid(script):
     """Bash parses each launch file, shellcheck finds nothing, and each may be executed."""
     assert subprocess.run(["bash", "-n", str(script)], capture_output=True, text=True).stderr == ""
     shellcheck = Path(sysconfig.get_path("scripts")) / "shellcheck"
@@ -129,7 +126,7 @@ def test_scripts_are_valid(script: Path) -> None:
     assert os.access(script, os.X_OK)
 
 
-def test_all_are_listed() -> None:
+def test_all_are_listed():
     """The table names every launch file, and every launch file that it names is there."""
     text = (JOBS / "README.md").read_text()
     named = set(re.findall(r"`(?:\w+ )?(?:kubectl apply -f )?(jobs/[\w/]+\.\w+)", text))
@@ -138,7 +135,7 @@ def test_all_are_listed() -> None:
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
-def test_options_of_slurm_come_first(script: Path) -> None:
+def test_options_of_slurm_come_first(script):
     """sbatch reads its options only before the first command; where tasks train, there is one for each GPU."""
     lines = script.read_text().splitlines()
     first_command = next(i for i, line in enumerate(lines) if line and not line.startswith("#"))
@@ -151,7 +148,7 @@ def test_options_of_slurm_come_first(script: Path) -> None:
     assert values.get("ntasks-per-node", "1") == tasks
 
 
-def test_torchrun_trains(warm: dict[str, str], data: DatagenConfig, tmp_path: Path) -> None:
+def test_torchrun_trains(warm, data, tmp_path):
     """jobs/torchrun.sh starts one training on two processes, which writes one run folder."""
     done = run("torchrun.sh", *train_arguments(data, tmp_path / "run", **SHORT), cwd=tmp_path, GPUS="2", **warm)
     assert done.returncode == 0, done.stderr[-4000:]
@@ -172,13 +169,13 @@ def test_torchrun_trains(warm: dict[str, str], data: DatagenConfig, tmp_path: Pa
         ({"RESTARTS": "-1"}, "error: RESTARTS must be a whole number, got '-1'\n"),
     ],
 )
-def test_torchrun_refuses(tmp_path: Path, variables: dict[str, str], message: str) -> None:
+def test_torchrun_refuses(tmp_path, variables, message):
     """Variables that make no sense are named before anything starts."""
     done = run("torchrun.sh", cwd=tmp_path, **variables)
     assert done.returncode == 2 and done.stderr.startswith(message) and done.stderr.count("\n") == 1
 
 
-def test_torchrun_on_several_machines(tmp_path: Path) -> None:
+def test_torchrun_on_several_machines(tmp_path):
     """With NODES and RENDEZVOUS torchrun is told where to meet and what the run is called; the training follows it."""
     write_program(tmp_path, "shown", '#!/usr/bin/env bash\nenv | grep ^TORCH | sort\nprintf "%s\\n" "$@"\n')
     variables = {"PYTHON": str(tmp_path / "shown"), "NODES": "3", "GPUS": "4", "RENDEZVOUS": "node0:29500"}
@@ -193,7 +190,7 @@ def test_torchrun_on_several_machines(tmp_path: Path) -> None:
     ]
 
 
-def test_slurm_trains(slurm: dict[str, str], warm: dict[str, str], data: DatagenConfig, tmp_path: Path) -> None:
+def test_slurm_trains(slurm, warm, data, tmp_path):
     """jobs/slurm/train.sbatch starts one training of two tasks that know their ranks from Slurm's variables."""
     arguments = train_arguments(data, tmp_path / "run", **SHORT)
     done = run("slurm/train.sbatch", *arguments, cwd=tmp_path, **slurm, **warm)
@@ -205,9 +202,7 @@ def test_slurm_trains(slurm: dict[str, str], warm: dict[str, str], data: Datagen
     assert not (tmp_path / "scontrol.log").exists()
 
 
-def test_slurm_trains_with_torchrun(
-    slurm: dict[str, str], warm: dict[str, str], data: DatagenConfig, tmp_path: Path
-) -> None:
+def test_slurm_trains_with_torchrun(slurm, warm, data, tmp_path):
     """jobs/slurm/train_torchrun.sbatch starts one torchrun a node. At the time limit the training ends with a
     checkpoint and the job is queued again; started again, it goes on in the same folder, named after the job."""
     (tmp_path / "jobs").symlink_to(JOBS)
@@ -255,9 +250,7 @@ def test_slurm_trains_with_torchrun(
         ("slurm/generate_array.sbatch", 143, 0, True, "2026-01-01T00:00:00"),
     ],
 )
-def test_time_limit(
-    slurm: dict[str, str], tmp_path: Path, script: str, code: int, returned: int, requeued: bool, preempted: str
-) -> None:
+def test_time_limit(slurm, tmp_path, script, code, returned, requeued, preempted):
     """Stopped by the signal before the time limit, or told to make room, a job is queued again; cancelled or failed, it
     is not."""
     write_program(tmp_path / "programs", "srun", f"#!/usr/bin/env bash\nexit {code}\n")
@@ -267,7 +260,7 @@ def test_time_limit(
 
 
 @pytest.fixture
-def generating(backend: object, slurm: dict[str, str], tmp_path: Path) -> dict[str, str]:
+def generating(backend, slurm, tmp_path):
     """The environment of one generating task, with an interpreter that has the solver's stand-in for the solver."""
     write_program(
         tmp_path / "programs",
@@ -278,7 +271,7 @@ def generating(backend: object, slurm: dict[str, str], tmp_path: Path) -> dict[s
     return slurm | variables | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'datagen'}"}
 
 
-def generate(script: str, tmp_path: Path, variables: dict[str, str]) -> Manifest:
+def generate(script, tmp_path, variables):
     sizes = ["scenes=5", "dataset.validation_scenes=1", "dataset.test_scenes=1", "dataset.frames=5"]
     arguments = [*sizes, "dataset.workers=1", f"out={tmp_path / 'data'}"]
     done = run(script, *arguments, cwd=tmp_path, **variables)
@@ -286,14 +279,14 @@ def generate(script: str, tmp_path: Path, variables: dict[str, str]) -> Manifest
     return Manifest.load(tmp_path / "data")
 
 
-def test_slurm_generates(generating: dict[str, str], tmp_path: Path) -> None:
+def test_slurm_generates(generating, tmp_path):
     """jobs/slurm/generate.sbatch makes the whole data set that its experiment and arguments ask for."""
     manifest = generate("slurm/generate.sbatch", tmp_path, generating)
     assert manifest.complete and manifest.published("train") == 5
     assert not (tmp_path / "scontrol.log").exists()
 
 
-def test_array_generates(generating: dict[str, str], tmp_path: Path) -> None:
+def test_array_generates(generating, tmp_path):
     """Tasks of jobs/slurm/generate_array.sbatch make one data set between them, each shard once."""
     for task in ("1", "0"):
         variables = generating | ARRAY | {"SLURM_ARRAY_TASK_ID": task}
@@ -303,7 +296,7 @@ def test_array_generates(generating: dict[str, str], tmp_path: Path) -> None:
     assert len(names) == len(set(names)) and manifest.published("train") == 5
 
 
-def test_array_with_gaps_is_refused(slurm: dict[str, str], tmp_path: Path) -> None:
+def test_array_with_gaps_is_refused(slurm, tmp_path):
     """Tasks that are missing would leave their shards unmade for ever."""
     variables = slurm | ARRAY | {"SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_MAX": "2"}
     done = run("slurm/generate_array.sbatch", cwd=tmp_path, **variables)

@@ -5,13 +5,10 @@ types (kubeflow-trainer-api). KubeRay publishes no Python types: the keys below 
 definition ray.io_rayjobs.yaml (version v1) in ray-project/kuberay, and the pods in it are Kubernetes' own.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import kubernetes_validate
 import pytest
@@ -83,17 +80,17 @@ RAY_WORKER = {
 }
 
 
-def documents(name: str) -> list[dict[str, Any]]:
+def documents(name):
     return list(yaml.safe_load_all((K8S / name).read_text()))
 
 
-def validate_pod(template: dict[str, Any]) -> None:
+def validate_pod(template):
     document = {"apiVersion": "v1", "kind": "PodTemplate", "metadata": {"name": "checked"}, "template": template}
     for version in (OLDEST, NEWEST):
         kubernetes_validate.validate(document, version, strict=True)
 
 
-def containers() -> list[dict[str, Any]]:
+def containers():
     """Every container of every file, and the trainer of the TrainJob."""
     (ray_job,) = documents("generate.yaml")
     cluster = ray_job["spec"]["rayClusterSpec"]
@@ -105,7 +102,7 @@ def containers() -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("version", [OLDEST, NEWEST])
 @pytest.mark.parametrize("name", ["service.yaml", "volume.yaml"])
-def test_objects_of_kubernetes(name: str, version: str) -> None:
+def test_objects_of_kubernetes(name, version):
     """Deployment, service and volume claim are valid by the published schemas, without an unknown key."""
     for document in documents(name):
         kubernetes_validate.validate(document, version, strict=True)
@@ -113,7 +110,7 @@ def test_objects_of_kubernetes(name: str, version: str) -> None:
         kubernetes_validate.validate(document | {"colour": 1}, version, strict=True)
 
 
-def test_train_job() -> None:
+def test_train_job():
     """The TrainJob is one by Kubeflow's types, and they know each of its keys: it comes back as it went in."""
     (job,) = documents("train.yaml")
     typed = TrainerV1alpha1TrainJob.from_dict(job)
@@ -131,7 +128,7 @@ def test_train_job() -> None:
     assert pod["spec"]["terminationGracePeriodSeconds"] > int(timeout)
 
 
-def test_ray_job() -> None:
+def test_ray_job():
     """The RayJob has only keys of its definition, those that must be there, and valid pods."""
     (job,) = documents("generate.yaml")
     assert (job["apiVersion"], job["kind"], set(job)) == (
@@ -152,13 +149,13 @@ def test_ray_job() -> None:
         assert all(isinstance(value, str) for value in group.get("rayStartParams", {}).values())
 
 
-def composed(monkeypatch: pytest.MonkeyPatch, config: str, arguments: list[str]) -> dict[str, Any]:
+def composed(monkeypatch, config, arguments):
     monkeypatch.setattr("sys.argv", [config, *arguments])
     (mapping,) = _compose(config)
     return mapping
 
 
-def test_commands_take_what_the_files_give_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_take_what_the_files_give_them(monkeypatch):
     """Each file's arguments compose to a valid configuration of the command that it starts."""
     arguments = documents("train.yaml")[0]["spec"]["trainer"]["args"]
     mapping = composed(monkeypatch, "train", arguments[arguments.index("hgn.train") + 1 :])
@@ -183,7 +180,7 @@ def test_commands_take_what_the_files_give_them(monkeypatch: pytest.MonkeyPatch)
     )
 
 
-def test_files_fit_each_other() -> None:
+def test_files_fit_each_other():
     """One image, one claim, one secret, one port: what one file names, another makes or the notes tell to make."""
     assert len({container["image"] for container in containers()}) == 1
     text = "\n".join(path.read_text() for path in K8S.glob("*.yaml"))
@@ -205,7 +202,7 @@ def test_files_fit_each_other() -> None:
     assert "kubectl create secret generic hgn-dataset --from-literal=token=" in text
 
 
-def test_pods_are_bounded_and_not_root() -> None:
+def test_pods_are_bounded_and_not_root():
     """No tag that changes, a limit of memory, no root, no privileges: what the policy "restricted" lets in; probes that
     wait longer than a second; and as much time to end as the service takes."""
     image = (K8S / "Dockerfile").read_text()

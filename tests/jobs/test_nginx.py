@@ -1,7 +1,5 @@
 """jobs/nginx.conf: TLS in front of a dataset service, with nginx itself where it is installed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket
@@ -9,7 +7,6 @@ import string
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +14,6 @@ from processes import PATIENCE_S, wait_until
 
 from datagen.service.server import make_app, make_server
 from datagen.service.supervisor import PoolState
-from hgn.config import DatagenConfig
 from hgn.data.storage import TOKEN_HOST_VARIABLE, TOKEN_VARIABLE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,12 +31,12 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def listening() -> socket.socket:
+def listening():
     return socket.create_server(("127.0.0.1", 0))
 
 
 @pytest.fixture
-def address(make_config: Callable[..., DatagenConfig], tmp_path: Path) -> Iterator[str]:
+def address(make_config, tmp_path):
     """Of nginx in front of a service of `data`, which asks for the token."""
     folder = Path(make_config().dataset.folder)
     listener = listening()
@@ -74,7 +70,7 @@ def address(make_config: Callable[..., DatagenConfig], tmp_path: Path) -> Iterat
         nginx.wait()
 
 
-def reader(address: str, tmp_path: Path, **variables: str) -> subprocess.Popen[str]:
+def reader(address, tmp_path, **variables):
     trust = {"SSL_CERT_FILE": str(tmp_path / "fullchain.pem"), "HGN_CACHE": str(tmp_path / "cache")}
     environment = os.environ | {"PYTHONPATH": str(ROOT), TOKEN_VARIABLE: TOKEN} | trust | variables
     return subprocess.Popen(
@@ -83,19 +79,14 @@ def reader(address: str, tmp_path: Path, **variables: str) -> subprocess.Popen[s
     )  # fmt: skip
 
 
-def test_a_data_set_that_grows(
-    make_config: Callable[..., DatagenConfig],
-    make_dataset: Callable[[DatagenConfig], Path],
-    address: str,
-    tmp_path: Path,
-) -> None:
+def test_a_data_set_that_grows(make_config, make_dataset, address, tmp_path):
     """A reader takes a data set through TLS, shards by ranges, and sees it grow. Without the token it is refused, also
     where the token is meant for another host; a certificate that nobody vouches for is refused too."""
     make_dataset(make_config(training_scenes=2))
     process = reader(address, tmp_path)
     assert process.stdin is not None and process.stdout is not None
 
-    def ask() -> str:
+    def ask():
         process.stdin.write("\n")
         process.stdin.flush()
         return process.stdout.readline()

@@ -1,7 +1,5 @@
 """The queue of one machine: its GPUs share a list, barriers hold, it stops and goes on; and the lists of networks."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -32,7 +30,7 @@ print(json.dumps(sys.argv[1:]))
 """
 
 
-def start(folder: Path, text: str | Path, *arguments: str, **variables: str) -> subprocess.Popen[str]:
+def start(folder, text, *arguments, **variables):
     """Starts the queue in a folder, on a list or its text, where nvidia-smi is what write_program made of it."""
     if isinstance(text, str):
         (folder / "list.txt").write_text(text)
@@ -51,13 +49,13 @@ def start(folder: Path, text: str | Path, *arguments: str, **variables: str) -> 
     )
 
 
-def run(folder: Path, text: str | Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run(folder, text, *arguments, **variables):
     process = start(folder, text, *arguments, **variables)
     output, errors = process.communicate(timeout=PATIENCE_S)
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
 
 
-def write_program(folder: Path, name: str, text: str) -> None:
+def write_program(folder, name, text):
     programs = folder / "programs"
     programs.mkdir(exist_ok=True)
     (programs / name).write_text(text)
@@ -65,19 +63,19 @@ def write_program(folder: Path, name: str, text: str) -> None:
 
 
 @pytest.fixture
-def machine(tmp_path: Path) -> Path:
+def machine(tmp_path):
     """A folder on a machine with two GPUs."""
     write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\nprintf '0\\n1\\n'\n")
     return tmp_path
 
 
-def events(output: str) -> list[tuple[str, str, str]]:
+def events(output):
     """(GPU, name, what) of each line about a command; what is `begin` or `end, exit code N`."""
     told = [line.split("  ") for line in output.splitlines() if "  GPU " in line]
     return [(gpu.removeprefix("GPU "), name, what.rpartition(", ")[0] or what) for _, gpu, name, what in told]
 
 
-def test_gpus_share_a_list(machine: Path) -> None:
+def test_gpus_share_a_list(machine):
     """Each GPU runs one command at a time, which sees that GPU alone; behind a barrier all before it is done."""
     meet = "touch {0}; until [[ -e {1} ]]; do sleep 0.02; done; echo $CUDA_VISIBLE_DEVICES"  # both at once, or never
     lines = [
@@ -107,7 +105,7 @@ def test_gpus_share_a_list(machine: Path) -> None:
 @pytest.mark.parametrize(
     ("visible", "gpus"), [("5", ["5"]), ("GPU-8a,MIG-1", ["GPU-8a", "MIG-1"]), ("3, 2,7", ["3", "2", "7"])]
 )
-def test_visible_gpus(tmp_path: Path, visible: str, gpus: list[str]) -> None:
+def test_visible_gpus(tmp_path, visible, gpus):
     """CUDA_VISIBLE_DEVICES says which GPUs there are; nvidia-smi is not asked."""
     write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\ntouch asked; exit 1\n")
     count = len(gpus)
@@ -121,14 +119,14 @@ def test_visible_gpus(tmp_path: Path, visible: str, gpus: list[str]) -> None:
     assert sorted(seen) == sorted(gpus)
 
 
-def test_without_gpus(machine: Path) -> None:
+def test_without_gpus(machine):
     """Without GPUs one command runs after the other, in the order of the list."""
     done = run(machine, "b: echo b >> order\na: echo a >> order\nc: echo c >> order\n", CUDA_VISIBLE_DEVICES="")
     assert done.returncode == 0 and (machine / "order").read_text() == "b\na\nc\n"
     assert done.stdout.startswith("3 commands, GPUs: cpu, logs in runs/queue\n")
 
 
-def test_nvidia_smi_that_fails_is_told(tmp_path: Path) -> None:
+def test_nvidia_smi_that_fails_is_told(tmp_path):
     """A driver at fault is no machine without GPUs."""
     write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\necho 'no driver'\nexit 9\n")
     done = run(tmp_path, "a: touch a\n")
@@ -139,7 +137,7 @@ def test_nvidia_smi_that_fails_is_told(tmp_path: Path) -> None:
     )
 
 
-def test_failing_and_going_on(machine: Path) -> None:
+def test_failing_and_going_on(machine):
     """A command that fails stops no other before the barrier, and all behind it. The same call runs what is not done,
     and that alone; a third finds nothing to do."""
     lines = [
@@ -169,7 +167,7 @@ def test_failing_and_going_on(machine: Path) -> None:
     assert (machine / "ran").read_text().split() == ["bad", "behind"]
 
 
-def test_done_with_other_variables_is_refused(machine: Path) -> None:
+def test_done_with_other_variables_is_refused(machine):
     """What a trial has done is not taken for the real thing: the variables of a command belong to it, no others do."""
     text = "a: echo $((100 * ${SHARE:-100})) >> ran\n"
     assert run(machine, text, SHARE="1").returncode == 0
@@ -194,7 +192,7 @@ while true; do sleep 0.02; done
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_signals_reach_the_commands(machine: Path, number: signal.Signals) -> None:
+def test_signals_reach_the_commands(machine, number):
     """Commands get SIGTERM, and what they still have to write is waited for, in pipes and in the background too; their
     lines do not go on, no other line begins, and the same call goes on with all of them."""
     write_program(machine, "training", TRAINING)
@@ -224,7 +222,7 @@ def test_signals_reach_the_commands(machine: Path, number: signal.Signals) -> No
     assert run(machine, text).returncode == 0 and (machine / "d").exists()
 
 
-def test_nothing_is_left_behind(machine: Path) -> None:
+def test_nothing_is_left_behind(machine):
     """What a command leaves running is ended before its GPU takes the next one."""
     write_program(machine, "training", TRAINING)
     text = "a: training a & until [[ -s a.session ]]; do sleep 0.02; done\nb: cat a\n"
@@ -232,7 +230,7 @@ def test_nothing_is_left_behind(machine: Path) -> None:
     assert (machine / "runs" / "queue" / "b.log").read_text() == "state\n"
 
 
-def test_one_queue_a_folder(machine: Path) -> None:
+def test_one_queue_a_folder(machine):
     """A second queue in the same folder is refused while the first works."""
     text = "a: touch a; until [[ -e end ]]; do sleep 0.02; done\n"
     first = start(machine, text)
@@ -263,14 +261,14 @@ def test_one_queue_a_folder(machine: Path) -> None:
         ("a: echo 'b", "list.txt:3: the command of 'a' must be one that bash can read, got 'echo 'b'; mend it: "),
     ],
 )
-def test_faulty_lines_are_refused(machine: Path, line: str, message: str) -> None:
+def test_faulty_lines_are_refused(machine, line, message):
     """File, line, rule and remedy are told before anything begins."""
     done = run(machine, f"# list\none: touch began\n{line}\n")
     assert done.returncode == 2 and done.stderr.startswith(f"error: {message}") and done.stderr.count("\n") == 1
     assert done.stdout == "" and not (machine / "began").exists() and not (machine / "runs").exists()
 
 
-def test_lists_are_refused(machine: Path) -> None:
+def test_lists_are_refused(machine):
     """So are a list that is not there, one without commands, and a call without any."""
     missing = run(machine, Path("none.txt"))
     assert missing.returncode == 2
@@ -284,7 +282,7 @@ def test_lists_are_refused(machine: Path) -> None:
     assert usage.returncode == 2 and usage.stderr.startswith("usage: jobs/queue.sh LIST [FOLDER]")
 
 
-def calls(machine: Path, file: str, **variables: str) -> dict[str, list[list[str]]]:
+def calls(machine, file, **variables):
     """The modules that each line of a list in jobs runs, with their arguments, in the order of the lines."""
     write_program(machine, "python", PYTHON)
     done = run(machine, JOBS / file, CUDA_VISIBLE_DEVICES="", **variables)
@@ -296,7 +294,7 @@ def calls(machine: Path, file: str, **variables: str) -> dict[str, list[list[str
     return {name: [call[1:] for call in lines] for name, lines in made.items()}
 
 
-def settings(lines: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
+def settings(lines, monkeypatch):
     """What each module of a line is given, by its name."""
     mappings: dict[str, dict[str, Any]] = {}
     for module, *arguments in lines:
@@ -305,9 +303,7 @@ def settings(lines: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> dict[st
     return mappings
 
 
-def trained_and_scored(
-    name: str, mappings: dict[str, dict[str, Any]], data: dict[str, DatagenConfig]
-) -> tuple[TrainConfig, EvaluateConfig]:
+def trained_and_scored(name, mappings, data):
     """A line that trains a network on data made before, exports it and scores it."""
     assert list(mappings) == ["hgn.train", "hgn.export", "hgn.evaluate"]
     mappings["hgn.train"].pop("name")
@@ -325,7 +321,7 @@ def trained_and_scored(
     return config, score
 
 
-def test_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_networks(tmp_path, monkeypatch):
     """jobs/networks.txt: each command's settings compose to a valid configuration; each network is trained on data that
     an earlier line makes, exported, and scored on the same data; all shipped networks are among them; reports take
     what was exported."""
@@ -350,7 +346,7 @@ def test_networks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(shipped_weights()) - {"mechanics"} <= {Path(file).stem for file in exported}
 
 
-def test_mechanics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mechanics(tmp_path, monkeypatch):
     """jobs/mechanics.txt trains the network that ships on data that it makes, exports it and scores it on them."""
     ((name, lines),) = calls(tmp_path, "mechanics.txt").items()
     mappings = settings(lines, monkeypatch)
@@ -364,7 +360,7 @@ def test_mechanics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_weights(shipped_weights()[Path(export.out).stem])[1].network == config.network
 
 
-def test_pushforward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pushforward(tmp_path, monkeypatch):
     """jobs/pushforward.txt: it begins with weights that jobs/networks.txt exports; each training goes on from weights
     that are there, on data that an earlier line makes; means are of weights that are there, and the last one ships."""
     data: dict[str, DatagenConfig] = {}
@@ -389,7 +385,7 @@ def test_pushforward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Path(mean.out).stem in shipped_weights()
 
 
-def test_trial_of_pushforward(tmp_path: Path) -> None:
+def test_trial_of_pushforward(tmp_path):
     """SCENES and SHARE shorten data and trainings."""
     lines = calls(tmp_path, "pushforward.txt", SCENES="2", SHARE="1")
     used = [argument for line in lines.values() for call in line for argument in call]
@@ -398,7 +394,7 @@ def test_trial_of_pushforward(tmp_path: Path) -> None:
     assert len(updates) == 5 and max(updates) < 1000
 
 
-def test_trial_of_networks(tmp_path: Path) -> None:
+def test_trial_of_networks(tmp_path):
     """SCENES, SHARE and REPORT_SECONDS shorten data, trainings and reports, and change nothing else."""
     (tmp_path / "trial").mkdir()
     whole = calls(tmp_path, "networks.txt")

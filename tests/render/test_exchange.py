@@ -1,10 +1,7 @@
 """Rollouts as USD and PLY, read back by USD's own library and trimesh."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +21,7 @@ from hgn.schema import ConfigError
 SPACING = 1 / 128
 
 
-def block(random: bool, side: int = 12) -> np.ndarray:
+def block(random, side=12):
     """A cube of water, 8 particles in a cell of 1/64, float64 [N, 3]."""
     if random:
         return 0.3 + np.random.default_rng(0).random((side**3, 3)) * side * SPACING
@@ -32,7 +29,7 @@ def block(random: bool, side: int = 12) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def rollout() -> Rollout:
+def rollout():
     """Water and sand by turns, moving; a box and a sheet; names that USD does not allow."""
     start_N3 = block(random=False, side=6).astype(np.float32)
     motion_T13 = np.arange(3, dtype=np.float32)[:, None, None] * np.float32((0.01, -0.002, 0.0))
@@ -45,7 +42,7 @@ def rollout() -> Rollout:
     return Rollout(start_N3 + motion_T13, material_N, obstacles, (1.0, 1.0, 1.0), 60.0)
 
 
-def test_usd_is_read_back(tmp_path: Path, rollout: Rollout) -> None:
+def test_usd_is_read_back(tmp_path, rollout):
     """Every position, velocity, index and triangle; seconds by the frame rate; nothing else is left in the folder."""
     path = save_rollout(tmp_path / "a" / "scene.usdc", rollout, surface=True)
     assert [file.name for file in path.parent.iterdir()] == ["scene.usdc"]
@@ -74,7 +71,7 @@ def test_usd_is_read_back(tmp_path: Path, rollout: Rollout) -> None:
     np.testing.assert_allclose(last.mean(0) - first.mean(0), (0.02, -0.004, 0), atol=SPACING / 2)
 
 
-def test_what_enters_and_what_moves(tmp_path: Path, rollout: Rollout) -> None:
+def test_what_enters_and_what_moves(tmp_path, rollout):
     """USD and PLY hold the particles that are there, and obstacles at each frame where their motion has them."""
     position_TN3 = rollout.position_TN3.copy()
     position_TN3[0, -7:] = np.nan
@@ -105,7 +102,7 @@ def test_what_enters_and_what_moves(tmp_path: Path, rollout: Rollout) -> None:
         np.testing.assert_allclose(ply.vertices, expected_V3, atol=1e-6)
 
 
-def test_ply_is_read_back(tmp_path: Path, rollout: Rollout) -> None:
+def test_ply_is_read_back(tmp_path, rollout):
     """A file a frame with places, velocities and materials; the obstacles once; the water's surface a frame."""
     first = save_rollout(tmp_path / "scene.ply", rollout, surface=True)
     assert first == tmp_path / "scene_0000.ply"
@@ -123,7 +120,7 @@ def test_ply_is_read_back(tmp_path: Path, rollout: Rollout) -> None:
 
 
 @pytest.mark.parametrize("random", [False, True])
-def test_the_surface_encloses_the_water(random: bool) -> None:
+def test_the_surface_encloses_the_water(random):
     """Closed, and of the particles' volume within 5 %, for a lattice and a random filling."""
     position_N3 = block(random)
     mesh = trimesh.Trimesh(*fluid_surface(position_N3, particle_spacing(position_N3)), process=False)
@@ -131,13 +128,13 @@ def test_the_surface_encloses_the_water(random: bool) -> None:
     assert mesh.volume == pytest.approx(len(position_N3) * SPACING**3, rel=0.05)
 
 
-def test_no_fluid_no_surface() -> None:
+def test_no_fluid_no_surface():
     """Sand alone has an empty surface."""
     vertex_V3, triangle_F3 = fluid_surface(np.zeros((0, 3)), SPACING)
     assert vertex_V3.shape == triangle_F3.shape == (0, 3)
 
 
-def test_what_cannot_be_written_is_said_before_the_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_is_said_before_the_simulation(monkeypatch):
     """A surface in VTKHDF; USD without its library."""
     with pytest.raises(ConfigError, match="surface must be false unless out ends in"):
         rollout_main({"surface": True, "weights": "no such weights"})

@@ -1,10 +1,7 @@
 """Pictures and animations of a small synthetic rollout."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,18 +25,18 @@ from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
 
-def falling_blobs(frames: int = 30, reference_frames: int | None = None) -> Rollout:
+def falling_blobs(frames=30, reference_frames=None):
     """One blob of each material falls and bounces once; the ground truth bounces less."""
     lattice = np.stack(np.meshgrid(*[np.arange(5)] * 3), axis=-1).reshape(-1, 3) / 128
     centers = np.array([[0.25, 0.6, 0.6], [0.5, 0.7, 0.3], [0.7, 0.65, 0.7]])
     start = np.concatenate([center + lattice for center in centers])
     seconds = np.arange(frames if reference_frames is None else max(frames, reference_frames)) / 60
 
-    def height(restitution: float) -> np.ndarray:
+    def height(restitution):
         fall = 0.5 * 9.8 * seconds**2
         return np.where(fall < 0.5, -fall, -0.5 + restitution * (fall - 0.5))
 
-    def motion(restitution: float) -> np.ndarray:
+    def motion(restitution):
         position = np.repeat(start[None], len(seconds), axis=0)
         position[..., 1] += height(restitution)[:, None]
         return position.astype(np.float32)
@@ -57,7 +54,7 @@ def falling_blobs(frames: int = 30, reference_frames: int | None = None) -> Roll
     )
 
 
-def has_hue(picture: Image.Image, material: int) -> bool:
+def has_hue(picture, material):
     """Whether at least 20 pixels have the hue of the material: blue, ochre, pale blue."""
     red, _, blue = np.moveaxis(np.asarray(picture).astype(np.int64), -1, 0)
     found = (
@@ -69,20 +66,20 @@ def has_hue(picture: Image.Image, material: int) -> bool:
 
 
 @pytest.mark.parametrize("material", [0, 1, 2])
-def test_each_material_is_seen_in_its_colour(material: int) -> None:
+def test_each_material_is_seen_in_its_colour(material):
     """A frame shows a material's hue when that material is there, and not when it is not."""
     rollout = falling_blobs()
 
     stage = Stage(rollout.domain_size, (), 0.01, 300)
 
-    def frame(kept: np.ndarray) -> Image.Image:
+    def frame(kept):
         return stage.draw(rollout.position_TN3[0, kept], rollout.material_N[kept])
 
     assert has_hue(frame(rollout.material_N == material), material)
     assert not has_hue(frame(np.zeros(len(rollout.material_N), bool)), material)
 
 
-def test_grid_of_frames() -> None:
+def test_grid_of_frames():
     """The grid has a column a frame and a row for each of prediction and ground truth; panels differ."""
     rollout = falling_blobs(30, 30)
     both = compare_picture(rollout, [0, 10, 29], size=120)
@@ -95,14 +92,14 @@ def test_grid_of_frames() -> None:
     assert (middle[:, 30:140] != middle[:, 30 + step : 140 + step]).any()
 
 
-def test_pictures_are_reproducible() -> None:
+def test_pictures_are_reproducible():
     """The same rollout gives the same pixels."""
     rollout = falling_blobs(12, 12)
     first, second = (np.asarray(compare_picture(rollout, [5, 11], size=100)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
-def test_ended_ground_truth_and_lost_particles_are_said() -> None:
+def test_ended_ground_truth_and_lost_particles_are_said():
     """A panel past the end of the ground truth says so, as does one with particles that are not finite."""
     rollout = falling_blobs(20, 10)
     whole = np.asarray(compare_picture(falling_blobs(20, 20), [15], size=150))
@@ -114,14 +111,14 @@ def test_ended_ground_truth_and_lost_particles_are_said() -> None:
 
 
 @pytest.mark.parametrize("frames", [[], [0, 30], [-1]])
-def test_frames_outside_the_rollout(frames: list[int]) -> None:
+def test_frames_outside_the_rollout(frames):
     """Frames that are not there are refused by name and number."""
     with pytest.raises(ConfigError, match="frames"):
         compare_picture(falling_blobs(), frames)
 
 
 @pytest.mark.parametrize(("every", "fps", "pictures", "milliseconds"), [(3, None, 10, 50), (7, 12.5, 5, 80)])
-def test_animation(tmp_path: Path, every: int, fps: float | None, pictures: int, milliseconds: int) -> None:
+def test_animation(tmp_path, every, fps, pictures, milliseconds):
     """The GIF has the frames asked for, in real time or at the rate asked for, loops, and moves."""
     seen: list[tuple[int, int]] = []
     path = tmp_path / "new" / "rollout.gif"
@@ -139,7 +136,7 @@ def test_animation(tmp_path: Path, every: int, fps: float | None, pictures: int,
         assert has_hue(Image.fromarray(shown[0][1]), material)
 
 
-def test_webp_animation(tmp_path: Path) -> None:
+def test_webp_animation(tmp_path):
     """A WebP holds the same pictures as the GIF in real time, loops, and is the smaller file."""
     rollout, progress = falling_blobs(24, 24), []
     animate(rollout, tmp_path / "a.webp", every=2, size=160, progress=lambda *step: progress.append(step))
@@ -156,14 +153,14 @@ def test_webp_animation(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["gif", "webp"])
-def test_single_frame_animation(tmp_path: Path, ending: str) -> None:
+def test_single_frame_animation(tmp_path, ending):
     """A rollout of one frame gives a still picture."""
     animate(falling_blobs(1), tmp_path / f"still.{ending}", size=80)
     with Image.open(tmp_path / f"still.{ending}") as picture:
         assert picture.n_frames == 1
 
 
-def test_animation_rates_that_viewers_change(tmp_path: Path) -> None:
+def test_animation_rates_that_viewers_change(tmp_path):
     """Rates above 50 per second (WebP 60), which viewers slow down, are refused with the remedy; so is every=0."""
     with pytest.raises(ConfigError, match="every >= 2"):
         animate(falling_blobs(), tmp_path / "a.gif", every=1)
@@ -176,7 +173,7 @@ def test_animation_rates_that_viewers_change(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_position_error() -> None:
+def test_position_error():
     """Squares are summed over axes and averaged over particles, of each material too."""
     rollout = falling_blobs(8, 6)
     moved = rollout.reference_TN3 + np.array([0.1, 0.0, 0.2], np.float32)
@@ -188,7 +185,7 @@ def test_position_error() -> None:
         position_error(falling_blobs(3))
 
 
-def test_error_curve() -> None:
+def test_error_curve():
     """The plot has the size asked for and its lines; errors of zero or NaN throughout draw without a warning."""
     picture = error_curve(position_error(falling_blobs(30, 30)), 60.0, (500, 300))
     assert picture.size == (500, 300)
@@ -197,7 +194,7 @@ def test_error_curve() -> None:
     error_curve({"all": np.full(5, np.nan)}, 60.0)
 
 
-def test_particle_spacing() -> None:
+def test_particle_spacing():
     """A lattice gives its spacing, at any scale; too few particles give the usual one."""
     lattice = np.stack(np.meshgrid(*[np.arange(9)] * 3), axis=-1).reshape(-1, 3) * 0.02
     assert particle_spacing(lattice) == pytest.approx(0.02)
@@ -206,7 +203,7 @@ def test_particle_spacing() -> None:
     assert particle_spacing(np.zeros((50, 3))) > 0
 
 
-def test_episode_as_rollout(tmp_path: Path) -> None:
+def test_episode_as_rollout(tmp_path):
     """An episode alone is no prediction and is not labelled as one; beside a prediction it is the ground truth."""
     blobs = falling_blobs(4, 6)
     assert blobs.reference_TN3 is not None
@@ -234,7 +231,7 @@ def test_episode_as_rollout(tmp_path: Path) -> None:
     assert compare_picture(alone, [0, 3], 100).width < compare_picture(predicted, [0, 3], 100).width
 
 
-def test_png_keeps_its_source(tmp_path: Path) -> None:
+def test_png_keeps_its_source(tmp_path):
     """The PNG says how the rollout was made."""
     write_picture(tmp_path / "a.png", Image.new("RGB", (4, 4)), {"weights": "model.safetensors"})
     with Image.open(tmp_path / "a.png") as picture:

@@ -1,7 +1,5 @@
 """The software renderer: geometry that can be checked by hand, occlusion, and particles that ran away."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -14,7 +12,7 @@ CENTER = np.array([[0.5, 0.5, 0.5]])
 WATER = np.zeros(1, np.uint8)
 
 
-def sheet_towards_the_eye(distance: float) -> Obstacle:
+def sheet_towards_the_eye(distance):
     """A large square across the line of sight, `distance` from the domain's centre towards the eye."""
     right, up, back = Camera(UNIT, 64).axes
     middle = CENTER[0] + distance * back
@@ -22,13 +20,13 @@ def sheet_towards_the_eye(distance: float) -> Obstacle:
     return Obstacle("sheet", np.array(corner), np.array([[0, 1, 2], [0, 2, 3]], np.int32), closed=False)
 
 
-def middle_color(stage: Stage, position_N3: np.ndarray, material_N: np.ndarray) -> np.ndarray:
+def middle_color(stage, position_N3, material_N):
     picture = np.asarray(stage.draw(position_N3, material_N)).astype(np.int64)
     (x, y), *_ = stage.camera.project(CENTER)[0] / 2
     return picture[int(y), int(x)]
 
 
-def test_fragments_of_a_right_triangle() -> None:
+def test_fragments_of_a_right_triangle():
     """The pixels under a right triangle are those whose centres it contains, and its weights give them back."""
     corner = np.array([[[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]]])
     triangle, pixel, weight = fragments(corner, 5, 6)
@@ -40,7 +38,7 @@ def test_fragments_of_a_right_triangle() -> None:
     np.testing.assert_allclose(weight @ corner[0], np.stack((pixel % 5, pixel // 5), axis=1) + 0.5)
 
 
-def test_fragments_are_clipped_and_either_winding_counts() -> None:
+def test_fragments_are_clipped_and_either_winding_counts():
     """A triangle beyond the picture fills it whole; a degenerate one gives nothing."""
     large = np.array([[-50.0, -50.0], [200.0, -50.0], [-50.0, 200.0]])
     flat = np.array([[0.0, 0.0], [2.0, 2.0], [4.0, 4.0]])
@@ -50,7 +48,7 @@ def test_fragments_are_clipped_and_either_winding_counts() -> None:
         assert sorted(pixel) == list(range(21))
 
 
-def test_smooth_normals() -> None:
+def test_smooth_normals():
     """A sphere's normals point outwards from its centre; a cube keeps the normals of its faces."""
     sphere = trimesh.creation.icosphere(subdivisions=3)
     corner = sphere.vertices[sphere.faces]
@@ -64,7 +62,7 @@ def test_smooth_normals() -> None:
 
 
 @pytest.mark.parametrize("domain_size", [UNIT, (4.0, 1.0, 2.0), (0.1, 0.3, 0.1)])
-def test_camera_fits_the_domain(domain_size: tuple[float, float, float]) -> None:
+def test_camera_fits_the_domain(domain_size):
     """All corners of the domain lie inside the picture, which they nearly fill; up is up."""
     camera = Camera(domain_size, 200)
     corner = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * np.array(domain_size)
@@ -74,7 +72,7 @@ def test_camera_fits_the_domain(domain_size: tuple[float, float, float]) -> None
     assert (xy[2::4, 1] < xy[0::4, 1]).all()
 
 
-def test_nearer_particles_cover_farther_ones() -> None:
+def test_nearer_particles_cover_farther_ones():
     """Of two particles on one line of sight the nearer is seen, whatever their order in the arrays."""
     stage = Stage(UNIT, (), 0.05, 100)
     back = stage.camera.axes[2]
@@ -86,7 +84,7 @@ def test_nearer_particles_cover_farther_ones() -> None:
     assert middle_color(stage, position, material[::-1])[0] > color[0]
 
 
-def test_obstacles_veil_only_what_lies_behind() -> None:
+def test_obstacles_veil_only_what_lies_behind():
     """A sheet before a particle lets it shine through; one behind it changes nothing."""
     bare = middle_color(Stage(UNIT, (), 0.05, 100), CENTER, WATER)
     behind = middle_color(Stage(UNIT, (sheet_towards_the_eye(-0.2),), 0.05, 100), CENTER, WATER)
@@ -97,7 +95,7 @@ def test_obstacles_veil_only_what_lies_behind() -> None:
     assert 0.3 * saturation[0] < saturation[2] < 0.8 * saturation[0]
 
 
-def test_particles_cast_a_shadow_along_the_light() -> None:
+def test_particles_cast_a_shadow_along_the_light():
     """The floor is darker where the light through a particle meets it."""
     stage = Stage(UNIT, (), 0.04, 200)
     empty = np.asarray(stage.draw(np.empty((0, 3)), np.empty(0, np.uint8))).astype(np.int64)
@@ -107,7 +105,7 @@ def test_particles_cast_a_shadow_along_the_light() -> None:
     assert (empty - picture)[int(y), int(x)].min() > 10
 
 
-def test_lost_particles_are_left_out() -> None:
+def test_lost_particles_are_left_out():
     """NaN, infinite, far and too near particles change nothing, without a warning."""
     stage = Stage(UNIT, (), 0.01, 80)
     lost = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e30, -1e30, 0.5], stage.camera.eye], np.float32)
@@ -115,7 +113,7 @@ def test_lost_particles_are_left_out() -> None:
     np.testing.assert_array_equal(np.asarray(stage.draw(lost, np.zeros(4, np.uint8))), empty)
 
 
-def test_particles_outside_the_domain_are_drawn() -> None:
+def test_particles_outside_the_domain_are_drawn():
     """A particle that left the box is seen as long as it is in the picture."""
     stage = Stage(UNIT, (), 0.02, 120)
     outside = np.array([[1.02, 0.5, 0.5], [0.5, -0.02, 0.99]])
@@ -124,7 +122,7 @@ def test_particles_outside_the_domain_are_drawn() -> None:
         assert (np.asarray(stage.draw(position[None], WATER)) != empty).any()
 
 
-def test_materials_can_be_told_apart() -> None:
+def test_materials_can_be_told_apart():
     """The hues of the materials are far from each other and from the background."""
     colors = np.concatenate((MATERIAL_COLORS, [(1.0, 1.0, 1.0)]))
     for i in range(len(colors)):

@@ -1,10 +1,6 @@
 """The mean of several networks' weights."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -15,7 +11,7 @@ from hgn.runtime.weights import load_weights, save_weights
 from hgn.schema import ConfigError
 
 
-def moved(path: Path, by: float, updates: int = 7, normaliser: float = 0.0, stored_precision: str = "fp32") -> Path:
+def moved(path, by, updates=7, normaliser=0.0, stored_precision="fp32"):
     """The weights of `weights_file`, each moved by a random number of this size."""
     network, info = load_weights(weights_file(path, "fp32"))
     generator = torch.Generator().manual_seed(updates)
@@ -28,7 +24,7 @@ def moved(path: Path, by: float, updates: int = 7, normaliser: float = 0.0, stor
 
 
 @pytest.mark.parametrize(("coefficients", "expected"), [(None, (0.5, 0.5)), ((0.7, 0.3), (0.7, 0.3))])
-def test_the_mean(tmp_path: Path, coefficients: tuple[float, ...] | None, expected: tuple[float, ...]) -> None:
+def test_the_mean(tmp_path, coefficients, expected):
     """Each tensor is the mean of the files' by their coefficients, in float16 where asked; the normaliser stays bit by
     bit, and the file says what it was made of."""
     files = [
@@ -64,7 +60,7 @@ def test_the_mean(tmp_path: Path, coefficients: tuple[float, ...] | None, expect
         ({"rate": 30.0}, r"weights\[1\] must have the frame_rate_hz of weights\[0\]"),
     ],
 )
-def test_others_are_refused(tmp_path: Path, changes: dict[str, Any], rule: str) -> None:
+def test_others_are_refused(tmp_path, changes, rule):
     """Weights of another network or of other data have no mean with these; nothing is written."""
     files = [weights_file(tmp_path / "a.safetensors"), weights_file(tmp_path / "b.safetensors", **changes)]
     out = tmp_path / "mean.safetensors"
@@ -73,7 +69,7 @@ def test_others_are_refused(tmp_path: Path, changes: dict[str, Any], rule: str) 
     assert not out.exists()
 
 
-def test_other_normalisers_are_refused(tmp_path: Path) -> None:
+def test_other_normalisers_are_refused(tmp_path):
     """Their latents have other units: trainings from nothing on data of their own."""
     files = [moved(tmp_path / "a.safetensors", 0.1), moved(tmp_path / "b.safetensors", 0.1, normaliser=0.5)]
     with pytest.raises(ConfigError, match=r"weights\[1\] must have the normaliser of weights\[0\] .*init_weights"):
@@ -88,6 +84,6 @@ def test_other_normalisers_are_refused(tmp_path: Path) -> None:
         (2, (0.7, 0.4), "coefficients must be 1 together, got 1.1"),
     ],
 )
-def test_bad_options(count: int, coefficients: tuple[float, ...] | None, rule: str) -> None:
+def test_bad_options(count, coefficients, rule):
     with pytest.raises(ConfigError, match=rule):
         AverageConfig(("a.safetensors",) * count, "out.safetensors", coefficients)

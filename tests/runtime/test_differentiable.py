@@ -1,15 +1,10 @@
 """Gradients through a simulation: against central differences in float64, and what is refused."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from network.states import gns_of, network_of
 
-from hgn.network.base import ParticleNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.posed_obstacles import Placement, PosedObstacleCells
 from hgn.runtime.differentiable import Pose
@@ -25,7 +20,7 @@ STEP = 1e-8  # of the central differences in float64: roundoff leaves about 1e-7
 PARTICLES = 12
 
 
-def scene() -> Scene:
+def scene():
     """Particles of all materials that fall on a cone, a bowl around both."""
     rng = np.random.default_rng(0)
     return Scene(
@@ -39,7 +34,7 @@ def scene() -> Scene:
     )
 
 
-def network(kind: str, dtype: torch.dtype = torch.float64) -> ParticleNetwork:
+def network(kind, dtype=torch.float64):
     if kind.startswith("gns"):
         return gns_of(dtype, kind=kind, message_passing_steps=2, static_spacing_cells=2.0)
     return network_of(dtype, inputs=kind)
@@ -55,7 +50,7 @@ INPUTS = {
 }
 
 
-def positions(simulator: Simulator, inputs: dict[str, torch.Tensor], smoothing: float) -> torch.Tensor:
+def positions(simulator, inputs, smoothing):
     rest = {name: value for name, value in inputs.items() if name not in ("rotation_3", "translation_3")}
     pose = Pose(inputs["rotation_3"], inputs["translation_3"])
     return simulator.differentiable(scene(), FRAMES, **rest, poses={0: pose}, smoothing=smoothing)
@@ -64,7 +59,7 @@ def positions(simulator: Simulator, inputs: dict[str, torch.Tensor], smoothing: 
 @pytest.mark.parametrize(
     ("kind", "smoothing"), [("absolute", 0.0), ("absolute", 0.5), ("relative", 1.0), ("gns_particles", 0.0)]
 )
-def test_gradients_are_those_of_central_differences(kind: str, smoothing: float) -> None:
+def test_gradients_are_those_of_central_differences(kind, smoothing):
     """Over 30 frames, along a random direction of each input, where no particle changes a cell between both sides."""
     simulator = Simulator(network(kind), 60.0, "torch")
     inputs = {name: value.clone().requires_grad_() for name, value in INPUTS.items()}
@@ -91,7 +86,7 @@ def test_gradients_are_those_of_central_differences(kind: str, smoothing: float)
 
 
 @pytest.mark.parametrize("kind", ["absolute", "relative", "gns_particles"])
-def test_positions_are_those_of_a_rollout(kind: str) -> None:
+def test_positions_are_those_of_a_rollout(kind):
     """What nothing replaces moves as in a rollout."""
     simulator = Simulator(network(kind, torch.float32), 60.0, "torch")
     (expected_TN3,) = simulator.rollout([scene()], 6)
@@ -100,7 +95,7 @@ def test_positions_are_those_of_a_rollout(kind: str) -> None:
     np.testing.assert_allclose(found_TN3.numpy(), expected_TN3, rtol=0, atol=2e-6)
 
 
-def test_normals_turn_with_their_obstacle() -> None:
+def test_normals_turn_with_their_obstacle():
     """A plate turned by a quarter has its normal along the turned axis, at the turned place and nowhere else; the mean
     over a cube falls off linearly across its layer of cells."""
     cell_size, still = 1 / 64, torch.zeros(1, dtype=torch.int64)
@@ -130,13 +125,13 @@ def test_normals_turn_with_their_obstacle() -> None:
         ({"poses": {0: Pose(rotation_3=torch.zeros(1))}}, r"rotation_3 must be of shape \(3,\), got \(1,\)"),
     ],
 )
-def test_what_is_refused(options: dict[str, Any], message: str) -> None:
+def test_what_is_refused(options, message):
     """By name, with the rule."""
     with pytest.raises(ConfigError, match=message):
         Simulator(network("absolute"), 60.0, "torch").differentiable(scene(), **({"frames": 2} | options))
 
 
-def test_divergence_names_the_frame() -> None:
+def test_divergence_names_the_frame():
     """What flies out of reach ends the simulation as in a rollout."""
     velocity_N3 = torch.full((PARTICLES, 3), 100.0)
     with pytest.raises(DivergedError, match="diverged at frame 1: 12 of 12 particles"):

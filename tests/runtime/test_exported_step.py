@@ -1,13 +1,10 @@
 """A step as ONNX and as a compiled package: what other programs run is what this one computes."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,7 +44,7 @@ class Written(NamedTuple):
 
 
 @pytest.fixture(autouse=True)
-def whole_precision() -> Iterator[None]:
+def whole_precision():
     """PyTorch multiplies in float32, whatever a backend has chosen for the process."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
@@ -56,7 +53,7 @@ def whole_precision() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def onnx_step(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Written:
+def onnx_step(request, tmp_path_factory):
     """A network's step as ONNX, and what the scene SCENE starts with."""
     return exported(tmp_path_factory.mktemp("onnx"), request.param, "onnx")
 
@@ -70,7 +67,7 @@ ALL = pytest.mark.parametrize(
 
 
 @ALL
-def test_onnx_is_the_step(onnx_step: Written) -> None:
+def test_onnx_is_the_step(onnx_step):
     """ONNX Runtime computes the step to 1e-6 at any number of particles, with and without obstacles; the file says
     what its weights say of themselves; the example in Python simulates a scene's arrays."""
     network, path = onnx_step
@@ -89,7 +86,7 @@ def test_onnx_is_the_step(onnx_step: Written) -> None:
     "ONNXRUNTIME_FOLDER" not in os.environ, reason="needs ONNXRUNTIME_FOLDER, a release of ONNX Runtime"
 )
 @ABSOLUTE
-def test_onnx_runs_in_cpp(onnx_step: Written) -> None:
+def test_onnx_runs_in_cpp(onnx_step):
     """The example in C++ simulates a scene's arrays."""
     options = [f"-DONNXRUNTIME_FOLDER={os.environ['ONNXRUNTIME_FOLDER']}", "-DCMAKE_DISABLE_FIND_PACKAGE_Torch=ON"]
     assert_rollout(onnx_step.network, built_and_run("step_onnx", onnx_step.path, options))
@@ -97,7 +94,7 @@ def test_onnx_runs_in_cpp(onnx_step: Written) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NETWORKS)
-def test_package_is_the_step(tmp_path: Path, name: str) -> None:
+def test_package_is_the_step(tmp_path, name):
     """The same of a package that PyTorch compiled, and of the example in C++."""
     network, path = exported(tmp_path, name, "package")
     package = torch._inductor.aoti_load_package(str(path))
@@ -125,7 +122,7 @@ def test_what_is_refused(options: dict[str, str], message: str) -> None:
         export.main(options)
 
 
-def exported(folder: Path, name: str, kind: str) -> Written:
+def exported(folder, name, kind):
     """What the command writes of a small network, and beside it a scene's arrays."""
     network = network_of(torch.float32, levels=2, message_passing_steps=1, **NETWORKS[name])
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
@@ -135,7 +132,7 @@ def exported(folder: Path, name: str, kind: str) -> Written:
     return Written(network, path)
 
 
-def compare(network: HierarchicalGraphNetwork, step: Callable[[dict[str, np.ndarray]], Sequence[np.ndarray]]) -> None:
+def compare(network, step):
     for particles, obstacles in SIZES:
         state = random_state((particles,), dtype=torch.float32, obstacles=obstacles)
         position_N3, velocity_NM3 = step(initial_arrays(state))
@@ -144,12 +141,12 @@ def compare(network: HierarchicalGraphNetwork, step: Callable[[dict[str, np.ndar
         np.testing.assert_allclose(velocity_NM3, after.velocity_NM3.numpy(), rtol=0, atol=TOLERANCE)
 
 
-def assert_rollout(network: HierarchicalGraphNetwork, found_TN3: np.ndarray) -> None:
+def assert_rollout(network, found_TN3):
     (expected_TN3,) = Simulator(network, 60.0, "torch").rollout([load_scene(SCENE)], FRAMES)
     np.testing.assert_allclose(found_TN3, expected_TN3, rtol=0, atol=FRAMES * TOLERANCE)
 
 
-def built_and_run(program: str, model: Path, options: Sequence[str]) -> np.ndarray:
+def built_and_run(program, model, options):
     """Positions that a C++ example writes."""
     folder = model.parent
     subprocess.run(["cmake", "-S", EXAMPLES, "-B", folder / "build", *options], check=True, capture_output=True)

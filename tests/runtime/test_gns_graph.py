@@ -1,7 +1,5 @@
 """GNS with room to spare, as its CUDA graphs run it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from network.states import gns_of, random_state

@@ -1,7 +1,5 @@
 """What the runtime loads."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -43,7 +41,7 @@ print(json.dumps({"shape": path.shape, "modules": sorted(sys.modules)}))
 """
 
 
-def test_public_names() -> None:
+def test_public_names():
     """What the package offers by name is what its modules have, told to type checkers too; another name is refused."""
     text = Path(hgn.__file__).read_text()
     for name in hgn.__all__:
@@ -53,7 +51,7 @@ def test_public_names() -> None:
         hgn.simulator  # noqa: B018
 
 
-def test_simulating_loads_no_training_stack(tmp_path: Path) -> None:
+def test_simulating_loads_no_training_stack(tmp_path):
     """Loading weights and simulating a scene file imports none of Lightning, Hydra, Taichi, WebDataset, TensorBoard,
     no package of any extra, nor the project's own training, data and generator."""
     network = network_of(torch.float32)

@@ -1,7 +1,5 @@
 """Scenes that change while they are simulated: what stays must stay to the bit, what changes must be what was asked."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 import torch
 from network.states import network_of, random_grid, silent
 
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.live import LiveSimulation, run_scene
 from hgn.runtime.simulator import InitialState, Simulator
@@ -20,7 +17,7 @@ from hgn.schema import ConfigError
 BACKENDS = ("torch", "cpu")
 
 
-def scene(particles: int, seed: int = 0, low: float = 0.05, domain: float = 1.0) -> InitialState:
+def scene(particles, seed=0, low=0.05, domain=1.0):
     rng = np.random.default_rng(seed)
     return InitialState(
         position_N3=(low + 0.1 * rng.random((particles, 3))).astype(np.float32),
@@ -32,20 +29,20 @@ def scene(particles: int, seed: int = 0, low: float = 0.05, domain: float = 1.0)
     )
 
 
-def entering(live: LiveSimulation, other: InitialState) -> np.ndarray:
+def entering(live, other):
     return live.add_particles(other.position_N3, other.velocity_N3, other.material_N)
 
 
-def frames(live: LiveSimulation, count: int) -> np.ndarray:
+def frames(live, count):
     return np.stack([live.step() for _ in range(count)])
 
 
-def small(**changes: object) -> HierarchicalGraphNetwork:
+def small(**changes):
     return network_of(torch.float32, width=16, levels=2, **changes)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_changes_that_change_nothing(backend: str) -> None:
+def test_changes_that_change_nothing(backend):
     """Frames with nothing added, the same obstacles and the same gravity set between them are bitwise a rollout's."""
     simulator, first = Simulator(small(), 60.0, backend), scene(40)
     (expected_TN3,) = simulator.rollout([first], 6)
@@ -59,7 +56,7 @@ def test_changes_that_change_nothing(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_particles_that_enter_are_those_of_a_scene(backend: str) -> None:
+def test_particles_that_enter_are_those_of_a_scene(backend):
     """Particles added before the first frame move, to the bit, as if the scene had begun with them: histories too."""
     simulator, first, second = Simulator(small(), 60.0, backend), scene(30), scene(20, 1)
     joined = {name: np.concatenate([getattr(one, name) for one in (first, second)]) for name in ARRAYS}
@@ -74,7 +71,7 @@ ARRAYS = ("position_N3", "velocity_N3", "material_N")
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_particles_far_away_do_not_matter(backend: str) -> None:
+def test_particles_far_away_do_not_matter(backend):
     """What enters beyond the grid's reach leaves the others' frames as they are, to rounding; what enters among them
     does not."""
     simulator, first = Simulator(small(), 60.0, backend), scene(40, domain=20.0)
@@ -89,7 +86,7 @@ def test_particles_far_away_do_not_matter(backend: str) -> None:
     assert reach[18.0] < 1e-6 < 1e-5 < reach[0.05]
 
 
-def test_empty_until_particles_enter() -> None:
+def test_empty_until_particles_enter():
     """A scene without particles waits; those that enter move as a scene of their own."""
     simulator, first = Simulator(small(), 60.0), scene(20)
     live = LiveSimulation(simulator, scene(0))
@@ -98,7 +95,7 @@ def test_empty_until_particles_enter() -> None:
     np.testing.assert_array_equal(frames(live, 3), simulator.rollout([first], 4)[0][1:])
 
 
-def test_obstacles_are_replaced() -> None:
+def test_obstacles_are_replaced():
     """From the next frame on particles feel other obstacles, and without any they move as if there were none."""
     simulator, first = Simulator(small(), 60.0), scene(40)
     bare = replace(first, obstacle_grid=replace(first.obstacle_grid, **{
@@ -111,7 +108,7 @@ def test_obstacles_are_replaced() -> None:
     assert np.abs(live.step() - simulator.rollout([bare], 5)[0][-1]).max() > 1e-6
 
 
-def test_gravity_changes_between_frames() -> None:
+def test_gravity_changes_between_frames():
     """Relative inputs: a lone particle falls on under the new gravity from the velocity that it had, by the closed
     form of the frame's integration: v += g dt^2, x += v."""
     simulator = Simulator(constant_relative(), 60.0)
@@ -126,13 +123,13 @@ def test_gravity_changes_between_frames() -> None:
     np.testing.assert_allclose(after_T13[:, 0], before_T13[1, 0] + rise_T3, rtol=0, atol=2e-6)
 
 
-def constant_relative() -> HierarchicalGraphNetwork:
+def constant_relative():
     """Relative inputs and an output of zero: free flight."""
     return silent(small(inputs="relative"))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_back_in_time(backend: str) -> None:
+def test_back_in_time(backend):
     """What is restored with positions and histories of an earlier frame repeats that frame's future to the bit, without
     those that entered later."""
     simulator, first = Simulator(small(), 60.0, backend), scene(30)
@@ -148,7 +145,7 @@ def test_back_in_time(backend: str) -> None:
     np.testing.assert_array_equal(frames(live, 3), expected_TN3)
 
 
-def test_what_is_refused_changes_nothing() -> None:
+def test_what_is_refused_changes_nothing():
     """Materials and gravity that the weights do not know, and arrays that do not fit, are refused by name; the
     simulation goes on as if nothing had been asked."""
     network = small(materials=("water", "sand"))
@@ -170,7 +167,7 @@ def test_what_is_refused_changes_nothing() -> None:
     np.testing.assert_array_equal(frames(live, 2), expected_TN3[1:])
 
 
-def test_divergence_says_at_which_frame_of_the_scene() -> None:
+def test_divergence_says_at_which_frame_of_the_scene():
     """Also behind changes, which begin the backend's own count anew; and the scene can be restored."""
     live = LiveSimulation(Simulator(small(), 60.0), scene(10))
     live.step()
@@ -185,7 +182,7 @@ def test_divergence_says_at_which_frame_of_the_scene() -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_scene_that_particles_enter(backend: str) -> None:
+def test_a_scene_that_particles_enter(backend):
     """Each particle is there from the frame of its entry on, at first where free flight has it; until another comes
     the others are bitwise those of a rollout, and then of a simulation that they were added to.
     """

@@ -1,16 +1,12 @@
 """The simulation loop: scenes in a batch, the start, and what happens when a network is not good enough."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from network.states import network_of, random_grid, silent
 
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.relative import history
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import InitialState, Simulator
@@ -24,9 +20,7 @@ EMPTY_GRID = ObstacleGrid(1 / 64, np.zeros((0, 3), np.int32), np.zeros((0, 3), n
 GRAVITY = (0.0, -9.8, 0.0)
 
 
-def initial(
-    particles: int, seed: int = 0, obstacles: bool = True, domain_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
-) -> InitialState:
+def initial(particles, seed=0, obstacles=True, domain_size=(1.0, 1.0, 1.0)):
     """A random scene; some of its particles lie in obstacle cells."""
     rng = np.random.default_rng(seed)
     return InitialState(
@@ -39,7 +33,7 @@ def initial(
     )
 
 
-def constant(acceleration: tuple[float, float, float], **changes: object) -> HierarchicalGraphNetwork:
+def constant(acceleration, **changes):
     """A network that predicts the same acceleration everywhere, in frame units."""
     network = network_of(torch.float32, **changes)
     network.normaliser.set("acceleration", torch.tensor(acceleration), torch.ones(3), 0.0)
@@ -47,7 +41,7 @@ def constant(acceleration: tuple[float, float, float], **changes: object) -> Hie
 
 
 @pytest.mark.parametrize("obstacles", [(True, True, True), (True, False, True), (False, False, False)])
-def test_batch_equals_each_alone(obstacles: tuple[bool, ...]) -> None:
+def test_batch_equals_each_alone(obstacles):
     """Scenes of different sizes, with and without obstacles, in one batch move as each does alone."""
     simulator = Simulator(network_of(torch.float32), 60.0)
     scenes = [initial(n, seed, wanted) for seed, (n, wanted) in enumerate(zip((40, 1, 90), obstacles, strict=True))]
@@ -58,14 +52,14 @@ def test_batch_equals_each_alone(obstacles: tuple[bool, ...]) -> None:
         np.testing.assert_allclose(path_TN3, alone_TN3, rtol=0, atol=2e-6)
 
 
-def test_obstacles_are_felt() -> None:
+def test_obstacles_are_felt():
     """The same particles move differently beside obstacles: the normals reach the network."""
     simulator = Simulator(network_of(torch.float32), 60.0)
     (with_TN3,), (without_TN3,) = (simulator.rollout([initial(60, obstacles=wanted)], 4) for wanted in (True, False))
     assert np.abs(with_TN3[-1] - without_TN3[-1]).max() > 1e-5
 
 
-def test_history_at_the_start_is_ballistic() -> None:
+def test_history_at_the_start_is_ballistic():
     """Before frame 0 particles flew freely into the initial state: v^{-k} = v0 dt - (k + 1/2) g dt^2, newest first."""
     simulator = Simulator(network_of(torch.float32), 60.0)
     scenes = [initial(20), initial(15, 1)]
@@ -77,7 +71,7 @@ def test_history_at_the_start_is_ballistic() -> None:
         np.testing.assert_allclose(state.velocity_NM3[:, k].numpy(), expected_N3, rtol=0, atol=3e-7)
 
 
-def test_perfect_network_falls_as_the_closed_form() -> None:
+def test_perfect_network_falls_as_the_closed_form():
     """With the true acceleration predicted, free flight follows x0 + v0 t + g t^2 / 2."""
     simulator = Simulator(constant((0.0, -9.8 / 3600, 0.0)), 60.0)
     scene = initial(25)
@@ -87,7 +81,7 @@ def test_perfect_network_falls_as_the_closed_form() -> None:
     np.testing.assert_allclose(path_TN3, expected_TN3, rtol=0, atol=2e-6)
 
 
-def test_frames_are_reported_and_scenes_untouched() -> None:
+def test_frames_are_reported_and_scenes_untouched():
     """Each simulated frame is reported once, frame 0 is the initial state, and the caller's arrays stay as they are."""
     simulator = Simulator(network_of(torch.float32), 60.0)
     scene = initial(30)
@@ -106,7 +100,7 @@ def test_frames_are_reported_and_scenes_untouched() -> None:
         ((float("inf"), 0.0, 0.0), 1, "40 of 40 particles are not finite"),
     ],
 )
-def test_divergence_names_the_frame(acceleration: tuple[float, float, float], frame: int, cause: str) -> None:
+def test_divergence_names_the_frame(acceleration, frame, cause):
     """A network that throws particles out of reach, or makes them NaN, is stopped at that frame: x > 2 after
     0.5 (1 + 2 + 3) domain units, at frame 3."""
     scene = initial(40)
@@ -117,7 +111,7 @@ def test_divergence_names_the_frame(acceleration: tuple[float, float, float], fr
     assert raised.value.frame == frame
 
 
-def test_range_of_a_domain_is_its_own() -> None:
+def test_range_of_a_domain_is_its_own():
     """What leaves a small domain is still inside a larger one."""
     simulator = Simulator(constant((0.5, 0.0, 0.0)), 60.0)
     scene = initial(10, domain_size=(4.0, 1.0, 1.0))
@@ -125,7 +119,7 @@ def test_range_of_a_domain_is_its_own() -> None:
     simulator.rollout([scene], 4)
 
 
-def test_initial_state_out_of_range_is_named() -> None:
+def test_initial_state_out_of_range_is_named():
     """A scene whose particles lie beyond what grid coordinates can express ends as divergence at frame 1."""
     scene = initial(3)
     scene.position_N3[0, 0] = 1e6
@@ -133,7 +127,7 @@ def test_initial_state_out_of_range_is_named() -> None:
         Simulator(network_of(torch.float32), 60.0).rollout([scene], 3)
 
 
-def test_unknown_material() -> None:
+def test_unknown_material():
     """A material that the network was not trained with is refused before anything moves."""
     scene = initial(10)
     scene.material_N[:] = 0
@@ -143,7 +137,7 @@ def test_unknown_material() -> None:
         simulator.rollout([scene], 3)
 
 
-def test_materials_are_found_by_name() -> None:
+def test_materials_are_found_by_name():
     """A network with another list of materials looks them up by name, not by index."""
     simulator = Simulator(network_of(torch.float32, materials=("snow", "water")), 60.0)
     scene = initial(4)
@@ -151,14 +145,14 @@ def test_materials_are_found_by_name() -> None:
     assert simulator.start([scene]).material_N.tolist() == [1, 0, 0, 1]
 
 
-def test_network_without_obstacle_features() -> None:
+def test_network_without_obstacle_features():
     """A network without normals ignores the obstacles of a scene."""
     simulator = Simulator(network_of(torch.float32, obstacle_features=False), 60.0)
     (with_TN3,), (without_TN3,) = (simulator.rollout([initial(60, obstacles=wanted)], 4) for wanted in (True, False))
     assert np.array_equal(with_TN3, without_TN3)
 
 
-def test_scene_file_to_rollout(tmp_path: Path) -> None:
+def test_scene_file_to_rollout(tmp_path):
     """A scene file, obstacles and all, starts with its own particles and with normals where obstacles are."""
     path = tmp_path / "scene.yaml"
     path.write_text(
@@ -173,7 +167,7 @@ def test_scene_file_to_rollout(tmp_path: Path) -> None:
     assert state.velocity_NM3[:, 0, 1].numpy() == pytest.approx(-1 / 60 + 0.5 * 9.8 / 3600, abs=1e-6)
 
 
-def test_frame_by_frame(tmp_path: Path) -> None:
+def test_frame_by_frame(tmp_path):
     """Frames asked for one by one are those of a rollout, beside another scene's; a Scene is taken as it is."""
     network = network_of(torch.float32)
     save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
@@ -189,7 +183,7 @@ def test_frame_by_frame(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.stack(found), expected)
 
 
-def test_what_loaded_weights_cannot_take(tmp_path: Path) -> None:
+def test_what_loaded_weights_cannot_take(tmp_path):
     """Another gravity, or obstacle cells of another size, is refused by name; a network that sees no obstacles minds
     gravity alone."""
     start = initial(5)
@@ -214,7 +208,7 @@ def test_what_loaded_weights_cannot_take(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (9.8, 0.0, -3.0), (0.0, 19.6, 0.0)])
-def test_relative_inputs_take_any_gravity(tmp_path: Path, gravity: tuple[float, float, float]) -> None:
+def test_relative_inputs_take_any_gravity(tmp_path, gravity):
     """Weights of relative inputs that add nothing to gravity fly a scene along the closed form, whatever its own is, in
     a batch with another's; the history that they begin with shows none of it."""
     network = silent(network_of(torch.float32, inputs="relative"))
@@ -232,7 +226,7 @@ def test_relative_inputs_take_any_gravity(tmp_path: Path, gravity: tuple[float, 
 
 
 @pytest.mark.parametrize("gravity", [(0.0, -99.0, 0.0), (60.0, 60.0, 60.0), (0.0, float("nan"), 0.0)])
-def test_no_network_takes_a_huge_gravity(tmp_path: Path, gravity: tuple[float, float, float]) -> None:
+def test_no_network_takes_a_huge_gravity(tmp_path, gravity):
     """More than ten times the earth's, or none that is a number, is refused with the bound."""
     network = network_of(torch.float32, inputs="relative")
     save_weights(tmp_path / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
@@ -251,14 +245,14 @@ def test_no_network_takes_a_huge_gravity(tmp_path: Path, gravity: tuple[float, f
         ({"material_N": np.array([4])}, r"material_N must be 0 to 3 \(water, sand, snow, elastic\), got 4"),
     ],
 )
-def test_scenes_of_arrays(change: dict[str, object], message: str) -> None:
+def test_scenes_of_arrays(change, message):
     """What people put together themselves is refused by name."""
     arrays = {"position_N3": np.full((1, 3), 0.5), "velocity_N3": np.zeros((1, 3)), "material_N": np.zeros(1, np.int64)}
     with pytest.raises(ConfigError, match=message):
-        Scene(**(arrays | change))  # type: ignore[arg-type]
+        Scene(**(arrays | change))
 
 
-def test_options_of_load() -> None:
+def test_options_of_load():
     """As on the command line, an option that does not exist is refused with those that do."""
     for option, value in (("backend", "quick"), ("precision", "half"), ("weights", "obstacle"), ("device", "abacus")):
         with pytest.raises(ConfigError, match=f"{option} must be .*, got '{value}'"):

@@ -1,10 +1,7 @@
 """hgn.runtime.triton_host: what is missing is named, and backend triton does not begin without it."""
 
-from __future__ import annotations
-
 import shutil
 import sysconfig
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,7 +14,7 @@ from hgn.schema import ConfigError
 
 
 @pytest.fixture
-def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def host(tmp_path, monkeypatch):
     """A machine with a GPU, nothing compiled yet, a compiler and no headers."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(sysconfig, "get_paths", lambda scheme: {"include": str(tmp_path / "include")})
@@ -28,7 +25,7 @@ def host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_what_is_missing(host: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_missing(host, monkeypatch):
     """Headers, then a compiler; nothing with both, or CC, or where they were used before."""
     assert f"headers: {host}/include/Python.h, on Debian" in str(host_unsupported_reason())
     (host / "more").mkdir()
@@ -49,7 +46,7 @@ def test_what_is_missing(host: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert host_unsupported_reason() is None
 
 
-def test_it_is_said(host: Path) -> None:
+def test_it_is_said(host):
     """Backend torch runs instead, and says why; who asks for triton is told what to install."""
     device, network = torch.device("cuda"), build_network(NetworkConfig(width=16))
     chosen = choose(device, network)

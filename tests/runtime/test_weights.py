@@ -1,15 +1,9 @@
 """Inference weights: what comes out is what went in, and every file that is not ours is refused."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from ballistic_dataset import MakeConfig, MakeDataset
 from network.states import network_of, random_state
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -25,7 +19,7 @@ STATE = random_state((70, 30), dtype=torch.float32)
 
 
 @pytest.fixture
-def weights(tmp_path: Path) -> Path:
+def weights(tmp_path):
     """The weights file of a small network."""
     network = network_of(torch.float32)
     path = tmp_path / "weights.safetensors"
@@ -33,25 +27,21 @@ def weights(tmp_path: Path) -> Path:
     return path
 
 
-def content(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def content(path):
     """The tensors and the declared structure of a weights file."""
     with safe_open(path, framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         return tensors, json.loads(file.metadata()["hgn"])
 
 
-def rewrite(
-    path: Path, change: Callable[[dict[str, torch.Tensor], dict[str, Any]], None], structure: str | None = None
-) -> None:
+def rewrite(path, change, structure=None):
     """Changes a weights file; `structure` replaces the declared one."""
     tensors, mapping = content(path)
     change(tensors, mapping)
     save_file(tensors, path, metadata={"hgn": json.dumps(mapping) if structure is None else structure})
 
 
-def test_exported_checkpoint_is_the_trained_network(
-    make_config: MakeConfig, make_dataset: MakeDataset, tmp_path: Path
-) -> None:
+def test_exported_checkpoint_is_the_trained_network(make_config, make_dataset, tmp_path):
     """A checkpoint of the trainer, exported and loaded, predicts what the checkpoint's network does (to 1e-6) and
     remembers what it was trained on."""
     config = make_config()
@@ -71,7 +61,7 @@ def test_exported_checkpoint_is_the_trained_network(
     assert [file.name for file in path.parent.iterdir()] == ["weights.safetensors"]
 
 
-def test_roundtrip_keeps_every_bit(weights: Path) -> None:
+def test_roundtrip_keeps_every_bit(weights):
     """Saved and loaded, every tensor is bitwise the same, normaliser included; the network is ready to predict."""
     expected = network_of(torch.float32)
     loaded, info = load_weights(weights)
@@ -82,14 +72,14 @@ def test_roundtrip_keeps_every_bit(weights: Path) -> None:
         assert torch.equal(found[name], tensor), name
 
 
-def test_same_network_same_bytes(weights: Path, tmp_path: Path) -> None:
+def test_same_network_same_bytes(weights, tmp_path):
     """A file depends on nothing but the network and what is said of it."""
     network, info = load_weights(weights)
     save_weights(tmp_path / "again.safetensors", network, info)
     assert (tmp_path / "again.safetensors").read_bytes() == weights.read_bytes()
 
 
-def test_half_precision(weights: Path, tmp_path: Path) -> None:
+def test_half_precision(weights, tmp_path):
     """fp16 rounds each learned tensor to float16 and halves the file; the normaliser keeps its float32 values, and
     the network computes in float32 again."""
     network, info = load_weights(weights)
@@ -108,14 +98,14 @@ def test_half_precision(weights: Path, tmp_path: Path) -> None:
     assert 0 < float(difference.abs().max()) < 0.02 * float(size.abs().max())
 
 
-def test_missing(tmp_path: Path) -> None:
+def test_missing(tmp_path):
     """A file that is not there is named, with the command that writes one."""
     with pytest.raises(ConfigError, match=r"weights must be an existing file, got .*none\.safetensors; write one with"):
         load_weights(tmp_path / "none.safetensors")
 
 
 @pytest.mark.parametrize("data", [b"", b"no weights at all", b"PK\x03\x04" + bytes(64)], ids=["empty", "text", "zip"])
-def test_not_safetensors(tmp_path: Path, data: bytes) -> None:
+def test_not_safetensors(tmp_path, data):
     """Another format is refused, and the file stays as it was."""
     path = tmp_path / "weights.safetensors"
     path.write_bytes(data)
@@ -125,7 +115,7 @@ def test_not_safetensors(tmp_path: Path, data: bytes) -> None:
 
 
 @pytest.mark.parametrize("kept", [0.01, 0.5, 0.999])
-def test_truncated(weights: Path, kept: float) -> None:
+def test_truncated(weights, kept):
     """A file cut anywhere is refused as such."""
     data = weights.read_bytes()
     weights.write_bytes(data[: int(kept * len(data))])
@@ -133,7 +123,7 @@ def test_truncated(weights: Path, kept: float) -> None:
         load_weights(weights)
 
 
-def test_without_structure(weights: Path) -> None:
+def test_without_structure(weights):
     """Tensors alone are no weights file: nothing says which network they belong to."""
     save_file(content(weights)[0], weights)
     with pytest.raises(ConfigError, match=r"weights must be a file of python -m hgn\.export, got .* without its"):
@@ -148,14 +138,14 @@ def test_without_structure(weights: Path) -> None:
         ('{"format_version": 1}', r"weights\.network is missing"),
     ],
 )
-def test_garbled_structure(weights: Path, structure: str, message: str) -> None:
+def test_garbled_structure(weights, structure, message):
     """A structure that cannot be understood is refused with what is wrong in it."""
     rewrite(weights, lambda tensors, mapping: None, structure)
     with pytest.raises(ConfigError, match=message):
         load_weights(weights)
 
 
-def test_other_format_version(weights: Path) -> None:
+def test_other_format_version(weights):
     """A file of another version is refused before anything else in it is looked at."""
     rewrite(weights, lambda tensors, mapping: mapping.update(format_version=2, invented_later=True))
     with pytest.raises(ConfigError, match=r"weights format_version must be 1, got 2 in .*; export again"):
@@ -174,7 +164,7 @@ def test_other_format_version(weights: Path) -> None:
         ({"levels": 2}, r"weights tensor .* must have shape none for the declared network, got"),
     ],
 )
-def test_tensors_of_another_network(weights: Path, change: dict[str, Any], message: str) -> None:
+def test_tensors_of_another_network(weights, change, message):
     """A structure that is invalid, or that the tensors do not fit, is refused with the key or the tensor."""
     rewrite(weights, lambda tensors, mapping: mapping["network"].update(change))
     with pytest.raises(ConfigError, match=message):
@@ -182,10 +172,10 @@ def test_tensors_of_another_network(weights: Path, change: dict[str, Any], messa
 
 
 @pytest.mark.parametrize("extra", [True, False])
-def test_tensor_names(weights: Path, extra: bool) -> None:
+def test_tensor_names(weights, extra):
     """One tensor too many or too few is named."""
 
-    def change(tensors: dict[str, torch.Tensor], mapping: dict[str, Any]) -> None:
+    def change(tensors, mapping):
         if extra:
             tensors["surplus.weight"] = torch.zeros(3)
         else:
@@ -197,7 +187,7 @@ def test_tensor_names(weights: Path, extra: bool) -> None:
         load_weights(weights)
 
 
-def test_frame_rate(weights: Path) -> None:
+def test_frame_rate(weights):
     """Data of another frame rate is refused: one step of a network is one frame."""
     _, info = load_weights(weights)
     require_frame_rate(info, 60.0)
@@ -205,12 +195,12 @@ def test_frame_rate(weights: Path) -> None:
         require_frame_rate(info, 30.0)
 
 
-def test_failed_save_leaves_the_old_file(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_save_leaves_the_old_file(weights, monkeypatch):
     """A full disk while writing leaves the earlier file, whole, and nothing beside it."""
     network, info = load_weights(weights)
     before = weights.read_bytes()
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("hgn.system.files.os.fsync", full)

@@ -11,7 +11,7 @@ COORDINATE = st.integers(-4, 4).map(float)  # small integers, so that degenerate
 POINT = st.tuples(COORDINATE, COORDINATE, COORDINATE)
 
 
-def brute_force(point: np.ndarray, triangle: np.ndarray, steps: int = 200) -> float:
+def brute_force(point, triangle, steps=200):
     """Smallest distance to a barycentric lattice on the triangle."""
     u, v = np.meshgrid(np.linspace(0, 1, steps + 1), np.linspace(0, 1, steps + 1))
     u, v = u[u + v <= 1 + 1e-12], v[u + v <= 1 + 1e-12]
@@ -19,7 +19,7 @@ def brute_force(point: np.ndarray, triangle: np.ndarray, steps: int = 200) -> fl
     return float(np.sqrt(((lattice - point) ** 2).sum(axis=1).min()))
 
 
-def obstacle_of(mesh: trimesh.Trimesh, closed: bool = True) -> Obstacle:
+def obstacle_of(mesh, closed=True):
     return Obstacle("mesh", np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32), closed)
 
 

@@ -1,7 +1,5 @@
 """The episode codec: nothing is lost, the same input gives the same bytes, and every fault is named."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json
@@ -18,7 +16,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError
 
 
-def make_episode(frames: int = 4, particles: int = 5, cells: int = 3, seed: int = 0, **changes: Any) -> Episode:
+def make_episode(frames=4, particles=5, cells=3, seed=0, **changes):
     generator = np.random.default_rng(seed)
     normal_K3 = generator.normal(size=(cells, 3))
     values: dict[str, Any] = {
@@ -41,7 +39,7 @@ def make_episode(frames: int = 4, particles: int = 5, cells: int = 3, seed: int 
     return Episode(**(values | changes))
 
 
-def assert_same(left: Episode, right: Episode) -> None:
+def assert_same(left, right):
     for field in dataclasses.fields(Episode):
         one, other = getattr(left, field.name), getattr(right, field.name)
         if isinstance(one, np.ndarray):
@@ -63,7 +61,7 @@ def test_roundtrip(frames: int, particles: int, cells: int, seed: int) -> None:
     assert_same(episode, decode_episode(episode.key, encode_episode(episode)))
 
 
-def test_material_parameters_roundtrip() -> None:
+def test_material_parameters_roundtrip():
     """Per-particle material parameters are stored under their names."""
     stiffness = np.linspace(1, 2, 5, dtype=np.float32)
     episode = make_episode(material_parameters={"youngs_modulus": stiffness})
@@ -72,7 +70,7 @@ def test_material_parameters_roundtrip() -> None:
     assert_same(episode, decode_episode(episode.key, members))
 
 
-def test_bytes_are_a_function_of_the_content() -> None:
+def test_bytes_are_a_function_of_the_content():
     """Memory layout and key order of the input leave no trace in the stored bytes."""
     episode = make_episode()
     other = dataclasses.replace(
@@ -83,7 +81,7 @@ def test_bytes_are_a_function_of_the_content() -> None:
     assert encode_episode(episode) == encode_episode(other)
 
 
-def test_members_are_readable_with_numpy_and_json_alone() -> None:
+def test_members_are_readable_with_numpy_and_json_alone():
     """No member needs this project to be read."""
     episode = make_episode()
     members = encode_episode(episode)
@@ -92,7 +90,7 @@ def test_members_are_readable_with_numpy_and_json_alone() -> None:
     assert json.loads(members["json"])["seed"] == episode.seed
 
 
-def test_decoding_flat_arrays_makes_views() -> None:
+def test_decoding_flat_arrays_makes_views():
     """Members given as arrays are not copied, so that a memory map stays one."""
     episode = make_episode()
     members = {name: np.frombuffer(data, np.uint8) for name, data in encode_episode(episode).items()}
@@ -120,13 +118,13 @@ BROKEN_FIELDS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "message"), BROKEN_FIELDS)
-def test_wrong_fields_are_refused(changes: dict[str, Any], message: str) -> None:
+def test_wrong_fields_are_refused(changes, message):
     """An episode with a wrong shape, type or value cannot be made, and the message names the field."""
     with pytest.raises(ConfigError, match=message):
         make_episode(**changes)
 
 
-def test_wrong_obstacle_grid_is_refused() -> None:
+def test_wrong_obstacle_grid_is_refused():
     """Cells and normals must agree in number and type."""
     cells = np.zeros((3, 3), np.int32)
     with pytest.raises(ConfigError, match="obstacle_normal must have shape"):
@@ -137,7 +135,7 @@ def test_wrong_obstacle_grid_is_refused() -> None:
         make_episode(obstacle_grid=ObstacleGrid(0.0, cells, np.zeros((3, 3), np.float32)))
 
 
-def test_positions_that_are_not_finite_are_refused_both_ways() -> None:
+def test_positions_that_are_not_finite_are_refused_both_ways():
     """Neither writing nor reading lets a NaN through, and the message names frame and particle."""
     episode = make_episode()
     members = encode_episode(episode)
@@ -150,19 +148,19 @@ def test_positions_that_are_not_finite_are_refused_both_ways() -> None:
 
 
 @pytest.mark.parametrize("solver", [{"x": float("nan")}, {"x": np.int64(3)}, {"x": {1, 2}}])
-def test_what_is_not_json_is_refused(solver: dict[str, Any]) -> None:
+def test_what_is_not_json_is_refused(solver):
     """Solver counters and specifications are plain JSON; a NaN would not be readable elsewhere."""
     with pytest.raises(ConfigError, match="must be plain JSON"):
         encode_episode(make_episode(solver=solver))
 
 
-def npy(array: np.ndarray, **options: Any) -> bytes:
+def npy(array, **options):
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, array, **options)
     return buffer.getvalue()
 
 
-def description(**changes: Any) -> bytes:
+def description(**changes):
     mapping = json.loads(encode_episode(make_episode())["json"]) | changes
     return json.dumps({key: value for key, value in mapping.items() if value is not None}).encode()
 
@@ -199,7 +197,7 @@ BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
 
 @pytest.mark.filterwarnings("ignore:Stored array in format 2.0")
 @pytest.mark.parametrize(("changes", "message"), BROKEN_MEMBERS)
-def test_wrong_members_are_refused(changes: dict[str, bytes | None], message: str) -> None:
+def test_wrong_members_are_refused(changes, message):
     """A missing, foreign, cut or altered member ends in one message that names it."""
     members: dict[str, bytes | None] = dict(encode_episode(make_episode())) | changes
     with pytest.raises(ConfigError, match=message):
@@ -207,11 +205,11 @@ def test_wrong_members_are_refused(changes: dict[str, bytes | None], message: st
 
 
 class Bomb:
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self):
         return (pytest.fail, ("a pickle was loaded",))
 
 
-def test_nothing_is_unpickled() -> None:
+def test_nothing_is_unpickled():
     """A member with a pickled object is refused without loading it."""
     members = encode_episode(make_episode())
     header = npy(np.array([None] * 5, dtype=object), allow_pickle=True)

@@ -1,7 +1,5 @@
 """Files from anywhere: what is wrong with them ends in one line, never in a traceback, a hang or foreign data."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
@@ -9,9 +7,7 @@ import signal
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import pytest
@@ -52,7 +48,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     ],
     ids=["bomb", "cycle", "nesting", "5000 digits", "400 digits", "nan"],
 )
-def test_scene_files(tmp_path: Path, text: str, message: str) -> None:
+def test_scene_files(tmp_path, text, message):
     """Aliases that stand for billions of values, deep nesting and endless numbers."""
     (tmp_path / "scene.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message) as caught:
@@ -70,14 +66,14 @@ def test_scene_files(tmp_path: Path, text: str, message: str) -> None:
         (NetworkConfig, {"cell_size": 10**400}, "cell_size must be a number of at most 63 bits"),
     ],
 )
-def test_sizes_that_no_machine_has(cls: type, mapping: dict[str, Any], message: str) -> None:
+def test_sizes_that_no_machine_has(cls, mapping, message):
     """Numbers that would end in MemoryError, or in hours of building a network, are refused by name."""
     with pytest.raises(ConfigError, match=message):
         from_mapping(cls, mapping)
 
 
 @pytest.mark.parametrize("uri", ["pipe", "../outside.bin", "/etc/hostname"])
-def test_mesh_that_names_other_files(tmp_path: Path, uri: str) -> None:
+def test_mesh_that_names_other_files(tmp_path, uri):
     """A GLB's buffers are plain files beside it: no pipe, on which reading would wait for ever, and none elsewhere."""
     folder = tmp_path / "meshes"
     folder.mkdir()
@@ -95,7 +91,7 @@ def test_mesh_that_names_other_files(tmp_path: Path, uri: str) -> None:
         load_mesh(folder / "mesh.glb")
 
 
-def test_mesh_of_another_gltf(tmp_path: Path) -> None:
+def test_mesh_of_another_gltf(tmp_path):
     """A GLB of a version that is not read is refused with a message."""
     content = bytearray(trimesh.creation.box().export(file_type="glb"))
     content[4] = 0
@@ -104,18 +100,18 @@ def test_mesh_of_another_gltf(tmp_path: Path) -> None:
         load_mesh(tmp_path / "mesh.glb")
 
 
-def test_rollout_with_data_of_other_files(tmp_path: Path) -> None:
+def test_rollout_with_data_of_other_files(tmp_path):
     """HDF5 can take data from any file that its reader may read: such a file is refused."""
     path, foreign = tmp_path / "rollout.vtkhdf", tmp_path / "foreign"
     foreign.write_bytes(bytes(10_000))
 
-    def external(file: h5py.File) -> None:
+    def external(file):
         points = file["VTKHDF/Points"]
         shape, dtype = points.shape, points.dtype
         del file["VTKHDF/Points"]
         file["VTKHDF"].create_dataset("Points", shape, dtype, external=[(str(foreign), 0, h5py.h5f.UNLIMITED)])
 
-    def link(file: h5py.File) -> None:
+    def link(file):
         file["VTKHDF/other"] = h5py.ExternalLink(str(foreign), "/")
 
     for change, message in ((external, "must lie in the file itself"), (link, "got a link in other")):
@@ -126,12 +122,12 @@ def test_rollout_with_data_of_other_files(tmp_path: Path) -> None:
             read_rollout(path)
 
 
-def mesh(suffix: str) -> tuple[str, bytes, Callable[[Path], object]]:
+def mesh(suffix):
     content = trimesh.creation.box().export(file_type=suffix)
     return f"box.{suffix}", content.encode() if isinstance(content, str) else content, load_mesh
 
 
-def checkpoint() -> tuple[str, bytes, Callable[[Path], object]]:
+def checkpoint():
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "last.ckpt"
         torch.save({"hgn": {"network": {"width": 8}}, "state_dict": {"weight": torch.arange(100.0)}}, path)
@@ -139,7 +135,7 @@ def checkpoint() -> tuple[str, bytes, Callable[[Path], object]]:
         return "last.ckpt", path.read_bytes(), read_checkpoint
 
 
-def tar() -> tuple[str, bytes, Callable[[Path], object]]:
+def tar():
     name = (
         b"train-000000.json".ljust(100, b"\0") + b"0000644\0" + b"0000000\0" * 2 + b"00000000003\0" + b"0" * 11 + b"\0"
     )
@@ -148,7 +144,7 @@ def tar() -> tuple[str, bytes, Callable[[Path], object]]:
     return "shard.tar", header + b"abc".ljust(512, b"\0") + bytes(1024), locate_members
 
 
-def hdf5() -> tuple[str, bytes, Callable[[Path], object]]:
+def hdf5():
     with tempfile.TemporaryDirectory() as folder:
         write_rollout(Path(folder) / "rollout.vtkhdf", make_rollout())
         return "rollout.vtkhdf", (Path(folder) / "rollout.vtkhdf").read_bytes(), read_rollout
@@ -157,7 +153,7 @@ def hdf5() -> tuple[str, bytes, Callable[[Path], object]]:
 LISTED = tempfile.TemporaryDirectory()  # data sets without their shards
 
 
-def index(name: str) -> tuple[str, bytes, Callable[[Path], object]]:
+def index(name):
     """A file of a data set's index: all that it lists is read, and looked up."""
     folder = Path(LISTED.name, name.strip("*"))
     folder.mkdir()
@@ -166,7 +162,7 @@ def index(name: str) -> tuple[str, bytes, Callable[[Path], object]]:
     (path,) = folder.rglob(name)
     content = path.read_bytes()
 
-    def decode(damaged: Path) -> None:
+    def decode(damaged):
         path.write_bytes(damaged.read_bytes())
         try:
             manifest = Manifest.load(folder)
@@ -197,7 +193,7 @@ EXAMPLES = int(os.environ.get("HGN_FUZZ_EXAMPLES", "25"))  # of each; more are o
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_decoders_bear_any_bytes(kind: str) -> None:
+def test_decoders_bear_any_bytes(kind):
     """A file with some bytes changed, cut or repeated is read, or refused with a message: nothing else comes out, and
     that in no more than 0.5 GB of memory."""
     name, content, decode = FILES[kind]

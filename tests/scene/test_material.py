@@ -1,13 +1,11 @@
 """What adding a material relies on; hgn.scene.material lists the files."""
 
-from __future__ import annotations
-
 from datagen.mpm.layout import MATERIAL_VARIANTS, VARIANT, has_solid
 from hgn.render.renderer import MATERIAL_COLORS
 from hgn.scene.material import FLUIDS, MATERIAL_BITS, MATERIAL_MASK, MATERIALS
 
 
-def test_labels_keep_scene_and_material() -> None:
+def test_labels_keep_scene_and_material():
     """A fifth material does not spill into the scene of the solver's labels, nor do a million scenes into it."""
     assert len(MATERIALS) < MATERIAL_MASK  # one more fits
     for scene in (0, 1, 10**6):
@@ -16,11 +14,11 @@ def test_labels_keep_scene_and_material() -> None:
             assert (label >> MATERIAL_BITS, label & MATERIAL_MASK) == (scene, material) and label < 2**31
 
 
-def test_each_material_has_its_look() -> None:
+def test_each_material_has_its_look():
     assert len(MATERIAL_COLORS) == len(MATERIALS) and set(FLUIDS) <= set(range(len(MATERIALS)))
 
 
-def test_what_is_no_fluid_is_a_solid() -> None:
+def test_what_is_no_fluid_is_a_solid():
     """A kernel keeps deformation gradients if it is compiled for a material outside of FLUIDS, whatever else it has."""
     other = VARIANT.contact | VARIANT.sweep | VARIANT.several_laws
     for material, bit in enumerate(MATERIAL_VARIANTS):

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -11,7 +9,7 @@ from hgn.schema import ConfigError
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
-def write(folder: Path, text: str, name: str = "mesh.obj") -> Path:
+def write(folder, text, name="mesh.obj"):
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
@@ -102,7 +100,7 @@ def test_one_sided_and_branching_surfaces_are_sheets(tmp_path):
     n = 12
     cells = [(i, j) for i in range(n) for j in range(n)]
 
-    def vertex(i: int, j: int) -> int:
+    def vertex(i, j):
         return (i % n) * n + ((j if i < n else -j) % n)
 
     faces = []

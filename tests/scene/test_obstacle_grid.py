@@ -15,11 +15,11 @@ CELL = 1 / 64
 TILT = euler_rotation((25.0, 40.0, 70.0))
 
 
-def rng(seed: int = 0) -> np.random.Generator:
+def rng(seed=0):
     return np.random.Generator(np.random.PCG64(seed))
 
 
-def sheet(*heights: float, flipped: bool = False) -> Obstacle:
+def sheet(*heights, flipped=False):
     """Horizontal unit squares at the given heights."""
     vertex = [(x, y, z) for y in heights for x, z in ((0, 0), (0, 1), (1, 1), (1, 0))]
     triangle = [(4 * i + a, 4 * i + b, 4 * i + c) for i in range(len(heights)) for a, b, c in ((0, 1, 2), (0, 2, 3))]
@@ -28,7 +28,7 @@ def sheet(*heights: float, flipped: bool = False) -> Obstacle:
     return Obstacle("sheet", np.array(vertex, float), np.array(triangle, np.int32), closed=False)
 
 
-def quarter(obstacle: Obstacle) -> Obstacle:
+def quarter(obstacle):
     return Obstacle(obstacle.name, 0.25 * obstacle.vertex_V3 + 0.25, obstacle.triangle_F3, obstacle.closed)
 
 

@@ -15,7 +15,6 @@ from hgn.scene.material import MATERIALS, PAPER_MATERIALS
 from hgn.scene.obstacle_grid import build_obstacle_grid
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import obstacles_of_episode
-from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.surface import split_long_edges
 from hgn.schema import ConfigError
 
@@ -25,7 +24,7 @@ CELL = 1 / 64
 SEEDS = [0, 1, 2, 12345]
 
 
-def digest(scene: Scene) -> str:
+def digest(scene):
     """Eight digits each of: specification, positions and velocities, obstacle vertices."""
     parts = (
         json.dumps(scene.specification, sort_keys=True).encode(),
@@ -35,7 +34,7 @@ def digest(scene: Scene) -> str:
     return " ".join(hashlib.sha256(part).hexdigest()[:8] for part in parts)
 
 
-def surface_distances(point: np.ndarray, obstacle: Obstacle) -> np.ndarray:
+def surface_distances(point, obstacle):
     """Exact distance of each point to the surface, by brute force."""
     corner = obstacle.vertex_V3[obstacle.triangle_F3]
     best = np.full(len(point), np.inf)

@@ -1,10 +1,7 @@
 """The rollout file: a roundtrip without loss, the VTKHDF layout, and messages for files that do not fit."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -31,7 +28,7 @@ from hgn.schema import ConfigError
 FRAMES, PARTICLES = 4, 7
 
 
-def make_rollout(reference_frames: int | None = 3) -> Rollout:
+def make_rollout(reference_frames=3):
     generator = np.random.default_rng(0)
     triangle = Obstacle("sheet", generator.random((3, 3)), np.array([[0, 1, 2]], np.int32), closed=False)
     tetrahedron = Obstacle(
@@ -57,7 +54,7 @@ def make_rollout(reference_frames: int | None = 3) -> Rollout:
 
 
 @pytest.mark.parametrize("reference_frames", [None, 3, 6])
-def test_roundtrip(tmp_path: Path, reference_frames: int | None) -> None:
+def test_roundtrip(tmp_path, reference_frames):
     """What is read is bit for bit what was written, ground truth of any length included."""
     written = make_rollout(reference_frames)
     write_rollout(tmp_path / "new" / "rollout.vtkhdf", written)
@@ -75,14 +72,14 @@ def test_roundtrip(tmp_path: Path, reference_frames: int | None) -> None:
         np.testing.assert_array_equal(left.triangle_F3, right.triangle_F3)
 
 
-def test_large_source_survives(tmp_path: Path) -> None:
+def test_large_source_survives(tmp_path):
     """A scene specification above HDF5's 64 KiB attribute limit is kept."""
     rollout = dataclasses.replace(make_rollout(), source={"specification": ["x" * 100] * 2000})
     write_rollout(tmp_path / "rollout.h5", rollout)
     assert read_rollout(tmp_path / "rollout.h5").source == rollout.source
 
 
-def test_files_of_other_materials(tmp_path: Path) -> None:
+def test_files_of_other_materials(tmp_path):
     """A file is read with the names that it brings, fewer or others than the solver's, and refused with too few."""
     path = tmp_path / "rollout.h5"
     write_rollout(path, make_rollout())
@@ -96,7 +93,7 @@ def test_files_of_other_materials(tmp_path: Path) -> None:
             assert read_rollout(path).materials == tuple(names)
 
 
-def test_diverged_rollout_is_kept(tmp_path: Path) -> None:
+def test_diverged_rollout_is_kept(tmp_path):
     """NaN positions are written and read, so that a divergence can be looked at."""
     rollout = make_rollout()
     rollout.position_TN3[2:] = np.nan
@@ -104,7 +101,7 @@ def test_diverged_rollout_is_kept(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_rollout(tmp_path / "rollout.h5").position_TN3, rollout.position_TN3)
 
 
-def test_particles_that_enter(tmp_path: Path) -> None:
+def test_particles_that_enter(tmp_path):
     """A frame's points are those that are there; what is not yet there is read as NaN, with its frame of entry."""
     entry_N = np.array([0, 0, 0, 1, 1, 3, 9])
     rollout = dataclasses.replace(make_rollout(), obstacles=(), entry_frame_N=entry_N)
@@ -125,7 +122,7 @@ def test_particles_that_enter(tmp_path: Path) -> None:
             np.testing.assert_allclose(vtk["PointData/velocity"][begin + 3 : begin + 5], expected, rtol=1e-5)
 
 
-def test_vtkhdf_layout(tmp_path: Path) -> None:
+def test_vtkhdf_layout(tmp_path):
     """Datasets have the shapes of a temporal PolyData in VTKHDF: the obstacles' vertices and then the particles in each
     step; topology is stored once."""
     rollout = make_rollout()
@@ -166,7 +163,7 @@ def test_vtkhdf_layout(tmp_path: Path) -> None:
             np.testing.assert_array_equal(vtk["PointData/velocity"][start : start + PARTICLES], expected)
 
 
-def moving_rollout() -> Rollout:
+def moving_rollout():
     """A particle less in the first two frames, and an obstacle that turns and moves beside one at rest."""
     rollout = make_rollout(None)
     entry_N = np.zeros(PARTICLES, np.int64)
@@ -181,7 +178,7 @@ def moving_rollout() -> Rollout:
     )
 
 
-def test_what_enters_and_what_moves(tmp_path: Path) -> None:
+def test_what_enters_and_what_moves(tmp_path):
     """Particles without a position yet come back as such, obstacles with their motion."""
     written = moving_rollout()
     write_rollout(tmp_path / "a.vtkhdf", written)
@@ -196,7 +193,7 @@ def test_what_enters_and_what_moves(tmp_path: Path) -> None:
         )
 
 
-def test_files_of_format_1_are_read(tmp_path: Path) -> None:
+def test_files_of_format_1_are_read(tmp_path):
     """They had no obstacles in /VTKHDF."""
     written = make_rollout()
     write_rollout(tmp_path / "a.vtkhdf", dataclasses.replace(written, obstacles=()))
@@ -206,7 +203,7 @@ def test_files_of_format_1_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_rollout(tmp_path / "a.vtkhdf").position_TN3, written.position_TN3)
 
 
-def test_vtk_reads_it(tmp_path: Path) -> None:
+def test_vtk_reads_it(tmp_path):
     """VTK's own reader has, at each time, the particles that are there and the obstacles where they then are, with
     material, velocity and the obstacle's number."""
     pytest.importorskip("vtkmodules", reason="vtk is not installed (half a gigabyte): pip install vtk")
@@ -246,7 +243,7 @@ def test_vtk_reads_it(tmp_path: Path) -> None:
         assert vtk_to_numpy(data.GetCellData().GetArray("obstacle")).tolist() == [-1] * count + [0, 1, 1, 1, 1]
 
 
-def test_frame_velocity() -> None:
+def test_frame_velocity():
     """Uniform motion has the same velocity in every frame; a single frame has none."""
     speed = np.array([1.0, -2.0, 0.5], np.float32)
     position_TN3 = (np.arange(5, dtype=np.float32)[:, None, None] / 50) * speed
@@ -254,7 +251,7 @@ def test_frame_velocity() -> None:
     assert not frame_velocity(position_TN3[:1], 50.0).any()
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_the_old_file(tmp_path):
     """An error while writing keeps the file that was there and leaves no temporary file."""
     path = tmp_path / "rollout.h5"
     write_rollout(path, make_rollout())
@@ -265,13 +262,13 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["rollout.h5"]
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_missing_file(tmp_path):
     """A missing file is named, with the command that writes one."""
     with pytest.raises(ConfigError, match=r"existing file, got .*nothing\.h5.*hgn\.rollout"):
         read_rollout(tmp_path / "nothing.h5")
 
 
-def test_not_hdf5(tmp_path: Path) -> None:
+def test_not_hdf5(tmp_path):
     """A file of another kind is refused."""
     (tmp_path / "text.h5").write_text("not a rollout")
     with pytest.raises(ConfigError, match="complete HDF5 file"):
@@ -279,7 +276,7 @@ def test_not_hdf5(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.2, 0.9])
-def test_truncated(tmp_path: Path, share: float) -> None:
+def test_truncated(tmp_path, share):
     """A file cut short is refused, wherever it was cut."""
     path = tmp_path / "rollout.h5"
     write_rollout(path, make_rollout())
@@ -289,7 +286,7 @@ def test_truncated(tmp_path: Path, share: float) -> None:
         read_rollout(path)
 
 
-def test_other_format_and_version(tmp_path: Path) -> None:
+def test_other_format_and_version(tmp_path):
     """HDF5 files of other programs and of other versions are told apart in the message."""
     path = tmp_path / "rollout.h5"
     with h5py.File(path, "w") as file:
@@ -303,7 +300,7 @@ def test_other_format_and_version(tmp_path: Path) -> None:
         read_rollout(path)
 
 
-def test_damaged_contents(tmp_path: Path) -> None:
+def test_damaged_contents(tmp_path):
     """A missing dataset, and one of the wrong size, are refused."""
     path = tmp_path / "rollout.h5"
     write_rollout(path, make_rollout())
@@ -329,13 +326,13 @@ def test_damaged_contents(tmp_path: Path) -> None:
         ({"reference_TN3": np.zeros((2, 6, 3), np.float32)}, "reference_TN3 must have shape"),
     ],
 )
-def test_inconsistent_rollouts_are_refused(change: dict, message: str) -> None:
+def test_inconsistent_rollouts_are_refused(change, message):
     """Arrays that do not fit together never reach a file."""
     with pytest.raises(ConfigError, match=message):
         dataclasses.replace(make_rollout(), **change)
 
 
-def episode(specification: dict) -> Episode:
+def episode(specification):
     return Episode(
         key="validation-000000",
         position_TN3=np.zeros((4, PARTICLES, 3), np.float32),
@@ -351,7 +348,7 @@ def episode(specification: dict) -> Episode:
     )
 
 
-def test_cell_obstacles() -> None:
+def test_cell_obstacles():
     """Each cell becomes one square of the cell's size across the stored normal, around the cell's centre."""
     normal = np.array([[0, 1, 0], [0.6, 0, 0.8]], np.float32)
     grid = ObstacleGrid(0.25, np.array([[0, 1, 2], [3, 0, 1]], np.int32), normal)
@@ -365,7 +362,7 @@ def test_cell_obstacles() -> None:
     assert cell_obstacles(ObstacleGrid(0.25, np.empty((0, 3), np.int32), np.empty((0, 3), np.float32))) == ()
 
 
-def test_obstacles_of_episodes() -> None:
+def test_obstacles_of_episodes():
     """A random scene's obstacles are built again from its specification; others show their obstacle cells."""
     record = {"shape": "cone", "size": 0.3, "position": [0.4, 0.3, 0.5], "quaternion": [0.5, 0.5, 0.5, 0.5]}
     (cone,) = obstacles_of_episode(episode({"kind": "random", "obstacles": [record]}))
@@ -376,7 +373,7 @@ def test_obstacles_of_episodes() -> None:
     assert len(cells.triangle_F3) == 2
 
 
-def test_obstacles_of_random_scenes_are_exact() -> None:
+def test_obstacles_of_random_scenes_are_exact():
     """The rebuilt meshes of a random scene are those it was simulated with, bit for bit, in the same order."""
     scene = generate_scene(SceneConfig(), 4)
     rebuilt = obstacles_of_episode(episode(scene.specification))

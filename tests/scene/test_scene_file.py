@@ -15,7 +15,7 @@ CUBE = {"shape": "cube", "size": 0.08, "position": [0.5, 0.5, 0.5], "material": 
 CONE = {"shape": "cone", "size": 0.2, "position": [0.5, 0.2, 0.5]}
 
 
-def write(folder: Path, mapping: object) -> Path:
+def write(folder, mapping):
     path = folder / "scene.yaml"
     path.write_text(yaml.safe_dump(mapping), encoding="utf-8")
     return path
@@ -132,11 +132,11 @@ def test_particles_inside_a_closed_obstacle_are_refused_with_their_count(tmp_pat
     assert load_scene(write(tmp_path, {"groups": [CUBE], "obstacles": [bowl]})).particle_count == 1074
 
 
-def scene_with(**changes: object) -> dict[str, object]:
+def scene_with(**changes):
     return {"groups": [CUBE], **changes}
 
 
-def group_with(**changes: object) -> dict[str, object]:
+def group_with(**changes):
     return {"groups": [{**CUBE, **changes}]}
 
 
@@ -150,11 +150,11 @@ DISC = {
 }
 
 
-def emitter_with(**changes: object) -> dict[str, object]:
+def emitter_with(**changes):
     return {"emitters": [{**DISC, **changes}]}
 
 
-def obstacle_with(**changes: object) -> dict[str, object]:
+def obstacle_with(**changes):
     entry = {key: value for key, value in {**CONE, **changes}.items() if value is not None}
     return {"groups": [CUBE], "obstacles": [entry]}
 
@@ -283,7 +283,7 @@ def test_numbers_as_people_write_them(tmp_path, text, value):
     np.testing.assert_array_equal(np.unique(scene.material_parameters["density_kg_m3"]), np.float32(value))
 
 
-def test_particles_of_a_file(tmp_path: Path) -> None:
+def test_particles_of_a_file(tmp_path):
     """A group's particles are those of an .npz, with its velocities and the group's own; beside shapes and without."""
     position_N3 = np.random.default_rng(0).random((9, 3)).astype(np.float32)
     np.savez(tmp_path / "own.npz", position=position_N3, velocity=2 * position_N3)
@@ -316,7 +316,7 @@ groups:
         ({"position": np.array([{}], object)}, "must be a readable .npz file"),
     ],
 )
-def test_particles_that_cannot_be_taken(tmp_path: Path, arrays: object, message: str) -> None:
+def test_particles_that_cannot_be_taken(tmp_path, arrays, message):
     """Each fault of a file of particles is named with the group's field; objects are never unpickled."""
     path = tmp_path / "own.npz"
     if isinstance(arrays, dict):

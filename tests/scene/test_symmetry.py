@@ -1,7 +1,5 @@
 """The symmetries of a scene, and which of them a sample is shown under."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np
@@ -14,7 +12,7 @@ DOWN = (0.0, -9.8, 0.0)
 CELL_SIZE = 1 / 64
 
 
-def matrix_of(symmetry: Symmetry) -> np.ndarray:
+def matrix_of(symmetry):
     """The linear part, [3, 3]."""
     matrix = np.zeros((3, 3))
     for i, (source, mirrored) in enumerate(zip(symmetry.source, symmetry.mirrored, strict=True)):
@@ -22,18 +20,18 @@ def matrix_of(symmetry: Symmetry) -> np.ndarray:
     return matrix
 
 
-def matrices(symmetries: tuple[Symmetry, ...]) -> set[bytes]:
+def matrices(symmetries):
     return {(matrix_of(symmetry) + 0.0).astype(np.int8).tobytes() for symmetry in symmetries}
 
 
-def square_about_y() -> list[np.ndarray]:
+def square_about_y():
     """Quarter turns about y, and each after a mirror of x."""
     turn, mirror = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.diag([-1, 1, 1])
     turns = [np.linalg.matrix_power(turn, k) for k in range(4)]
     return turns + [t @ mirror for t in turns]
 
 
-def test_the_eight_of_a_square() -> None:
+def test_the_eight_of_a_square():
     """In a cube with gravity along an axis they are the quarter turns about it and their mirrors, identity first; where
     the other sides differ the identity, two mirrors and the half turn."""
     found = scene_symmetries(DOWN, CUBE, CELL_SIZE)
@@ -46,7 +44,7 @@ def test_the_eight_of_a_square() -> None:
     assert len(scene_symmetries((0.0, 0.0, 1.0), CUBE, CELL_SIZE)) == 8
 
 
-def test_any_gravity() -> None:
+def test_any_gravity():
     """Without gravity all 48 of the cube remain, with an oblique one those that keep it; every set is a group."""
     counts = {(0.0, 0.0, 0.0): 48, (1.0, 1.0, 0.0): 4, (-2.0, -2.0, -2.0): 6, (1.0, -1.0, 0.0): 4, (1.0, 2.0, 3.0): 1}
     for gravity, count in counts.items():
@@ -59,14 +57,14 @@ def test_any_gravity() -> None:
         assert products == matrices(group)
 
 
-def test_mirrors_keep_the_solvers_walls() -> None:
+def test_mirrors_keep_the_solvers_walls():
     """Nodes go to nodes: of 64, the three at the lower wall to the three at the upper one, and the other way round."""
     nodes = np.arange(64) * CELL_SIZE
     for symmetry in scene_symmetries(DOWN, CUBE, CELL_SIZE):
         np.testing.assert_array_equal(symmetry.mirror_sum[0] - nodes, nodes[::-1])
 
 
-def test_draws_are_uniform_and_belong_to_the_seed() -> None:
+def test_draws_are_uniform_and_belong_to_the_seed():
     """Over 16,000 seeds of an order, or in a row, each of the eight is drawn within five standard deviations as often
     as the others; the same seed draws the same."""
     group = scene_symmetries(DOWN, CUBE, CELL_SIZE)
@@ -81,7 +79,7 @@ def test_draws_are_uniform_and_belong_to_the_seed() -> None:
     assert drawn_symmetry(group[:1], 5) == group[0]
 
 
-def test_codes_tell_all() -> None:
+def test_codes_tell_all():
     """A code holds source, mirror and cells of each axis, in 20 bits each."""
     for symmetry in scene_symmetries((0.0, 0.0, 0.0), CUBE, CELL_SIZE):
         assert symmetry.code < 2**60

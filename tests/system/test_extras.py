@@ -1,7 +1,5 @@
 """Extras: a command that lacks a package says which extra brings it."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os
@@ -27,7 +25,7 @@ BROUGHT_BY = {
 }  # listed in an extra
 
 
-def test_each_package_is_in_the_extra_that_is_named() -> None:
+def test_each_package_is_in_the_extra_that_is_named():
     """pyproject.toml and the errors agree."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for package, extra in EXTRA_OF.items():
@@ -35,13 +33,13 @@ def test_each_package_is_in_the_extra_that_is_named() -> None:
         assert BROUGHT_BY.get(package, package) in listed, package
 
 
-def test_a_package_of_no_extra_is_no_such_error() -> None:
+def test_a_package_of_no_extra_is_no_such_error():
     """A module that is missing for another reason is a fault, not a missing extra."""
     assert missing_extra(ModuleNotFoundError(name="hgn.nothing")) is None
     assert error_message(ModuleNotFoundError(name="hgn.nothing"))[0] == "error"
 
 
-def test_a_worker_names_the_extra_that_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_names_the_extra_that_it_lacks(monkeypatch):
     """Generating without the solver's package ends in one line too; where there is none, it says for which Pythons."""
     error = ModuleNotFoundError(name="taichi.lang")
     told = "this needs taichi, which is not installed; pip install 'hgn[datagen]'"
@@ -65,9 +63,7 @@ FOREIGN = {"bounds": [[0, 1]] * 3, "sequence_length": 10, "default_connectivity_
         ("s3fs", "hgn.evaluate", {"weights": "obstacles", "data": "s3://bucket/set"}),
     ],
 )
-def test_what_is_optional_names_its_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, module: str, settings: dict[str, object]
-) -> None:
+def test_what_is_optional_names_its_extra(tmp_path, monkeypatch, package, module, settings):
     """Before anything is written, in the words of `missing_extra`."""
     foreign, here = tmp_path / "foreign", tmp_path / "here"
     foreign.mkdir()
@@ -103,7 +99,7 @@ sys.meta_path.insert(0, Hide())
         ("starlette", ["datagen.service", "+experiment=demo", "port=0", "progress=off"]),
     ],
 )
-def test_missing_extra_is_named(tmp_path: Path, package: str, arguments: list[str]) -> None:
+def test_missing_extra_is_named(tmp_path, package, arguments):
     """One line, exit code 1, no traceback, and no hour of work before."""
     (tmp_path / "sitecustomize.py").write_text(HIDE.format(package=package))
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}

@@ -1,7 +1,5 @@
 """hgn.system.machine: the cores and the memory that a process may use, as Linux tells them, and folders."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -18,7 +16,7 @@ GIB = 2**30
 
 
 @pytest.fixture
-def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def root(tmp_path, monkeypatch):
     """A file system of its own, of a machine of 16 cores and 64 GiB."""
     monkeypatch.setattr(machine, "ROOT", tmp_path)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(16)), raising=False)
@@ -27,13 +25,13 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def write(root: Path, files: dict[str, str]) -> None:
+def write(root, files):
     for name, text in files.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(f"{text}\n")
 
 
-def test_where_nothing_limits(root: Path) -> None:
+def test_where_nothing_limits(root):
     """Another system, a machine without control groups, and groups without limits: all cores and all memory."""
     assert (available_cpus(), available_memory()) == (16, 64 * GIB)
     write(root, {"proc/self/cgroup": "0::/", "sys/fs/cgroup/cgroup.procs": "1"})
@@ -46,14 +44,14 @@ def test_where_nothing_limits(root: Path) -> None:
 
 
 @pytest.mark.parametrize(("quota", "cpus"), [("150000", 2), ("200000", 2), ("10000", 1), ("9900000", 16)])
-def test_a_container(root: Path, quota: str, cpus: int) -> None:
+def test_a_container(root, quota, cpus):
     """Version 2: its own group is the outermost that it sees. Parts of a core count as one."""
     write(root, {"proc/self/cgroup": "0::/", "sys/fs/cgroup/cpu.max": f"{quota} 100000"})
     write(root, {"sys/fs/cgroup/memory.max": str(8 * GIB)})
     assert (available_cpus(), available_memory()) == (cpus, 8 * GIB)
 
 
-def test_the_least_of_all_groups_around(root: Path) -> None:
+def test_the_least_of_all_groups_around(root):
     """A limit of any of them holds for what is within."""
     write(root, {"proc/self/cgroup": "0::/a/b/c"})
     folder = "sys/fs/cgroup/a"
@@ -63,7 +61,7 @@ def test_the_least_of_all_groups_around(root: Path) -> None:
     assert (available_cpus(), available_memory()) == (3, 32 * GIB)
 
 
-def test_version_1(root: Path) -> None:
+def test_version_1(root):
     """A tree for each controller, or for several; -1 and a number that no memory has are no limits."""
     groups = "9:name=systemd:/x\n4:memory:/pod/one\n2:cpu,cpuacct:/pod/one\n1:cpuset:/\n0::/"
     write(root, {"proc/self/cgroup": groups})
@@ -77,20 +75,20 @@ def test_version_1(root: Path) -> None:
 
 
 @pytest.mark.parametrize("own", ["/docker/0a1b", "/../../machine.slice"])
-def test_groups_that_cannot_be_seen(root: Path, own: str) -> None:
+def test_groups_that_cannot_be_seen(root, own):
     """A container is told of groups outside of it, and sees its own as the outermost."""
     write(root, {"proc/self/cgroup": f"0::{own}", "sys/fs/cgroup/cpu.max": "400000 100000"})
     write(root, {"sys/machine.slice/cpu.max": "100000 100000"})
     assert available_cpus() == 4
 
 
-def test_this_machine() -> None:
+def test_this_machine():
     """What it tells is at least one core, and no more than it has."""
     assert 1 <= available_cpus() <= (os.cpu_count() or 1)
     assert 0 < available_memory() <= os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def test_threads_keep_to_a_quota(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_keep_to_a_quota(monkeypatch):
     """PyTorch's are as many as there are cores to keep busy, never more than they were, unless somebody chose."""
     before = torch.get_num_threads()
     try:
@@ -106,7 +104,7 @@ def test_threads_keep_to_a_quota(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.set_num_threads(before)
 
 
-def test_folders_that_can_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_that_can_be_written_to(tmp_path, monkeypatch):
     """The usual one, there or not yet, and nothing is made. Else this user's own, the same one each time, which nobody
     else reads; and not a link that stands in its place."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
@@ -125,7 +123,7 @@ def test_folders_that_can_be_written_to(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("named", [None, "TRITON_HOME", "TRITON_CACHE_DIR"])
-def test_where_triton_keeps_what_it_compiles(tmp_path: Path, named: str | None) -> None:
+def test_where_triton_keeps_what_it_compiles(tmp_path, named):
     """A home that cannot be written to is in nobody's way, unless somebody named a folder; how sums and products are
     rounded is said, which Triton's next version would do otherwise."""
     (tmp_path / "file").touch()

@@ -1,14 +1,12 @@
 """Where a figure comes from, without the folders of the machine that it was made on."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
 from hgn.system.provenance import without_folders
 
 
-def test_folders_are_left_out() -> None:
+def test_folders_are_left_out():
     """Of absolute paths the last part stays, wherever they stand in a text; relative ones, URLs and fractions stay."""
     cases = {
         "/any/out/a.json": "a.json",
@@ -34,7 +32,7 @@ def test_folders_are_left_out() -> None:
     assert without_folders(nested) == {"a": ["y", 3, None], "b": {"c": ["z"]}}
 
 
-def test_the_command_is_told_whole() -> None:
+def test_the_command_is_told_whole():
     """A recorded command names its module and the part, and can be typed again but for the folders."""
     code = "import runpy, sys; sys.argv = ['x']; from hgn.system.provenance import command_line; print(command_line())"
     told = subprocess.run([sys.executable, "-c", code, "part", "out=/tmp/x.json"], capture_output=True, text=True)

@@ -7,12 +7,9 @@ FOLDER/signals.json holds [restart, rank, update, signal, target] rows: in that 
 that update, to itself (target self) or to torchrun (launcher).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +19,7 @@ from hgn import train
 from hgn.training.module import TrainingModule
 
 
-def main(folder: Path) -> int:
+def main(folder):
     mapping: dict[str, Any] = json.loads((folder / "mapping.json").read_text())
     rank, restart = int(os.environ["RANK"]), int(os.environ["TORCHELASTIC_RESTART_COUNT"])
     signals = {
@@ -33,8 +30,8 @@ def main(folder: Path) -> int:
     end: dict[str, Any] = {}
     update, talked = 0, set()
 
-    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **options: Any) -> Any:
+    def counted(function):
+        def call(*arguments, **options):
             talked.add(update)
             return function(*arguments, **options)
 
@@ -43,22 +40,22 @@ def main(folder: Path) -> int:
     for name in ("all_gather", "all_reduce", "barrier", "broadcast", "broadcast_object_list"):
         setattr(torch.distributed, name, counted(getattr(torch.distributed, name)))
 
-    def at_update(module: TrainingModule, *_: Any) -> None:
+    def at_update(module, *_):
         nonlocal update
         update = module.global_step + 1
 
-    def at_start(module: TrainingModule) -> None:
+    def at_start(module):
         with (folder / f"starts_{rank}").open("a") as file:
             file.write(f"{module.global_step}\n")
 
-    def before_step(module: TrainingModule, optimizer: torch.optim.Optimizer) -> None:
+    def before_step(module, optimizer):
         if module.global_step == 0:
             gradients = {name: parameter.grad.clone() for name, parameter in module.named_parameters()}
             torch.save(gradients, folder / f"gradients_{rank}.pt")
         if module.global_step in signals:
             os.kill(*signals[module.global_step])
 
-    def at_end(module: TrainingModule) -> None:
+    def at_end(module):
         end.update(weights=module.state_dict(), update=module.global_step)
 
     TrainingModule.on_train_start = at_start

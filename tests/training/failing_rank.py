@@ -4,13 +4,10 @@ Trains as FOLDER/mapping.json says. At update 3 that rank meets an error of its 
 (FAULT weights).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -19,8 +16,8 @@ from hgn.schema import ConfigError
 from hgn.training.module import TrainingModule
 
 
-def main(folder: Path, fault: str, failing: str) -> int:
-    def fail(module: TrainingModule, *_: Any) -> None:
+def main(folder, fault, failing):
+    def fail(module, *_):
         if module.global_step == 3 and os.environ.get("LOCAL_RANK", "0") == failing:
             if fault == "error":
                 raise ConfigError("this rank fails")

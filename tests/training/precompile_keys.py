@@ -4,12 +4,9 @@ They are asked for in a process for each order: `launch`, as a training does, `b
 compiles a share of them; `gns` are another network's.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from dataclasses import replace
-from typing import Any
 
 from no_gpu import use_h100
 from triton.compiler import ASTSource
@@ -21,18 +18,16 @@ from hgn.kernels.update.op import UpdateSettings
 from hgn.runtime.precompile_program import PrecompileJob, launches_of
 
 
-def key_of(function: JITFunction[Any], signature: Any, constants: Any, attributes: Any, options: Any) -> str:
+def key_of(function, signature, constants, attributes, options):
     return f"{function.__name__} {ASTSource(function, signature, constants, attributes).hash()} {options.hash()}"
 
 
-def not_compiled(
-    self: Any, key: Any, signature: Any, device: Any, constants: Any, options: Any, attributes: Any, **_: Any
-) -> None:
+def not_compiled(self, key, signature, device, constants, options, attributes, **_):
     """Stands for JITFunction._do_compile once the launches are known."""
     print(key_of(self, signature, constants, attributes, options))
 
 
-def tell(order: str) -> None:
+def tell(order):
     """Prints a blank line, and then the keys."""
     settings = UpdateSettings(2, 1e-3, True, 1 / 64, True, 0.5)
     network, sizes = NetworkConfig(width=16, levels=2, message_passing_steps=2), (200, 60)

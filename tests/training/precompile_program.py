@@ -1,7 +1,5 @@
 """Lists the launches of a small update twice, and compiles one kernel, under a driver that needs no GPU."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from no_gpu import use_h100

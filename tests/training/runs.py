@@ -1,12 +1,7 @@
 """Small trainings for the tests."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
-from hgn.config import DatagenConfig
 from hgn.schema import to_mapping
 
 NETWORK = {"width": 8, "levels": 2, "message_passing_steps": 1, "material_embedding": 2}
@@ -25,7 +20,7 @@ TRAINING = {
 }
 
 
-def train_mapping(config: DatagenConfig, run: Path, **training: Any) -> dict[str, Any]:
+def train_mapping(config, run, **training):
     """What Hydra would hand to the command."""
     return to_mapping(config) | {
         "network": dict(NETWORK),
@@ -35,7 +30,7 @@ def train_mapping(config: DatagenConfig, run: Path, **training: Any) -> dict[str
     }
 
 
-def train_arguments(config: DatagenConfig, run: Path, **training: Any) -> list[str]:
+def train_arguments(config, run, **training):
     """The same as overrides on the command line."""
     names = ("folder", "frames", "training_scenes", "validation_scenes", "test_scenes")
     dataset = {name: getattr(config.dataset, name) for name in names}
@@ -44,6 +39,6 @@ def train_arguments(config: DatagenConfig, run: Path, **training: Any) -> list[s
     return [*values, f"run={run}"]
 
 
-def metrics(run: Path) -> list[dict[str, float]]:
+def metrics(run):
     """All logged records of a run."""
     return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]

@@ -1,13 +1,8 @@
 """Checkpoints written beside the training: what they hold, and what becomes of them when something goes wrong."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import threading
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -41,7 +36,7 @@ writer.wait()
 
 
 @pytest.fixture
-def writer() -> Iterator[CheckpointWriter]:
+def writer():
     made = CheckpointWriter()
     yield made
     made.teardown()
@@ -50,19 +45,19 @@ def writer() -> Iterator[CheckpointWriter]:
 class Gate:
     """Holds up every write until it is opened, and remembers what happened."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch):
         self.opened = threading.Event()
         self.events: list[str] = []
         monkeypatch.setattr(checkpoint_writer, "write_atomically", self.write)
 
-    def write(self, path: Path, content: bytes) -> None:
+    def write(self, path, content):
         self.events.append(f"begin {path.name}")
         assert self.opened.wait(60)
         write_atomically(path, content)
         self.events.append(f"end {path.name}")
 
 
-def load(path: Path) -> Any:
+def load(path):
     return torch.load(path, weights_only=True)
 
 
@@ -141,7 +136,7 @@ def test_a_training_ends_when_it_cannot_write(data, tmp_path, monkeypatch, faili
     assert train.main(train_mapping(data, run, maximum_updates=2)) == 0
     kept = (run / "checkpoints" / "last.ckpt").read_bytes()
 
-    def write(path: Path, content: bytes) -> None:
+    def write(path, content):
         if path.name == failing:
             raise OSError(28, "No space left on device", str(path))
         write_atomically(path, content)
@@ -157,7 +152,7 @@ def test_a_stopped_training_waits_for_its_checkpoint(data, tmp_path, monkeypatch
     gate = Gate(monkeypatch)
     original = TrainingModule.on_before_optimizer_step
 
-    def signalled(module: TrainingModule, optimizer: torch.optim.Optimizer) -> None:
+    def signalled(module, optimizer):
         if module.global_step == 5:
             assert gate.events in ([], ["begin last.ckpt"])
             signal.raise_signal(signal.SIGTERM)

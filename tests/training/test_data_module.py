@@ -1,23 +1,17 @@
 """However the samples come to the trainer, whole or in windows, from a folder or a URL, the numbers are the same."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import fsspec
 import numpy as np
 import pytest
 import torch
-from ballistic_dataset import MakeConfig, MakeDataset
 from training.runs import NETWORK, TRAINING
 
 from hgn.config import NetworkConfig, TrainingConfig
-from hgn.data.batch import Batch
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import CACHE_VARIABLE, LIMIT_VARIABLE
@@ -28,12 +22,12 @@ UPDATES = 40  # of 2 samples, where an epoch has 25
 SETTINGS = (NetworkConfig(**NETWORK), TrainingConfig(**TRAINING))
 
 
-def streamed(folder: Path | str, training: TrainingConfig = SETTINGS[1]) -> list[Batch]:
+def streamed(folder, training=SETTINGS[1]):
     return list(islice(EpisodeDataModule(EpisodeStore(folder, "train"), SETTINGS[0], training).batches(), UPDATES))
 
 
 @pytest.mark.parametrize(("importance", "at_rest"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.01), (0.0, 0.01)])
-def test_resident_feeding_equals_streaming(folder: Path, importance: float, at_rest: float) -> None:
+def test_resident_feeding_equals_streaming(folder, importance, at_rest):
     """Whole episodes, which stay in a GPU's memory, hold the windows that streaming reads, bitwise, for samples of the
     same order, seeds, weights and noise; each episode comes once, and the cursors agree wherever a chunk ends."""
     changes = {"frame_importance": importance, "noise_min_scale": at_rest, "noise_std": 1.0}  # nothing moves as much
@@ -66,9 +60,7 @@ def test_resident_feeding_equals_streaming(folder: Path, importance: float, at_r
     assert len(resident) == 5
 
 
-def test_feeding_from_a_url_equals_feeding_from_a_folder(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_feeding_from_a_url_equals_feeding_from_a_folder(folder, tmp_path, monkeypatch):
     """The same batches come through the cache of a remote data set, bitwise."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     files = fsspec.filesystem("memory")
@@ -78,7 +70,7 @@ def test_feeding_from_a_url_equals_feeding_from_a_folder(
         assert (here.seeds_S, here.sampler_state) == (there.seeds_S, there.sampler_state)
 
 
-def test_shard_made_again_is_not_mixed_up(make_config: MakeConfig, make_dataset: MakeDataset, folder: Path) -> None:
+def test_shard_made_again_is_not_mixed_up(make_config, make_dataset, folder):
     """A damaged shard that was deleted and made again is published last: an epoch that began before does not go on,
     for some samples would come twice."""
     feed = EpisodeDataModule(EpisodeStore(folder, "train"), *SETTINGS)
@@ -92,35 +84,28 @@ def test_shard_made_again_is_not_mixed_up(make_config: MakeConfig, make_dataset:
 
 
 @pytest.mark.parametrize("here", [True, False])
-def test_ranks_with_other_data_are_refused(folder: Path, here: bool) -> None:
+def test_ranks_with_other_data_are_refused(folder, here):
     """Ranks whose data were published in another order end together, wherever the difference is seen."""
 
     asked: list[bool] = []
 
     class Strategy:
-        def broadcast(self, mine: tuple[int, str, Any]) -> tuple[int, str, Any]:
+        def broadcast(self, mine):
             return (mine[0], "another order" if here else mine[1], {"seed": 0})
 
-        def reduce_boolean_decision(self, same: bool, all: bool) -> bool:
+        def reduce_boolean_decision(self, same, all):
             asked.append(same)
             return same and (here or len(asked) == 1)
 
     trainer = SimpleNamespace(world_size=2, global_rank=1, strategy=Strategy())
     with pytest.raises(ConfigError, match=r"must show the same 5 episodes on every node, got others.* rank"):
-        agreed_count(EpisodeStore(folder, "train"), trainer, {"seed": 0})  # type: ignore[arg-type]
+        agreed_count(EpisodeStore(folder, "train"), trainer, {"seed": 0})
     with pytest.raises(ConfigError, match=r"training.seed must be the same on all ranks, got \{'seed': 1\} on rank 1"):
-        agreed_count(EpisodeStore(folder, "train"), trainer, {"seed": 1})  # type: ignore[arg-type]
+        agreed_count(EpisodeStore(folder, "train"), trainer, {"seed": 1})
 
 
 @pytest.mark.parametrize(("ahead", "room"), [(False, 1 / 3), (True, 1 / 3), (True, 2 / 3)])
-def test_data_larger_than_the_cache(
-    make_config: MakeConfig,
-    make_dataset: MakeDataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    ahead: bool,
-    room: float,
-) -> None:
+def test_data_larger_than_the_cache(make_config, make_dataset, tmp_path, monkeypatch, ahead, room):
     """Shuffled in windows, an epoch fetches each shard once through a cache with room for a third of the data, and its
     batches are those of a reader that has all of it. With room for two windows no shard is waited for but the first
     window's: the order says what is needed next."""
@@ -137,7 +122,7 @@ def test_data_larger_than_the_cache(
     waited_for: list[int] = []  # batches so far, of each shard that was not fetched ahead
     real, given = files.cat_file, 0
 
-    def cat_file(path: str, *arguments: Any, **options: Any) -> bytes:
+    def cat_file(path, *arguments, **options):
         fetched.append(path)
         if path.endswith(".tar") and threading.current_thread().name != "shards":
             waited_for.append(given)
@@ -146,7 +131,7 @@ def test_data_larger_than_the_cache(
     monkeypatch.setattr(files, "cat_file", cat_file)
     epoch = 32 * 2 // 2
 
-    def batches(place: Path | str, training: TrainingConfig) -> list[Batch]:
+    def batches(place, training):
         nonlocal given
         given = 0
         feed, found = EpisodeDataModule(EpisodeStore(place, "train"), SETTINGS[0], training, batches_ahead=0), []
@@ -168,7 +153,7 @@ def test_data_larger_than_the_cache(
     assert len([name for name in fetched if name.endswith(".tar")]) > 2 * len(sizes)
 
 
-def test_data_larger_than_the_device(make_config: MakeConfig, make_dataset: MakeDataset) -> None:
+def test_data_larger_than_the_device(make_config, make_dataset):
     """Backend triton holds two windows of the order, here a quarter of the data, through two epochs: every sample's
     episode is held when it is trained on, and is the one that a trainer of all of the data has."""
     folder = make_dataset(make_config(training_scenes=64, validation_scenes=0, test_scenes=0, frames=4))

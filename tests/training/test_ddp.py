@@ -1,7 +1,5 @@
 """Training on several processes: the same gradients, the same weights, one run folder, one decision to stop."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
@@ -9,18 +7,17 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from ballistic_dataset import MakeConfig
 from processes import PATIENCE_S
 from training.runs import metrics, train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig, TrainingConfig
+from hgn.config import TrainingConfig
 from hgn.data.sampler import EpisodeSampler
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
@@ -37,9 +34,7 @@ LAUNCHER_VARIABLES = (
 )
 
 
-def torchrun(
-    folder: Path, *options: str, python: Path, prefix: Sequence[str] = (), **variables: str
-) -> subprocess.Popen[str]:
+def torchrun(folder, *options, python, prefix=(), **variables):
     """Starts torchrun on ddp_program.py, CPU processes that talk through gloo."""
     return subprocess.Popen(
         [*prefix, str(python), "-m", "torch.distributed.run", *options, str(PROGRAM), str(folder)],
@@ -54,7 +49,7 @@ def torchrun(
     )
 
 
-def output(process: subprocess.Popen[str]) -> str:
+def output(process):
     """What it printed until it ended; nothing may hang."""
     try:
         return process.communicate(timeout=PATIENCE_S)[0]
@@ -63,7 +58,7 @@ def output(process: subprocess.Popen[str]) -> str:
         raise AssertionError(process.communicate(timeout=PATIENCE_S)[0][-4000:]) from None
 
 
-def load(path: Path) -> Any:
+def load(path):
     return torch.load(path, weights_only=True)
 
 
@@ -74,14 +69,14 @@ class Reference:
     mapping: Callable[[Path], dict[str, Any]]
     gradients: dict[str, torch.Tensor]
 
-    def folder(self, path: Path, signals: Sequence[tuple[int, int, int, int, str]]) -> Path:
+    def folder(self, path, signals):
         """A folder for ddp_program.py: 40 updates of two ranks with a scene each, and the signals it sends itself."""
         path.mkdir()
         (path / "mapping.json").write_text(json.dumps(self.mapping(path)))
         (path / "signals.json").write_text(json.dumps(signals))
         return path
 
-    def check(self, folder: Path, exit_code: int) -> dict[str, torch.Tensor]:
+    def check(self, folder, exit_code):
         """The gradients of both ranks are those of one with both scenes, to 1e-6; both ended at update 20 with equal
         weights, the checkpoint's, and one run folder. Where nothing is logged (every 4 updates), saved (5) or agreed on
         (10), and no epoch begins, gradients alone travelled. Returns the weights."""
@@ -112,7 +107,7 @@ class Reference:
 
 
 @pytest.fixture
-def reference(data: DatagenConfig, tmp_path: Path) -> Reference:
+def reference(data, tmp_path):
     changes: dict[str, Any] = {"monitor_rollout_frames": 0, "monitor_every": 1000}
     run = tmp_path / "one"
     assert train.main(train_mapping(data, run, **changes, maximum_updates=1, batch_scenes=2)) == 0
@@ -127,7 +122,7 @@ def reference(data: DatagenConfig, tmp_path: Path) -> Reference:
     return Reference(lambda folder: train_mapping(data, folder / "run", **two), gradients)
 
 
-def test_two_ranks_train_as_one(reference: Reference, warm_python: Path, tmp_path: Path) -> None:
+def test_two_ranks_train_as_one(reference, warm_python, tmp_path):
     """Two ranks with a scene each have the gradients of one with both (to 1e-6); their weights stay bitwise equal;
     SIGTERM to one of them ends both at the same update, with a checkpoint and the same exit code. A `kill -9` of a rank
     instead restarts both from the last checkpoint, SIGTERM to torchrun then ends all ranks in order, and the weights
@@ -165,7 +160,7 @@ def test_two_ranks_train_as_one(reference: Reference, warm_python: Path, tmp_pat
 
 
 @pytest.fixture
-def two_machines() -> Iterator[tuple[str, str, str]]:
+def two_machines():
     """Two network namespaces joined by a cable: their names and the address of the first."""
     if os.geteuid() != 0 or shutil.which("ip") is None:
         pytest.skip("network namespaces need root and ip")
@@ -173,7 +168,7 @@ def two_machines() -> Iterator[tuple[str, str, str]]:
     if subprocess.run(["ip", "netns", "add", first], capture_output=True).returncode:
         pytest.skip("this machine allows no network namespaces")
 
-    def ip(*arguments: str) -> None:
+    def ip(*arguments):
         subprocess.run(["ip", *arguments], check=True, capture_output=True)
 
     try:
@@ -189,9 +184,7 @@ def two_machines() -> Iterator[tuple[str, str, str]]:
             subprocess.run(["ip", "netns", "del", name], capture_output=True)
 
 
-def test_two_machines_train_as_one(
-    reference: Reference, two_machines: tuple[str, str, str], warm_python: Path, tmp_path: Path
-) -> None:
+def test_two_machines_train_as_one(reference, two_machines, warm_python, tmp_path):
     """Two machines (network namespaces) under torchrun have the gradients of one process and equal weights after 20
     updates; SIGUSR1 to one rank of one machine ends both, with a checkpoint."""
     folder = reference.folder(tmp_path / "two", [(0, 1, 11, signal.SIGUSR1, "self")])
@@ -215,7 +208,7 @@ def test_two_machines_train_as_one(
 
 
 @pytest.fixture
-def no_launcher(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+def no_launcher(monkeypatch):
     for name in LAUNCHER_VARIABLES:
         monkeypatch.delenv(name, raising=False)
     return monkeypatch
@@ -234,7 +227,7 @@ def no_launcher(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
         ({"LOCAL_RANK": "0", "NODE_RANK": "1"}, False),
     ],
 )
-def test_one_process_leads(no_launcher: pytest.MonkeyPatch, variables: dict[str, str], first: bool) -> None:
+def test_one_process_leads(no_launcher, variables, first):
     """Whatever launched the processes, exactly the one of global rank 0 leads."""
     for name, value in variables.items():
         no_launcher.setenv(name, value)
@@ -253,9 +246,7 @@ def test_one_process_leads(no_launcher: pytest.MonkeyPatch, variables: dict[str,
         ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4"}, True),
     ],
 )
-def test_launcher_and_configuration_agree(
-    no_launcher: pytest.MonkeyPatch, variables: dict[str, str], accepted: bool
-) -> None:
+def test_launcher_and_configuration_agree(no_launcher, variables, accepted):
     """A launcher that started another number of processes than devices x nodes is refused: each would train alone."""
     for name, value in variables.items():
         no_launcher.setenv(name, value)
@@ -280,16 +271,14 @@ def test_launcher_and_configuration_agree(
         ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, (2, 2)),
     ],
 )
-def test_layout_follows_the_launcher(
-    no_launcher: pytest.MonkeyPatch, variables: dict[str, str], expected: tuple[int, int]
-) -> None:
+def test_layout_follows_the_launcher(no_launcher, variables, expected):
     """Where the configuration leaves them open, devices and nodes are those that the launcher started."""
     for name, value in variables.items():
         no_launcher.setenv(name, value)
     assert layout(TrainingConfig(accelerator="cpu")) == expected
 
 
-def test_restarts_that_would_hang_are_refused(no_launcher: pytest.MonkeyPatch) -> None:
+def test_restarts_that_would_hang_are_refused(no_launcher):
     """Where torchrun may restart processes that share its store, the missing variable is named at the start."""
     no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "True")
     no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
@@ -317,7 +306,7 @@ def test_restarts_that_would_hang_are_refused(no_launcher: pytest.MonkeyPatch) -
         ({"HGN_RUN": "/shared/mine"}, "/shared/mine"),
     ],
 )
-def test_one_folder_a_run(no_launcher: pytest.MonkeyPatch, variables: dict[str, str], folder: str) -> None:
+def test_one_folder_a_run(no_launcher, variables, folder):
     """All processes of a job, and its restarts, agree on the folder; two jobs get two. Our own variable comes first,
     then torchrun's id (unless it is random, as --standalone makes it), then Slurm's."""
     for name, value in variables.items():
@@ -325,7 +314,7 @@ def test_one_folder_a_run(no_launcher: pytest.MonkeyPatch, variables: dict[str, 
     assert str(default_run("small")) == folder
 
 
-def test_devices_that_are_not_there(no_launcher: pytest.MonkeyPatch) -> None:
+def test_devices_that_are_not_there(no_launcher):
     """All GPUs are taken unless fewer are asked for; more than there are, or a GPU where there is none, is refused."""
     for gpus in (0, 4):
         no_launcher.setattr(torch.cuda, "is_available", lambda gpus=gpus: gpus > 0)
@@ -340,7 +329,7 @@ def test_devices_that_are_not_there(no_launcher: pytest.MonkeyPatch) -> None:
         layout(TrainingConfig(accelerator="gpu"))
 
 
-def test_checksum() -> None:
+def test_checksum():
     """Any one other bit, anywhere, is another number; so are two values that change places."""
     tensors = [torch.arange(6.0).view(2, 3), torch.full((4,), -0.5)]
     found = {int(checksum(tensors))}
@@ -365,15 +354,7 @@ GPUS = (pytest.mark.multigpu, pytest.mark.skipif(torch.cuda.device_count() < 2, 
         *(pytest.param("gpu", fault, rank, marks=GPUS) for fault in ("error", "weights") for rank in ("0", "1")),
     ],
 )
-def test_no_rank_waits_for_one_that_fails(
-    data: DatagenConfig,
-    no_launcher: pytest.MonkeyPatch,
-    warm_python: Path,
-    tmp_path: Path,
-    accelerator: str,
-    fault: str,
-    failing: str,
-) -> None:
+def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_path, accelerator, fault, failing):
     """Two ranks of Lightning's own launcher end where one of them meets an error of its own, and where one has other
     weights, which the next log line finds."""
     options: dict[str, Any] = {"accelerator": accelerator, "backend": "torch", "devices": 2, "maximum_updates": 10**6}
@@ -392,13 +373,7 @@ def test_no_rank_waits_for_one_that_fails(
 
 
 @pytest.mark.parametrize(("local_rank", "expected"), [("0", []), ("1", [signal.SIGKILL])])
-def test_ranks_end_with_the_one_that_started_them(
-    monkeypatch: pytest.MonkeyPatch,
-    make_config: MakeConfig,
-    tmp_path: Path,
-    local_rank: str,
-    expected: Any,
-) -> None:
+def test_ranks_end_with_the_one_that_started_them(monkeypatch, make_config, tmp_path, local_rank, expected):
     """Lightning's launcher leaves the other ranks waiting when the first one fails: the kernel ends them. The first
     one of a machine outlives its shell, as any command."""
     for name in LAUNCHER_VARIABLES:
@@ -407,7 +382,7 @@ def test_ranks_end_with_the_one_that_started_them(
     asked: list[int] = []
     monkeypatch.setattr(train, "die_with_parent", asked.append)
 
-    def far_enough(training: TrainingConfig) -> None:
+    def far_enough(training):
         raise ConfigError("far enough")
 
     monkeypatch.setattr(train, "layout", far_enough)

@@ -1,7 +1,5 @@
 """What is told of errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,12 +10,12 @@ from hgn.training.errors import format_ratio, mean_so_far
     ("gain", "text"),
     [(18.5, "18.50 times below"), (1.0, "1.00 times below"), (0.1, "10.00 times above")],
 )
-def test_gain_in_words(gain: float, text: str) -> None:
+def test_gain_in_words(gain, text):
     """An error that is larger than the other is not said to be below it."""
     assert format_ratio(gain) == text
 
 
-def test_mean_over_the_scenes_that_came_so_far() -> None:
+def test_mean_over_the_scenes_that_came_so_far():
     """A scene that ended counts in no frame behind its end; behind the last one there is no mean."""
     none = np.nan
     value_ST = np.array([[1.0, 2.0, none, none], [3.0, 6.0, 9.0, none]])

@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import yaml
@@ -14,7 +13,7 @@ from hgn.schema import ConfigError
 from hgn.training.generator import Generator
 
 
-def small_config(folder: Path) -> DatagenConfig:
+def small_config(folder):
     return DatagenConfig(
         scene=SceneConfig(
             obstacle_count=1, obstacle_shapes=("cone",), group_count=1, group_size=0.03, materials=("water",)
@@ -26,14 +25,14 @@ def small_config(folder: Path) -> DatagenConfig:
     )
 
 
-def wait(generator: Generator) -> None:
+def wait(generator):
     end = time.monotonic() + PATIENCE_S
     while generator.running and time.monotonic() < end:
         time.sleep(0.1)
     assert not generator.running
 
 
-def test_makes_what_is_missing(tmp_path: Path) -> None:
+def test_makes_what_is_missing(tmp_path):
     """It asks for the first episodes early, says how many frames are done, goes on after a stop, and completes the data
     set; where the folder holds another one, `check` gives the generator's own message and names its log.
     """

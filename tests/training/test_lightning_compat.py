@@ -1,10 +1,5 @@
 """What hgn.training.lightning_compat takes for granted of Lightning."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from typing import Any
-
 import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch.utils.data import DataLoader, IterableDataset
@@ -13,25 +8,25 @@ from hgn.training import lightning_compat
 
 
 class Endless(IterableDataset[torch.Tensor]):
-    def __iter__(self) -> Iterator[torch.Tensor]:
+    def __iter__(self):
         return iter(lambda: torch.zeros(1), None)
 
 
 class Manual(LightningModule):
     """Each step makes three updates by itself, as chunks do."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.automatic_optimization = False
         self.layer = torch.nn.Linear(1, 1)
 
-    def training_step(self, batch: Any, index: int) -> None:
+    def training_step(self, batch, index):
         lightning_compat.count_updates(self.trainer, 3)
         scheduler = self.lr_schedulers()
         assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
         lightning_compat.advance_scheduler(scheduler, self.global_step, 0.1**self.global_step)
 
-    def configure_optimizers(self) -> Any:
+    def configure_optimizers(self):
         optimizer = torch.optim.Adam(self.layer.parameters(), lr=1.0)
         return [optimizer], [torch.optim.lr_scheduler.LambdaLR(optimizer, lambda update: 0.1**update)]
 

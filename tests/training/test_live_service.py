@@ -1,19 +1,15 @@
 """Training from a data set that a service makes and serves at the same time."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import fsspec
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset
 from processes import wait_until
 from training.runs import metrics, train_mapping
 
@@ -24,7 +20,6 @@ from hgn import train
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import CACHE_VARIABLE, TOKEN_VARIABLE
-from hgn.scene.episode import Episode
 from hgn.training.checkpoint import read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,13 +29,13 @@ SCENES = 5
 class Service:
     """The ballistic service in processes of its own, always on the same port."""
 
-    def __init__(self, folder: Path, log: Path) -> None:
+    def __init__(self, folder, log):
         with socket.create_server(("127.0.0.1", 0)) as listener:
             self.port = listener.getsockname()[1]
         self.folder, self.url, self._log = folder, f"http://127.0.0.1:{self.port}", log
         self.process: subprocess.Popen[bytes] | None = None
 
-    def start(self) -> None:
+    def start(self):
         path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "datagen")])
         dataset = {"training_scenes": SCENES, "validation_scenes": 1, "test_scenes": 0, "frames": 6, "workers": 1}
         overrides = [f"dataset.{key}={value}" for key, value in dataset.items()]
@@ -53,7 +48,7 @@ class Service:
                 start_new_session=True,
             )
 
-    def kill(self) -> None:
+    def kill(self):
         """Ends the service and all processes below it at once."""
         if self.process is not None:
             os.killpg(self.process.pid, signal.SIGKILL)
@@ -62,7 +57,7 @@ class Service:
 
 
 @pytest.fixture
-def service(control: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
+def service(control, tmp_path, monkeypatch):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setenv(TOKEN_VARIABLE, "correct-horse-battery")
     monkeypatch.setattr(hgn.data.storage, "_AWAY_S", 0.2)
@@ -71,7 +66,7 @@ def service(control: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     service.kill()
 
 
-def test_service_restarted_midway(make_config: MakeConfig, service: Service, control: Path, tmp_path: Path) -> None:
+def test_service_restarted_midway(make_config, service, control, tmp_path):
     """A trainer reads over HTTP what a service makes meanwhile. The service is killed with all its processes and
     started again: training goes on through it, with the scenes it has and then with those that come."""
     config = make_config(folder=service.url, training_scenes=SCENES, validation_scenes=1, test_scenes=0)
@@ -83,7 +78,7 @@ def test_service_restarted_midway(make_config: MakeConfig, service: Service, con
 
     ended = threading.Event()
 
-    def steer() -> None:
+    def steer():
         try:
             wait_until(lambda: ended.is_set() or updates(run) >= 8)
             service.kill()
@@ -119,12 +114,7 @@ def test_service_restarted_midway(make_config: MakeConfig, service: Service, con
     assert cached >= {shard.sha256 for shard in EpisodeStore(service.folder, "train").manifest.shards_of("train")}
 
 
-def test_stopped_while_its_service_is_away(
-    make_config: MakeConfig,
-    make_dataset: MakeDataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_stopped_while_its_service_is_away(make_config, make_dataset, tmp_path, monkeypatch):
     """SIGTERM that finds a training waiting for a server that is gone ends it at once, after a checkpoint of all that
     was trained on; the same command goes on there."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
@@ -134,12 +124,12 @@ def test_stopped_while_its_service_is_away(
     files.put(str(tmp_path / "data"), "/leaving", recursive=True)
     real, opened, asked = EpisodeStore.open, [], []
 
-    def gone(*arguments: object, **options: object) -> bytes:
+    def gone(*arguments, **options):
         asked.append(1)
         os.kill(os.getpid(), signal.SIGTERM)
         raise ConnectionResetError("gone")
 
-    def open_episode(store: EpisodeStore, index: int) -> Episode:
+    def open_episode(store, index):
         opened.append(index)
         if len(opened) == 12:
             files.cat_file = gone
@@ -162,7 +152,7 @@ def test_stopped_while_its_service_is_away(
     assert train.main(train_mapping(config, tmp_path / "run", monitor_every=100)) == 0
 
 
-def updates(run: Path) -> int:
+def updates(run):
     try:
         return int(metrics(run)[-1]["update"])
     except (FileNotFoundError, IndexError):

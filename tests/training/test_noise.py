@@ -1,7 +1,5 @@
 """Noise injection and grid jitter."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -18,7 +16,7 @@ from hgn.training.noise import jittered_origin, perturbed_window, random_walk
 STD = 0.000848528
 
 
-def episode(particles: int, frames: int = 12, seed: int = 0) -> Episode:
+def episode(particles, frames=12, seed=0):
     rng = np.random.default_rng(seed)
     steps = rng.normal(0, 1e-3, (frames, particles, 3))
     return Episode(
@@ -36,7 +34,7 @@ def episode(particles: int, frames: int = 12, seed: int = 0) -> Episode:
     )
 
 
-def batch_of(*episodes: Episode, frame: int = 6, seeds: tuple[int, ...] | None = None):
+def batch_of(*episodes, frame=6, seeds=None):
     pairs = [(e, frame) for e in episodes]
     return make_batch(pairs, NetworkConfig(), seeds or tuple(range(1, len(pairs) + 1)))
 
@@ -70,7 +68,7 @@ def test_smooth_noise():
     scene = replace(episode(4_000), position_TN3=np.repeat(still, 12, 0))
     cell_size = 0.035
 
-    def last_velocity(smooth: float, seed: int) -> torch.Tensor:
+    def last_velocity(smooth, seed):
         batch = batch_of(scene, scene, seeds=(seed, seed + 1))
         noise_WN3 = perturbed_window(batch, STD, smooth, cell_size).double() - batch.window_WN3.double()
         return noise_WN3[-2] - noise_WN3[-3]
@@ -107,7 +105,7 @@ def test_noise_belongs_to_the_sample():
 
 
 @pytest.mark.parametrize("smooth", [0.0, 0.3])
-def test_a_scene_can_have_less_noise(smooth: float):
+def test_a_scene_can_have_less_noise(smooth):
     """Each scene's noise is its scale times what its seed draws; without scales it is all of it."""
     batch = batch_of(episode(50), episode(30, seed=1))
     clean, whole = (perturbed_window(batch, std, smooth, 0.035).double() for std in (0.0, STD))

@@ -1,7 +1,5 @@
 """How much noise a sample gets, by how much happens in it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +12,7 @@ from hgn.training.noise import noise_scale, target_acceleration
     ("acceleration", "smallest", "power"),
     [(0.0, 0.02, 2.0), (1e-5, 0.02, 2.0), (1e-4, 0.1, 2.0), (5e-4, 0.5, 2.0), (1e-4, 0.1, 1.0), (1e-4, 0.1, 0.0)],
 )
-def test_scales_are_log_uniform_down_to_what_happens(acceleration: float, smallest: float, power: float) -> None:
+def test_scales_are_log_uniform_down_to_what_happens(acceleration, smallest, power):
     """From the larger of the least scale and the frame's own acceleration up to 1, each seed its own; errors count in
     units of the noise, of its root, or all alike."""
     training = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02, noise_weight_power=power)
@@ -27,7 +25,7 @@ def test_scales_are_log_uniform_down_to_what_happens(acceleration: float, smalle
     assert [weight for _, weight in drawn] == pytest.approx(1 / scales**power)
 
 
-def test_elsewhere_noise_is_as_asked() -> None:
+def test_elsewhere_noise_is_as_asked():
     """Where more happens than the noise, where no other scale is asked for, and without noise."""
     training = TrainingConfig(noise_std=1e-3, noise_min_scale=0.02)
     assert noise_scale(training, 1e-3, 5) == noise_scale(training, 0.1, 5) == (1.0, 1.0)
@@ -36,7 +34,7 @@ def test_elsewhere_noise_is_as_asked() -> None:
     assert noise_scale(training, float("nan"), 5) == (1.0, 1.0)
 
 
-def test_what_is_asked_for() -> None:
+def test_what_is_asked_for():
     """Root mean square over axes and particles of the last acceleration of each window."""
     time = torch.arange(7.0)
     window_7N3 = torch.zeros(7, 4, 3)

@@ -1,41 +1,37 @@
 """Kernels compiled ahead: processes that compile, what the user hears of them, and that the cache then has it all."""
 
-from __future__ import annotations
-
 import sys
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from processes import run_compiled
 
 from hgn.config import NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
 from hgn.runtime.precompile import Precompilation, frame_sizes
-from hgn.runtime.precompile_program import FrameJob, PrecompileJob, job_of, job_text
+from hgn.runtime.precompile_program import FrameJob, job_of, job_text
 from hgn.training.precompile import job_of_training
 
 
-def job(batch_scenes: int = 8) -> PrecompileJob:
+def job(batch_scenes=8):
     training = TrainingConfig(batch_scenes=batch_scenes, precision="fp16")
     config = TrainConfig(SceneConfig(), network=NetworkConfig(width=16, levels=2), training=training)
     return job_of_training(config, (9, 0), False)
 
 
 @pytest.fixture
-def started() -> Iterator[list[Precompilation]]:
+def started():
     all_started: list[Precompilation] = []
     yield all_started
     for ahead in all_started:
         ahead.stop()
 
 
-def start(started: list[Precompilation], program: str) -> Precompilation:
+def start(started, program):
     started.append(Precompilation(job(), 2, (sys.executable, "-c", f"import sys; {program}")))
     return started[0]
 
 
-def test_the_job_follows_from_the_configuration() -> None:
+def test_the_job_follows_from_the_configuration():
     """Sizes are those of the scenes' distribution as it begins, to a few per cent, and the job survives its text."""
     made = job()
     assert made.precision == "fp16" and made.capability == 90 and made.settings.scenes == 8
@@ -44,7 +40,7 @@ def test_the_job_follows_from_the_configuration() -> None:
     assert job_of(job_text(made)) == made
 
 
-def test_jobs_of_simulations() -> None:
+def test_jobs_of_simulations():
     """Networks keep their precisions through the job's text; few and many particles, dense and spread, are among the
     sizes, and as many as there are cases change little."""
     networks = ((NetworkConfig(width=16), "fp16"), (NetworkConfig(width=16, levels=2), "tf32"))
@@ -55,19 +51,19 @@ def test_jobs_of_simulations() -> None:
     assert len(frame_sizes(range(1, 1000))) == 9
 
 
-def test_what_was_compiled_is_counted(started: list[Precompilation]) -> None:
+def test_what_was_compiled_is_counted(started):
     """Each process gets its share and the job; the counts of all are told together."""
     ahead = start(started, "assert 'fp16' in sys.stdin.read(); print(10 + int(sys.argv[1]) + int(sys.argv[2]))")
     assert "backend triton: 25 kernels ready" in ahead.wait(lambda: False)
 
 
-def test_a_failure_is_told(started: list[Precompilation]) -> None:
+def test_a_failure_is_told(started):
     """When a process fails, its exit code and last line are told, and that nothing is lost."""
     text = start(started, "sys.exit('no ptxas' if sys.argv[1] == '1' else 0)").wait(lambda: False)
     assert "1 of 2 processes" in text and "exit code 1: no ptxas" in text and "when it is first used" in text
 
 
-def test_an_interruption_ends_them(started: list[Precompilation]) -> None:
+def test_an_interruption_ends_them(started):
     """Whoever is interrupted waits no longer, and no process is left."""
     ahead = start(started, "import time; time.sleep(60)")
     begin = time.monotonic()
@@ -76,7 +72,7 @@ def test_an_interruption_ends_them(started: list[Precompilation]) -> None:
     assert all(process.poll() is not None for process in ahead._processes)
 
 
-def test_the_launches_are_those_of_an_update(warm_python: Path, tmp_path: Path) -> None:
+def test_the_launches_are_those_of_an_update(warm_python, tmp_path):
     """Without memory and without a GPU the same kernels with the same specialisations are found as on tensors that
     exist, and one of them is compiled into Triton's cache."""
     run_compiled(warm_python, tmp_path, "training/precompile_program.py")
@@ -84,20 +80,20 @@ def test_the_launches_are_those_of_an_update(warm_python: Path, tmp_path: Path) 
 
 
 @pytest.fixture(scope="module")
-def keys(warm_python: Path, tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
+def keys(warm_python, tmp_path_factory):
     """Of a small update: as it launches, from behind, and a GNS's."""
     folder = tmp_path_factory.mktemp("triton")
     text = run_compiled(warm_python, folder, "training/precompile_keys.py", "launch", "behind", "gns")
     return [part.split("\n") for part in text.split("\n\n")]
 
 
-def test_every_process_looks_under_the_same_keys(keys: list[list[str]]) -> None:
+def test_every_process_looks_under_the_same_keys(keys):
     """A kernel's key in the cache on disk does not depend on which kernels the process saw before: those that a share
     compiles are found by a training, which begins with others."""
     assert len(keys[0]) > 30 and keys[0] == keys[1][::-1]
 
 
-def test_an_update_of_gns_never_asks_the_device(keys: list[list[str]]) -> None:
+def test_an_update_of_gns_never_asks_the_device(keys):
     """From the samples to new weights it runs on tensors without memory, which have no value to wait for; neighbours,
     edges, both passes and the optimiser are among its kernels, which can be compiled ahead."""
     assert {line.split()[0] for line in keys[2]} >= {

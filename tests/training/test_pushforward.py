@@ -1,11 +1,6 @@
 """Pushforward on backend torch."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +13,10 @@ from training.test_resume import stop_at as stop_at
 from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
-from hgn.config import DatagenConfig, DatasetConfig, NetworkConfig, TrainConfig, TrainingConfig
+from hgn.config import DatasetConfig, NetworkConfig, TrainConfig, TrainingConfig
 from hgn.data.batch import BatchSample, UpdateSamples, make_batch
 from hgn.data.sampler import SamplerState
-from hgn.network.base import ParticleNetwork
 from hgn.runtime.simulator import Simulator
-from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
@@ -32,7 +25,7 @@ from hgn.training.pushforward import PushforwardPool, drawn_pool_samples, drawn_
 HISTORY, CELL = 5, 0.1
 
 
-def training_of(**changes: Any) -> TrainingConfig:
+def training_of(**changes):
     values = {
         "batch_scenes": 4,
         "pushforward_fraction": 0.5,
@@ -43,7 +36,7 @@ def training_of(**changes: Any) -> TrainingConfig:
     return TrainingConfig(**values | changes)
 
 
-def test_windows_are_those_of_the_simulation() -> None:
+def test_windows_are_those_of_the_simulation():
     """Each simulated frame k gives the positions of the six frames up to it, the first of them true, and as the answer
     its own place moved as the truth moves, plus a share of its distance from the truth: none of it with pull 0, all of
     it with pull 1, where the answer is the truth; farther than a cell no particle is pulled harder."""
@@ -66,7 +59,7 @@ def test_windows_are_those_of_the_simulation() -> None:
                 torch.testing.assert_close(found[-1][near], true[now + 1][near])
 
 
-def test_what_is_simulated_is_drawn_from_seed_and_update() -> None:
+def test_what_is_simulated_is_drawn_from_seed_and_update():
     """Every episode long enough comes once before one comes twice, from any frame whose truth is known long enough, the
     first included; the same for the same update and rank, another for another. Without any it is refused."""
     training = training_of(pushforward_scenes=5)
@@ -83,7 +76,7 @@ def test_what_is_simulated_is_drawn_from_seed_and_update() -> None:
 
 
 @pytest.mark.parametrize(("share", "scenes"), [(0.3, 4), (0.25, 8), (0.1, 1), (0.0, 4)])
-def test_the_share_is_kept(share: float, scenes: int) -> None:
+def test_the_share_is_kept(share, scenes):
     """On average this share of the samples is replaced, at most one sample more or less in an update, by windows of the
     whole pool; with an empty pool none is."""
     training = training_of(pushforward_fraction=share, batch_scenes=scenes)
@@ -96,14 +89,14 @@ def test_the_share_is_kept(share: float, scenes: int) -> None:
     assert drawn_pool_samples(training, 3, 0, 0) == []
 
 
-def samples_of(episodes: list[Episode], frame: int, seeds: tuple[int, ...]) -> UpdateSamples:
+def samples_of(episodes, frame, seeds):
     pairs = zip(episodes, seeds, strict=True)
     return UpdateSamples(
         tuple(BatchSample(e, frame, window(e, frame, HISTORY), seed) for e, seed in pairs), SamplerState()
     )
 
 
-def pool_of(network: ParticleNetwork, training: TrainingConfig | None = None) -> PushforwardPool:
+def pool_of(network, training=None):
     return PushforwardPool(network, training or training_of(), 0)
 
 
@@ -116,7 +109,7 @@ def pool_of(network: ParticleNetwork, training: TrainingConfig | None = None) ->
     ],
     ids=["hgn", "gns", "gns_particles"],
 )
-def test_the_pool_is_what_the_network_does(network: ParticleNetwork) -> None:
+def test_the_pool_is_what_the_network_does(network):
     """From frame 0, whose past is ballistic, and from a later one, the pool holds the windows of each scene simulated
     by itself; a batch gets them in place of its first samples, with its seeds, and the others stay."""
     episodes = [scene_with_obstacles(i, 5 + i, cells=200) for i in range(2)]
@@ -148,11 +141,11 @@ def test_the_pool_is_what_the_network_does(network: ParticleNetwork) -> None:
     assert all(np.array_equal(scene, sample.window_WN3) for scene, sample in zip(by_scene, replaced, strict=True))
 
 
-def falling(episode: Episode, domain: float) -> Episode:
+def falling(episode, domain):
     return replace(episode, domain_size=(domain, domain, domain))
 
 
-def wild_network() -> ParticleNetwork:
+def wild_network():
     """One that accelerates everything by 0.02 a frame, along each axis."""
     network = network_of(torch.float32, levels=1, message_passing_steps=1, cell_size=0.5)
     with torch.no_grad():
@@ -161,7 +154,7 @@ def wild_network() -> ParticleNetwork:
     return network
 
 
-def test_lost_scenes_are_dropped() -> None:
+def test_lost_scenes_are_dropped():
     """A scene whose particles leave its domain by more than its size, or are no longer numbers, gives the windows
     before that and none after; the others give all, and one too far from the truth none from there on."""
     network = wild_network()
@@ -193,15 +186,13 @@ def test_lost_scenes_are_dropped() -> None:
         ),
     ],
 )
-def test_wrong_values_are_refused(changes: dict[str, Any], message: str) -> None:
+def test_wrong_values_are_refused(changes, message):
     """Each key names its rule, the value and what follows from the data set."""
     with pytest.raises(ConfigError, match=message):
         TrainConfig(dataset=DatasetConfig(frames=6), network=NetworkConfig(), training=TrainingConfig(**changes))
 
 
-def test_a_resume_where_the_pool_is_made_anew_changes_nothing(
-    data: DatagenConfig, tmp_path: Path, stop_at: Callable[[int | None], None]
-) -> None:
+def test_a_resume_where_the_pool_is_made_anew_changes_nothing(data, tmp_path, stop_at):
     """Interrupted at a multiple of pushforward_every, a training ends where an uninterrupted one does, bit by bit, and
     it tells how many windows it has; interrupted elsewhere it goes on with a pool of its own."""
     own = {
@@ -212,7 +203,7 @@ def test_a_resume_where_the_pool_is_made_anew_changes_nothing(
         "ema_decay": 0.8,
     }
 
-    def trained(name: str, stops: list[int], **changes: Any) -> dict[str, Any]:
+    def trained(name, stops, **changes):
         for stop in (*stops, None):
             stop_at(stop)
             train.main(train_mapping(data, tmp_path / name, backend="torch", **own | changes))

@@ -1,10 +1,7 @@
 """Order and resume: each sample once an epoch, and an interruption anywhere changes nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 import tempfile
-from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,8 +13,7 @@ from hypothesis import strategies as st
 from training.runs import NETWORK, TRAINING, train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
-from hgn.data.batch import Batch
+from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.reader import EpisodeStore
 from hgn.data.sampler import EpisodeSampler, SamplerState
 from hgn.training.checkpoint import read_checkpoint
@@ -33,10 +29,10 @@ FRAMES = st.lists(st.integers(2, 9), min_size=1, max_size=6)
 class Samples:
     """The samples of an epoch as (episode, frame), in the order in which they were trained on."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.epochs: dict[int, list[tuple[int, int]]] = {}
 
-    def take(self, orders: Sequence[EpisodeSampler]) -> None:
+    def take(self, orders):
         """One global batch: the ranks' shares follow each other, and may run over the end of an epoch."""
         sampler_state = orders[0].state
         left = len(orders[0]._order) - sampler_state.position
@@ -44,7 +40,7 @@ class Samples:
             self.epochs.setdefault(sampler_state.epoch + (number >= left), []).append((sample.episode, sample.frame))
         assert all(order.state == orders[0].state for order in orders)
 
-    def require_each_once(self, sampler_state: SamplerState, frames: Callable[[int], Sequence[int]]) -> None:
+    def require_each_once(self, sampler_state, frames):
         """Every epoch before that state's has each sample of episodes of `frames` frames once, its own none twice."""
         for epoch, samples in self.epochs.items():
             expected = [(e, n) for e, count in enumerate(frames(epoch)) for n in range(count - 1)]
@@ -54,9 +50,7 @@ class Samples:
                 assert len(set(samples)) == len(samples) and set(samples) <= set(expected)
 
 
-def ranks_of(
-    world_size: int, batch: int, published: Callable[[int], Sequence[int]], sampler_state: SamplerState | None = None
-) -> list[EpisodeSampler]:
+def ranks_of(world_size, batch, published, sampler_state=None):
     return [EpisodeSampler(5, batch, published, sampler_state, rank, world_size) for rank in range(world_size)]
 
 
@@ -93,7 +87,7 @@ def test_an_epoch_keeps_the_revision_it_began_with(
     begun: dict[int, int] = {}
     looks = iter(growth * 1000)
 
-    def look(epoch: int) -> list[int]:
+    def look(epoch):
         if epoch not in begun:
             published.extend([3] * next(looks))
             begun[epoch] = len(published)
@@ -111,13 +105,13 @@ def test_an_epoch_keeps_the_revision_it_began_with(
     seen.require_each_once(sampler_state, lambda epoch: published[: begun[epoch]])
 
 
-def test_reading_ahead_changes_nothing(data: DatagenConfig) -> None:
+def test_reading_ahead_changes_nothing(data):
     """With 0 to 3 batches read ahead the batches are the same, bit by bit, and each carries the sampler's state after
     it, from which a feed goes on with the next one."""
     network, training = NetworkConfig(**NETWORK), TrainingConfig(**TRAINING)
     store = EpisodeStore(data.dataset.folder, "train")
 
-    def batches(ahead: int, count: int, sampler_state: SamplerState | None = None) -> list[Batch]:
+    def batches(ahead, count, sampler_state=None):
         feed = EpisodeDataModule(store, network, training, batches_ahead=ahead)
         feed.sampler_state = sampler_state or SamplerState()
         return list(islice(feed.batches(), count))
@@ -136,17 +130,17 @@ def test_reading_ahead_changes_nothing(data: DatagenConfig) -> None:
 class Shared:
     """What a feed asks of the trainer of one rank of several, when all see the same data set."""
 
-    def __init__(self, rank: int, world_size: int) -> None:
+    def __init__(self, rank, world_size):
         self.global_rank, self.world_size, self.strategy, self.global_step = rank, world_size, self, 0
 
-    def broadcast(self, mine: Any) -> Any:
+    def broadcast(self, mine):
         return mine
 
-    def reduce_boolean_decision(self, decision: bool, all: bool) -> bool:
+    def reduce_boolean_decision(self, decision, all):
         return decision
 
 
-def test_feeds_of_all_ranks_resume_anywhere(data: DatagenConfig) -> None:
+def test_feeds_of_all_ranks_resume_anywhere(data):
     """Interrupted after any batches, on 1 to 8 ranks that may be others at each start, with 0 to 3 batches read ahead
     at that moment, the ranks together get the samples of one uninterrupted process, update by update."""
     network = NetworkConfig(**NETWORK)
@@ -183,16 +177,16 @@ def test_feeds_of_all_ranks_resume_anywhere(data: DatagenConfig) -> None:
 
 
 @pytest.fixture
-def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
+def stop_at(monkeypatch):
     """Makes the next start of a training stop once it has made that many updates in all."""
     place: dict[str, Any] = {"update": None, "module": None}
     original = TrainingModule.on_train_batch_start
 
-    def on_train_batch_start(module: TrainingModule, *arguments: Any) -> Any:
+    def on_train_batch_start(module, *arguments):
         place["module"] = module
         return original(module, *arguments)
 
-    def requested(_: StopRequest) -> bool:
+    def requested(_):
         module = place["module"]
         return place["update"] is not None and module is not None and module.global_step >= place["update"]
 
@@ -201,7 +195,7 @@ def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
     return lambda update: place.update(update=update, module=None)
 
 
-def assert_same(found: Any, expected: Any, where: str = "") -> None:
+def assert_same(found, expected, where=""):
     """Equal bit by bit, tensors inside containers included."""
     if isinstance(expected, torch.Tensor):
         assert torch.equal(found, expected), where
@@ -217,12 +211,12 @@ def assert_same(found: Any, expected: Any, where: str = "") -> None:
         assert found == expected, where
 
 
-def test_resume_equals_no_interruption(data: DatagenConfig, stop_at: Callable[[int | None], None]) -> None:
+def test_resume_equals_no_interruption(data, stop_at):
     """Interrupted at any updates, once or several times, a training ends where an uninterrupted one does, bit by bit:
     weights, their average, both moments, learning rate and order; noise, jitter and symmetries come from the samples'
     seeds, so they agree too."""
 
-    def trained(run: Path, stops: Sequence[int]) -> dict[str, Any]:
+    def trained(run, stops):
         for stop in (*stops, None):
             stop_at(stop)
             mapping = train_mapping(data, run, maximum_updates=UPDATES, monitor_every=1000, **MORE)

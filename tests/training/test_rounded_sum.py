@@ -1,10 +1,5 @@
 """Gradients that travel in bfloat16: what rounding leaves out is sent later, so the loss falls as with float32."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 import torch
 import torch.distributed as dist
@@ -14,14 +9,14 @@ from hgn.training.distributed import RoundedSum, averaging_options, rounded_aver
 
 
 @pytest.fixture
-def alone(tmp_path: Path) -> Iterator[None]:
+def alone(tmp_path):
     """A group of this process alone."""
     dist.init_process_group("gloo", init_method=f"file://{tmp_path / 'store'}", rank=0, world_size=1)
     yield
     dist.destroy_process_group()
 
 
-def test_nothing_is_lost(alone: None) -> None:
+def test_nothing_is_lost(alone):
     """Over many updates the sums that come out are those that went in, to one rounding of the last one; each alone is
     as far off as bfloat16 is. Updates that are void, or not finite, come and go without a trace."""
     generator = torch.Generator().manual_seed(0)
@@ -42,12 +37,12 @@ def test_nothing_is_lost(alone: None) -> None:
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
-def test_average(alone: None, monkeypatch: pytest.MonkeyPatch, ranks: int) -> None:
+def test_average(alone, monkeypatch, ranks):
     """A message is half as long, and its sum becomes an average."""
     sent: list[torch.Tensor] = []
     original = dist.all_reduce
 
-    def several(tensor: torch.Tensor, **options: bool) -> dist.Work | None:
+    def several(tensor, **options):
         sent.append(tensor)
         return original(tensor.mul_(ranks), **options)
 
@@ -63,10 +58,10 @@ def test_average(alone: None, monkeypatch: pytest.MonkeyPatch, ranks: int) -> No
     torch.testing.assert_close(layer.weight.grad, x.sum(0).expand(3, 4), rtol=1e-2, atol=1e-3)
 
 
-def test_loss(alone: None) -> None:
+def test_loss(alone):
     """A fit whose gradients are far apart in size ends at float32's loss; without feedback it stays above it."""
 
-    def loss(hook: RoundedSum | None) -> float:
+    def loss(hook):
         torch.manual_seed(0)
         x = torch.randn(64, 16, dtype=torch.float32) * torch.logspace(0, -2, 16)
         target = x @ torch.randn(16, 1)

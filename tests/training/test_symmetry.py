@@ -1,8 +1,5 @@
 """Symmetry augmentation on backend torch."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +10,8 @@ from scene.test_symmetry import matrix_of
 from training.test_noise import episode
 
 from hgn.config import TrainingConfig
-from hgn.data.batch import Batch, make_batch
-from hgn.network.base import ParticleNetwork
+from hgn.data.batch import make_batch
 from hgn.network.obstacles import ObstacleCells, SurfaceParticles
-from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.scene import Obstacle
 from hgn.scene.symmetry import Symmetry, drawn_symmetry, scene_symmetries
@@ -33,7 +28,7 @@ CYCLIC = Symmetry((1, 2, 0), (True, False, False), (63, 63, 63), CELL_SIZE)
 CENTRE = np.full(3, 63 / 128)  # of the solver's nodes
 
 
-def scene_with_obstacles(seed: int, particles: int = 12, cells: int = 4_000) -> Episode:
+def scene_with_obstacles(seed, particles=12, cells=4_000):
     """Particles in the middle of random obstacle cells, as random as their motion."""
     made, grid = episode(particles, seed=seed), random_grid(seed, cells)
     middle = 0.25 + 0.02 * np.random.default_rng(seed).normal(size=(1, particles, 3))
@@ -41,7 +36,7 @@ def scene_with_obstacles(seed: int, particles: int = 12, cells: int = 4_000) -> 
     return replace(made, position_TN3=position, obstacle_grid=grid)
 
 
-def seeds_of(symmetries: Sequence[Symmetry], group: tuple[Symmetry, ...] = EIGHT) -> tuple[int, ...]:
+def seeds_of(symmetries, group=EIGHT):
     """A seed for each, that draws it from the group, of different noise."""
     found, seed = [], 100
     for symmetry in symmetries:
@@ -52,12 +47,12 @@ def seeds_of(symmetries: Sequence[Symmetry], group: tuple[Symmetry, ...] = EIGHT
     return tuple(found)
 
 
-def doubled(batch: Batch) -> Batch:
+def doubled(batch):
     names = ("window_WN3", "domain_S3", "gravity_S3")
     return replace(batch, **{name: getattr(batch, name).double() for name in names})
 
 
-def by_hand(batch: Batch, episodes: Sequence[Episode], symmetries: Sequence[Symmetry]) -> Batch:
+def by_hand(batch, episodes, symmetries):
     """The batch of the images, each scene multiplied by its matrix about the centre of the solver's nodes."""
     windows, grids, points = [], [], []
     parts = batch.window_WN3.numpy().astype(np.float64)
@@ -83,7 +78,7 @@ def by_hand(batch: Batch, episodes: Sequence[Episode], symmetries: Sequence[Symm
     )
 
 
-def loss_and_gradients(network: ParticleNetwork, batch: Batch, symmetry: str) -> tuple[float, torch.Tensor]:
+def loss_and_gradients(network, batch, symmetry):
     module = TrainingModule(network, TrainingConfig(symmetry=symmetry), DataInfo("", 60.0, CELL_SIZE))
     loss = module.loss(batch)
     found = torch.autograd.grad(loss, list(network.parameters()), allow_unused=True)
@@ -100,7 +95,7 @@ def loss_and_gradients(network: ParticleNetwork, batch: Batch, symmetry: str) ->
     ],
     ids=["hgn", "relative", "gns", "gns_particles"],
 )
-def test_training_sees_the_image(network: ParticleNetwork, shown: Sequence[Symmetry]) -> None:
+def test_training_sees_the_image(network, shown):
     """With noise and grid jitter, loss and gradients of a batch whose samples draw each of the symmetries are those of
     the batch of images made by hand, to 1e-6 (positions of float32) or better; and not those of the batch itself."""
     cells = 200 if network.config.obstacle_particles else 4_000  # sampling surfaces takes time
@@ -117,7 +112,7 @@ def test_training_sees_the_image(network: ParticleNetwork, shown: Sequence[Symme
     assert abs(other_loss - loss) > 1e-4 * loss and float((gradient - other).norm() / expected.norm()) > 1e-3
 
 
-def test_particles_meet_the_same_obstacles() -> None:
+def test_particles_meet_the_same_obstacles():
     """Each particle's normal in the image is the image of its normal, and those of a scene's cells exist; velocities
     and target accelerations are images too."""
     episodes = [scene_with_obstacles(i, 200) for i in range(8)]
@@ -127,7 +122,7 @@ def test_particles_meet_the_same_obstacles() -> None:
     assert batch.obstacles is not None and image.obstacles is not None
     matrix_N33 = torch.tensor(np.array([matrix_of(s) for s in shown]))[batch.scene_N]
 
-    def turned(vector_N3: torch.Tensor) -> torch.Tensor:
+    def turned(vector_N3):
         return torch.einsum("nij,nj->ni", matrix_N33, vector_N3)
 
     before = batch.obstacles.normals(batch.window_WN3[-2], batch.scene_N)
@@ -142,14 +137,14 @@ def test_particles_meet_the_same_obstacles() -> None:
     assert torch.equal(image.domain_S3, batch.domain_S3)
 
 
-def test_cells_are_those_of_the_mirrored_mesh() -> None:
+def test_cells_are_those_of_the_mirrored_mesh():
     """Three axis-aligned sheets give in the image the cells and normals that their mirrored meshes give."""
     low, high, at = 10.5 * CELL_SIZE, 20.5 * CELL_SIZE, np.array([30.3, 40.8, 50.4]) * CELL_SIZE
     corner = np.array([(low, low), (high, low), (high, high), (low, high)])
     sheets = [np.insert(corner, axis, at[axis], axis=1) for axis in range(3)]
     triangle = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
-    def grid(symmetry: Symmetry) -> ObstacleGrid:
+    def grid(symmetry):
         moved = [(sheet - CENTRE) @ matrix_of(symmetry).T + CENTRE for sheet in sheets]
         return build_obstacle_grid([Obstacle("sheet", v, triangle, False) for v in moved], CELL_SIZE, 3)
 
@@ -160,7 +155,7 @@ def test_cells_are_those_of_the_mirrored_mesh() -> None:
     torch.testing.assert_close(found.normal_K3, expected.normal_K3, rtol=0, atol=1e-6)
 
 
-def test_a_particle_on_a_face_takes_the_cell_above_in_the_image() -> None:
+def test_a_particle_on_a_face_takes_the_cell_above_in_the_image():
     """At 10 cells exactly, mirrored to 53, a particle sees what lies in the image's cell 53: the scene's cell 9."""
     (mirror,) = (s for s in EIGHT if s.source == (0, 1, 2) and s.mirrored == (True, False, False))
     cell = np.array([[9, 5, 5], [10, 5, 5]], np.int32)
@@ -171,7 +166,7 @@ def test_a_particle_on_a_face_takes_the_cell_above_in_the_image() -> None:
     assert obstacles_under(cells, [mirror]).normals(point, scene).tolist() == [[-1.0, 0.0, 0.0]]
 
 
-def test_symmetries_belong_to_samples_and_data_stay() -> None:
+def test_symmetries_belong_to_samples_and_data_stay():
     """What a sample is shown as depends on its seed alone, and the identity, as none, changes no bit."""
     episodes = [scene_with_obstacles(i) for i in range(3)]
     config = network_of().config
@@ -188,7 +183,7 @@ def test_symmetries_belong_to_samples_and_data_stay() -> None:
     assert torch.equal(same.obstacles.normal_K3, together.obstacles.normal_K3)
 
 
-def test_unknown_symmetry_is_refused() -> None:
+def test_unknown_symmetry_is_refused():
     """Another word is refused with the choices."""
     with pytest.raises(ConfigError, match="symmetry must be one of none, gravity, got 'square'"):
         TrainingConfig(symmetry="square")

@@ -1,15 +1,11 @@
 """The training command: from shards to checkpoints, resume, stop, and every refusal."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal
 import zipfile
-from collections.abc import Collection
 from dataclasses import replace
 from itertools import permutations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +30,7 @@ from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
 
-def weights(path: Path) -> dict[str, torch.Tensor]:
+def weights(path):
     return read_checkpoint(path)["state_dict"]
 
 
@@ -95,7 +91,7 @@ def test_relative_inputs_train_as_all_others(data, tmp_path):
     assert math.isfinite(values["one_step/validation"]) and values["pushforward/windows"] > 0
 
 
-def gradients_with_faults(monkeypatch: pytest.MonkeyPatch, faulty: Collection[int]) -> None:
+def gradients_with_faults(monkeypatch, faulty):
     """Puts one NaN into the gradient of some updates, before the callbacks see it."""
     original = TrainingModule.on_after_backward
 

@@ -1,18 +1,13 @@
 """What a run begins with, how it warms up, and the moving average it ends with."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from ballistic_dataset import MakeConfig, MakeDataset
 from training.runs import NETWORK, TRAINING, metrics, train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig, NetworkConfig, TrainConfig, TrainingConfig
+from hgn.config import NetworkConfig, TrainConfig, TrainingConfig
 from hgn.data.lookup import first_episodes
 from hgn.data.reader import EpisodeStore
 from hgn.evaluate import EvaluateConfig, one_step_rows
@@ -26,15 +21,13 @@ from hgn.training.module import TrainingModule
 
 
 @pytest.fixture
-def data(make_config: MakeConfig, make_dataset: MakeDataset) -> DatagenConfig:
+def data(make_config, make_dataset):
     config = make_config(training_scenes=2, validation_scenes=1, test_scenes=0)
     make_dataset(config)
     return config
 
 
-def weights_file(
-    path: Path, stored_precision: str = "fp16", rate: float = 60.0, cell_size: float = 1 / 64, **network: Any
-) -> Path:
+def weights_file(path, stored_precision="fp16", rate=60.0, cell_size=1 / 64, **network):
     torch.manual_seed(3)
     config = NetworkConfig(**NETWORK | network)
     built = build_network(config)
@@ -44,7 +37,7 @@ def weights_file(
     return path
 
 
-def evaluate(data: DatagenConfig, weights: Path) -> float:
+def evaluate(data, weights):
     mapping = {"weights": str(weights), "data": data.dataset.folder, "rollout_frames": 0, "device": "cpu"}
     config = EvaluateConfig(**mapping)
     rows = one_step_rows(
@@ -53,14 +46,12 @@ def evaluate(data: DatagenConfig, weights: Path) -> float:
     return next(row["one_step_mse"] for row in rows if row["system"] == "network")
 
 
-def last(run: Path) -> dict[str, Any]:
+def last(run):
     return read_checkpoint(run / "checkpoints" / "last.ckpt")
 
 
 @pytest.mark.parametrize("stored_precision", ["fp16", "fp32"])
-def test_a_run_begins_with_weights(
-    data: DatagenConfig, tmp_path: Path, stored_precision: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_begins_with_weights(data, tmp_path, stored_precision, capsys):
     """A new run has the file's weights and its normaliser, whether rounded or not; one that goes on takes its
     checkpoint's, even where the file is gone, and says so."""
     file = weights_file(tmp_path / "begin.safetensors", stored_precision)
@@ -88,7 +79,7 @@ def test_a_run_begins_with_weights(
         (None, r"training.init_weights must be an existing file, got .*; write one with python -m hgn.export"),
     ],
 )
-def test_other_weights_are_refused(data: DatagenConfig, tmp_path: Path, file: Any, message: str) -> None:
+def test_other_weights_are_refused(data, tmp_path, file, message):
     """Another structure, other materials, frame rates and cells are refused by name before anything is written."""
     path = tmp_path / "other.safetensors"
     if file is not None:
@@ -98,7 +89,7 @@ def test_other_weights_are_refused(data: DatagenConfig, tmp_path: Path, file: An
     assert {path.name for path in (tmp_path / "run").rglob("*")} <= {".lock"}
 
 
-def test_another_contact_gate_is_taken(tmp_path: Path) -> None:
+def test_another_contact_gate_is_taken(tmp_path):
     """Weights that were trained with a particle's own gate begin a network with the cells': the same tensors."""
     path = weights_file(tmp_path / "own.safetensors", "fp32", inputs="relative")
     wanted = NetworkConfig(**NETWORK | {"inputs": "relative", "contact_gate": "cell"})
@@ -111,7 +102,7 @@ def test_another_contact_gate_is_taken(tmp_path: Path) -> None:
         network_of_weights(replace(config, network=replace(wanted, contact_reach_cells=2.0)))
 
 
-def test_warm_up() -> None:
+def test_warm_up():
     """The rate grows linearly over the first updates to what it is without warm-up, and is the same from there."""
     values = {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "maximum_updates": 100}
     warm, cold = (
@@ -128,14 +119,12 @@ def test_warm_up() -> None:
     assert cold._rate(0) == 1e-3 and warm._rate(100) == pytest.approx(1e-5)
 
 
-def test_the_average_is_what_is_measured_and_exported(
-    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatch):
     """The average follows its definition over every update; the export holds it, and monitoring measures it."""
     seen: list[dict[str, torch.Tensor]] = []
     original = TrainingModule.optimizer_step
 
-    def optimizer_step(self: TrainingModule, *arguments: Any, **named: Any) -> None:
+    def optimizer_step(self, *arguments, **named):
         if not seen:
             seen.append({name: p.detach().clone() for name, p in self.network.named_parameters()})
         original(self, *arguments, **named)

@@ -1,7 +1,5 @@
 """The page in a real browser, headless, one session of it for all tests; skipped where there is none."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil
@@ -10,7 +8,6 @@ import time
 import urllib.error
 import urllib.request
 import zipfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,13 +38,13 @@ CONF = Path(__file__).parents[2] / "conf"
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 
 
-def floating() -> Simulator:
+def floating():
     """Relative inputs and an output of zero: particles without gravity stay where they are."""
     return Simulator(silent(network_of(torch.float32, width=16, levels=2, inputs="relative")), 60.0, "cpu")
 
 
 @pytest.fixture(scope="module")
-def play() -> Iterator[PlayPage]:
+def play():
     block_N3 = 0.4 + 0.2 * np.random.default_rng(0).random((600, 3)).astype(np.float32)
     cone = shape_obstacle("cone", 0.3, (0.5, 0.5, 0.5))
     still = (0.0, 0.0, 0.0)
@@ -63,7 +60,7 @@ def play() -> Iterator[PlayPage]:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def browser():
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
@@ -76,11 +73,11 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def viewer(browser: Any, play: PlayPage) -> Any:
+def viewer(browser, play):
     return opened(browser, play.address)
 
 
-def opened(browser: Any, address: str) -> Any:
+def opened(browser, address):
     """A viewer's page, once its canvas shows more than one colour."""
     page = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]}).new_page()
     page.set_default_timeout(300_000)
@@ -90,11 +87,11 @@ def opened(browser: Any, address: str) -> Any:
     return page
 
 
-def pixels(page: Any) -> np.ndarray:
+def pixels(page):
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
-def until(condition: Callable[[], Any], seconds: float = 300.0) -> Any:
+def until(condition, seconds=300.0):
     """Waits for a condition, patiently: the browser draws on a shared core."""
     end = time.monotonic() + seconds
     while not (met := condition()):
@@ -103,13 +100,13 @@ def until(condition: Callable[[], Any], seconds: float = 300.0) -> Any:
     return met
 
 
-def blue(page: Any) -> int:
+def blue(page):
     """Pixels of water."""
     red, green, blue = np.moveaxis(pixels(page), -1, 0)
     return int(((blue > red + 60) & (blue > green + 25)).sum())
 
 
-def on_screen(play: PlayPage, point: tuple[float, float, float]) -> tuple[float, float]:
+def on_screen(play, point):
     """Where the first viewer's camera sees a point, in pixels."""
     camera = next(iter(play.server.get_clients().values())).camera
     forward = np.asarray(camera.look_at) - camera.position
@@ -122,7 +119,7 @@ def on_screen(play: PlayPage, point: tuple[float, float, float]) -> tuple[float,
     return SIZE[0] / 2 + scale * (offset @ right), SIZE[1] / 2 - scale * (offset @ np.cross(right, forward))
 
 
-def drag(page: Any, begin: tuple[float, float], end: tuple[float, float], key: str | None = None) -> None:
+def drag(page, begin, end, key=None):
     """A mouse's way in steps that the page cannot miss, with the button held."""
     if key:
         page.keyboard.down(key)
@@ -136,11 +133,11 @@ def drag(page: Any, begin: tuple[float, float], end: tuple[float, float], key: s
         page.keyboard.up(key)
 
 
-def press(page: Any, name: str) -> None:
+def press(page, name):
     page.get_by_role("button", name=name, exact=True).first.click()
 
 
-def test_points_are_drawn(viewer: Any, play: PlayPage) -> None:
+def test_points_are_drawn(viewer, play):
     """The page shows the water where the camera sees it, the numbers of particles and frames a second."""
     until(lambda: blue(viewer) > 300)
     x, y = (int(value) for value in on_screen(play, (0.5, 0.56, 0.5)))
@@ -149,7 +146,7 @@ def test_points_are_drawn(viewer: Any, play: PlayPage) -> None:
     until(lambda: re.search(r"[1-9]\d* frames a second · 600 particles", viewer.inner_text("body")))
 
 
-def test_a_drag_with_shift_pours(viewer: Any, play: PlayPage) -> None:
+def test_a_drag_with_shift_pours(viewer, play):
     """Particles of the chosen material enter while the mouse is held, above what it points at, and none thereafter."""
     sliders: Any = play
     sliders.speed.value, sliders.diameter.value = 0.2, 0.2  # slow: nothing stops it before it is out of the domain
@@ -170,13 +167,13 @@ def test_a_drag_with_shift_pours(viewer: Any, play: PlayPage) -> None:
     until(lambda: play.session.frame > 3)
 
 
-def test_an_obstacle_that_is_dragged_moves(viewer: Any, play: PlayPage) -> None:
+def test_an_obstacle_that_is_dragged_moves(viewer, play):
     """On screen by as much as the mouse, for the network as for the eye; with Ctrl it turns about the vertical."""
     (before,) = play.session.obstacles
     begin = on_screen(play, (0.5, 0.5, 0.5))
     drag(viewer, begin, (begin[0] + 80, begin[1]))
 
-    def shown() -> tuple[float, float]:
+    def shown():
         moved_3 = np.subtract(play.session.obstacles[0].position, before.position)
         return on_screen(play, tuple(np.add((0.5, 0.5, 0.5), moved_3)))
 
@@ -189,7 +186,7 @@ def test_an_obstacle_that_is_dragged_moves(viewer: Any, play: PlayPage) -> None:
     until(lambda: play.session.obstacles[0].rotation[1] == pytest.approx(-36, abs=4))
 
 
-def test_pause_step_and_back(viewer: Any, play: PlayPage) -> None:
+def test_pause_step_and_back(viewer, play):
     """Pause holds the scene, Step makes one frame, Back takes frames away and holds it, Play goes on."""
     press(viewer, "Pause")
     until(lambda: not play.playing)
@@ -208,7 +205,7 @@ def test_pause_step_and_back(viewer: Any, play: PlayPage) -> None:
     until(lambda: play.playing)
 
 
-def test_scene_and_rollout_are_taken_away(viewer: Any, play: PlayPage, tmp_path: Path) -> None:
+def test_scene_and_rollout_are_taken_away(viewer, play, tmp_path):
     """Both come as downloads; the scene opens as it is now, the rollout has its frames."""
     with viewer.expect_download() as download:
         press(viewer, "Scene (YAML, zip)")
@@ -222,7 +219,7 @@ def test_scene_and_rollout_are_taken_away(viewer: Any, play: PlayPage, tmp_path:
     assert rollout.particle_count == 600 and rollout.frame_count > 3
 
 
-def test_own_meshes(viewer: Any, play: PlayPage) -> None:
+def test_own_meshes(viewer, play):
     """An uploaded mesh stands in the middle, as large as the slider says; what is none is told and changes nothing."""
     count = len(play.session.obstacles)
     field = viewer.locator("input[type=file]")
@@ -238,7 +235,7 @@ def test_own_meshes(viewer: Any, play: PlayPage) -> None:
     until(lambda: len(play.session.obstacles) == count)
 
 
-def test_two_viewers_and_a_lost_connection(browser: Any, viewer: Any, play: PlayPage) -> None:
+def test_two_viewers_and_a_lost_connection(browser, viewer, play):
     """A second viewer sees the same scene; when all connections break the scene goes on, and both come back to it."""
     second = opened(browser, play.address)
     until(lambda: len(play.server.get_clients()) == 2 and blue(second) > 300)
@@ -253,7 +250,7 @@ def test_two_viewers_and_a_lost_connection(browser: Any, viewer: Any, play: Play
     second.context.close()
 
 
-def test_without_the_token_there_is_nothing(browser: Any, play: PlayPage) -> None:
+def test_without_the_token_there_is_nothing(browser, play):
     """Neither the page nor the websocket answers without it, nor with another; the host is loopback's."""
     bare = play.address.split("?")[0]
     assert bare.startswith("http://127.0.0.1:")
@@ -269,7 +266,7 @@ def test_without_the_token_there_is_nothing(browser: Any, play: PlayPage) -> Non
         start_server("192.0.2.1", 0, "HGN")
 
 
-def test_a_film_plays_by_itself(browser: Any, play: PlayPage, tmp_path: Path) -> None:
+def test_a_film_plays_by_itself(browser, play, tmp_path):
     """The static page draws the rollout's particles without any server."""
     play.do(lambda: setattr(play, "playing", False))
     until(lambda: not play.playing)
@@ -280,14 +277,14 @@ def test_a_film_plays_by_itself(browser: Any, play: PlayPage, tmp_path: Path) ->
     page.context.close()
 
 
-def test_it_begins_when_somebody_looks_and_restarts_as_it_was() -> None:
+def test_it_begins_when_somebody_looks_and_restarts_as_it_was():
     """No frame before the first viewer. Restart goes on after a divergence, and stays paused where a viewer paused."""
     session = PlaySession(floating(), load_scene(CONF / "example/play.yaml"), CONF / "example")
     page = PlayPage(session, port=0)
     thread = threading.Thread(target=page.run)
     thread.start()
 
-    def done(action: Callable[[], Any]) -> None:
+    def done(action):
         """Done between two frames, and the frame behind it, too."""
         for each in (action, lambda: None):
             over = threading.Event()

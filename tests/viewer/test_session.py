@@ -1,7 +1,5 @@
 """What the page's buttons do, without a page."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from dataclasses import replace
@@ -31,19 +29,19 @@ groups:
 """
 
 
-def free_flight() -> Simulator:
+def free_flight():
     """A network of relative inputs whose output is zero."""
     return Simulator(silent(network_of(torch.float32, width=16, levels=2, inputs="relative")), 60.0, "cpu")
 
 
-def simulator(factor: float = 1.0) -> Simulator:
+def simulator(factor=1.0):
     network = network_of(torch.float32, width=16, levels=2, inputs="relative")
     network.normaliser.acceleration_std.mul_(factor)
     return Simulator(network, 60.0, "cpu")
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     ramp = Path(__file__).parents[2] / "conf/example/ramp.obj"
     (tmp_path / "ramp.obj").write_bytes(ramp.read_bytes())
     (tmp_path / "scene.yaml").write_text(SCENE)
@@ -51,18 +49,18 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def session(folder: Path) -> PlaySession:
+def session(folder):
     return PlaySession(simulator(), load_scene(folder / "scene.yaml"), folder)
 
 
-def steps(session: PlaySession, count: int) -> np.ndarray:
+def steps(session, count):
     """The newest positions after some frames."""
     for _ in range(count):
         session.step()
     return session.newest.position_N3
 
 
-def test_untouched_it_is_a_rollout(session: PlaySession, folder: Path) -> None:
+def test_untouched_it_is_a_rollout(session, folder):
     """Frames are those of a rollout of the scene, to rounding of the cells' normals; the file has each of them."""
     scene = load_scene(folder / "scene.yaml")
     (expected_TN3,) = simulator().rollout([scene], 5)
@@ -74,7 +72,7 @@ def test_untouched_it_is_a_rollout(session: PlaySession, folder: Path) -> None:
         np.testing.assert_allclose(found.vertex_V3, expected.vertex_V3, rtol=0, atol=1e-7)
 
 
-def test_spout(session: PlaySession) -> None:
+def test_spout(session):
     """A spout gives as many particles a frame as its material has at rest in what leaves it, from its disc, at its
     speed, until it is closed; and none while what it gave is still there."""
     session.use_weights(free_flight())
@@ -95,7 +93,7 @@ def test_spout(session: PlaySession) -> None:
     assert len(steps(session, 5)) == before + len(poured_A3) + count
 
 
-def test_nothing_enters_where_there_is_no_place(session: PlaySession) -> None:
+def test_nothing_enters_where_there_is_no_place(session):
     """Not among particles, not in closed obstacles, not beyond the limit, not in the walls."""
     assert session.drop("water", (0.5, 0.5, 0.5), 0.06) == 0
     session.add_obstacle(ObstacleEntry(shape="cone", size=0.3, position=(0.2, 0.8, 0.8)))
@@ -110,7 +108,7 @@ def test_nothing_enters_where_there_is_no_place(session: PlaySession) -> None:
         session.drop("lava", (0.8, 0.8, 0.2), 0.2)
 
 
-def test_obstacles_act_where_they_are_put(session: PlaySession) -> None:
+def test_obstacles_act_where_they_are_put(session):
     """Cells with normals follow an obstacle that is moved and turned, those of one that is removed go; turning is about
     the vertical through the obstacle's position."""
     for obstacle in session.obstacles:
@@ -129,7 +127,7 @@ def test_obstacles_act_where_they_are_put(session: PlaySession) -> None:
     assert moved.entry.rotation == pytest.approx((0, 45, 0))
 
 
-def test_going_back_repeats_to_the_bit(session: PlaySession) -> None:
+def test_going_back_repeats_to_the_bit(session):
     """After going back to a frame its future is the same again, with the obstacles and gravity of then, and particles
     that entered a frame before with their histories."""
     steps(session, 2)
@@ -151,11 +149,11 @@ def test_going_back_repeats_to_the_bit(session: PlaySession) -> None:
     assert session.frame == 0
 
 
-def load_count(session: PlaySession) -> int:
+def load_count(session):
     return len(session.recording[0].position_N3)
 
 
-def test_what_is_kept_is_bounded(session: PlaySession) -> None:
+def test_what_is_kept_is_bounded(session):
     """Frames beyond the limit are forgotten, going back to them is refused with the frames that are kept, and the
     oldest that is kept repeats to the bit."""
     session.recording.limit_bytes = 12 * session.recording.bytes
@@ -169,7 +167,7 @@ def test_what_is_kept_is_bounded(session: PlaySession) -> None:
     np.testing.assert_array_equal(steps(session, 7), expected_N3)
 
 
-def test_the_scene_is_saved(session: PlaySession, tmp_path: Path) -> None:
+def test_the_scene_is_saved(session, tmp_path):
     """The archive is a scene file: the particles with their velocities, the obstacles where they are, the gravity."""
     session.set_gravity((1.0, -2.0, 0.5))
     session.add_obstacle(ObstacleEntry(shape="cone", size=0.2, position=(0.8, 0.2, 0.8), rotation=(10, 20, 30)))
@@ -189,7 +187,7 @@ def test_the_scene_is_saved(session: PlaySession, tmp_path: Path) -> None:
     assert len(again.live.scene.obstacle_grid.cell_K3) == len(session.live.scene.obstacle_grid.cell_K3)
 
 
-def test_the_rollout_is_saved(session: PlaySession, tmp_path: Path) -> None:
+def test_the_rollout_is_saved(session, tmp_path):
     """Each particle is in the frames since it entered, and nowhere before; obstacles move as they were moved."""
     steps(session, 2)
     box, _ = session.obstacles
@@ -213,7 +211,7 @@ def test_the_rollout_is_saved(session: PlaySession, tmp_path: Path) -> None:
     np.testing.assert_allclose(moved.motion.place(moved.vertex_V3, 3 / 60), now, atol=1e-6)
 
 
-def test_other_weights_go_on_from_here(session: PlaySession) -> None:
+def test_other_weights_go_on_from_here(session):
     """The state is kept to the bit, histories too, and what follows is the other network's; a rate or a material that
     does not fit is refused and nothing changes."""
     steps(session, 3)
@@ -232,7 +230,7 @@ def test_other_weights_go_on_from_here(session: PlaySession) -> None:
     assert not np.array_equal(steps(session, 1), other_N3) and session.frame == 4
 
 
-def test_divergence_is_taken_back(session: PlaySession) -> None:
+def test_divergence_is_taken_back(session):
     """What throws the scene apart is said, and the scene is as it was a frame before."""
     before_N3 = steps(session, 2)
     session.drop("water", (0.3, 0.8, 0.3), 0.1, speed=600.0)
@@ -242,7 +240,7 @@ def test_divergence_is_taken_back(session: PlaySession) -> None:
     assert np.isfinite(steps(session, 2)).all()
 
 
-def test_scenes_that_cannot_be_played() -> None:
+def test_scenes_that_cannot_be_played():
     """Too many particles are refused by the setting's name; an empty scene plays, and cannot be saved."""
     cloud_N3 = np.random.default_rng(0).random((30, 3)).astype(np.float32)
     scene = Scene(cloud_N3, 0 * cloud_N3, np.zeros(30, np.uint8))
