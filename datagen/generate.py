@@ -105,7 +105,7 @@ def generate(
             except Stopped:
                 progress.message(
                     f"stopped; {writer.done} of {writer.total} episodes are kept in {writer.folder}: run the same "
-                    "command to go on"
+                    "command to resume"
                 )
                 return False
         progress.message(_summary(config, writer))

@@ -87,7 +87,7 @@ def _exit_code(main: Callable[[dict[str, Any]], int | None], config_name: str) -
             raise
         place = f": {error.filename}" if error.filename else ""
         remedy = _MACHINE_ERRORS[error.errno]
-        code = _fail(f"{error.strerror}{place}; {remedy} and run the same command again to go on", EXIT_MACHINE)
+        code = _fail(f"{error.strerror}{place}; {remedy} and run the same command again", EXIT_MACHINE)
     except KeyboardInterrupt:
         code = _fail("interrupted", EXIT_INTERRUPTED)
     return code

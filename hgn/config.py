@@ -399,8 +399,8 @@ class NetworkConfig:
         return 3 * self.velocity_history + 3 * self.obstacle_features + 6 + self.material_embedding
 
 
-# Plane waves of the smooth noise, and the lengths that they are drawn from, in finest cells: short ones stir a body,
-# long ones shift it.
+# Plane waves of the correlated noise, and the lengths that they are drawn from, in finest cells: short ones stir a
+# body, long ones shift it.
 CORRELATED_WAVES, CORRELATED_WAVELENGTHS = 16, (4, 64)
 
 

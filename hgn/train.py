@@ -1,6 +1,6 @@
 """python -m hgn.train +experiment=obstacles: trains a network, and makes the data it needs.
 
-A run is a folder; the same command again goes on where it stopped. Ctrl-C, SIGTERM and SIGUSR1 end the run at the
+A run is a folder; the same command again resumes it. Ctrl-C, SIGTERM and SIGUSR1 end the run at the
 next update, after a checkpoint.
 """
 
@@ -72,7 +72,7 @@ def main(mapping: dict[str, Any]) -> int:
         precompilation = precompile_kernels(config, stack)
         store = wait_for_episodes(config, generator, stop, others)
         if store is None:
-            print("stopped before the first episode was published; the same command goes on", file=sys.stderr)
+            print("stopped before the first episode was published; the same command resumes it", file=sys.stderr)
             return stop.exit_code
         stop.restart_clock(config.training.maximum_minutes)
         published = PublishedEpisodes(config, generator)

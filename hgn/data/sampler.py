@@ -109,12 +109,12 @@ class EpisodeSampler:
         self._particles = particles if world_size > 1 else None
         if self.state.position > 0 and self.state.window != window:
             raise ConfigError(
-                f"training.shuffle_episodes must be {self.state.window} to go on in the middle of epoch "
+                f"training.shuffle_episodes must be {self.state.window} to resume in the middle of epoch "
                 f"{self.state.epoch}, got {window}; set it so, or start another run"
             )
         if self.state.position > 0 and self.state.seed not in (None, seed):
             raise ConfigError(
-                f"training.seed must be {self.state.seed} to go on in the middle of epoch {self.state.epoch}, got "
+                f"training.seed must be {self.state.seed} to resume in the middle of epoch {self.state.epoch}, got "
                 f"{seed}: samples would come twice; set it so, or start another run"
             )
         self._order = np.zeros(0, np.int64)

@@ -83,7 +83,7 @@ class SameWeights(Callback):
         if not same_on_all_ranks(checksum(pl_module.parameters())):
             raise ConfigError(
                 f"weights must be the same on all ranks, got others at update {trainer.global_step}: a device or a "
-                "link computes wrongly; find it, and run the same command again to go on from rank 0's last checkpoint"
+                "link computes wrongly; find it, and run the same command again to resume from rank 0's last checkpoint"
             )
 
 

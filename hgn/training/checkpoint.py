@@ -74,7 +74,7 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     stored, section = from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network"), checkpoint[SECTION]
     pairs = _network_pairs(stored, config)
     pairs.append(("training.noise_std", section["noise_std"], config.training.noise_std))  # is in the normaliser
-    _require_equal(pairs, f" to go on with {path}", remedy)
+    _require_equal(pairs, f" to resume {path}", remedy)
     if section["data"]["config_hash"] != config_hash:
         raise ConfigError(
             f"dataset.folder must hold the data set that {path} was trained on, got another one (config hash "

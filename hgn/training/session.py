@@ -170,4 +170,4 @@ def _report(config: TrainConfig, updates: int, last: dict[str, float], stop: Sto
             f"{format_ratio(last['baseline_ratio/validation'])} the best baseline's"
         )
     if stop.requested:
-        print("stopped; the same command goes on from here")
+        print("stopped; the same command resumes it")

@@ -154,7 +154,7 @@ def test_window_cannot_change_within_an_epoch():
     """Another window is another order: an epoch goes on with its own, and its end with any."""
     order = EpisodeSampler(0, 1, lambda _: [5] * 20, window=8)
     take(order, 1)
-    with pytest.raises(ConfigError, match=r"training\.shuffle_episodes must be 8 to go on in the middle of epoch 0"):
+    with pytest.raises(ConfigError, match=r"training\.shuffle_episodes must be 8 to resume in the middle of epoch 0"):
         EpisodeSampler(0, 1, lambda _: [5] * 20, order.state)
     assert EpisodeSampler(0, 1, lambda _: [5] * 20, SamplerState(1, 0, 20, "", 8)).state.window == 0
 
@@ -163,7 +163,7 @@ def test_seed_cannot_change_within_an_epoch():
     """Another seed is another order: an epoch goes on with its own; the next one, and old checkpoints, with any."""
     order = EpisodeSampler(7, 1, lambda _: [5] * 3)
     take(order, 2)
-    with pytest.raises(ConfigError, match=r"training\.seed must be 7 to go on in the middle of epoch 0, got 8"):
+    with pytest.raises(ConfigError, match=r"training\.seed must be 7 to resume in the middle of epoch 0, got 8"):
         EpisodeSampler(8, 1, lambda _: [5] * 3, order.state)
     EpisodeSampler(8, 1, lambda _: [5] * 3, replace(order.state, seed=None))
     assert EpisodeSampler(8, 1, lambda _: [5] * 3, SamplerState(1, 0, 3)).state.seed == 8

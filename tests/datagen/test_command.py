@@ -176,7 +176,7 @@ def test_json_progress(backend, tmp_path):
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for orphans in /proc")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path, number, code):
-    """Ctrl-C, SIGTERM and even SIGKILL keep every staged episode and leave no process; the same command goes on."""
+    """Ctrl-C, SIGTERM and even SIGKILL keep every staged episode and leave no process; the same command resumes."""
     (control / "slow").touch()
     process = start(*SMALL, "out=made", cwd=tmp_path)
     manifest = tmp_path / "made" / "manifest.json"
@@ -189,7 +189,7 @@ def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path, number, 
     assert process.returncode == code
     wait_until(lambda: not processes_of_session(process.pid))
     if number != signal.SIGKILL:
-        assert "episodes are kept in made: run the same command to go on" in errors
+        assert "episodes are kept in made: run the same command to resume" in errors
         assert "Traceback" not in errors
         assert not list((tmp_path / "made").rglob("*.partial"))
     (control / "slow").unlink()

@@ -1,13 +1,10 @@
 """SIGKILL of anything, at any moment, costs time and nothing else; `python -m tools.studies.kills` is longer."""
 
-import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from processes import PATIENCE_S
 
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError
@@ -63,20 +60,3 @@ def test_faults_are_seen(make_config, make_dataset, command, tmp_path):
             KillsConfig(kills=1, interval_s=1000),
             tmp_path / "log",
         )
-
-
-def test_killed_at_any_instruction(control, tmp_path):
-    """Ended before any line that touches the folder, with half-written, staged or not yet listed files in it, a
-    generator has lost nothing: the next one completes the same data set, bitwise, and removes what was half-written."""
-    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
-    program = subprocess.run(
-        [sys.executable, str(Path(__file__).with_name("crash_program.py")), str(tmp_path / "made"), "48"],
-        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-    )
-    assert program.returncode == 0, program.stderr
-    report = json.loads(program.stdout)
-    assert report["wrong"] == []
-    assert min(report["lines"]) > 600 and all(count > 0 for count in report["met"].values()), report

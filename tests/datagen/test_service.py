@@ -339,7 +339,7 @@ def test_stopping_ends_the_pool_in_order(make_config, backend, control):
     with Supervisor(config, recorder, backend) as supervisor:
         wait_until(lambda: len(recorder.episodes) >= 2)
     assert supervisor.state.status == "stopped" and not list(Path(config.dataset.folder).rglob("*.partial"))
-    assert "run the same command to go on" in recorder.messages[-1]
+    assert "run the same command to resume" in recorder.messages[-1]
 
 
 @pytest.mark.parametrize("error", [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space left"), KeyError("fault")])

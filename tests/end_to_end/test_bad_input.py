@@ -260,9 +260,9 @@ def test_data_of_another_schema(place, command, change, message, capsys, monkeyp
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["network.width=16"], "network.width must be 8 to go on with"),
-        (["network.materials=[snow,sand,water]"], "network.materials must be ['water', 'sand', 'snow'] to go on with"),
-        (["training.noise_std=0.01"], "training.noise_std must be 0.000848528 to go on with"),
+        (["network.width=16"], "network.width must be 8 to resume"),
+        (["network.materials=[snow,sand,water]"], "network.materials must be ['water', 'sand', 'snow'] to resume"),
+        (["training.noise_std=0.01"], "training.noise_std must be 0.000848528 to resume"),
         (["dataset.frames=7"], "holds another data set: frames is 6 there, 7 is asked for"),
     ],
 )

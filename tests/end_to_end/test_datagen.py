@@ -39,7 +39,7 @@ def test_interrupted_dataset_is_completed(tmp_path):
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 130 and "run the same command to go on" in errors, errors
+    assert process.returncode == 130 and "run the same command to resume" in errors, errors
     first = (folder / "train-000000-000001.tar").read_bytes()
 
     for _ in range(2):

@@ -29,7 +29,7 @@ def test_every_command_takes_a_baseline(data, tmp_path, kind):
     for updates in (2, 4):
         mapping = train_mapping(data, run, maximum_updates=updates, precision="fp16")
         assert train.main(mapping | {"network": network}) == 0
-    with pytest.raises(ConfigError, match=r"network\.kind must be '.*' to go on with"):
+    with pytest.raises(ConfigError, match=r"network\.kind must be '.*' to resume"):
         train.main(train_mapping(data, run))
     weights = tmp_path / "weights.safetensors"
     export(run / "checkpoints" / "last.ckpt", weights)

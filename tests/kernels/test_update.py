@@ -211,7 +211,7 @@ def test_a_flat_network_is_shown_no_noise_across() -> None:
     assert updates.origin_S3[0, 2] == 0 and (updates.origin_S3[0, :2] < 0).all()
 
 
-def test_smooth_noise() -> None:
+def test_correlated_noise() -> None:
     """With noise_correlated_fraction=1 a scene gets the sum of its waves for noise, as in backend torch, of the asked
     spread; other scenes have other waves; half of the variance leaves the other half to each particle."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.01)

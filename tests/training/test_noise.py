@@ -61,7 +61,7 @@ def test_noise_in_the_window_is_that_walk():
     torch.testing.assert_close(noise_WN3[-1], noise_WN3[-2], rtol=0, atol=2e-7)
 
 
-def test_smooth_noise():
+def test_correlated_noise():
     """The waves' share of the variance is asked for; what is left of it are the particles' own walks. Neighbours have
     the waves in common, particles far apart do not, nor do other scenes; no share is bitwise the noise without."""
     still = np.random.default_rng(3).uniform(0.1, 0.9, (1, 4_000, 3)).astype(np.float32)

@@ -224,7 +224,7 @@ def test_training_learns(make_config, make_dataset, tmp_path):
 @pytest.mark.parametrize(
     ("section", "change", "message"),
     [
-        ("network", {"width": 16}, "network.width must be 8 to go on with"),
+        ("network", {"width": 16}, "network.width must be 8 to resume"),
         ("network", {"levels": 3}, "network.levels must be 2"),
         ("training", {"noise_std": 0.0}, "training.noise_std must be"),
     ],

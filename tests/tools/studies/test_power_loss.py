@@ -14,10 +14,11 @@ from tools.studies import power_loss
 from tools.studies.power_loss import SCENARIOS, Disk, fail, lose_power
 
 
-@pytest.mark.parametrize(("name", "every"), [("generation", 30), ("checkpoints", 5), ("cache", 2)])
+@pytest.mark.parametrize(("name", "every"), [("generation", 20), ("checkpoints", 5), ("cache", 2)])
 def test_nothing_is_lost(tmp_path: Path, name: str, every: int) -> None:
-    """After a loss of power, or an error of the disk, before some calls, with reads and writes of 1,000 bytes at most:
-    what was published or saved is there, nothing else is taken for whole, and the next run makes the same files."""
+    """After a loss of power, a kill (all calls before it count) or an error of the disk, before some calls, with reads
+    and writes of 1,000 bytes at most: what was published or saved is there, nothing else is taken for whole, and the
+    next run makes the same files."""
     calls, tried, faults = lose_power(SCENARIOS[name], tmp_path, every, 1, 0)
     assert faults == [] and tried == calls // every > 3
     failed, faults = fail(SCENARIOS[name], tmp_path, 2 * every, 1000)
