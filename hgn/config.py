@@ -337,6 +337,8 @@ class NetworkConfig:
     # what the mean force of surfaces on a coarsest cell may be: any; or normal: only along the normals of what is
     # touched there, so that bodies slip as in solvers without friction, whatever the weights
     contact_forces: Annotated[str, one_of(*CONTACT_FORCES)] = "any"
+    # what touches and deforms by less than that many |g| a frame rests (hgn.network.rest); 0: nothing does
+    rest_threshold: NonNegative[float] = 0.0
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
     dimensions: int = 3  # 2: z is that of a plane; imported data alone have it
     maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
@@ -354,6 +356,8 @@ class NetworkConfig:
         else:
             require(not self.gates_by_cell, "contact_gate", "particle with inputs=absolute", self.contact_gate)
             require(not self.slips, "contact_forces", "any with inputs=absolute", self.contact_forces)
+            require(not self.rests, "rest_threshold", "0 with inputs=absolute", self.rest_threshold)
+        require(not self.rests or self.dimensions == 3, "rest_threshold", "0 with dimensions=2", self.rest_threshold)
         if self.kind == "hgn":
             require(self.maximum_neighbours is None, "maximum_neighbours", "null for an hgn", self.maximum_neighbours)
         else:
@@ -389,6 +393,11 @@ class NetworkConfig:
     def slips(self) -> bool:
         """Whether surfaces push coarsest cells along their normals alone."""
         return self.contact_forces == "normal"
+
+    @property
+    def rests(self) -> bool:
+        """Whether slow deformations of what touches stop."""
+        return self.rest_threshold > 0
 
     @property
     def feature_width(self) -> int:

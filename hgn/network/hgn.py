@@ -19,6 +19,7 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import CORNER_83, DIRECTION_63, GridHierarchy, Level, build_hierarchy
 from hgn.network.mlp import MLP
 from hgn.network.relative import OUTPUTS, balanced
+from hgn.network.rest import rested
 
 
 class MessagePassing(nn.Module):
@@ -92,7 +93,11 @@ class HierarchicalGraphNetwork(ParticleNetwork):
             return propagate(self.encode_particles(state, grid), grid)
         feature_NF, contacts = self.relative_features(state, grid)
         output_N9 = propagate(self.encode_features(feature_NF, state.material_N), grid)
-        return balanced(output_N9, contacts, grid)
+        acceleration_N3 = balanced(output_N9, contacts, grid)
+        if not self.config.rests:
+            return acceleration_N3
+        scale = self.normaliser.acceleration_std[0]
+        return rested(acceleration_N3, state, contacts.touched_C, grid, self.config.rest_threshold, scale)
 
     def grid(self, state: ParticleState, origin_S3: torch.Tensor | None = None) -> GridHierarchy:
         """The cells of all levels around a state's particles."""

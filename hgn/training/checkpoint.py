@@ -104,7 +104,7 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     path = find_weights(config.training.init_weights, "training.init_weights")
     weights, info = load_weights(path, field="training.init_weights")
     remedy = "set it so, or take other training.init_weights"
-    free = ("network.contact_gate", "network.contact_forces")
+    free = ("network.contact_gate", "network.contact_forces", "network.rest_threshold")
     pairs = [pair for pair in _network_pairs(info.network, config) if pair[0] not in free]
     pairs.append(("dataset.frame_rate_hz", info.frame_rate_hz, config.dataset.frame_rate_hz))
     if info.network.sees_obstacles:

@@ -44,6 +44,7 @@ def engine_of(
         config.cell_size,
         where,
         config.relative,
+        config.rests,
     )
     packed = pack_network(network)
     values = packed.gather(list(network.parameters())).to(where)

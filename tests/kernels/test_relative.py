@@ -92,6 +92,27 @@ def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels:
     assert max(output, together, *each) < {"any": 2e-5, "normal": 4e-5}[forces]
 
 
+@pytest.mark.parametrize(
+    ("counts", "obstacles", "levels"), [(EVERYWHERE, True, 2), ((9, 33), False, 1), ((1,), False, 2), ((40,), False, 3)]
+)
+def test_rest(counts: tuple[int, ...], obstacles: bool, levels: int) -> None:
+    """Outputs and every gradient with deformations that are slow, nearly so, and fast, to 1e-4: of cells that hold few
+    particles the rounding of inertia counts, as it does in PyTorch. What rest changes is more, and keeps momenta."""
+    changes = {"levels": levels, "contact_forces": "normal"}
+    without, network = (relative_network(rest_threshold=value, **changes) for value in (0.0, 1.0))
+    state = moving_state(counts, obstacles, 0.1)
+    state = replace(state, velocity_NM3=state.velocity_NM3.clamp(-2e-3, 2e-3))
+    origin_S3, _ = drawn(network, state)
+    found = [run_forward(engine_of(given, state), given, state, origin_S3).double() for given in (without, network)]
+    change_N3 = found[1] - found[0]
+    assert (float(change_N3.abs().max()) > 0.1) == (len(change_N3) > 1)
+    for kept_N3 in (change_N3, torch.linalg.cross(state.position_N3, change_N3)):
+        for scene in range(len(counts)):
+            assert float(kept_N3[state.scene_N == scene].sum(0).abs().max()) < 1e-5 * float(found[0].abs().sum())
+    output, together, each = compare(network, state, "fp32", 1.0, 512)
+    assert max(output, together, *each) < 1e-4
+
+
 @pytest.mark.parametrize("precision", list(PRECISIONS))
 @pytest.mark.parametrize("counts", [(70, 23, 1), (30,)])
 def test_momentum_is_kept_where_nothing_touches(counts: tuple[int, ...], precision: str) -> None:

@@ -48,7 +48,7 @@ def network(levels: int = 1, **changes: object) -> HierarchicalGraphNetwork:
     return network_of(torch.float32, width=16, levels=levels, message_passing_steps=1, **changes).to(device())
 
 
-@pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "contact_gate": "cell"}])
+@pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "rest_threshold": 2.0}])
 def test_frames_are_those_of_the_plain_loop(changes: dict) -> None:
     """Two scenes at once, of different gravity, move as in the plain simulator, frame by frame, and each frame is
     announced once."""

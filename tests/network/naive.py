@@ -92,7 +92,16 @@ def _one_scene(network, state, members, scene, origin_S3):
     for row, cell, weight, offset in pairs:
         change[row] = change[row] + weight * network.cell_to_particle(values[cell], latent[row], -offset)
     output = [network.decode(value + delta) for value, delta in zip(latent, change, strict=True)]
-    return _balanced(config, *felt, pairs, output) if config.relative else output
+    if not config.relative:
+        return output
+    output = _balanced(config, *felt, pairs, output)
+    scale = network.normaliser.acceleration_std[0]
+    moving = [value + state.velocity_NM3[i, 0] / scale for i, value in zip(members, output, strict=True)]
+    slow = []
+    for rate in _deforming(config, felt[0], pairs, moving):
+        ratio = rate.norm() * scale / (config.rest_threshold * state.gravity_S3[scene].norm() + 1e-300)
+        slow.append((2 - ratio**2).clamp(0, 1) * rate)
+    return [value - part for value, part in zip(output, _deforming(config, felt[0], pairs, slow), strict=True)]
 
 
 def _relative(network, state, i, scene, row, members, pairs):
@@ -171,20 +180,11 @@ def _gated(config, columns, pairs):
     return partial(around, touched), partial(around, disturbed), slip
 
 
-def _balanced(config, touched, disturbed, slip, pairs, output):
-    """Of accelerations and stresses what keeps momenta (relative.balanced): a coarsest cell's rotation is taken out,
-    and that of two: fields over their particles, as they are."""
-    top = [(row, tuple(k >> config.levels - 1 for k in cell), weight) for row, cell, weight, _ in pairs]
-    # in coarsest cells
-    place = [(torch.tensor(cell) + 0.5 - offset) / 2 ** (config.levels - 1) for _, cell, _, offset in pairs]
-    mass, mean = {}, {}
-    for row, cell, weight in top:
-        mass[cell] = mass.get(cell, 0.0) + weight
-        mean[cell] = mean.get(cell, 0.0) + weight * output[row]
-    result = [torch.zeros(3, dtype=value.dtype) for value in output]
+def _free(top, place):
+    """What takes mean and rotation out of a field of pairs of particles and cells, which lie there, in cells."""
 
     def free(field, cells):
-        """Accelerations of the pairs of particles and these cells, without what turns them all."""
+        """How well a rotation is known, and accelerations of these cells' pairs without what turns them all."""
         mine = [i for i, (_, cell, _) in enumerate(top) if cell in cells]
         total = sum(top[i][2] for i in mine)
         centre = sum(top[i][2] * place[i] for i in mine) / total
@@ -198,12 +198,47 @@ def _balanced(config, touched, disturbed, slip, pairs, output):
         known = product / (product + (0.2 * (moments + 1e-3)) ** 3)
         rate = torch.linalg.lstsq(inertia, turn, rcond=1e-10, driver="gelsd").solution
         still = [field[i] - mean - torch.linalg.cross(rate, place[i] - centre) for i in mine]
-        return {i: known * value for i, value in zip(mine, still, strict=True)}
+        return known, {i: known * value for i, value in zip(mine, still, strict=True)}
+
+    return free
+
+
+def _deforming(config, touched, pairs, values):
+    """The part of values that deforms what touches (rest.Deformation)."""
+    span, hats = 2 ** (config.levels - 1), []
+    for row in range(len(values)):
+        mine = [(cell, weight, offset) for i, cell, weight, offset in pairs if i == row]
+        gate = sum(weight * touched(tuple(k >> config.levels - 1 for k in cell)) for cell, weight, _ in mine)
+        place = (torch.tensor(mine[0][0]) + 0.5 - mine[0][2]) / span
+        for corner in itertools.product((0, 1), repeat=3):
+            middle = torch.floor(place - 0.5) + 0.5 + torch.tensor(corner)
+            hats.append((row, tuple(middle.tolist()), gate * (1 - (place - middle).abs()).prod(), place))
+    top = [hat[:3] for hat in hats if float(hat[2]) > 0]
+    free = _free(top, [hat[3] for hat in hats if float(hat[2]) > 0])
+    result = [torch.zeros(3, dtype=value.dtype) for value in values]
+    for middle in {middle for _, middle, _ in top}:
+        known, parts = free({i: values[row] for i, (row, at, _) in enumerate(top) if at == middle}, {middle})
+        for i, part in parts.items():
+            row, _, weight = top[i]
+            result[row] = result[row] + weight * part / max(known, 0.5)
+    return result
+
+
+def _balanced(config, touched, disturbed, slip, pairs, output):
+    """Of accelerations and stresses what keeps momenta (relative.balanced): a coarsest cell's rotation is taken out,
+    and that of two: fields over their particles, as they are."""
+    top = [(row, tuple(k >> config.levels - 1 for k in cell), weight) for row, cell, weight, _ in pairs]
+    free = _free(top, [(torch.tensor(k) + 0.5 - offset) / 2 ** (config.levels - 1) for _, k, _, offset in pairs])
+    mass, mean = {}, {}
+    for row, cell, weight in top:
+        mass[cell] = mass.get(cell, 0.0) + weight
+        mean[cell] = mean.get(cell, 0.0) + weight * output[row]
+    result = [torch.zeros(3, dtype=value.dtype) for value in output]
 
     fields, pushes = [None] * len(top), []
     for cell in mass:
         own = {i: output[row][:3] for i, (row, at, _) in enumerate(top) if at == cell}
-        for i, value in free(own, {cell}).items():
+        for i, value in free(own, {cell})[1].items():
             kept = own[i] - slip(cell) @ mean[cell][:3] / mass[cell]
             fields[i] = disturbed(cell) * (touched(cell) * kept + (1 - touched(cell)) * value)
         for axis in range(3):
@@ -215,7 +250,7 @@ def _balanced(config, touched, disturbed, slip, pairs, output):
                     i: force / mass[cell] if at == cell else -force / mass[other] for i, (_, at, _) in enumerate(top)
                 }
                 factor = disturbed(cell) * disturbed(other) * mass[cell] * mass[other] / (mass[cell] + mass[other])
-                pushes.append((factor, free(pair, {cell, other})))
+                pushes.append((factor, free(pair, {cell, other})[1]))
     for factor, values in pushes:
         for i, value in values.items():
             fields[i] = fields[i] + factor * value

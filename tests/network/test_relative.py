@@ -505,6 +505,10 @@ def test_one_scale_for_all_axes() -> None:
         ({"inputs": "relative", "contact_gate": "near"}, "contact_gate must be one of particle, cell, got 'near'"),
         ({"contact_gate": "cell"}, "contact_gate must be particle with inputs=absolute, got 'cell'"),
         ({"contact_forces": "normal"}, "contact_forces must be any with inputs=absolute, got 'normal'"),
+        ({"rest_threshold": 0.3}, "rest_threshold must be 0 with inputs=absolute, got 0.3"),
+        ({"inputs": "relative", "rest_threshold": 0.3, "dimensions": 2}, "rest_threshold must be 0 with dimensions=2"),
+        ({"inputs": "relative", "rest_threshold": float("nan")}, "rest_threshold must be a finite number >= 0"),
+        ({"inputs": "relative", "rest_threshold": -0.1}, "rest_threshold must be a finite number >= 0, got -0.1"),
     ],
 )
 def test_bad_input(changes: dict[str, object], message: str) -> None:

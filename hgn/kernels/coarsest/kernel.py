@@ -11,9 +11,12 @@ import triton.language as tl
 from hgn.kernels.geometry import GEOMETRY_COLUMNS, most_around
 from hgn.kernels.triton_compat import gdc_launch_dependents, gdc_wait, settle_keys
 from hgn.network.relative import OUTPUTS, POINT, THIN
+from hgn.network.rest import LEAST, SURE
 
 THINNEST, SMALLEST = tl.constexpr(THIN), tl.constexpr(POINT)  # of a cell's contents, for a rotation to be known
 DECODED = tl.constexpr(OUTPUTS)
+RATES = tl.constexpr(8)  # columns of what `rest` sums up and spreads
+SURELY, TINY = tl.constexpr(SURE), tl.constexpr(LEAST)
 
 
 @triton.jit
@@ -352,6 +355,218 @@ def add_coarsest(
     for i in tl.static_range(3):
         total += tl.where(column == i, tl.sum(swing[i], 1)[:, None], 0.0)
     tl.store(x + row[:, None] * OUT + column, total + factor[:, None] * own, mask=live[:, None] & (column < USED))
+
+
+# rest, behind `balance`: P, two numbers of P, and P again, for P does not grow and is its own adjoint
+
+
+@triton.jit
+def _lowest(base_of, gate_of, row, live):
+    return tl.load(base_of + row, mask=live, other=0), tl.load(gate_of + row, mask=live, other=0.0)
+
+
+@triton.jit
+def _middles(base, gate, place_of, geometry, row, live, LEVELS: tl.constexpr):
+    """From the lowest slots and the gates of particles, the slots [N, 8] of all middles of coarsest cells around them,
+    their places from there, and their weights."""
+    line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
+    corner = tl.arange(0, 8)[None, :]
+    axes, weight = (), gate[:, None]
+    for i in tl.static_range(3):
+        place = tl.load(place_of + row * 3 + i, mask=live, other=0.0)
+        place = (place - tl.floor(place))[:, None] - (corner >> 2 - i & 1).to(tl.float32)
+        weight = weight * (1 - tl.abs(place))
+        axes = axes + (place,)  # noqa: RUF005 - Triton knows no unpacking here
+    across = (corner >> 2 & 1) * tl.load(line + 2) + (corner >> 1 & 1)
+    slot = base[:, None] + across * tl.load(line + 3) + (corner & 1)
+    return slot, axes, weight
+
+
+@triton.jit
+def _add_bodies(sums, slot, place, weight, value, BODIES: tl.constexpr, COLUMNS: tl.constexpr):
+    """Adds values of particles and their moments to middles' sums [K, COLUMNS]: behind mass, places and their products
+    xx, yy, zz, yz, xz, xy with BODIES."""
+    at: tl.constexpr = 10 * BODIES
+    moment = _cross(place, (value[0][:, None], value[1][:, None], value[2][:, None]))
+    column = tl.arange(0, COLUMNS)[None, None, :]
+    added = tl.zeros((slot.shape[0], 8, COLUMNS), tl.float32)
+    if BODIES:
+        added = tl.where(column == 0, weight[:, :, None], added)
+        for i in tl.static_range(3):
+            one, other = place[(i + 1) % 3], place[(i + 2) % 3]
+            added = tl.where(column == 1 + i, (weight * place[i])[:, :, None], added)
+            added = tl.where(column == 4 + i, (weight * place[i] * place[i])[:, :, None], added)
+            added = tl.where(column == 7 + i, (weight * one * other)[:, :, None], added)
+    for i in tl.static_range(3):
+        added = tl.where(column == at + i, (weight * value[i][:, None])[:, :, None], added)
+        added = tl.where(column == at + 3 + i, (weight * moment[i])[:, :, None], added)
+    # columns of zeros are added too, four at once
+    there = (weight > 0)[:, :, None] & (column < COLUMNS)
+    tl.atomic_add(sums + slot[:, :, None] * COLUMNS + column, added, mask=there, sem="relaxed")
+
+
+@triton.jit
+def _deforming(table, slot, place, weight, value):
+    """The part of values of particles that deforms what touches, by the middles' table [K, RATES]."""
+    there = weight > 0
+    base = _three(table, slot, 0, there, weight, RATES)
+    swing = _cross(_three(table, slot, 4, there, weight, RATES), place)
+    factor = tl.sum(tl.load(table + slot * RATES + 3, mask=there, other=0.0) * weight, 1)
+    result = ()
+    for i in tl.static_range(3):
+        part = factor * value[i] - tl.sum(base[i] + swing[i], 1)
+        result = result + (part,)  # noqa: RUF005 - Triton knows no unpacking here
+    return result
+
+
+@triton.jit
+def _displaced(x, velocity, scale, row, live, OUT: tl.constexpr, HISTORY: tl.constexpr, MOVING: tl.constexpr):
+    """Columns 0 to 2 of x [N, OUT], and with MOVING the newest velocities in its unit besides."""
+    ax, ay, az = _three(x, row, 0, live, 1.0, OUT)
+    if MOVING:
+        vx, vy, vz = _three(velocity, row, 0, live, 1 / tl.load(scale), 3 * HISTORY)
+        ax, ay, az = ax + vx, ay + vy, az + vz
+    return ax, ay, az
+
+
+@triton.jit
+def sum_displacements(
+    x, velocity, scale, coarsest_of, share_of, place_of, felt, slot_of_cell, geometry, base_of, gate_of, sums,
+    particle_count,
+    OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, COLUMNS: tl.constexpr, FORWARD: tl.constexpr,
+    OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Adds the particles' next displacements over `scale`, or with FORWARD off their gradients alone, to the sums
+    [K, COLUMNS] of the middles of coarsest cells around them, moments too; forward with the bodies' own. There the
+    lowest of these slots goes into `base_of` [N], and the gate into `gate_of` [N].
+
+    Reference: hgn.network.rest; test: tests/kernels/test_relative.py.
+    """
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < tl.load(particle_count)
+    if FORWARD:
+        line = geometry + (LEVELS - 1) * GEOMETRY_COLUMNS
+        cell, share = _coarsest_cells(coarsest_of, share_of, row, live)
+        gate = tl.sum(share * tl.load(felt + cell * 2 + 1, mask=cell >= 0, other=0.0), 1)
+        own = tl.load(coarsest_of + row * 8, mask=live, other=-1)
+        base = tl.load(slot_of_cell + tl.load(line + 6) + own, mask=own >= 0, other=0)
+        for i in tl.static_range(3):
+            below = live & (tl.load(place_of + row * 3 + i, mask=live, other=0.0) < 0)
+            stride = 1
+            if i < 2:
+                stride = tl.load(line + 3)
+            if i == 0:
+                stride = stride * tl.load(line + 2)
+            base -= tl.where(below, stride, 0)
+        base, gate = tl.maximum(base, 0), tl.where(own >= 0, gate, 0.0)
+    else:
+        base, gate = _lowest(base_of, gate_of, row, live)
+    slot, place, weight = _middles(base, gate, place_of, geometry, row, live, LEVELS)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    if FORWARD:
+        tl.store(base_of + row, base, mask=live)
+        tl.store(gate_of + row, gate, mask=live)
+    value = _displaced(x, velocity, scale, row, live, OUT, HISTORY, FORWARD)
+    _add_bodies(sums, slot, place, weight, value, FORWARD, COLUMNS)
+
+
+@triton.jit
+def find_deformation(
+    bodies, sums, table, count,
+    AT: tl.constexpr, COLUMNS: tl.constexpr, BODIES: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """From a field's sums [K, COLUMNS] at the middles of coarsest cells, from column AT on, and `bodies` [K, BODIES] to
+    their table [K, RATES]: what is subtracted there, the factor of a particle's own in column 3, and the rate of
+    rotation that is subtracted in columns 4 to 6.
+
+    Reference: hgn.network.rest; test: tests/kernels/test_relative.py.
+    """
+    middle = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = middle < count
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    inverse = _inverse(tl.load(bodies + middle * BODIES, mask=there, other=0.0))
+    x, y, z, inertia = _body(bodies + 1, middle, there, inverse, BODIES)
+    centre = (x, y, z)
+    mean = _three(sums, middle, AT, there, inverse, COLUMNS)
+    moment = _three(sums, middle, AT + 3, there, inverse, COLUMNS)
+    lever = _cross(centre, mean)
+    known, wx, wy, wz = _rotation(inertia, moment[0] - lever[0], moment[1] - lever[1], moment[2] - lever[2])
+    share = 1 / tl.maximum(known, SURELY)
+    turn = (share * wx, share * wy, share * wz)
+    lever = _cross(turn, centre)
+    line = table + middle * RATES
+    for i in tl.static_range(3):
+        tl.store(line + i, share * known * mean[i] - lever[i], mask=there)
+        tl.store(line + 4 + i, turn[i], mask=there)
+    tl.store(line + 3, share * known, mask=there)
+
+
+@triton.jit
+def slow_displacements(
+    x, velocity, scale, scene_of, gravity, threshold, rate, slow, table, place_of, base_of, gate_of, geometry, sums,
+    particle_count,
+    OUT: tl.constexpr, HISTORY: tl.constexpr, LEVELS: tl.constexpr, FORWARD: tl.constexpr, OVERLAP: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """What of the deformation by the middles' table is slow goes into `slow` [N, 3], and with its moments to the sums
+    [K, RATES]; all of it into `rate` [N, 3]. With FORWARD off gradients go the same way back, by the rates of before.
+
+    Reference: hgn.network.rest; test: tests/kernels/test_relative.py.
+    """
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < tl.load(particle_count)
+    value = _displaced(x, velocity, scale, row, live, OUT, HISTORY, FORWARD)
+    gx, gy, gz = _three(gravity, tl.load(scene_of + row, mask=live, other=0), 0, live, threshold / tl.load(scale), 3)
+    limit = gx * gx + gy * gy + gz * gz
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    base, gate = _lowest(base_of, gate_of, row, live)
+    slot, place, weight = _middles(base, gate, place_of, geometry, row, live, LEVELS)
+    part = _deforming(table, slot, place, weight, value)
+    d = part
+    if not FORWARD:
+        d = _three(rate, row, 0, live, 1.0, 3)
+    ratio = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / tl.maximum(limit, TINY)
+    phi = tl.where(limit > 0, tl.minimum(tl.maximum(2 - ratio, 0.0), 1.0), 0.0)
+    along = 0.0 * phi
+    if not FORWARD:
+        inner = (d[0] * part[0] + d[1] * part[1] + d[2] * part[2]) / tl.maximum(limit, TINY)
+        along = tl.where((phi > 0) & (phi < 1), 2 * inner, 0.0)
+    stopped = ()
+    for i in tl.static_range(3):
+        if FORWARD:
+            tl.store(rate + row * 3 + i, d[i], mask=live)
+        stopped = stopped + (phi * part[i] - along * d[i],)  # noqa: RUF005
+        tl.store(slow + row * 3 + i, stopped[i], mask=live)
+    _add_bodies(sums, slot, place, weight, stopped, False, RATES)
+
+
+@triton.jit
+def stop_slow(
+    x, slow, table, place_of, base_of, gate_of, geometry, particle_count,
+    OUT: tl.constexpr, LEVELS: tl.constexpr, OVERLAP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Takes what of `slow` [N, 3] deforms, by the middles' table, off columns 0 to 2 of x [N, OUT].
+
+    Reference: hgn.network.rest; test: tests/kernels/test_relative.py.
+    """
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = row < tl.load(particle_count)
+    base, gate = _lowest(base_of, gate_of, row, live)
+    slot, place, weight = _middles(base, gate, place_of, geometry, row, live, LEVELS)
+    own = _three(x, row, 0, live, 1.0, OUT)
+    value = _three(slow, row, 0, live, 1.0, 3)
+    if OVERLAP:
+        gdc_wait()
+        gdc_launch_dependents()
+    part = _deforming(table, slot, place, weight, value)
+    for i in tl.static_range(3):
+        tl.store(x + row * OUT + i, own[i] - part[i], mask=live)
 
 
 settle_keys(globals())

@@ -25,6 +25,7 @@ from hgn.network.relative import FEW, OUTPUTS, QUIET, RARE
 MARK_BLOCK = 128
 PARTICLE_BLOCK = 32
 FILL_BLOCK = 4096 if interpreting() else 512  # slots; the interpreter's time goes by programs
+RATES = coarsest_kernel.RATES.value
 SUMS = 16  # columns of what goes through the coarsest cells, as many as the decoder's padded output has
 MARGIN_CELLS = 4  # of a window, around what it must hold
 OBSTACLE_COLUMNS = obstacle_lookup.OBSTACLE_COLUMNS.value
@@ -139,6 +140,7 @@ class DeviceGrid:
         cell_size: float,
         device: torch.device,
         relative: bool = False,
+        rests: bool = False,
     ) -> None:
         assert scenes < SCENE_LIMIT
         self.window, self.scenes, self.capacities, self.particles = window, scenes, tuple(capacities), particles
@@ -158,15 +160,19 @@ class DeviceGrid:
         self.geometry = torch.tensor(rows, dtype=torch.int32, device=device)
         self.low = torch.tensor(window.low, dtype=torch.int32, device=device)
         coarsest = self.capacities[-1] if relative else 0
-        parts = [4 * at if relative else 4, *[SUMS * coarsest] * 3, 2 * coarsest, start]
+        self._middles = rows[-1][1] * rests  # slots of the coarsest cells
+        rest_sums = [columns * self._middles for columns in (SUMS, RATES, RATES, RATES)]
+        parts = [4 * at if relative else 4, *rest_sums, *[SUMS * coarsest] * 3, 2 * coarsest, start]
         self._cleared = integers(sum(parts))  # one piece, cleared at once
         motion, *sums, moments, disturbed, self.occupied = self._cleared.split(parts)
+        self._rest_sums, sums = [x.view(torch.float32) for x in sums[:4]], sums[4:]
         self.prefix_sum = integers(start)
         self.slot_of_cell, self._parent, self._octant = integers(at), integers(at), integers(at)
         self._neighbour, self._children = integers(6 * at), integers(8 * at)
         self.counts_L, self.needed_L = integers(self.levels), integers(self.levels)
         self.status = integers(1)
         self.slips = False  # the network last prepared for: whether surfaces push along their normals alone
+        self._rest: dict[str, Any] | None = None  # and what its deformations rest by
         self.cell_N8 = integers(particles, 8)
         self.weight_N8 = torch.zeros(particles, 8, device=device)
         self.fraction_N3 = torch.zeros(particles, 3, device=device)
@@ -180,6 +186,9 @@ class DeviceGrid:
         self.disturbed_C2 = disturbed.view(-1, 2)
         self.felt_C2 = torch.zeros(coarsest, 2, device=device)
         self.table_C = torch.zeros(coarsest, SUMS, device=device)
+        self._rest_table = torch.zeros(self._middles, RATES, device=device)
+        self._rate_N3, self._slow_N3 = (torch.zeros(particles * rests, 3, device=device) for _ in range(2))
+        self._base_N, self._gate_N = integers(particles * rests), torch.zeros(particles * rests, device=device)
         self._at = [row[6] for row in rows]
 
     def neighbour(self, level: int) -> torch.Tensor:
@@ -242,7 +251,10 @@ class DeviceGrid:
         `symmetry` the obstacles are seen under the symmetries in their rows.
         """
         blocks, overlap = (triton.cdiv(self.particles, PARTICLE_BLOCK),), overlaps()
-        self.slips = config.slips
+        self.slips, self._rest = config.slips, None
+        if config.rests:
+            self._rest = {"velocity": velocity, "scale": std_3, "scene_of": scene_N, "gravity": gravity_S3}
+            self._rest |= {"threshold": config.rest_threshold, "HISTORY": config.velocity_history}
         arguments = feature_arguments(
             config, position, velocity, scene_N, material_N, domain_S3, count, obstacles, symmetry, self.feature_NF
         )
@@ -279,9 +291,13 @@ class DeviceGrid:
     def balance(self, output: torch.Tensor, count: torch.Tensor) -> None:
         """From what the decoder puts out [N, OUT] to accelerations less gravity in columns 0 to 2, in place."""
         self._through_coarsest(output, count, self.sum_C, coarsest_kernel.balance, OUTPUTS, 3)
+        if self._rest:
+            self._take_rest(output, count, self._rest, True)
 
     def balance_backward(self, gradient: torch.Tensor, count: torch.Tensor) -> None:
         """From the gradient of what `balance` leaves to that of what it was given, in place."""
+        if self._rest:
+            self._take_rest(gradient, count, self._rest, False)
         self._through_coarsest(gradient, count, self.gradient_sum_C, coarsest_kernel.balance_backward, 3, OUTPUTS)
 
     def _through_coarsest(
@@ -308,6 +324,40 @@ class DeviceGrid:
             x=x, table=self.table_C, **pairs, USED=left, COLUMNS=triton.next_power_of_2(left + 1), **sizes,
             launch_pdl=overlap,
         )  # fmt: skip
+
+    def _take_rest(self, x: torch.Tensor, count: torch.Tensor, rest: dict[str, Any], forward: bool) -> None:
+        """Slow deformations out of columns 0 to 2, or the same of their gradients, in place."""
+        overlap, blocks = overlaps(), (triton.cdiv(self.particles, PARTICLE_BLOCK),)
+        whole, *halves = self._rest_sums
+        first, second = (whole, halves[0]) if forward else halves[1:]
+        pairs: dict[str, Any] = {"place_of": self.place_N3, "base_of": self._base_N, "gate_of": self._gate_N}
+        pairs |= {"x": x, "geometry": self.geometry, "particle_count": count, "OUT": x.shape[1], "LEVELS": self.levels}
+        sizes: dict[str, Any] = {"OVERLAP": overlap, "BLOCK": PARTICLE_BLOCK}
+        moving = {name: rest[name] for name in ("velocity", "scale", "HISTORY")} | {"FORWARD": forward}
+
+        def find(sums: torch.Tensor) -> None:
+            columns = SUMS if sums is whole else RATES
+            coarsest_kernel.find_deformation[(triton.cdiv(self._middles, PARTICLE_BLOCK),)](
+                bodies=whole, sums=sums, table=self._rest_table, count=self._middles, AT=10 if sums is whole else 0,
+                COLUMNS=columns, BODIES=SUMS, **sizes, launch_pdl=overlap,
+            )  # fmt: skip
+
+        # behind what is not a kernel in a backward pass
+        coarsest_kernel.sum_displacements[blocks](
+            **pairs, **moving, **sizes, coarsest_of=self.coarsest_N8, share_of=self.share_N8, felt=self.felt_C2,
+            slot_of_cell=self.slot_of_cell, sums=first, COLUMNS=SUMS if forward else RATES,
+            launch_pdl=overlap and forward,
+        )  # fmt: skip
+        find(first)
+        coarsest_kernel.slow_displacements[blocks](
+            **pairs, **moving, **sizes, scene_of=rest["scene_of"], gravity=rest["gravity"],
+            threshold=rest["threshold"], rate=self._rate_N3, slow=self._slow_N3, table=self._rest_table, sums=second,
+            launch_pdl=overlap,
+        )  # fmt: skip
+        find(second)
+        coarsest_kernel.stop_slow[blocks](
+            **pairs, **sizes, slow=self._slow_N3, table=self._rest_table, launch_pdl=overlap
+        )
 
 
 def feature_arguments(

@@ -1,0 +1,129 @@
+"""Slow deformations of what touches rest: what holds for any weights, in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from network.states import network_of
+from network.test_relative import ODD_BODIES, airborne, drawn_outputs
+
+from hgn.network.features import ParticleState
+from hgn.network.grid import GridHierarchy, build_hierarchy
+from hgn.network.rest import Deformation, rested
+
+ONE = torch.ones((), dtype=torch.float64)
+THRESHOLDS = pytest.mark.parametrize("threshold", [0.3, 2.0, 1e3])  # few, half and all of the particles are slower
+
+
+def touching(counts: tuple[int, ...] = (60, 17, 1, 40)) -> ParticleState:
+    """Scenes on a floor, which all of the first's coarsest cells touch; particles move as they please."""
+    state = airborne(counts)
+    return replace(state, position_N3=state.position_N3 - torch.tensor([0.0, 0.37, 0.0], dtype=torch.float64))
+
+
+def on_cells(place_N3: torch.Tensor, levels: int = 3) -> tuple[ParticleState, GridHierarchy, torch.Tensor]:
+    """One scene at rest, its grid, and how its coarsest cells touch, all wholly; gravity is 1."""
+    zero_N, one_13 = torch.zeros(len(place_N3), dtype=torch.long), place_N3.new_ones(1, 3)
+    grid = build_hierarchy(place_N3, zero_N, 0 * one_13, 0.035, levels)
+    one_C = place_N3.new_ones(grid.levels[-1].cell_count)
+    gravity_13 = torch.tensor([[0.0, -1.0, 0.0]], dtype=place_N3.dtype)
+    state = ParticleState(place_N3, 0 * place_N3[:, None], zero_N, zero_N, one_13, gravity_13, None)
+    return state, grid, one_C
+
+
+def within_a_cell(count: int = 30) -> torch.Tensor:
+    """Places in one coarsest cell of three levels."""
+    place_N3 = torch.rand(count, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    return 0.42 + 0.035 * (0.6 + 2.8 * place_N3)
+
+
+@THRESHOLDS
+@pytest.mark.parametrize("levels", [1, 3])
+@pytest.mark.parametrize("body", range(len(ODD_BODIES) + 1))
+def test_momenta_stay_and_energy_never_grows(body: int, levels: int, threshold: float) -> None:
+    """Of a body over many cells, of lines, planes and points, whatever moves: momentum and angular momentum are as
+    without rest to rounding, and the next displacements have at most the energy that they had."""
+    place_N3 = [*ODD_BODIES, torch.cat([within_a_cell(), 4 * within_a_cell(80) - 1.6])][body]
+    state, grid, touched_C = on_cells(place_N3, levels)
+    velocity_N13 = drawn_outputs(len(place_N3))[:, None, 3:6] + torch.tensor([3.0, 0.0, 1.0])
+    state = replace(state, velocity_NM3=velocity_N13)
+    acceleration_N3 = drawn_outputs(len(place_N3))[:, :3]
+    found_N3 = rested(acceleration_N3, state, touched_C, grid, threshold, ONE)
+    change_N3 = found_N3 - acceleration_N3
+    assert float(change_N3.sum(0).abs().max()) < 1e-11
+    assert float(torch.linalg.cross(place_N3 - 0.4, change_N3).sum(0).abs().max()) < 1e-11
+    before, after = (float((velocity_N13[:, 0] + a).square().sum()) for a in (acceleration_N3, found_N3))
+    assert after < before + 1e-11
+    if body == len(ODD_BODIES) and threshold > 1 and levels > 1:
+        assert after < before - 1
+
+
+@THRESHOLDS
+def test_nothing_changes_in_flight(threshold: float) -> None:
+    """Where no surface is within reach, and where there is no gravity, a network's accelerations are bitwise those
+    without rest; on a floor they are not."""
+    network, resting = (network_of(inputs="relative", rest_threshold=value) for value in (0.0, threshold))
+    falling, lying = airborne(), touching()
+    assert torch.equal(network(falling), resting(falling))
+    assert not torch.equal(network(lying), resting(lying))
+    weightless = replace(lying, gravity_S3=0 * lying.gravity_S3)
+    assert torch.equal(network(weightless), resting(weightless))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.02, 0.05, 0.07, 0.12])  # over a face of cells of 0.14, too
+def test_a_pile_comes_to_rest(shift: float) -> None:
+    """Under random pushes below the threshold a body of half a coarsest cell, wherever it lies, never deforms faster
+    than by two of them, and without any it comes to rest; without rest deformation grows and stays. What moves as one
+    rigid body goes on so, as on a slope, and what deforms faster than 1.5 of the threshold is left alone."""
+    place_N3 = within_a_cell() * 0.7 + shift
+    state, grid, touched_C = on_cells(place_N3)
+    middle_N3 = place_N3 - place_N3.mean(0)
+    rigid_N3 = torch.tensor([0.5, -2.0, 0.1]).double() + torch.linalg.cross(
+        torch.tensor([[9.0, 3.0, 5.0]]).double(), middle_N3
+    )
+    sizes = {}
+    for threshold in (0.0, 0.3):
+        velocity_N3, generator = rigid_N3, torch.Generator().manual_seed(1)
+        push_N3 = 0.02 * torch.randn(30, 3, generator=generator, dtype=torch.float64)
+        push_N3 -= Deformation(0 * touched_C, grid)(push_N3) + push_N3.mean(0)
+        for frame in range(60):
+            moving = replace(state, velocity_NM3=velocity_N3[:, None])
+            push_N3 = push_N3 * (frame < 40)
+            velocity_N3 = velocity_N3 + rested(push_N3, moving, touched_C, grid, threshold, ONE)
+            sizes[threshold, frame] = float(Deformation(touched_C, grid)(velocity_N3).norm(dim=1).max())
+    assert sizes[0.0, 39] > 0.5 and sizes[0.0, 59] == pytest.approx(sizes[0.0, 39])
+    assert max(sizes[0.3, frame] for frame in range(60)) < 0.12 and sizes[0.3, 59] < 1e-3
+    moving = replace(state, velocity_NM3=rigid_N3[:, None])
+    torch.testing.assert_close(rested(rigid_N3, moving, touched_C, grid, 0.3, ONE), rigid_N3, rtol=0, atol=1e-12)
+    swift_N3 = 100 * drawn_outputs(30)[:, :3]
+    torch.testing.assert_close(rested(swift_N3, moving, touched_C, grid, 0.3, ONE), swift_N3, rtol=0, atol=0)
+
+
+@THRESHOLDS
+def test_no_boost_is_seen(threshold: float) -> None:
+    """A common velocity or rate of rotation more of all within a cell changes nothing."""
+    place_N3 = within_a_cell()
+    state, grid, touched_C = on_cells(place_N3)
+    acceleration_N3 = drawn_outputs(len(place_N3))[:, :3]
+    boost_N3 = torch.linalg.cross(torch.tensor([[30.0, -20.0, 50.0]]).double(), place_N3 - 0.3) + 7.0
+    boosted = replace(state, velocity_NM3=state.velocity_NM3 + boost_N3[:, None])
+    found = [rested(acceleration_N3, given, touched_C, grid, threshold, ONE) for given in (state, boosted)]
+    torch.testing.assert_close(*found, rtol=0, atol=1e-11)
+
+
+def test_gradients_of_rest() -> None:
+    """Those by accelerations, velocities and places are finite differences, below, within and beyond the threshold."""
+    place_N3, output_N9 = within_a_cell(9), drawn_outputs(9)
+    place_N3[4:] += 0.1  # in several cells
+
+    def of(place_N3: torch.Tensor, acceleration_N3: torch.Tensor, velocity_N3: torch.Tensor) -> torch.Tensor:
+        state, grid, touched_C = on_cells(place_N3, 2)
+        state = replace(state, velocity_NM3=velocity_N3[:, None])
+        return rested(acceleration_N3, state, touched_C, grid, 1.3, ONE)
+
+    inputs = [x.clone().requires_grad_() for x in (place_N3, output_N9[:, :3], output_N9[:, 3:6])]
+    changed_N = (of(*inputs) - inputs[1]).norm(dim=1)
+    assert changed_N.max() > 0.3 and (changed_N > 0).sum() > 4
+    assert torch.autograd.gradcheck(of, inputs, eps=1e-7, atol=1e-4)
