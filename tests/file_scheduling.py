@@ -17,7 +17,7 @@ LONGEST_FILES = (  # five seconds and more of one core; begun last, one of them 
     *("test_defaults", "data/test_import", "cpu/test_rows", "kernels/test_pushforward", "docs/test_notebooks"),
     *("docs/test_pages", "tools/studies/test_solver_targets", "data/test_index"),
 )
-GENERATING = ("training/test_generator", "end_to_end/test_datagen", "docs/test_tutorials")  # water around a solid
+GENERATING = ("training/test_generator", "docs/test_tutorials")  # water around a solid
 PLACES = {name: number for number, name in enumerate(LONGEST_FILES)}
 
 

@@ -6,9 +6,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from written_files import first_release, hashes
@@ -165,9 +163,6 @@ def test_first_releases_manifest_is_gone_on_with(make_config, make_dataset):
     make_dataset(make_config())
     assert before.items() <= hashes(folder).items() and Manifest.load(folder).published("train") == 5
     assert "shards" not in json.loads((folder / "manifest.json").read_text())
-
-
-Edit = Callable[[Any], None]
 
 
 def edits():

@@ -14,6 +14,7 @@ from datagen.service.server import Published
 from hgn.data.identity import dataset_identity, identity_differences, identity_hash
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import EpisodeEntry, Manifest, QuarantinedScene, ShardEntry
+from hgn.data.reader import EpisodeStore
 from hgn.data.statistics import Moments, Statistics
 from hgn.schema import ConfigError
 
@@ -53,6 +54,7 @@ def test_counts():
 def test_missing_manifest(tmp_path):
     """A folder without a data set is named together with the command that makes one."""
     for folder in (tmp_path, tmp_path / "nowhere"):
+        assert not EpisodeStore.available(folder)
         with pytest.raises(ConfigError, match=r"manifest\.json must be the manifest .* generate one with"):
             Manifest.load(folder)
 

@@ -82,13 +82,6 @@ def test_frames_of_episodes(make_config, make_dataset):
     assert store.frames() == [episode.frame_count for episode in store.episodes] == [6, 6, 9, 6, 9]
 
 
-def test_no_dataset(tmp_path):
-    """A folder without a manifest is told apart, and opening it names the remedy."""
-    assert not EpisodeStore.available(tmp_path) and not EpisodeStore.available(tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match=r"manifest\.json must be the manifest of a data set"):
-        EpisodeStore(tmp_path, "train")
-
-
 def test_unknown_split(folder):
     """Only the three splits exist."""
     with pytest.raises(ConfigError, match="split must be one of train, validation, test, got 'dev'"):

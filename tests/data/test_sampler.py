@@ -80,20 +80,6 @@ def test_ranks_get_as_many_particles():
     assert largest(lambda episodes: size[episodes]) < 0.01 < 0.04 < largest(None)
 
 
-def test_growing_data_waits_for_the_next_epoch():
-    """Episodes published during an epoch join the next one, also when the run was interrupted between."""
-    published = [3]
-    order = EpisodeSampler(0, 1, lambda _: published)
-    first = take(order, 1)
-    published.append(4)
-    again = EpisodeSampler(0, 1, lambda _: published, order.state)
-    rest = take(again, 1)
-    assert sorted(s[:2] for s in first + rest) == [(0, 0), (0, 1)]
-    assert again.state.episodes == 1
-    assert sorted(s[:2] for s in take(again, 5)) == [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]
-    assert again.state == SamplerState(1, 5, 2, seed=again.seed)
-
-
 def test_epochs_and_seeds_differ():
     """Another epoch and another seed shuffle differently; each sample's noise seed is its own."""
     samples = take(EpisodeSampler(0, 1, lambda _: [101]), 200)

@@ -444,14 +444,6 @@ def test_server_that_comes_back(folder, serve):
     assert same_episodes(store, EpisodeStore(folder, "train"))
 
 
-def test_server_that_stays_away():
-    """After its patience a reader ends with an error that names the URL and the cause."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    with pytest.raises(UnreachableError, match=r"no answer for 0 s .*: 'http://127.0.0.1:"):
-        Manifest.load(url, patience_s=0.05)
-
-
 def test_command_without_its_server(monkeypatch, capsys):
     """A command whose server stays away ends with one line that says what to do, and exit code 1."""
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -10,7 +10,6 @@ import sys
 import threading
 from asyncio.selector_events import _SelectorSocketTransport
 from collections import Counter
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from types import SimpleNamespace
 
@@ -33,9 +32,6 @@ def file(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(hashlib.shake_128(b"file").digest(SIZE))
     return path
-
-
-Port = Callable[..., tuple[int, uvicorn.Server]]
 
 
 @pytest.fixture

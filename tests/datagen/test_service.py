@@ -13,7 +13,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,7 +34,6 @@ from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.storage import TOKEN_VARIABLE, file_sha256
 from hgn.schema import to_mapping
 
-Ask = Callable[..., tuple[int, dict[str, str], bytes]]
 ROOT = Path(__file__).resolve().parents[2]
 TOKEN = "correct-horse-battery"
 SHARD = "/train-000002-000004.tar"
@@ -44,9 +42,6 @@ SHARD = "/train-000002-000004.tar"
 @pytest.fixture(autouse=True)
 def no_long_pauses(monkeypatch):
     monkeypatch.setattr(datagen.service.supervisor, "_FIRST_PAUSE_S", 0.1)
-
-
-Answer = tuple[int, dict[str, str], bytes]
 
 
 async def request(app, path, method="GET", **headers):
@@ -258,31 +253,6 @@ class Recorder(Progress):
 
     def message(self, text):
         self.messages.append(text)
-
-
-def children(process):
-    tasks = Path(f"/proc/{process}/task").glob("*/children")
-    return [int(child) for path in tasks for child in path.read_text().split()]
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="finds the pool in /proc")
-def test_pool_that_dies_is_started_again(make_config, backend, control):
-    """The service outlives its pool: a killed one is started again and completes the data set."""
-    (control / "slow").touch()
-    recorder = Recorder()
-    config = make_config(validation_scenes=0, test_scenes=0, training_scenes=3)
-    with Supervisor(config, recorder, backend) as supervisor:
-        wait_until(lambda: recorder.episodes)
-        (pool,) = [
-            child for child in children(os.getpid()) if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
-        ]
-        os.kill(pool, signal.SIGKILL)
-        wait_until(lambda: supervisor.state.status == "complete")
-    assert (
-        supervisor.state.starts == 2
-        and "the pool ended (ended by SIGKILL); it is started again" in recorder.messages[0]
-    )
-    assert Manifest.load(config.dataset.folder).complete
 
 
 def test_pool_that_says_nothing_is_started_again(make_config, monkeypatch):

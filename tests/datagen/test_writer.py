@@ -6,7 +6,6 @@ import io
 import os
 import subprocess
 import tarfile
-from pathlib import Path
 from threading import Event, Lock, current_thread
 
 import ballistic_solver
@@ -22,7 +21,6 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.shard import locate_members
 from hgn.data.statistics import Moments
 from hgn.schema import ConfigError
-from tools.studies.kills import verified_shards
 
 
 def test_dataset_is_complete_and_in_order(folder):
@@ -200,17 +198,6 @@ def test_dataset_without_some_splits(make_config, make_dataset):
     assert Manifest.load(folder).complete and len(EpisodeStore(folder, "test")) == 0
 
 
-def test_partial_files_are_removed(make_config, make_dataset):
-    """What a killed run was writing is removed by the next."""
-    config = make_config()
-    folder = Path(config.dataset.folder)
-    (folder / ".staging").mkdir(parents=True)
-    for path in (folder / ".train-000000-000001.tar.77.partial", folder / ".staging" / ".train-000001.tar.77.partial"):
-        path.write_bytes(b"half")
-    make_dataset(config)
-    assert not list(folder.rglob("*.partial"))
-
-
 def test_default_dataset_is_the_papers():
     """800 training, 5 validation and 20 test scenes."""
     assert [DatasetConfig().scenes(split) for split in ("train", "validation", "test")] == [800, 5, 20]
@@ -283,32 +270,3 @@ def test_full_disk_while_several_are_packed(make_config, make_dataset, stage, fu
     assert not list(writer.folder.rglob("*.partial"))
     make_dataset(make_config())
     assert Manifest.load(writer.folder).complete
-
-
-def test_a_disk_that_fails(make_config, make_dataset, tmp_path, monkeypatch):
-    """Wherever the disk cannot keep what was written (EIO), the generation ends with that error, what is published is
-    whole, and the next one goes on; at the end the data set is the one of a sound disk, bitwise."""
-    expected = hashes(make_dataset(make_config(training_scenes=3, folder=str(tmp_path / "sound"))))
-    config = make_config(training_scenes=3, folder=str(tmp_path / "failing"))
-    real, failures, published = os.fsync, 0, []
-    while True:
-        left = [failures % 7]
-
-        def fsync(descriptor, left=left):
-            left[0] -= 1
-            if left[0] == -1:
-                raise OSError(errno.EIO, "Input/output error")
-            real(descriptor)
-
-        monkeypatch.setattr(os, "fsync", fsync)
-        try:
-            folder = make_dataset(config)
-            break
-        except OSError as error:
-            assert error.errno == errno.EIO
-            failures += 1
-        monkeypatch.setattr(os, "fsync", real)
-        published = verified_shards(tmp_path / "failing", published)
-    monkeypatch.setattr(os, "fsync", real)
-    assert failures > 10
-    assert hashes(make_dataset(config)) == expected and folder == tmp_path / "failing"

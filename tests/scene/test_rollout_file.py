@@ -275,17 +275,6 @@ def test_not_hdf5(tmp_path):
         read_rollout(tmp_path / "text.h5")
 
 
-@pytest.mark.parametrize("share", [0.2, 0.9])
-def test_truncated(tmp_path, share):
-    """A file cut short is refused, wherever it was cut."""
-    path = tmp_path / "rollout.h5"
-    write_rollout(path, make_rollout())
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ConfigError, match="complete HDF5 file"):
-        read_rollout(path)
-
-
 def test_other_format_and_version(tmp_path):
     """HDF5 files of other programs and of other versions are told apart in the message."""
     path = tmp_path / "rollout.h5"

@@ -1,7 +1,6 @@
 """Checkpoints written beside the training: what they hold, and what becomes of them when something goes wrong."""
 
 import signal
-import subprocess
 import threading
 
 import pytest
@@ -14,25 +13,6 @@ from hgn.training import checkpoint_writer
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.module import TrainingModule
-
-KILLED = """
-import sys, time
-from pathlib import Path
-import torch
-from hgn.system import files
-from hgn.training.checkpoint_writer import CheckpointWriter
-
-def forever(descriptor):
-    print("writing", flush=True)
-    time.sleep(600)
-
-writer, path = CheckpointWriter(), Path(sys.argv[1])
-writer.save_checkpoint({"value": torch.ones(1000)}, path)
-writer.wait()
-files.os.fsync = forever
-writer.save_checkpoint({"value": torch.zeros(1000)}, path)
-writer.wait()
-"""
 
 
 @pytest.fixture
@@ -115,18 +95,6 @@ def test_a_failed_write_is_raised(tmp_path):
         writer.wait()
         writer.teardown()
     assert [path.name for path in tmp_path.iterdir()] == ["folder.ckpt"]
-
-
-def test_killed_while_writing(warm_python, tmp_path):
-    """`kill -9` in the middle of a write leaves the file before it, whole."""
-    path = tmp_path / "last.ckpt"
-    (program := tmp_path / "killed.py").write_text(KILLED)
-    process = subprocess.Popen([warm_python, program, path], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None and process.stdout.readline() == "writing\n"
-    process.kill()
-    process.communicate()
-    assert torch.equal(load(path)["value"], torch.ones(1000))
-    assert len(list(tmp_path.glob(".last.ckpt.*.partial"))) == 1  # which the next start of the training removes
 
 
 @pytest.mark.parametrize("failing", ["best.ckpt", "last.ckpt"])

@@ -55,24 +55,6 @@ def ranks_of(world_size, batch, published, sampler_state=None):
 
 
 @settings(max_examples=80, deadline=None)
-@given(FRAMES, st.lists(st.tuples(st.integers(1, 8), st.integers(1, 3), st.integers(0, 7)), min_size=1, max_size=6))
-def test_each_sample_once_an_epoch_through_any_interruptions(
-    frames: list[int], starts: list[tuple[int, int, int]]
-) -> None:
-    """However often a training is interrupted, and on whatever number of ranks and batch size it goes on, each epoch
-    has every sample exactly once."""
-    total, seen, sampler_state = sum(frames) - len(frames), Samples(), SamplerState()
-    for world_size, batch, batches in starts:
-        orders = ranks_of(world_size, min(batch, max(1, total // world_size)), lambda _: frames, sampler_state)
-        if world_size * orders[0].batch_scenes > total:
-            continue  # a batch of more than an epoch has its own test
-        for _ in range(batches):
-            seen.take(orders)
-        sampler_state = orders[0].state
-    seen.require_each_once(sampler_state, lambda _: frames)
-
-
-@settings(max_examples=80, deadline=None)
 @given(
     st.lists(st.integers(1, 3), min_size=1, max_size=6),
     st.integers(1, 4),

@@ -221,34 +221,6 @@ def test_training_learns(make_config, make_dataset, tmp_path):
     assert sum(losses[-4:]) < 0.8 * sum(losses[:4])
 
 
-@pytest.mark.parametrize(
-    ("section", "change", "message"),
-    [
-        ("network", {"width": 16}, "network.width must be 8 to resume"),
-        ("network", {"levels": 3}, "network.levels must be 2"),
-        ("training", {"noise_std": 0.0}, "training.noise_std must be"),
-    ],
-)
-def test_checkpoints_of_another_configuration_are_refused(data, tmp_path, section, change, message):
-    """Resuming with another network or noise names the key, and leaves the checkpoint as it was."""
-    run = tmp_path / "run"
-    train.main(train_mapping(data, run, maximum_updates=2))
-    before = (run / "checkpoints" / "last.ckpt").read_bytes()
-    mapping = train_mapping(data, run)
-    mapping[section] |= change
-    with pytest.raises(ConfigError, match=message):
-        train.main(mapping)
-    assert (run / "checkpoints" / "last.ckpt").read_bytes() == before
-
-
-def test_another_data_set_is_refused(data, make_config, tmp_path):
-    """A run goes on with the data it began with; a folder that holds another data set is named."""
-    run = tmp_path / "run"
-    train.main(train_mapping(data, run, maximum_updates=2))
-    with pytest.raises(ConfigError, match="frames is 6 there, 7 is asked for"):
-        train.main(train_mapping(make_config(frames=7), run))
-
-
 def test_damaged_checkpoints_are_refused(data, tmp_path, capsys):
     """Of the last three checkpoints the newest whole one is gone on with: one that was cut, or of which a bit changed,
     is named and stays. Where none is whole the training ends with a message."""
@@ -297,28 +269,6 @@ def test_missing_data_without_generator(make_config, tmp_path):
     """Without data and with generate=false the message says how to make some."""
     with pytest.raises(ConfigError, match="generate it with python -m datagen"):
         train.main(train_mapping(make_config(), tmp_path / "run"))
-
-
-@pytest.mark.parametrize(
-    ("section", "change", "message"),
-    [
-        ("training", {"learning_rate": float("nan")}, "training.learning_rate must be a finite number > 0"),
-        ("training", {"learning_rate": -1.0}, "training.learning_rate must be a finite number > 0"),
-        ("training", {"batch_scenes": 0}, "training.batch_scenes must be"),
-        ("training", {"batch_scenes": "many"}, "training.batch_scenes must be a whole number"),
-        ("training", {"batchscenes": 2}, "training.batchscenes is not a known key; did you mean batch_scenes"),
-        ("network", {"materials": ["lava"]}, "network.materials"),
-        ("scene", {"materials": ["lava"]}, "scene.materials"),
-        ("network", {"obstacle_features": False}, "obstacle_features must be true"),
-    ],
-)
-def test_bad_configuration(make_config, tmp_path, section, change, message):
-    """Unknown keys, wrong types, negative and NaN numbers and unknown materials are named before anything starts."""
-    mapping = train_mapping(make_config(), tmp_path / "run")
-    mapping[section] |= change
-    with pytest.raises(ConfigError, match=message):
-        train.main(mapping)
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture
