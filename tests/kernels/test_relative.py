@@ -95,7 +95,7 @@ def test_outputs_and_gradients(counts: tuple[int, ...], obstacles: bool, levels:
 @pytest.mark.parametrize(
     ("counts", "obstacles", "levels"), [(EVERYWHERE, True, 2), ((9, 33), False, 1), ((1,), False, 2), ((40,), False, 3)]
 )
-def test_rest(counts: tuple[int, ...], obstacles: bool, levels: int) -> None:
+def test_rest(counts, obstacles, levels):
     """Outputs and every gradient with deformations that are slow, nearly so, and fast, to 1e-4: of cells that hold few
     particles the rounding of inertia counts, as it does in PyTorch. What rest changes is more, and keeps momenta."""
     changes = {"levels": levels, "contact_forces": "normal"}

@@ -1,7 +1,5 @@
 """Slow deformations of what touches rest: what holds for any weights, in float64."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -10,20 +8,20 @@ from network.states import network_of
 from network.test_relative import ODD_BODIES, airborne, drawn_outputs
 
 from hgn.network.features import ParticleState
-from hgn.network.grid import GridHierarchy, build_hierarchy
+from hgn.network.grid import build_hierarchy
 from hgn.network.rest import Deformation, rested
 
 ONE = torch.ones((), dtype=torch.float64)
 THRESHOLDS = pytest.mark.parametrize("threshold", [0.3, 2.0, 1e3])  # few, half and all of the particles are slower
 
 
-def touching(counts: tuple[int, ...] = (60, 17, 1, 40)) -> ParticleState:
+def touching(counts=(60, 17, 1, 40)):
     """Scenes on a floor, which all of the first's coarsest cells touch; particles move as they please."""
     state = airborne(counts)
     return replace(state, position_N3=state.position_N3 - torch.tensor([0.0, 0.37, 0.0], dtype=torch.float64))
 
 
-def on_cells(place_N3: torch.Tensor, levels: int = 3) -> tuple[ParticleState, GridHierarchy, torch.Tensor]:
+def on_cells(place_N3, levels=3):
     """One scene at rest, its grid, and how its coarsest cells touch, all wholly; gravity is 1."""
     zero_N, one_13 = torch.zeros(len(place_N3), dtype=torch.long), place_N3.new_ones(1, 3)
     grid = build_hierarchy(place_N3, zero_N, 0 * one_13, 0.035, levels)
@@ -33,7 +31,7 @@ def on_cells(place_N3: torch.Tensor, levels: int = 3) -> tuple[ParticleState, Gr
     return state, grid, one_C
 
 
-def within_a_cell(count: int = 30) -> torch.Tensor:
+def within_a_cell(count=30):
     """Places in one coarsest cell of three levels."""
     place_N3 = torch.rand(count, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     return 0.42 + 0.035 * (0.6 + 2.8 * place_N3)
@@ -42,7 +40,7 @@ def within_a_cell(count: int = 30) -> torch.Tensor:
 @THRESHOLDS
 @pytest.mark.parametrize("levels", [1, 3])
 @pytest.mark.parametrize("body", range(len(ODD_BODIES) + 1))
-def test_momenta_stay_and_energy_never_grows(body: int, levels: int, threshold: float) -> None:
+def test_momenta_stay_and_energy_never_grows(body, levels, threshold):
     """Of a body over many cells, of lines, planes and points, whatever moves: momentum and angular momentum are as
     without rest to rounding, and the next displacements have at most the energy that they had."""
     place_N3 = [*ODD_BODIES, torch.cat([within_a_cell(), 4 * within_a_cell(80) - 1.6])][body]
@@ -61,7 +59,7 @@ def test_momenta_stay_and_energy_never_grows(body: int, levels: int, threshold: 
 
 
 @THRESHOLDS
-def test_nothing_changes_in_flight(threshold: float) -> None:
+def test_nothing_changes_in_flight(threshold):
     """Where no surface is within reach, and where there is no gravity, a network's accelerations are bitwise those
     without rest; on a floor they are not."""
     network, resting = (network_of(inputs="relative", rest_threshold=value) for value in (0.0, threshold))
@@ -73,7 +71,7 @@ def test_nothing_changes_in_flight(threshold: float) -> None:
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.02, 0.05, 0.07, 0.12])  # over a face of cells of 0.14, too
-def test_a_pile_comes_to_rest(shift: float) -> None:
+def test_a_pile_comes_to_rest(shift):
     """Under random pushes below the threshold a body of half a coarsest cell, wherever it lies, never deforms faster
     than by two of them, and without any it comes to rest; without rest deformation grows and stays. What moves as one
     rigid body goes on so, as on a slope, and what deforms faster than 1.5 of the threshold is left alone."""
@@ -102,7 +100,7 @@ def test_a_pile_comes_to_rest(shift: float) -> None:
 
 
 @THRESHOLDS
-def test_no_boost_is_seen(threshold: float) -> None:
+def test_no_boost_is_seen(threshold):
     """A common velocity or rate of rotation more of all within a cell changes nothing."""
     place_N3 = within_a_cell()
     state, grid, touched_C = on_cells(place_N3)
@@ -113,12 +111,12 @@ def test_no_boost_is_seen(threshold: float) -> None:
     torch.testing.assert_close(*found, rtol=0, atol=1e-11)
 
 
-def test_gradients_of_rest() -> None:
+def test_gradients_of_rest():
     """Those by accelerations, velocities and places are finite differences, below, within and beyond the threshold."""
     place_N3, output_N9 = within_a_cell(9), drawn_outputs(9)
     place_N3[4:] += 0.1  # in several cells
 
-    def of(place_N3: torch.Tensor, acceleration_N3: torch.Tensor, velocity_N3: torch.Tensor) -> torch.Tensor:
+    def of(place_N3, acceleration_N3, velocity_N3):
         state, grid, touched_C = on_cells(place_N3, 2)
         state = replace(state, velocity_NM3=velocity_N3[:, None])
         return rested(acceleration_N3, state, touched_C, grid, 1.3, ONE)
