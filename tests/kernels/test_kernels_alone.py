@@ -47,6 +47,7 @@ ELSEWHERE = {
     *("mark_cells", "fill_tables", "prepare_particles", "prepare_features"),
     *("sum_motion", "prepare_relative_features"),
     *("sum_coarsest", "balance", "balance_backward", "add_coarsest"),
+    *("sum_displacements", "find_deformation", "slow_displacements", "stop_slow"),
     *("pack_cells", "find_runs", "walk_neighbours", "check_room"),
     *("draw_waves", "assemble_batch", "loss_gradient", "tell_overflow", "square_norm", "average_values"),
     *("finish_update", "adam", "momentum_directions", "step_blocks", "integrate", "advance"),
