@@ -90,7 +90,7 @@ def export(checkpoint_path: Path, out: Path, stored_precision: str = "fp32") -> 
     )
 
     checkpoint = read_checkpoint(checkpoint_path)
-    network = network_of_checkpoint(checkpoint)
+    network = network_of_checkpoint(checkpoint, checkpoint_path)
     data = data_of_checkpoint(checkpoint)
     info = WeightsInfo(
         network=network.config,

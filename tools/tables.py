@@ -43,7 +43,16 @@ FOLDERS = ("results", "hgn/weights", "jobs", "docs")  # of the repository, searc
 SPECIFICATION = "tables.yaml"
 REMEDY = "run python -m tools.tables"
 
-EXPRESSION_ERRORS = (ArithmeticError, AttributeError, LookupError, NameError, SyntaxError, TypeError, ValueError)
+EXPRESSION_ERRORS = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    NameError,
+    OSError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+)
 
 TABLE = re.compile(r"(?P<begin><!-- table: (?P<name>[\w-]+) -->\n)(?P<text>.*?)(?P<end><!-- end -->)", re.DOTALL)
 VALUE = re.compile(r"(?P<begin><!--=(?P<name>[\w-]+)-->)(?P<text>[^<]*)(?P<end><!--/-->)")

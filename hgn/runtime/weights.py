@@ -90,7 +90,8 @@ def load_weights(
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     except SafetensorError as error:
-        raise ConfigError(f"{field} must be a safetensors file, got {path}: {error}; export it again") from None
+        remedy = f"python -m hgn.export checkpoint={path} out=…" if path.suffix == ".ckpt" else "export it again"
+        raise ConfigError(f"{field} must be a safetensors file, got {path}: {error}; {remedy}") from None
     if "hgn" not in metadata:
         raise ConfigError(f"{field} must be a file of python -m hgn.export, got {path} without its structure")
     try:

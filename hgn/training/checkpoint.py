@@ -71,7 +71,7 @@ def check_checkpoint(checkpoint: dict[str, Any], config: TrainConfig, config_has
     """
     remedy = "set it so, or choose another run=FOLDER"
     # Through the dataclass: a key that is younger than the checkpoint has its default in it.
-    stored, section = from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network"), checkpoint[SECTION]
+    stored, section = _network_config(checkpoint, path), checkpoint[SECTION]
     pairs = _network_pairs(stored, config)
     pairs.append(("training.noise_std", section["noise_std"], config.training.noise_std))  # is in the normaliser
     _require_equal(pairs, f" to resume {path}", remedy)
@@ -115,14 +115,30 @@ def network_of_weights(config: TrainConfig) -> ParticleNetwork:
     return network
 
 
-def network_of_checkpoint(checkpoint: dict[str, Any]) -> ParticleNetwork:
-    """The network of a checkpoint, normaliser included, in evaluation mode: the moving average where there is one."""
-    network = build_network(from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network"))
-    state = checkpoint["state_dict"]
+def network_of_checkpoint(checkpoint: dict[str, Any], path: Path) -> ParticleNetwork:
+    """The network of a checkpoint, normaliser included, in evaluation mode: the moving average where there is one.
+
+    Raises: ConfigError where this version builds other networks.
+    """
+    network, state = build_network(_network_config(checkpoint, path)), checkpoint["state_dict"]
     prefix = AVERAGED if any(name.startswith(AVERAGED) for name in state) else NETWORK
-    network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    try:
+        network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    except RuntimeError as error:
+        raise ConfigError(_other_version(path, str(error).split("\n")[1].strip())) from None
     network.eval()
     return network
+
+
+def _network_config(checkpoint: dict[str, Any], path: Path) -> NetworkConfig:
+    try:
+        return from_stored(NetworkConfig, checkpoint[SECTION]["network"], "network")
+    except ConfigError as error:
+        raise ConfigError(_other_version(path, str(error))) from None
+
+
+def _other_version(path: Path, reason: str) -> str:
+    return f"checkpoint must hold a network as this version builds it, got {path}: {reason}; export it with its version"
 
 
 def sampler_state_of_checkpoint(checkpoint: dict[str, Any]) -> SamplerState:

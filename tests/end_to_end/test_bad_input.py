@@ -157,6 +157,11 @@ EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "jso
             [*ROLLOUT, "weights=none.safetensors"],
             "weights must be an existing file, got none.safetensors; write one",
         ),
+        (
+            "rollout",
+            [*ROLLOUT, "weights=run/checkpoints/last.ckpt"],
+            "; python -m hgn.export checkpoint=run/checkpoints/last.ckpt out=…",
+        ),
         ("evaluate", [*EVALUATE, "scenes=0"], "scenes must be a finite number > 0, got 0"),
         ("evaluate", [*EVALUATE, "split=moon"], "split must be one of train, validation, test, got 'moon'"),
         (
@@ -256,10 +261,22 @@ def test_damaged_checkpoint(place, command, capsys, monkeypatch):
     check(place, command, arguments, "checkpoint must be a whole checkpoint file, got", capsys, monkeypatch)
 
 
-def test_checkpoint_of_another_project(place, capsys, monkeypatch):
-    """A file of torch.save that is no checkpoint of ours is refused."""
-    torch.save({"state_dict": {}}, place.path("foreign.ckpt"))
-    message = "checkpoint must be one of python -m hgn.train, got foreign.ckpt"
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda ours: ours.clear(), "checkpoint must be one of python -m hgn.train, got foreign.ckpt"),
+        (
+            lambda ours: ours["network"].update(wings=2),
+            "got foreign.ckpt: network.wings is not a known key; ",
+        ),
+        (lambda ours: ours["network"].update(width=16), "got foreign.ckpt: size mismatch for "),
+    ],
+)
+def test_checkpoint_of_another_project(place, change, message, capsys, monkeypatch):
+    """A file of torch.save that is no checkpoint of ours is refused; so is one whose network is another's."""
+    checkpoint = torch.load(place.path("run/checkpoints/last.ckpt"), weights_only=True)
+    change(checkpoint["hgn"])
+    torch.save(checkpoint if checkpoint["hgn"] else {"state_dict": {}}, place.path("foreign.ckpt"))
     check(place, "export", ["checkpoint=foreign.ckpt", "out=weights.safetensors"], message, capsys, monkeypatch)
 
 

@@ -52,7 +52,7 @@ def test_exported_checkpoint_is_the_trained_network(make_config, make_dataset, t
     path = tmp_path / "shipped" / "weights.safetensors"
     export(checkpoint, path)
     loaded, info = load_weights(path)
-    expected = network_of_checkpoint(read_checkpoint(checkpoint))
+    expected = network_of_checkpoint(read_checkpoint(checkpoint), checkpoint)
     assert expected.normaliser.velocity_std.min() > 0.001  # the data's, no longer the identity
     with torch.no_grad():
         torch.testing.assert_close(loaded(STATE), expected(STATE), rtol=1e-6, atol=1e-6)

@@ -116,6 +116,7 @@ def test_writes_tables_and_figures(
         (("row.mse['10']:?", "row.mse['10']:"), "table frames: LookupError: no '10' among"),
         (("row.ms:.2g", "row.mse:.2g"), "table frames: TypeError"),
         (("  chosen:", "  other:"), "has no table chosen; define it there or take the marker away"),
+        (("bench.json", "none.json"), "FileNotFoundError: [Errno 2] No such file or directory: "),
         (("values:", "values:\n  more: '1'"), "no page has a marker for more"),
     ],
 )

@@ -60,7 +60,7 @@ def test_a_run_begins_with_weights(data, tmp_path, stored_precision, capsys):
     assert train.main(mapping) == 0
     assert "begins with the weights" in capsys.readouterr().err
     begun, _ = load_weights(file)
-    for name, tensor in network_of_checkpoint(last(tmp_path / "run")).state_dict().items():
+    for name, tensor in network_of_checkpoint(last(tmp_path / "run"), tmp_path).state_dict().items():
         torch.testing.assert_close(tensor, begun.state_dict()[name], rtol=0, atol=1e-10)
     file.unlink()
     again = train_mapping(data, tmp_path / "run", init_weights=str(file), **tiny | {"maximum_updates": 2})
