@@ -11,7 +11,7 @@ import taichi as ti
 
 from datagen.mpm.layout import CONSTANT, COUNT, VARIANT
 from datagen.mpm.svd import svd3
-from hgn.scene.material import ELASTIC, SAND, SNOW
+from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 
 # Jp beyond these is rounding: hardening is capped, or nothing is left of it
 SMALLEST_PLASTIC_VOLUME, LARGEST_PLASTIC_VOLUME = 1e-3, 1e3
@@ -144,6 +144,44 @@ def _project_sand(log_strain, volume: ti.f32, law: ti.template(), row: ti.i32, s
         # the mapping keeps the trace, so log det F takes up all of v_c, which ends at 0
         new_strain = strain - deviator * (excess / size)
     return new_strain, new_volume
+
+
+@ti.func
+def foreseen_stiffness(
+    C,
+    volume: ti.f32,
+    material: ti.i32,
+    time: ti.f32,
+    inverse_dx: ti.f32,
+    law: ti.template(),
+    row: ti.i32,
+    variant: ti.template(),
+) -> ti.f32:
+    """(3 lambda + 2 mu) / density of a particle that goes on for a time with the gradient C of its velocity; of an
+    elastic solid, whose stretch it would take a decomposition to tell, more than of any other.
+    """
+    density = law[row + CONSTANT.density]
+    bulk = 3.0 * law[row + CONSTANT.bulk]
+    stiffness = bulk + 2.0 * law[row + CONSTANT.shear]
+    change = ti.abs(C.trace()) * time
+    if ti.static(bool(variant & VARIANT.water)):
+        if material == WATER:
+            J = volume * (1.0 + change)
+            more = J * (2.0 * J - 1.0)
+            if ti.static(bool(variant & VARIANT.stiffening_water)):
+                least = ti.max(volume * (1.0 - change), 0.1)
+                more = (J + 6.0 / least**6) / 7.0
+            rough = ti.sqrt(bulk * ti.max(1.0, more)) + 4.0 * law[row + CONSTANT.viscosity] * inverse_dx / ti.sqrt(
+                density
+            )
+            stiffness = rough * rough
+    if ti.static(bool(variant & VARIANT.snow)):
+        if material == SNOW:
+            stiffness *= hardening(volume * (1.0 - change), law, row)
+    if ti.static(bool(variant & VARIANT.elastic)):
+        if material == ELASTIC:
+            stiffness = 1e30
+    return stiffness / density
 
 
 @ti.func

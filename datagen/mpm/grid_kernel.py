@@ -14,6 +14,7 @@ from datagen.mpm.mls_mpm import (
     Nodes,
     Scalars,
     Vectors,
+    acts,
     find_hidden,
     ghost_place,
     initial_stiffness,
@@ -21,9 +22,11 @@ from datagen.mpm.mls_mpm import (
     interpolate_hidden,
     is_fluid,
     mark,
+    mark_changed,
     move,
     node_places,
     node_velocity,
+    own_step,
     respond,
     settle,
     settles,
@@ -44,11 +47,13 @@ def _particle_to_grid(
     affine: ti.template(),
     deformation: ti.template(),
     volume: ti.template(),
+    covered: ti.template(),
     label: ti.template(),
     law_row: ti.template(),
     hidden: ti.template(),
     node: ti.template(),
     gain: ti.template(),
+    block: ti.template(),
     scene_value: ti.template(),
     counter: ti.template(),
     setting: ti.template(),
@@ -91,11 +96,20 @@ def _particle_to_grid(
             )
         C = C_now
         raise_maximum(counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
-    A, new_stretch, new_F, new_volume, stiffness = respond(
-        C, stretch, F, volume[p], material, row, step, begins, scene, counter, setting, law, variant
+    length, until, many = own_step(
+        covered[p], C, volume[p], material, row, begins, step, scene, scene_value, setting, law, variant
     )
+    covered[p] = until
+    A, new_stretch, new_F, new_volume, stiffness = respond(
+        C, stretch, F, volume[p], material, row, length, begins, scene, counter, setting, law, variant
+    )
+    if many > 1.0:
+        raise_maximum(counter, scene, COUNT.held_stiffness_bits, stiffness)
     if scene_value[scene, VALUE.interval_remaining] > 0.0:
         affine[p] = new_stretch
+        if begins == 0.0:
+            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+            mark_changed(position[p], scene, inverse_dx, shape, block, 3 * shape[SHAPE.all_blocks] + 2, now)
     volume[p] = new_volume
     if ti.static(has_solid(variant)):
         if ti.static(not variant & VARIANT.water) or not is_fluid(material):
@@ -193,6 +207,7 @@ def substep(
     affine: Matrices,
     deformation: Matrices,
     volume: Scalars,
+    covered: Scalars,
     label: Integers,
     law_row: Integers,
     hidden: Integers,
@@ -203,6 +218,7 @@ def substep(
     shape: Integers,
     node: Nodes,
     gain: Nodes,
+    fallen: Scalars,
     block: Integers,
     contact: Integers,
     contact_normal: Vectors,
@@ -239,10 +255,11 @@ def substep(
         for p in range(position.shape[0]):
             scene = label[p] >> MATERIAL_BITS
             step = scene_value[scene, VALUE.time_step]
-            if step > 0.0:
+            if step > 0.0 and acts(covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value):
                 _particle_to_grid(
-                    p, 0, scene, step, position, velocity, affine, deformation, volume, label, law_row, hidden,
-                    node, gain, scene_value, counter, setting, law, shape, contact, contact_normal, variant,
+                    p, 0, scene, step, position, velocity, affine, deformation, volume, covered, label, law_row,
+                    hidden, node, gain, block, scene_value, counter, setting, law, shape, contact, contact_normal,
+                    variant,
                 )  # fmt: skip
     else:
         for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
@@ -252,11 +269,13 @@ def substep(
             if step > 0.0:
                 copy = (task - scene * parts) * shape[SHAPE.all_blocks]
                 for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
-                    if label[p] >> MATERIAL_BITS == scene:
+                    if label[p] >> MATERIAL_BITS == scene and acts(
+                        covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value
+                    ):
                         _particle_to_grid(
-                            p, copy, scene, step, position, velocity, affine, deformation, volume, label, law_row,
-                            hidden, node, gain, scene_value, counter, setting, law, shape, contact, contact_normal,
-                            variant,
+                            p, copy, scene, step, position, velocity, affine, deformation, volume, covered, label,
+                            law_row, hidden, node, gain, block, scene_value, counter, setting, law, shape, contact,
+                            contact_normal, variant,
                         )  # fmt: skip
 
     for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
@@ -266,7 +285,13 @@ def substep(
             block[3 * shape[SHAPE.all_blocks] + 1] = 0
         place = global_block * BLOCK_NODES + (n & 63)
         scene = global_block // shape[SHAPE.scene_blocks]
-        if scene_value[scene, VALUE.time_step] > 0.0:
+        begins = scene_value[scene, VALUE.begins] == 1.0
+        changed = begins or scene_value[scene, VALUE.interval_remaining] == 0.0
+        if not changed:
+            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+            changed = block[3 * shape[SHAPE.all_blocks] + 2 + global_block] == now
+        if scene_value[scene, VALUE.time_step] > 0.0 and changed:
+            fallen_before = scene_value[scene, VALUE.fallen]
             entry = -1
             node_fields = 1
             if ti.static(bool(variant & VARIANT.contact)):
@@ -278,8 +303,11 @@ def substep(
                 if field == 1:
                     own = shape[SHAPE.ghost_begin] + entry
                 before = ti.Vector([0.0, 0.0, 0.0, 0.0])
-                if scene_value[scene, VALUE.begins] == 0.0:
+                missed = 0.0
+                if not begins:
                     before = node[own]
+                    missed = fallen_before - fallen[own]
+                fallen[own] = fallen_before + scene_value[scene, VALUE.gravity_time]
                 total = gain[own]
                 for part in ti.static(range(1, variant // VARIANT.parts)):  # what copies hold is summed in order
                     total += gain[own + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
@@ -289,7 +317,8 @@ def substep(
                 v = node_velocity(
                     ti.Vector([before[0], before[1], before[2]]), ti.Vector([total[0], total[1], total[2]]), mass,
                     n & 63, 2 * entry + field, block[2 * shape[SHAPE.all_blocks] + (n >> 6)],
-                    falls(scene, scene_value), scene, scene_value, shape, contact_normal, variant,
+                    falls(scene_value[scene, VALUE.gravity_time] + missed, scene, scene_value), scene, scene_value,
+                    shape, contact_normal, variant,
                 )  # fmt: skip
                 node[own] = ti.Vector([v[0], v[1], v[2], mass])
 

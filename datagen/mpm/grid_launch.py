@@ -68,8 +68,9 @@ class GridLaunch(Launch):
         self.velocity = device_vectors(np.concatenate([scene.velocity_N3 for scene in self.scenes]))
         self.affine = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)
         self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, self.particles if has_solid(self.variant) else 1)
-        self.volume = ti.ndarray(ti.f32, self.particles)
-        self.block = device_array(np.zeros(3 * self.all_blocks + 2, np.int32))
+        self.volume, self.covered = (ti.ndarray(ti.f32, self.particles) for _ in range(2))
+        self.covered.fill(0)
+        self.block = device_array(np.zeros(4 * self.all_blocks + 2, np.int32))
         grid_kernel.start(
             self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter,
             self.law,
@@ -78,6 +79,7 @@ class GridLaunch(Launch):
     def _node_array(self, nodes: int) -> ti.VectorNdarray:
         self.gain = ti.Vector.ndarray(4, ti.f32, nodes)
         self.gain.fill(0)
+        self.fallen = ti.ndarray(ti.f32, nodes // self.copies)
         return ti.Vector.ndarray(4, ti.f32, nodes // self.copies)
 
     def _vector_arrays(self) -> list[Any]:
@@ -125,9 +127,10 @@ class GridLaunch(Launch):
         while pending:
             for _ in range(min(pending, SUBSTEPS_PER_CHECK)):
                 grid_kernel.substep(
-                    self.position, self.velocity, self.affine, self.deformation, self.volume, self.label,
-                    self.law_row, self.hidden, self.scene_value, self.counter, self.setting, self.law, self.shape,
-                    self.node, self.gain, self.block, self.contact, self.contact_normal, self.variant,
+                    self.position, self.velocity, self.affine, self.deformation, self.volume, self.covered,
+                    self.label, self.law_row, self.hidden, self.scene_value, self.counter, self.setting, self.law,
+                    self.shape, self.node, self.gain, self.fallen, self.block, self.contact, self.contact_normal,
+                    self.variant,
                 )  # fmt: skip
             value = self.scene_value.to_numpy()
             busy = value[:, VALUE.remaining] > 0

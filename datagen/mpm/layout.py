@@ -56,7 +56,8 @@ class Count(NamedTuple):
     # a GPU has no maximum of floats that many threads may take at once.
     stiffness_bits: int = 10  # of (3 lambda + 2 mu) / density, m²/s²
     speed_square_bits: int = 11
-    length: int = 12
+    held_stiffness_bits: int = 12  # the same of particles that take longer steps of their own, in this interval
+    length: int = 13
 
 
 REPORTED = Count._fields[:8]
@@ -82,7 +83,9 @@ class SceneValue(NamedTuple):
     wall_friction: int = 16  # 16, 17, 18: of the domain's walls across x, y, z
     frame: int = 19  # length of the present frame, s
     stiffness: int = 20  # largest in the step before, m²/s²
-    length: int = 21
+    last_interval: int = 21  # how long the interval before was, s
+    fallen: int = 22  # for which gravity has acted in this interval before the present substep, s
+    length: int = 23
 
 
 class Status(NamedTuple):

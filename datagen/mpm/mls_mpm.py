@@ -7,7 +7,10 @@ up apart from the nodes' velocities, and is zero between substeps. Masses are in
 density.
 
 Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
-as the stiffest material needs. In its first substep particles give mass and momentum to the nodes and force; in the
+as the stiffest particle needs. Others take steps of their own, each of several substeps, as long as their own wave
+speed allows (impulse multiple time stepping, Tuckerman et al. 1992; regional steps of the material point method, Fang
+et al. 2018): the impulse of such a step goes to the nodes in its first substep, at once, and nodes all of whose
+particles wait are left as they are, and get what gravity gives them later. In the interval's first substep particles give mass and momentum to the nodes and force; in the
 others they stay where they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give
 force alone, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity
 and gradient, and move by the interval times that velocity: momentum and angular momentum are kept, as stresses are
@@ -23,7 +26,7 @@ Everything is per scene: time step, interval, remaining time, state, counters. A
 
 import taichi as ti
 
-from datagen.mpm.constitutive import count_event, hardening, settled, solid, water
+from datagen.mpm.constitutive import count_event, foreseen_stiffness, hardening, settled, solid, water
 from datagen.mpm.layout import (
     BLOCK,
     BLOCK_NODES,
@@ -39,6 +42,7 @@ from datagen.mpm.layout import (
 from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
+SLACK = 1e-3  # of a substep, within which times are the same
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 
 Scalars = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -121,6 +125,69 @@ def mark(
                 entry = list_begin + ti.atomic_add(length[length_at], 1)
                 block[entry] = index[n]
                 block[entry + shape[SHAPE.all_blocks]] = (corner[n, 0] << 20) | (corner[n, 1] << 10) | corner[n, 2]
+
+
+@ti.func
+def mark_changed(
+    x, scene: ti.i32, inverse_dx: ti.f32, shape: ti.template(), block: ti.template(), begin: ti.i32, now: ti.i32
+):
+    """Writes down, from block[begin] on, that the particle's nodes change in the substep `now`: a number for each block."""
+    first = base_node(x, inverse_dx)
+    last = (first + 2) >> 2
+    first = first >> 2
+    for n in ti.static(range(8)):
+        corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
+        index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
+        block[begin + scene * shape[SHAPE.scene_blocks] + index] = now
+
+
+@ti.func
+def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_value: ti.template()) -> ti.i32:
+    """Whether a particle takes a step of its own in this substep: its last one ends within it."""
+    return begins == 1.0 or covered < scene_value[scene, VALUE.interval_elapsed] - SLACK * step
+
+
+@ti.func
+def own_step(
+    covered: ti.f32,
+    C,
+    volume: ti.f32,
+    material: ti.i32,
+    row: ti.i32,
+    begins: ti.f32,
+    step: ti.f32,
+    scene: ti.i32,
+    scene_value: ti.template(),
+    setting: ti.template(),
+    law: ti.template(),
+    variant: ti.template(),
+):
+    """How long a step a particle takes that acts now, until when in the interval that is, and over how many substeps:
+    what is left of the interval in equal parts, as few as its own stiffness allows.
+
+    `covered` is until when in the interval its steps before reach.
+    """
+    left = scene_value[scene, VALUE.interval_remaining]
+    begin = scene_value[scene, VALUE.interval_elapsed] - step
+    reached = covered
+    if begins == 1.0:  # where the last interval ended before its time
+        reached = covered - scene_value[scene, VALUE.last_interval]
+    many = 1.0
+    if left > 0.0:
+        substeps = ti.round(left / step) + 1.0
+        stiffness = foreseen_stiffness(
+            C, volume, material, left + step, setting[SETTING.inverse_cell_size], law, row, variant
+        )
+        longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
+        longest /= ti.sqrt(ti.max(stiffness, 1e-3))
+        most = ti.min(ti.max(ti.floor(longest / step + 1e-4), 1.0), substeps)
+        many = ti.ceil(substeps / ti.ceil(substeps / most))
+    length = many * step
+    until = begin + length
+    if ti.abs(reached - begin) > SLACK * step and (begins == 0.0 or reached > begin):
+        until = ti.max(until, reached)
+        length = until - reached
+    return length, until, many
 
 
 @ti.func

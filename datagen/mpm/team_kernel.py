@@ -22,10 +22,13 @@ from datagen.mpm.mls_mpm import (
     Integers,
     Scalars,
     Vectors,
+    acts,
     find_hidden,
     initial_stiffness,
     mark,
+    mark_changed,
     move,
+    own_step,
     respond,
     settle,
     settles,
@@ -52,7 +55,7 @@ from datagen.mpm.team_particles import (
     sort,
 )
 from datagen.mpm.team_transfers import gather, scatter, update_nodes
-from datagen.mpm.time_step import falls, raise_maximum
+from datagen.mpm.time_step import raise_maximum
 from hgn.scene.material import MATERIAL_BITS, MATERIAL_MASK, SAND, WATER
 
 CPU_ITEMS = 512  # of a loop, that Taichi gives to a thread of a CPU at once: a block of one thread
@@ -74,12 +77,16 @@ def _strain(
     velocities: ti.i32,
     step: ti.f32,
     begins: ti.f32,
+    ends: ti.i32,
+    now: ti.i32,
     state: ti.template(),
     tag: ti.template(),
+    covered: ti.template(),
     hidden: ti.template(),
     node: ti.template(),
     block: ti.template(),
     live: ti.template(),
+    scene_value: ti.template(),
     counter: ti.template(),
     setting: ti.template(),
     law: ti.template(),
@@ -89,15 +96,23 @@ def _strain(
     variant: ti.template(),
     threads: ti.template(),
 ):
-    """The materials' answer of each particle to the gradient of the nodes' velocities, left in place of C; in the first
-    step of an interval to C, and also which nodes it touches.
+    """The materials' answer of each particle that acts to the gradient of the nodes' velocities, left in place of C; in
+    the first step of an interval to C, and also which nodes it touches. `covered` is less than 0 for what acts now.
     """
     solid = ti.static(has_solid(variant))
     largest = 0.0
+    held = 0.0
     fastest = 0.0
     own = lane
     while own < owned:
         p = dealt(own, part, chunk, blocks)
+        own += threads
+        last = covered[first + p]
+        reached = ti.abs(last)
+        if not acts(reached, begins, step, scene, scene_value):
+            if last < 0.0:
+                covered[first + p] = reached
+            continue
         place = particles + p
         x = get_vector(state, place, stride, FIELD.position)
         C = ti.Matrix.zero(ti.f32, 3, 3)
@@ -119,24 +134,35 @@ def _strain(
             fastest = ti.max(fastest, v.dot(v))
             if ti.static(solid):
                 stretch = get_symmetric(state, place, stride, FIELD.stretch)
+            if not ends:
+                mark_changed(
+                    x, scene, setting[SETTING.inverse_cell_size], shape, block, 3 * shape[SHAPE.all_blocks], now
+                )
         F = ti.Matrix.identity(ti.f32, 3)
         if ti.static(solid):
             F = get_matrix(state, place, stride, FIELD.deformation)
         row = 0
         if ti.static(bool(variant & VARIANT.several_laws)):
             row = tag[tags + TAG.law_row * stride + p]
+        material = tag[tags + TAG.material * stride + p]
+        old_volume = load(state, place + FIELD.volume * stride)
+        length, until, many = own_step(
+            reached, C, old_volume, material, row, begins, step, scene, scene_value, setting, law, variant
+        )
+        covered[first + p] = -until
         A, new_stretch, new_F, volume, stiffness = respond(
-            C, stretch, F, load(state, place + FIELD.volume * stride),
-            tag[tags + TAG.material * stride + p], row, step, begins, scene, counter, setting, law, variant,
-        )  # fmt: skip
+            C, stretch, F, old_volume, material, row, length, begins, scene, counter, setting, law, variant
+        )
         put_matrix(state, place, stride, FIELD.affine, A)
         if ti.static(solid):
             put_matrix(state, place, stride, FIELD.deformation, new_F)
             put_symmetric(state, place, stride, FIELD.stretch, new_stretch)
         store(state, place + FIELD.volume * stride, volume)
         largest = ti.max(largest, stiffness)
-        own += threads
+        if many > 1.0:
+            held = ti.max(held, stiffness)
     raise_by_warps(lane, counter, scene, COUNT.stiffness_bits, largest, threads)
+    raise_by_warps(lane, counter, scene, COUNT.held_stiffness_bits, held, threads)
     raise_by_warps(lane, counter, scene, COUNT.speed_square_bits, fastest, threads)
 
 
@@ -204,6 +230,7 @@ def advance(
     node_entries: ti.i32,
     tag: Integers,
     rank: Integers,
+    covered: Scalars,
     hidden: Integers,
     cell_count: Integers,
     column_count: Integers,
@@ -291,7 +318,9 @@ def advance(
                     step = scene_value[scene, VALUE.time_step]
                     begins = scene_value[scene, VALUE.begins]
                     ends = scene_value[scene, VALUE.interval_remaining] == 0.0
-                    fall = falls(scene, scene_value)
+                    gravity_time = scene_value[scene, VALUE.gravity_time]
+                    fallen = scene_value[scene, VALUE.fallen]
+                    now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
                     going = step > 0.0 and columns[segment + LEAVES] == 0
                     if going:
                         if begins == 1.0 and not sorted_already:
@@ -306,21 +335,21 @@ def advance(
                             sorted_already = True
                         _strain(
                             owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, velocities, step,
-                            begins, state, tag, hidden, node, block, live, counter, setting, law, shape, contact,
-                            contact_normal, variant, threads,
+                            begins, ends, now, state, tag, covered, hidden, node, block, live, scene_value, counter,
+                            setting, law, shape, contact, contact_normal, variant, threads,
                         )  # fmt: skip
                         wait(threads)
                         scatter(
                             owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, begins, state,
-                            tag, hidden, node, setting, law, shape, contact, variant, threads, run,
+                            tag, covered, hidden, node, setting, law, shape, contact, variant, threads, run,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         # a thread that hardly has nodes of its own, while the others are at theirs
                         if not ends and member == members - 1:
                             choose(scene, scene_value, counter, setting, shape, live)
                         update_nodes(
-                            member, scene, velocities, begins, ends, block, live, node, fall, scene_value, shape,
-                            contact, contact_normal, variant, members,
+                            member, scene, velocities, begins, ends, now, gravity_time, fallen, block, live, node,
+                            scene_value, shape, contact, contact_normal, variant, members,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         if ends:

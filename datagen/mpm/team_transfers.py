@@ -10,6 +10,7 @@ from datagen.mpm.device_memory import add, load, load4, store4
 from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
 from datagen.mpm.mls_mpm import base_node, ghost_place, node_place, node_places, node_velocity, spline, weights
 from datagen.mpm.team_particles import dealt, get_vector
+from datagen.mpm.time_step import falls
 
 LANES = 4  # components of a node, and threads that share a particle where it gives to nodes
 MASS = 3  # the component
@@ -83,6 +84,16 @@ def gather(
 
 
 @ti.func
+def _next_acting(p: ti.i32, end: ti.i32, first: ti.i32, begins: ti.f32, covered: ti.template()) -> ti.i32:
+    """The first particle from p on that acts in this substep, or the end."""
+    found = p
+    if begins == 0.0:
+        while found < end and covered[first + found] >= 0.0:
+            found += 1
+    return found
+
+
+@ti.func
 def scatter(
     owned: ti.i32,
     part: ti.i32,
@@ -97,6 +108,7 @@ def scatter(
     begins: ti.f32,
     state: ti.template(),
     tag: ti.template(),
+    covered: ti.template(),
     hidden: ti.template(),
     node: ti.template(),
     setting: ti.template(),
@@ -107,8 +119,8 @@ def scatter(
     threads: ti.template(),
     run: ti.template(),
 ):
-    """Adds what each particle gives to its 27 nodes: momentum and mass, in later steps of an interval what forces
-    change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes up a
+    """Adds what each particle that acts gives to its 27 nodes: momentum and mass, in later steps of an interval what
+    forces change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes up a
     column with them; what it leaves goes to the nodes.
     """
     dx = setting[SETTING.cell_size]
@@ -123,6 +135,7 @@ def scatter(
         end = p + ti.min(run, owned - own)
         if begins == 0.0 and component == MASS:
             p = end
+        p = _next_acting(p, end, first, begins, covered)
         gain = ti.Vector([0.0 for _ in range(27)])
         base = ti.Vector([0, 0, 0])
         x = ti.Vector([0.0, 0.0, 0.0])
@@ -167,7 +180,7 @@ def scatter(
                         add(node, LANES * ghost + component, weight * (v + A.dot(away)))
                     bits >>= 1
                     n += 1
-            p += 1
+            p = _next_acting(p + 1, end, first, begins, covered)
             following = base
             if p < end:
                 x = get_vector(state, particles + p, stride, FIELD.position)
@@ -190,18 +203,49 @@ def scatter(
 
 @ti.func
 def _read_node(place: ti.i32, velocities: ti.i32, begins: ti.f32, node: ti.template()):
-    """What came to its momentum, its mass, and its velocity before (none where an interval begins)."""
+    """What came to its momentum, its mass, and its velocity before (none where an interval begins), with the time that
+    it has fallen in this interval.
+    """
     before = ti.Vector([0.0, 0.0, 0.0, 0.0])
     if begins == 0.0:
         before = load4(node, velocities + place)
     gain = load4(node, place)
-    return _vector(gain), gain[MASS], _vector(before)
+    return _vector(gain), gain[MASS], before
 
 
 @ti.func
-def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, node: ti.template()):
+def _write_node(place: ti.i32, velocities: ti.i32, v, mass: ti.f32, ends: ti.i32, fallen: ti.f32, node: ti.template()):
     store4(node, place, 0.0, 0.0, 0.0, 0.0 if ends else mass)
-    store4(node, velocities + place, v[0], v[1], v[2], mass)
+    store4(node, velocities + place, v[0], v[1], v[2], mass if ends else fallen)
+
+
+@ti.func
+def _update(
+    place: ti.i32,
+    facing: ti.i32,
+    gain,
+    mass: ti.f32,
+    before,
+    velocities: ti.i32,
+    local: ti.i32,
+    corner: ti.i32,
+    scene: ti.i32,
+    begins: ti.f32,
+    ends: ti.i32,
+    gravity_time: ti.f32,
+    fallen: ti.f32,
+    node: ti.template(),
+    scene_value: ti.template(),
+    shape: ti.template(),
+    contact_normal: ti.template(),
+    variant: ti.template(),
+):
+    missed = fallen - before[MASS] if begins == 0.0 else 0.0
+    fall = falls(gravity_time + missed, scene, scene_value)
+    v = node_velocity(
+        _vector(before), gain, mass, local, facing, corner, fall, scene, scene_value, shape, contact_normal, variant
+    )
+    _write_node(place, velocities, v, mass, ends, fallen + gravity_time, node)
 
 
 @ti.func
@@ -211,10 +255,12 @@ def update_nodes(
     velocities: ti.i32,
     begins: ti.f32,
     ends: ti.i32,
+    now: ti.i32,
+    gravity_time: ti.f32,
+    fallen: ti.f32,
     block: ti.template(),
     live: ti.template(),
     node: ti.template(),
-    fall,
     scene_value: ti.template(),
     shape: ti.template(),
     contact: ti.template(),
@@ -222,7 +268,9 @@ def update_nodes(
     variant: ti.template(),
     members: ti.i32,
 ):
-    """New velocities of the nodes of all blocks that particles touch."""
+    """New velocities of the nodes of all blocks that particles touch; within an interval of those alone whose particles
+    act. What gravity gives to the others they get later.
+    """
     block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
     count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
     n = member
@@ -230,6 +278,10 @@ def update_nodes(
         touched = block[block_list + n // BLOCK_NODES]
         corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
         local = n % BLOCK_NODES
+        n += members
+        if begins == 0.0 and not ends:  # noqa: SIM102 (`and` would read the block in any case)
+            if block[3 * shape[SHAPE.all_blocks] + touched] != now:
+                continue
         # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
         place = LANES * (touched * BLOCK_NODES + local)
         entry = -1
@@ -239,17 +291,15 @@ def update_nodes(
         if local == 0:
             block[touched] = 0
         if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
-            v = node_velocity(
-                before, gain, mass, local, 2 * entry, corner, fall, scene, scene_value, shape, contact_normal, variant
-            )
-            _write_node(place, velocities, v, mass, ends, node)
+            _update(
+                place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time,
+                fallen, node, scene_value, shape, contact_normal, variant,
+            )  # fmt: skip
         if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
             if entry >= 0 and entry < shape[SHAPE.ghosts]:
                 ghost = LANES * (shape[SHAPE.ghost_begin] + entry)
                 gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
-                v = node_velocity(
-                    before_there, gain_there, mass_there, local, 2 * entry + 1, corner, fall, scene, scene_value,
-                    shape, contact_normal, variant,
+                _update(
+                    ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene,
+                    begins, ends, gravity_time, fallen, node, scene_value, shape, contact_normal, variant,
                 )  # fmt: skip
-                _write_node(ghost, velocities, v, mass_there, ends, node)
-        n += members

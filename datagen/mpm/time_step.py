@@ -39,7 +39,8 @@ def choose_time_step(
     remaining = scene_value[scene, VALUE.remaining]
     status = counter[scene, COUNT.status]
     least = scene_value[scene, VALUE.least_stiffness]
-    stiffness = ti.max(_maximum(counter, scene, COUNT.stiffness_bits), least, 1e-3)
+    held = _maximum(counter, scene, COUNT.held_stiffness_bits)
+    stiffness = ti.max(_maximum(counter, scene, COUNT.stiffness_bits), held, least, 1e-3)
     speed_square = _maximum(counter, scene, COUNT.speed_square_bits)
     largest_speed_square = scene_value[scene, VALUE.largest_speed_square]
     gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
@@ -58,6 +59,8 @@ def choose_time_step(
     transfer_interval = setting[SETTING.transfer_interval]
     speed_fraction = setting[SETTING.speed_fraction]
     leapfrog = setting[SETTING.leapfrog]
+    last_interval = scene_value[scene, VALUE.last_interval]
+    fallen = scene_value[scene, VALUE.fallen] + scene_value[scene, VALUE.gravity_time]
     step = 0.0
     if remaining > 0.0 and status == STATUS.running:
         # what stiffens as it is pressed together goes on to do so in the step
@@ -66,7 +69,9 @@ def choose_time_step(
         begins = left == 0.0
         shift = 0.0  # from the middle of the last interval to that of the present one is not its length
         if begins:
+            last_interval = elapsed
             elapsed = 0.0
+            fallen = 0.0
             longest = ti.max(limit, transfer_interval)
             # the fall within the interval counts too
             speed = ti.sqrt(speed_square) + gravity.norm() * ti.min(longest, remaining)
@@ -110,19 +115,23 @@ def choose_time_step(
             scene_value[scene, VALUE.interval_remaining] = left
             scene_value[scene, VALUE.begins] = ti.cast(begins, ti.f32)
             scene_value[scene, VALUE.gravity_time] = step + shift
+            scene_value[scene, VALUE.last_interval] = last_interval
+            scene_value[scene, VALUE.fallen] = fallen
             scene_value[scene, VALUE.substeps_ahead] = total - 1.0
             scene_value[scene, VALUE.smallest_time_step] = ti.min(smallest, step)
             counter[scene, COUNT.transfers] = transfers + ti.cast(begins, ti.i64)
             counter[scene, COUNT.frame_substeps] = ti.cast(done + 1, ti.i64)
             counter[scene, COUNT.substeps] = substeps + ti.cast(1, ti.i64)
-            # maxima are gathered anew while the step runs
+            # maxima are gathered anew while the step runs, or the interval
+            if begins:
+                counter[scene, COUNT.held_stiffness_bits] = ti.cast(0, ti.i64)
             counter[scene, COUNT.stiffness_bits] = ti.cast(0, ti.i64)
             counter[scene, COUNT.speed_square_bits] = ti.cast(0, ti.i64)
     scene_value[scene, VALUE.time_step] = step
 
 
 @ti.func
-def falls(scene: ti.i32, scene_value: ti.template()):
-    """What gravity adds to velocities in the present substep."""
+def falls(time: ti.f32, scene: ti.i32, scene_value: ti.template()):
+    """What gravity adds to velocities in a time."""
     gravity = ti.Vector([scene_value[scene, VALUE.gravity + i] for i in range(3)])
-    return scene_value[scene, VALUE.gravity_time] * gravity
+    return time * gravity
