@@ -10,9 +10,9 @@ Transfers come at a rate of their own, since each smooths velocities: an interva
 as the stiffest particle needs. Others take steps of their own, each of several substeps, as long as their own wave
 speed allows (impulse multiple time stepping, Tuckerman et al. 1992; regional steps of the material point method, Fang
 et al. 2018): the impulse of such a step goes to the nodes in its first substep, at once, and nodes all of whose
-particles wait are left as they are, and get what gravity gives them later. In the interval's first substep particles give mass and momentum to the nodes and force; in the
-others they stay where they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give
-force alone, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity
+particles wait are left as they are, and get what gravity gives them later. In the interval's first substep particles
+give mass and momentum to the nodes and force; in the others they stay where they are on the grid, take the gradient of
+the nodes' velocities for strain and stress, and give force alone, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity
 and gradient, and move by the interval times that velocity: momentum and angular momentum are kept, as stresses are
 symmetric and each particle moves along its velocity. Within an interval no velocity is smoothed.
 
@@ -131,7 +131,7 @@ def mark(
 def mark_changed(
     x, scene: ti.i32, inverse_dx: ti.f32, shape: ti.template(), block: ti.template(), begin: ti.i32, now: ti.i32
 ):
-    """Writes down, from block[begin] on, that the particle's nodes change in the substep `now`: a number for each block."""
+    """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`."""
     first = base_node(x, inverse_dx)
     last = (first + 2) >> 2
     first = first >> 2

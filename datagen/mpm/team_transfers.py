@@ -120,8 +120,8 @@ def scatter(
     run: ti.template(),
 ):
     """Adds what each particle that acts gives to its 27 nodes: momentum and mass, in later steps of an interval what
-    forces change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes up a
-    column with them; what it leaves goes to the nodes.
+    forces change in momentum. A thread adds up what `run` particles in their order give, in a window of nodes that goes
+    up a column with them; what it leaves goes to the nodes.
     """
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
