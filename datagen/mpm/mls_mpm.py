@@ -12,9 +12,10 @@ speed allows (impulse multiple time stepping, Tuckerman et al. 1992; regional st
 et al. 2018): the impulse of such a step goes to the nodes in its first substep, at once, and nodes all of whose
 particles wait are left as they are, and get what gravity gives them later. In the interval's first substep particles
 give mass and momentum to the nodes and force; in the others they stay where they are on the grid, take the gradient of
-the nodes' velocities for strain and stress, and give force alone, as in the Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity
-and gradient, and move by the interval times that velocity: momentum and angular momentum are kept, as stresses are
-symmetric and each particle moves along its velocity. Within an interval no velocity is smoothed.
+the nodes' velocities for strain and stress, and give force alone, as in the Lagrangian phase of the classical method
+(Sulsky et al. 1994). After the last they take velocity and gradient, and move by the interval times that velocity:
+momentum and angular momentum are kept, as stresses are symmetric and each particle moves along its velocity. Within an
+interval no velocity is smoothed.
 
 Positions belong to the ends of intervals, velocities to their middles (leapfrog): gravity acts for half the last and
 half the present interval, at first for half of the first, so that free fall is v t + g t² / 2 at the end of each,
