@@ -15,6 +15,7 @@ from datagen.mpm.mls_mpm import (
     Scalars,
     Vectors,
     acts,
+    change_of,
     find_hidden,
     ghost_place,
     initial_stiffness,
@@ -107,9 +108,8 @@ def _particle_to_grid(
         raise_maximum(counter, scene, COUNT.held_stiffness_bits, stiffness)
     if scene_value[scene, VALUE.interval_remaining] > 0.0:
         affine[p] = new_stretch
-        if begins == 0.0:
-            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-            mark_changed(position[p], scene, inverse_dx, shape, block, 3 * shape[SHAPE.all_blocks] + 2, now)
+        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+        mark_changed(position[p], scene, now, many, inverse_dx, shape, block, 3 * shape[SHAPE.all_blocks] + 2)
     volume[p] = new_volume
     if ti.static(has_solid(variant)):
         if ti.static(not variant & VARIANT.water) or not is_fluid(material):
@@ -286,11 +286,13 @@ def substep(
         place = global_block * BLOCK_NODES + (n & 63)
         scene = global_block // shape[SHAPE.scene_blocks]
         begins = scene_value[scene, VALUE.begins] == 1.0
-        changed = begins or scene_value[scene, VALUE.interval_remaining] == 0.0
-        if not changed:
+        many = 1.0
+        if scene_value[scene, VALUE.interval_remaining] > 0.0:
             now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-            changed = block[3 * shape[SHAPE.all_blocks] + 2 + global_block] == now
-        if scene_value[scene, VALUE.time_step] > 0.0 and changed:
+            many = change_of(block[3 * shape[SHAPE.all_blocks] + 2 + global_block], now)
+        if scene_value[scene, VALUE.time_step] > 0.0 and many > 0.0:
+            lead = (many - 1.0) * scene_value[scene, VALUE.time_step]
+            gravity_time = scene_value[scene, VALUE.gravity_time]
             fallen_before = scene_value[scene, VALUE.fallen]
             entry = -1
             node_fields = 1
@@ -303,11 +305,11 @@ def substep(
                 if field == 1:
                     own = shape[SHAPE.ghost_begin] + entry
                 before = ti.Vector([0.0, 0.0, 0.0, 0.0])
-                missed = 0.0
+                ahead = 0.0
                 if not begins:
                     before = node[own]
-                    missed = fallen_before - fallen[own]
-                fallen[own] = fallen_before + scene_value[scene, VALUE.gravity_time]
+                    ahead = fallen[own] - fallen_before
+                fallen[own] = fallen_before + gravity_time + lead
                 total = gain[own]
                 for part in ti.static(range(1, variant // VARIANT.parts)):  # what copies hold is summed in order
                     total += gain[own + part * shape[SHAPE.all_blocks] * BLOCK_NODES]
@@ -317,7 +319,7 @@ def substep(
                 v = node_velocity(
                     ti.Vector([before[0], before[1], before[2]]), ti.Vector([total[0], total[1], total[2]]), mass,
                     n & 63, 2 * entry + field, block[2 * shape[SHAPE.all_blocks] + (n >> 6)],
-                    falls(scene_value[scene, VALUE.gravity_time] + missed, scene, scene_value), scene, scene_value,
+                    falls(gravity_time + lead - ahead, scene, scene_value), scene, scene_value,
                     shape, contact_normal, variant,
                 )  # fmt: skip
                 node[own] = ti.Vector([v[0], v[1], v[2], mass])

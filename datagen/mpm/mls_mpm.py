@@ -9,13 +9,14 @@ density.
 Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
 as the stiffest particle needs. Others take steps of their own, each of several substeps, as long as their own wave
 speed allows (impulse multiple time stepping, Tuckerman et al. 1992; regional steps of the material point method, Fang
-et al. 2018): the impulse of such a step goes to the nodes in its first substep, at once, and nodes all of whose
-particles wait are left as they are, and get what gravity gives them later. In the interval's first substep particles
-give mass and momentum to the nodes and force; in the others they stay where they are on the grid, take the gradient of
-the nodes' velocities for strain and stress, and give force alone, as in the Lagrangian phase of the classical method
-(Sulsky et al. 1994). After the last they take velocity and gradient, and move by the interval times that velocity:
-momentum and angular momentum are kept, as stresses are symmetric and each particle moves along its velocity. Within an
-interval no velocity is smoothed.
+et al. 2018): the impulse of such a step goes to the nodes in its first substep, at once, as does that of gravity where
+all particles of a block of nodes take several; until the next of them acts the block is left as it is.
+
+In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
+they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the
+Lagrangian phase of the classical method (Sulsky et al. 1994). After the last they take velocity and gradient, and move
+by the interval times that velocity: momentum and angular momentum are kept, as stresses are symmetric and each particle
+moves along its velocity. Within an interval no velocity is smoothed.
 
 Positions belong to the ends of intervals, velocities to their middles (leapfrog): gravity acts for half the last and
 half the present interval, at first for half of the first, so that free fall is v t + g t² / 2 at the end of each,
@@ -43,6 +44,7 @@ from datagen.mpm.layout import (
 from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
+MANY = 32  # substeps at most that a change of nodes is for
 SLACK = 1e-3  # of a substep, within which times are the same
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 
@@ -130,16 +132,37 @@ def mark(
 
 @ti.func
 def mark_changed(
-    x, scene: ti.i32, inverse_dx: ti.f32, shape: ti.template(), block: ti.template(), begin: ti.i32, now: ti.i32
+    x,
+    scene: ti.i32,
+    now: ti.i32,
+    many: ti.f32,
+    inverse_dx: ti.f32,
+    shape: ti.template(),
+    block: ti.template(),
+    begin: ti.i32,
 ):
-    """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`."""
+    """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`, and for
+    how many substeps, the fewest of all that change them (see change_of).
+    """
     first = base_node(x, inverse_dx)
     last = (first + 2) >> 2
     first = first >> 2
+    change = now * MANY + MANY - ti.min(ti.cast(many, ti.i32), MANY)
     for n in ti.static(range(8)):
         corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
         index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
-        block[begin + scene * shape[SHAPE.scene_blocks] + index] = now
+        index += begin + scene * shape[SHAPE.scene_blocks]
+        if block[index] < change:
+            ti.atomic_max(block[index], change)
+
+
+@ti.func
+def change_of(mark: ti.i32, now: ti.i32) -> ti.f32:
+    """For how many substeps a block changes in the substep `now`; 0 where it does not."""
+    many = 0.0
+    if mark // MANY == now:
+        many = ti.cast(MANY - mark % MANY, ti.f32)
+    return many
 
 
 @ti.func

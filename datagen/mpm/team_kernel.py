@@ -134,10 +134,6 @@ def _strain(
             fastest = ti.max(fastest, v.dot(v))
             if ti.static(solid):
                 stretch = get_symmetric(state, place, stride, FIELD.stretch)
-            if not ends:
-                mark_changed(
-                    x, scene, setting[SETTING.inverse_cell_size], shape, block, 3 * shape[SHAPE.all_blocks], now
-                )
         F = ti.Matrix.identity(ti.f32, 3)
         if ti.static(solid):
             F = get_matrix(state, place, stride, FIELD.deformation)
@@ -150,6 +146,10 @@ def _strain(
             reached, C, old_volume, material, row, begins, step, scene, scene_value, setting, law, variant
         )
         covered[first + p] = -until
+        if not ends:
+            mark_changed(
+                x, scene, now, many, setting[SETTING.inverse_cell_size], shape, block, 3 * shape[SHAPE.all_blocks]
+            )
         A, new_stretch, new_F, volume, stiffness = respond(
             C, stretch, F, old_volume, material, row, length, begins, scene, counter, setting, law, variant
         )
@@ -348,8 +348,8 @@ def advance(
                         if not ends and member == members - 1:
                             choose(scene, scene_value, counter, setting, shape, live)
                         update_nodes(
-                            member, scene, velocities, begins, ends, now, gravity_time, fallen, block, live, node,
-                            scene_value, shape, contact, contact_normal, variant, members,
+                            member, scene, velocities, begins, ends, now, step, gravity_time, fallen, block, live,
+                            node, scene_value, shape, contact, contact_normal, variant, members,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         if ends:

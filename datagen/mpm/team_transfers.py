@@ -8,7 +8,16 @@ import taichi as ti
 
 from datagen.mpm.device_memory import add, load, load4, store4
 from datagen.mpm.layout import BLOCK_NODES, CONSTANT, FIELD, LIVE, SETTING, SHAPE, TAG, VARIANT
-from datagen.mpm.mls_mpm import base_node, ghost_place, node_place, node_places, node_velocity, spline, weights
+from datagen.mpm.mls_mpm import (
+    base_node,
+    change_of,
+    ghost_place,
+    node_place,
+    node_places,
+    node_velocity,
+    spline,
+    weights,
+)
 from datagen.mpm.team_particles import dealt, get_vector
 from datagen.mpm.time_step import falls
 
@@ -233,6 +242,7 @@ def _update(
     begins: ti.f32,
     ends: ti.i32,
     gravity_time: ti.f32,
+    lead: ti.f32,
     fallen: ti.f32,
     node: ti.template(),
     scene_value: ti.template(),
@@ -240,12 +250,12 @@ def _update(
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    missed = fallen - before[MASS] if begins == 0.0 else 0.0
-    fall = falls(gravity_time + missed, scene, scene_value)
+    ahead = before[MASS] - fallen if begins == 0.0 else 0.0
+    fall = falls(gravity_time + lead - ahead, scene, scene_value)
     v = node_velocity(
         _vector(before), gain, mass, local, facing, corner, fall, scene, scene_value, shape, contact_normal, variant
     )
-    _write_node(place, velocities, v, mass, ends, fallen + gravity_time, node)
+    _write_node(place, velocities, v, mass, ends, fallen + gravity_time + lead, node)
 
 
 @ti.func
@@ -256,6 +266,7 @@ def update_nodes(
     begins: ti.f32,
     ends: ti.i32,
     now: ti.i32,
+    step: ti.f32,
     gravity_time: ti.f32,
     fallen: ti.f32,
     block: ti.template(),
@@ -269,7 +280,7 @@ def update_nodes(
     members: ti.i32,
 ):
     """New velocities of the nodes of all blocks that particles touch; within an interval of those alone whose particles
-    act. What gravity gives to the others they get later.
+    act.
     """
     block_list = shape[SHAPE.all_blocks] + scene * shape[SHAPE.scene_blocks]
     count = live[scene * LIVE.length + LIVE.blocks] * BLOCK_NODES
@@ -279,9 +290,12 @@ def update_nodes(
         corner = block[block_list + shape[SHAPE.all_blocks] + n // BLOCK_NODES]
         local = n % BLOCK_NODES
         n += members
-        if begins == 0.0 and not ends:  # noqa: SIM102 (`and` would read the block in any case)
-            if block[3 * shape[SHAPE.all_blocks] + touched] != now:
+        many = 1.0
+        if not ends:
+            many = change_of(block[3 * shape[SHAPE.all_blocks] + touched], now)
+            if many == 0.0:
                 continue
+        lead = (many - 1.0) * step
         # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
         place = LANES * (touched * BLOCK_NODES + local)
         entry = -1
@@ -293,7 +307,7 @@ def update_nodes(
         if mass > 0.0:  # others keep a velocity of before, in which no particle has a share
             _update(
                 place, 2 * entry, gain, mass, before, velocities, local, corner, scene, begins, ends, gravity_time,
-                fallen, node, scene_value, shape, contact_normal, variant,
+                lead, fallen, node, scene_value, shape, contact_normal, variant,
             )  # fmt: skip
         if ti.static(bool(variant & VARIANT.sheets)):  # noqa: SIM102 (this one is the compiler's)
             if entry >= 0 and entry < shape[SHAPE.ghosts]:
@@ -301,5 +315,5 @@ def update_nodes(
                 gain_there, mass_there, before_there = _read_node(ghost, velocities, begins, node)
                 _update(
                     ghost, 2 * entry + 1, gain_there, mass_there, before_there, velocities, local, corner, scene,
-                    begins, ends, gravity_time, fallen, node, scene_value, shape, contact_normal, variant,
+                    begins, ends, gravity_time, lead, fallen, node, scene_value, shape, contact_normal, variant,
                 )  # fmt: skip
