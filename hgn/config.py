@@ -169,7 +169,7 @@ class MpmConfig:
     )
     time_step: Annotated[str, one_of("adaptive", "fixed")] = "adaptive"  # or fixed
     fixed_time_step_s: Positive[float] = 0.02 / 64
-    stability_fraction: Positive[float] = 0.8  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
+    stability_fraction: Positive[float] = 0.875  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
     speed_fraction: Positive[float] = 0.3  # of a cell that the fastest particle may cross between two transfers
     # particles and grid exchange velocities every cell_size / this: 32 times a frame of 1/60 s at 64 cells,
     # whatever the materials, with as many steps of stress between as they need; null: at every step. Fewer

@@ -157,8 +157,9 @@ def foreseen_stiffness(
     row: ti.i32,
     variant: ti.template(),
 ) -> ti.f32:
-    """(3 lambda + 2 mu) / density of a particle that goes on for a time with the gradient C of its velocity; of an
-    elastic solid, whose stretch it would take a decomposition to tell, more than of any other.
+    """(3 lambda + 2 mu) / density of a particle that goes on for a time with the gradient C of its velocity. Elastic
+    solids, whose stretch it would take a decomposition to tell, and water whose pressure grows with J^-7 go for stiffer
+    than any other: they take no steps of their own.
     """
     density = law[row + CONSTANT.density]
     bulk = 3.0 * law[row + CONSTANT.bulk]
@@ -167,14 +168,11 @@ def foreseen_stiffness(
     if ti.static(bool(variant & VARIANT.water)):
         if material == WATER:
             J = volume * (1.0 + change)
-            more = J * (2.0 * J - 1.0)
-            if ti.static(bool(variant & VARIANT.stiffening_water)):
-                least = ti.max(volume * (1.0 - change), 0.1)
-                more = (J + 6.0 / least**6) / 7.0
-            rough = ti.sqrt(bulk * ti.max(1.0, more)) + 4.0 * law[row + CONSTANT.viscosity] * inverse_dx / ti.sqrt(
-                density
-            )
+            rough = ti.sqrt(bulk * ti.max(1.0, J * (2.0 * J - 1.0)))
+            rough += 4.0 * law[row + CONSTANT.viscosity] * inverse_dx / ti.sqrt(density)
             stiffness = rough * rough
+            if ti.static(bool(variant & VARIANT.stiffening_water)):
+                stiffness = 1e30
     if ti.static(bool(variant & VARIANT.snow)):
         if material == SNOW:
             stiffness *= hardening(volume * (1.0 - change), law, row)

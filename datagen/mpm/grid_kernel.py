@@ -23,7 +23,6 @@ from datagen.mpm.mls_mpm import (
     interpolate_hidden,
     is_fluid,
     mark,
-    mark_changed,
     move,
     node_places,
     node_velocity,
@@ -98,7 +97,23 @@ def _particle_to_grid(
         C = C_now
         raise_maximum(counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
     length, until, many = own_step(
-        covered[p], C, volume[p], material, row, begins, step, scene, scene_value, setting, law, variant
+        covered[p],
+        position[p],
+        C,
+        volume[p],
+        material,
+        row,
+        begins,
+        step,
+        scene,
+        counter,
+        shape,
+        block,
+        3 * shape[SHAPE.all_blocks] + 2,
+        scene_value,
+        setting,
+        law,
+        variant,
     )
     covered[p] = until
     A, new_stretch, new_F, new_volume, stiffness = respond(
@@ -108,8 +123,6 @@ def _particle_to_grid(
         raise_maximum(counter, scene, COUNT.held_stiffness_bits, stiffness)
     if scene_value[scene, VALUE.interval_remaining] > 0.0:
         affine[p] = new_stretch
-        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-        mark_changed(position[p], scene, now, many, inverse_dx, shape, block, 3 * shape[SHAPE.all_blocks] + 2)
     volume[p] = new_volume
     if ti.static(has_solid(variant)):
         if ti.static(not variant & VARIANT.water) or not is_fluid(material):

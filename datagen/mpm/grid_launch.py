@@ -70,7 +70,7 @@ class GridLaunch(Launch):
         self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, self.particles if has_solid(self.variant) else 1)
         self.volume, self.covered = (ti.ndarray(ti.f32, self.particles) for _ in range(2))
         self.covered.fill(0)
-        self.block = device_array(np.zeros(4 * self.all_blocks + 2, np.int32))
+        self.block = device_array(np.zeros(6 * self.all_blocks + 2, np.int32))
         grid_kernel.start(
             self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter,
             self.law,

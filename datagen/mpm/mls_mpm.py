@@ -136,24 +136,57 @@ def mark_changed(
     scene: ti.i32,
     now: ti.i32,
     many: ti.f32,
+    interval: ti.i32,
+    own: ti.f32,
     inverse_dx: ti.f32,
     shape: ti.template(),
     block: ti.template(),
     begin: ti.i32,
 ):
     """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`, and for
-    how many substeps, the fewest of all that change them (see change_of).
+    how many substeps, the fewest of all that change them (see change_of). In one of two arrays after that, in turns for
+    intervals, the fewest that any bears by itself.
     """
     first = base_node(x, inverse_dx)
     last = (first + 2) >> 2
     first = first >> 2
     change = now * MANY + MANY - ti.min(ti.cast(many, ti.i32), MANY)
+    least = interval * MANY + MANY - ti.cast(ti.min(own, ti.cast(MANY, ti.f32)), ti.i32)
+    turn = (1 + (interval & 1)) * shape[SHAPE.all_blocks]
     for n in ti.static(range(8)):
         corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
         index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
         index += begin + scene * shape[SHAPE.scene_blocks]
         if block[index] < change:
             ti.atomic_max(block[index], change)
+        if block[index + turn] < least:
+            ti.atomic_max(block[index + turn], least)
+
+
+@ti.func
+def fewest_around(
+    x,
+    scene: ti.i32,
+    interval: ti.i32,
+    inverse_dx: ti.f32,
+    shape: ti.template(),
+    block: ti.template(),
+    begin: ti.i32,
+) -> ti.f32:
+    """The fewest substeps that a particle beside bore by itself in the interval before; marks begin at `begin`."""
+    first = base_node(x, inverse_dx)
+    last = (first + 2) >> 2
+    first = first >> 2
+    turn = (1 + ((interval - 1) & 1)) * shape[SHAPE.all_blocks]
+    found = 0
+    for n in ti.static(range(8)):
+        corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
+        index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
+        found = ti.max(found, block[index + begin + scene * shape[SHAPE.scene_blocks] + turn])
+    fewest = ti.cast(MANY, ti.f32)
+    if found // MANY == interval - 1:
+        fewest = ti.cast(MANY - found % MANY, ti.f32)
+    return fewest
 
 
 @ti.func
@@ -174,6 +207,7 @@ def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_val
 @ti.func
 def own_step(
     covered: ti.f32,
+    x,
     C,
     volume: ti.f32,
     material: ti.i32,
@@ -181,13 +215,18 @@ def own_step(
     begins: ti.f32,
     step: ti.f32,
     scene: ti.i32,
+    counter: ti.template(),
+    shape: ti.template(),
+    block: ti.template(),
+    marks: ti.i32,
     scene_value: ti.template(),
     setting: ti.template(),
     law: ti.template(),
     variant: ti.template(),
 ):
     """How long a step a particle takes that acts now, until when in the interval that is, and over how many substeps:
-    what is left of the interval in equal parts, as few as its own stiffness allows.
+    what is left of the interval in equal parts, as few as its own stiffness allows, and no longer than what is stiffer
+    beside it takes (else bodies that meet rebound too fast). Marks of all are left from block[marks] on.
 
     `covered` is until when in the interval its steps before reach.
     """
@@ -204,13 +243,18 @@ def own_step(
         )
         longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
         longest /= ti.sqrt(ti.max(stiffness, 1e-3))
-        most = ti.min(ti.max(ti.floor(longest / step + 1e-4), 1.0), substeps)
-        many = ti.ceil(substeps / ti.ceil(substeps / most))
+        most = ti.max(ti.floor(longest / step + 1e-4), 1.0)
+        own = ti.ceil(substeps / ti.ceil(substeps / ti.min(most, substeps)))
+        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+        interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
+        inverse_dx = setting[SETTING.inverse_cell_size]
+        many = ti.min(own, fewest_around(x, scene, interval, inverse_dx, shape, block, marks))
+        mark_changed(x, scene, now, many, interval, most, inverse_dx, shape, block, marks)
     length = many * step
     until = begin + length
     if ti.abs(reached - begin) > SLACK * step and (begins == 0.0 or reached > begin):
-        until = ti.max(until, reached)
-        length = until - reached
+        length = ti.max(until - reached, SLACK * step)
+        until = reached + length
     return length, until, many
 
 

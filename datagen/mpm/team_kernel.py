@@ -26,7 +26,6 @@ from datagen.mpm.mls_mpm import (
     find_hidden,
     initial_stiffness,
     mark,
-    mark_changed,
     move,
     own_step,
     respond,
@@ -77,8 +76,6 @@ def _strain(
     velocities: ti.i32,
     step: ti.f32,
     begins: ti.f32,
-    ends: ti.i32,
-    now: ti.i32,
     state: ti.template(),
     tag: ti.template(),
     covered: ti.template(),
@@ -143,13 +140,25 @@ def _strain(
         material = tag[tags + TAG.material * stride + p]
         old_volume = load(state, place + FIELD.volume * stride)
         length, until, many = own_step(
-            reached, C, old_volume, material, row, begins, step, scene, scene_value, setting, law, variant
+            reached,
+            x,
+            C,
+            old_volume,
+            material,
+            row,
+            begins,
+            step,
+            scene,
+            counter,
+            shape,
+            block,
+            3 * shape[SHAPE.all_blocks],
+            scene_value,
+            setting,
+            law,
+            variant,
         )
         covered[first + p] = -until
-        if not ends:
-            mark_changed(
-                x, scene, now, many, setting[SETTING.inverse_cell_size], shape, block, 3 * shape[SHAPE.all_blocks]
-            )
         A, new_stretch, new_F, volume, stiffness = respond(
             C, stretch, F, old_volume, material, row, length, begins, scene, counter, setting, law, variant
         )
@@ -335,7 +344,7 @@ def advance(
                             sorted_already = True
                         _strain(
                             owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, velocities, step,
-                            begins, ends, now, state, tag, covered, hidden, node, block, live, scene_value, counter,
+                            begins, state, tag, covered, hidden, node, block, live, scene_value, counter,
                             setting, law, shape, contact, contact_normal, variant, threads,
                         )  # fmt: skip
                         wait(threads)

@@ -63,7 +63,7 @@ class TeamLaunch(Launch):
         self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
         self.column_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES // BLOCK)
         self.covered = ti.ndarray(ti.f32, self.particles)
-        self.block = ti.ndarray(ti.i32, 4 * self.all_blocks)
+        self.block = ti.ndarray(ti.i32, 6 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING)
         self.columns = ti.ndarray(ti.i32, SEGMENT * self.teams * team.blocks)

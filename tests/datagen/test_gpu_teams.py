@@ -25,14 +25,14 @@ def _scene():
     ("threads", "blocks", "run"), [(256, 1, 8), (128, 2, 8), (256, 4, 4), (128, 40, 1), (512, 60, 8)]
 )
 def test_teams_agree_with_one_launch_a_substep(threads, blocks, run):
-    """Three materials on a sheet: one frame agrees to 1e-6, twelve to 1e-4 of the domain; as many substeps. With 60
+    """Three materials on a sheet: one frame agrees to 1e-6, ten to 2e-5 of the domain; as many substeps. With 60
     blocks of 512 threads two teams take three scenes.
     """
     from datagen.mpm.solver import Team, simulate
 
     config = MpmConfig(device="gpu")
-    expected = simulate([_scene()], config, 13, 60.0, team=Team(0))
-    _require_alike(expected * 3, simulate([_scene()] * 3, config, 13, 60.0, team=Team(threads, blocks, run)))
+    expected = simulate([_scene()], config, 11, 60.0, team=Team(0))
+    _require_alike(expected * 3, simulate([_scene()] * 3, config, 11, 60.0, team=Team(threads, blocks, run)))
 
 
 @pytest.mark.gpu
@@ -45,9 +45,9 @@ def test_blocks_that_do_not_fit_end_in_one_launch_a_substep(monkeypatch):
 
     monkeypatch.setattr(solver, "_teams_at_once", lambda device, team: 1)
     config = MpmConfig(device="gpu")
-    expected = solver.simulate([_scene()], config, 13, 60.0, team=solver.Team(0))
+    expected = solver.simulate([_scene()], config, 11, 60.0, team=solver.Team(0))
     with pytest.warns(RuntimeWarning, match="does not run 4000 blocks"):
-        found = solver.simulate([_scene()], config, 13, 60.0, team=solver.Team(512, 4000))
+        found = solver.simulate([_scene()], config, 11, 60.0, team=solver.Team(512, 4000))
     _require_alike(expected, found)
 
 
@@ -57,5 +57,5 @@ def _require_alike(expected, found):
     for one, other in zip(found, expected, strict=True):
         assert isinstance(one, Simulated) and isinstance(other, Simulated)
         away_T = np.abs(one.position_TN3 - other.position_TN3).max(axis=(1, 2))
-        assert away_T[1] < 1e-6 and away_T.max() < 1e-4
+        assert away_T[1] < 1e-6 and away_T.max() < 2e-5
         assert one.counters["substeps"] == other.counters["substeps"]
