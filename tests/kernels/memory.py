@@ -4,13 +4,9 @@ Inside `checked_memory` every access of a kernel, through an argument or a raw a
 storage of a tensor that is alive when the kernel is launched.
 """
 
-from __future__ import annotations
-
 import gc
 import weakref
-from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +19,7 @@ class IllegalAccessError(AssertionError):
     """A kernel has read or written what is no tensor's memory."""
 
 
-def living_tensors() -> list[torch.Tensor]:
+def living_tensors():
     """All tensors with memory of their own; what another test traced leaves subclasses behind that have none."""
     return [thing for thing in gc.get_objects() if type(thing) in (torch.Tensor, torch.nn.Parameter)]
 
@@ -31,7 +27,7 @@ def living_tensors() -> list[torch.Tensor]:
 class Alive:
     """The memory of all tensors that are alive now."""
 
-    def __init__(self, tensors: list[torch.Tensor] | None = None) -> None:
+    def __init__(self, tensors=None):
         found = {}
         for tensor in living_tensors() if tensors is None else tensors:
             if tensor.device.type == "cpu":
@@ -39,7 +35,7 @@ class Alive:
         spans = np.array(sorted((at, at + size) for at, size in found.items() if at and size), np.uint64)
         self._start, self._end = spans[:, 0].copy(), spans[:, 1].copy()
 
-    def holds(self, address: Any, size: int) -> np.ndarray:
+    def holds(self, address, size):
         """Of each address whether so many bytes from it on belong to one tensor."""
         at = np.asarray(address, np.uint64)
         index = np.searchsorted(self._start, at, side="right").astype(np.int64) - 1
@@ -49,7 +45,7 @@ class Alive:
 class Checked:
     """The interpreter's memory operations, each address looked up first."""
 
-    def __init__(self, module: Any) -> None:
+    def __init__(self, module):
         self._module = module
         self._launch = ""
         # what is there at the start is looked for once, and leaves the collector's lists: they are long
@@ -58,16 +54,16 @@ class Checked:
         self._alive = self._now()
         self.launches: list[tuple[str, tuple[int, ...]]] = []  # each with the addresses of its tensors
 
-    def _now(self) -> Alive:
+    def _now(self):
         old = [tensor for tensor in (reference() for reference in self._old) if tensor is not None]
         return Alive(old + living_tensors())
 
-    def begin(self, launch: str, arguments: dict[str, Any]) -> None:
+    def begin(self, launch, arguments):
         pointers = tuple(a.data_ptr() for a in arguments.values() if isinstance(a, torch.Tensor))
         self.launches.append((launch, pointers))
         self._launch, self._alive = launch, self._now()
 
-    def _check(self, what: str, address: Any, mask: Any, size: int) -> None:
+    def _check(self, what, address, mask, size):
         at = np.asarray(address).reshape(-1).astype(np.uint64)
         if mask is not None:
             at = at[np.broadcast_to(np.asarray(mask), np.asarray(address).shape).reshape(-1).astype(bool)]
@@ -75,24 +71,24 @@ class Checked:
         if wrong:
             raise IllegalAccessError(f"{self._launch}: {what} at {wrong} addresses that are no tensor's")
 
-    def load(self, address: Any, mask: Any, other: Any, dtype: Any) -> Any:
+    def load(self, address, mask, other, dtype):
         self._check("load", address, mask, np.dtype(dtype).itemsize)
         return self._module.load(address, mask, other, dtype)
 
-    def store(self, address: Any, value: Any, mask: Any) -> Any:
+    def store(self, address, value, mask):
         self._check("store", address, mask, np.asarray(value).dtype.itemsize)
         return self._module.store(address, value, mask)
 
-    def atomic_rmw(self, operation: Any, address: Any, value: Any, mask: Any, order: Any) -> Any:
+    def atomic_rmw(self, operation, address, value, mask, order):
         self._check("atomic", address, mask, np.asarray(value).dtype.itemsize)
         return self._module.atomic_rmw(operation, address, value, mask, order)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return getattr(self._module, name)
 
 
 @contextmanager
-def checked_memory() -> Iterator[Checked]:
+def checked_memory():
     """Raises IllegalAccessError (inside Triton's InterpreterError) in a launch that leaves the memory of tensors.
 
     On a GPU it sees nothing; there run the test under compute-sanitizer with PYTORCH_NO_CUDA_MEMORY_CACHING=1.
@@ -104,7 +100,7 @@ def checked_memory() -> Iterator[Checked]:
         return
     run = interpreter.GridExecutor.__call__
 
-    def launch(self: Any, **arguments: Any) -> None:
+    def launch(self, **arguments):
         checked.begin(self.fn.__name__, arguments)
         run(self, **arguments)
 

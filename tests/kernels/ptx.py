@@ -1,7 +1,5 @@
 """Faults of Triton's compiler that show in what it made: see hazards and overwritten_tiles."""
 
-from __future__ import annotations
-
 import re
 
 WAIT = "wgmma.wait_group"
@@ -9,7 +7,7 @@ BARRIERS = ("bar.sync", "barrier.sync", "barrier.cta.sync")
 WRITES = ("st.shared", "stmatrix", "cp.async.ca", "cp.async.cg", "cp.async.bulk", "atom.shared", "red.shared")
 
 
-def hazards(ptx: str) -> list[str]:
+def hazards(ptx):
     """Writes to shared memory that one group of four warps may make while another's product still reads it.
 
     After a wait for products each group goes on by itself: Triton's wait does not hold the others (triton issue 11047),
@@ -41,7 +39,7 @@ def hazards(ptx: str) -> list[str]:
     return found
 
 
-def overwritten_tiles(ttgir: str) -> tuple[int, int]:
+def overwritten_tiles(ttgir):
     """How many tiles are copied to shared memory ahead, and how many products may be under way during the next copy.
 
     Of a tile that is read twice Triton keeps one buffer too few for a product under way (3.6 and 3.9): the tile after

@@ -3,11 +3,7 @@
 How far a network's outputs and gradients move is one draw of many roundings: of one particle from 2e-4 to 4e-3.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 from unittest import mock
 
 import torch
@@ -18,7 +14,7 @@ from hgn.network.mlp import MLP
 MANTISSA_BITS = 10  # of TF32 and float16, the leading one not counted
 
 
-def rounded(x: torch.Tensor) -> torch.Tensor:
+def rounded(x):
     """To the nearest number of so many bits, whatever its size."""
     mantissa, exponent = torch.frexp(x)
     scale = 2.0 ** (MANTISSA_BITS + 1)
@@ -29,13 +25,13 @@ class _Product(torch.autograd.Function):
     """x [..., K] times w [N, K], and both gradients, of rounded operands."""
 
     @staticmethod
-    def forward(ctx: Any, x: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
+    def forward(ctx, x, w):
         x, w = rounded(x), rounded(w)
         ctx.save_for_backward(x, w)
         return x @ w.mT
 
     @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def backward(ctx, gradient):
         x, w = ctx.saved_tensors
         gradient = rounded(gradient)
         return gradient @ w, gradient.flatten(0, -2).mT @ x.flatten(0, -2)
@@ -45,26 +41,26 @@ class _Stored(torch.autograd.Function):
     """What is kept rounded between kernels, and its gradient too."""
 
     @staticmethod
-    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+    def forward(ctx, x):
         return rounded(x)
 
     @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:
+    def backward(ctx, gradient):
         return rounded(gradient)
 
 
 @contextmanager
-def rounding(stored: bool) -> Iterator[None]:
+def rounding(stored):
     """Plain networks compute with rounded operands, and with `stored` keep what goes from one layer to the next so."""
 
-    def linear(value: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
+    def linear(value, weight, bias=None):
         out = _Product.apply(value, weight)
         return out if bias is None else out + bias
 
-    def add_projection(self: MLP, hidden: torch.Tensor, part: int, value: torch.Tensor) -> torch.Tensor:
+    def add_projection(self, hidden, part, value):
         return hidden.add_(self.project(part, value))
 
-    def kept(function: Any) -> Any:
+    def kept(function):
         return lambda *values: _Stored.apply(function(*values)) if stored else function(*values)
 
     with (

@@ -1,7 +1,5 @@
 """GNS's fused kernels against the reference network: in Triton's interpreter on a CPU, natively on a GPU."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -11,7 +9,6 @@ from network.states import gns_of, random_state
 from network.test_gns_edges import output_and_gradients
 
 from hgn.kernels.gns.op import FusedEdges, Tuning, fits
-from hgn.network.features import ParticleState
 from hgn.network.gns_edges import PlainEdges
 from hgn.runtime.backend import triton_unsupported_reason
 from hgn.runtime.gns_graph import padded
@@ -24,7 +21,7 @@ SMALL = Tuning(block=16, backward_block=16, product_rows=16)
 NATIVE = torch.cuda.is_available()
 
 
-def on_device(state: ParticleState) -> ParticleState:
+def on_device(state):
     names = ("position_N3", "velocity_NM3", "material_N", "scene_N", "domain_S3")
     moved = {name: getattr(state, name).to(device()) for name in names}
     return replace(state, **moved, obstacles=state.obstacles and state.obstacles.to(device()))

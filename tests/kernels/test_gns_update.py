@@ -1,7 +1,5 @@
 """GNS's training updates on the device against the reference network under torch's Adam and Muon."""
 
-from __future__ import annotations
-
 import copy
 
 import pytest
@@ -12,7 +10,6 @@ from network.states import gns_of
 
 from hgn.kernels.gns.update import GnsUpdates
 from hgn.kernels.update.op import UpdateSettings
-from hgn.network.gns import GraphNetworkSimulator
 from hgn.schema import ConfigError
 from hgn.training.muon import Muon
 from hgn.training.parity import require_parity
@@ -20,7 +17,7 @@ from hgn.training.parity import require_parity
 PRECISION = "fp32" if device().type == "cpu" else "fp16"
 
 
-def updates_of(network: GraphNetworkSimulator, scenes: int, edges: int = 0, **changes: object) -> GnsUpdates:
+def updates_of(network, scenes, edges=0, **changes):
     settings = {"noise_std": 0.0, "grid_jitter": False} | changes
     return GnsUpdates(
         copy.deepcopy(network).float().to(device()),
@@ -33,7 +30,7 @@ def updates_of(network: GraphNetworkSimulator, scenes: int, edges: int = 0, **ch
 
 
 @pytest.mark.parametrize("optimizer", ["adam", "muon"])
-def test_updates_are_those_of_torch(optimizer: str) -> None:
+def test_updates_are_those_of_torch(optimizer):
     """Three updates of two scenes, with and without obstacles, weighted, of fewer particles after more: losses and
     parameters are those of autograd in float64 with torch's Adam or with Muon; an update that needs more room for edges
     than there is gets it, and is repeated."""
@@ -65,7 +62,7 @@ def test_updates_are_those_of_torch(optimizer: str) -> None:
     assert int(updates.step) == 3 and updates.counters[1] == 3 and updates.counters[2] == 0
 
 
-def test_wrong_kernels_are_refused() -> None:
+def test_wrong_kernels_are_refused():
     """Before the first update outputs and gradients are compared with the reference network's on the noisy batch, under
     symmetries: they agree to rounding, and what computes another network is refused with the remedy."""
     network = gns_of(message_passing_steps=1, cell_size=0.1)
@@ -79,7 +76,7 @@ def test_wrong_kernels_are_refused() -> None:
         require_parity(updates, episodes)
 
 
-def test_what_is_left_of_other_updates_does_no_harm() -> None:
+def test_what_is_left_of_other_updates_does_no_harm():
     """Rows beyond the particles may hold anything, NaN too: the same losses, the same gradients."""
     network = gns_of(message_passing_steps=1, cell_size=0.1)
     made, _ = episode(1, 5, True)
@@ -94,7 +91,7 @@ def test_what_is_left_of_other_updates_does_no_harm() -> None:
     assert found[0][0] == found[1][0] and found[0][0][1] == 1 and torch.equal(found[0][1], found[1][1])
 
 
-def test_positions_must_be_within_reach() -> None:
+def test_positions_must_be_within_reach():
     """Positions that are not finite, or too far away for a cell's key, end the training with what is wrong."""
     network = gns_of(message_passing_steps=1, cell_size=0.1)
     for wild, message in ((float("nan"), "must be finite"), (1e5, "must be within 3277 domain units")):

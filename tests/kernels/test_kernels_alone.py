@@ -6,20 +6,16 @@ Whether the right numbers go from one to the next is seen by the whole network i
 `pytest -s` prints the largest error of each kernel and output.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil
-from collections.abc import Iterator
 from dataclasses import replace
 from types import FunctionType
-from typing import Any
 
 import pytest
 import torch
 from kernels.engines import device, engine_of, inference_of, run_forward
-from kernels.launches import Launch, watched_edges, watched_engine
+from kernels.launches import watched_edges, watched_engine
 from kernels.test_gns import on_device
 from kernels.test_network import drawn, float32_state
 from network.states import gns_of, network_of, random_state
@@ -28,10 +24,8 @@ from triton.runtime.jit import KernelInterface
 
 import hgn.kernels
 from hgn.kernels.backward import FusedTrainingNetwork
-from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.gns.op import FusedEdges
 from hgn.kernels.tuning import Tuning
-from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import relative_error
 from hgn.runtime.weights import find_weights, load_weights
@@ -56,7 +50,7 @@ ELSEWHERE = {
 Table = dict[tuple[str, str, str], float]  # the largest error of a kernel's output at a precision
 
 
-def public_functions(name: str, kind: type) -> dict[str, Any]:
+def public_functions(name, kind):
     """Those of such modules beside the kernels that are defined there, by name."""
     result = {}
     for module in pkgutil.walk_packages(hgn.kernels.__path__, "hgn.kernels."):
@@ -73,7 +67,7 @@ REFERENCES = {k: f for k, f in public_functions("reference", FunctionType).items
 
 
 @pytest.fixture(scope="module")
-def table() -> Iterator[Table]:
+def table():
     """Printed when all is done."""
     largest: Table = {}
     yield largest
@@ -85,12 +79,12 @@ def table() -> Iterator[Table]:
 class Judge:
     """Compares launches with their references at one precision."""
 
-    def __init__(self, table: Table, precision: str) -> None:
+    def __init__(self, table, precision):
         self.table, self.precision = table, precision
         self.kernels: set[str] = set()
         self.wrong: list[str] = []
 
-    def __call__(self, launch: Launch) -> None:
+    def __call__(self, launch):
         if launch.kernel in ELSEWHERE:
             return
         assert launch.kernel in REFERENCES, f"{launch.kernel} has no reference"
@@ -106,18 +100,18 @@ class Judge:
             if not error < BOUND[self.precision]:
                 self.wrong.append(f"{launch.kernel}: {output} {error:.2e}")
 
-    def _note(self, kernel: str, output: str, error: float) -> None:
+    def _note(self, kernel, output, error):
         key = kernel, output, self.precision
         self.table[key] = max(error, self.table.get(key, 0.0))
 
 
-def kernels_of(*modules: str) -> set[str]:
+def kernels_of(*modules):
     """Those that modules of hgn.kernels launch."""
     found = [vars(importlib.import_module(f"hgn.kernels.{module}")).values() for module in modules]
     return {value.__name__ for values in found for value in values if isinstance(value, KernelInterface)}
 
 
-def judged(judge: Judge, engine: FusedNetwork, network: HierarchicalGraphNetwork, state: ParticleState) -> None:
+def judged(judge, engine, network, state):
     """A forward pass, and a backward pass where the engine has one. The grids' origins are those of space."""
     with watched_engine(judge, engine):
         run_forward(engine, network, state, torch.zeros_like(state.domain_S3))
@@ -128,7 +122,7 @@ def judged(judge: Judge, engine: FusedNetwork, network: HierarchicalGraphNetwork
     assert int(engine.grid.status) == 0
 
 
-def made(network: HierarchicalGraphNetwork, state: ParticleState, precision: str, room: int) -> FusedTrainingNetwork:
+def made(network, state, precision, room):
     """Tiles are larger in the interpreter, whose time goes by their number."""
     tuning = Tuning.of(precision)
     if not NATIVE:
@@ -138,19 +132,19 @@ def made(network: HierarchicalGraphNetwork, state: ParticleState, precision: str
 
 
 @pytest.fixture
-def many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def many_rows(monkeypatch):
     """Every level is one of many rows, and so few programs run that each takes several tiles."""
     monkeypatch.setattr("hgn.kernels.tuning.FEW_ROWS", 0)
     monkeypatch.setattr("hgn.kernels.tuning.PROCESSORS", 2)
     monkeypatch.setattr("hgn.kernels.tuning.RESIDENT_PROGRAMS", 2)
 
 
-def width_for(precision: str) -> int:
+def width_for(precision):
     """On a GPU the one that trainings have; compiling for it takes more than a second a kernel."""
     return 128 if NATIVE and precision in ("tf32", "fp16") else 16
 
 
-def crowd(cell_size: float) -> ParticleState:
+def crowd(cell_size):
     """Three scenes of odd numbers of particles, the first five on borders, corners and centres of cells."""
     state = float32_state((301, 1, 131), spread=0.2) if NATIVE else float32_state((5, 1, 3), spread=0.06)
     halves = torch.tensor([[0, 0, 0], [1, 3, 2], [2, 2, 2], [2, 3, 1], [3, 2, 4]], dtype=torch.float64)
@@ -160,7 +154,7 @@ def crowd(cell_size: float) -> ParticleState:
 
 @pytest.mark.parametrize("precision", ["tf32", "fp16", "fp32"])
 @pytest.mark.usefixtures("many_rows")
-def test_several_scenes(precision: str, table: Table) -> None:
+def test_several_scenes(precision, table):
     """Scenes of odd numbers of particles, one with a single one, one with particles on their cells' borders, and the
     kernels for many rows: every kernel that an engine has is within its bound."""
     network = network_of(width=width_for(precision), levels=2, message_passing_steps=2, cell_size=0.03125)
@@ -173,7 +167,7 @@ def test_several_scenes(precision: str, table: Table) -> None:
 
 
 @pytest.mark.parametrize("precision", ["tf32", "fp16", "fp32"])
-def test_one_particle(precision: str, table: Table) -> None:
+def test_one_particle(precision, table):
     """A single particle, and the kernels for few rows. What is left of the gradient of the pairs' offsets is a fifth of
     its summands here, and by itself misses the bound."""
     network = network_of(width=width_for(precision), levels=1, message_passing_steps=2)
@@ -184,7 +178,7 @@ def test_one_particle(precision: str, table: Table) -> None:
 
 
 @pytest.mark.parametrize("precision", ["tf32", "fp16"])
-def test_empty_levels(precision: str, table: Table) -> None:
+def test_empty_levels(precision, table):
     """Without particles no level has a cell: nothing is written, and gradients are zero."""
     network = network_of(width=width_for(precision), levels=2, message_passing_steps=2)
     state = float32_state((2,))
@@ -201,7 +195,7 @@ def test_empty_levels(precision: str, table: Table) -> None:
     [("tf32", False, False), ("fp16", True, True)],
 )
 @pytest.mark.usefixtures("many_rows")
-def test_inference(precision: str, half_cells: bool, half_sums: bool, table: Table) -> None:
+def test_inference(precision, half_cells, half_sums, table):
     """The kernels where nothing is kept for gradients and buffers are shared, in fp16 with cells rounded
     between kernels, and so summed."""
     network = network_of(width=width_for(precision), levels=2, message_passing_steps=2, cell_size=0.03125)
@@ -213,7 +207,7 @@ def test_inference(precision: str, half_cells: bool, half_sums: bool, table: Tab
 
 
 @pytest.mark.parametrize("precision", ["tf32", "fp16"])
-def test_a_trained_network(precision: str, table: Table) -> None:
+def test_a_trained_network(precision, table):
     """The shipped one, of width 128, with four iterations on each of four levels."""
     network, _ = load_weights(find_weights("obstacles"))
     assert isinstance(network, HierarchicalGraphNetwork)
@@ -225,7 +219,7 @@ def test_a_trained_network(precision: str, table: Table) -> None:
 
 
 @pytest.mark.parametrize("precision", ["tf32", "fp16"] if NATIVE else ["tf32", "fp16", "fp32"])
-def test_gns(precision: str, table: Table) -> None:
+def test_gns(precision, table):
     """The kernels of GNS's edges, forward and backward."""
     network = gns_of(torch.float32, width=width_for(precision), message_passing_steps=2).to(device())
     counts = (301, 1, 81) if NATIVE else (13, 1, 6)
@@ -237,7 +231,7 @@ def test_gns(precision: str, table: Table) -> None:
     assert not judge.wrong and judge.kernels == kernels_of("gns.op")
 
 
-def test_no_kernel_is_left_out() -> None:
+def test_no_kernel_is_left_out():
     """Every kernel has a reference beside it, whose arguments are the kernel's, or is compared elsewhere."""
     assert KERNELS.keys() == REFERENCES.keys() | ELSEWHERE and not REFERENCES.keys() & ELSEWHERE
     for name, function in REFERENCES.items():

@@ -1,7 +1,5 @@
 """Kernels stay within the memory of living tensors: in buffers that are too small, at raw addresses of tables."""
 
-from __future__ import annotations
-
 import gc
 from dataclasses import replace
 
@@ -27,7 +25,7 @@ cpu_only = pytest.mark.skipif(device().type != "cpu", reason="the checker sees w
 
 
 @cpu_only
-def test_the_checker_sees_what_has_gone() -> None:
+def test_the_checker_sees_what_has_gone():
     """A window whose episode is no longer alive is noticed before it is read."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     updates = updates_of(network, 1, capacities=(64,))
@@ -47,7 +45,7 @@ def test_the_checker_sees_what_has_gone() -> None:
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_a_pass_without_room_stays_within_memory(training: bool) -> None:
+def test_a_pass_without_room_stays_within_memory(training):
     """Where only the coarse level has too little room, cells of the fine one have no parent: the pass is void, and
     reads nothing in its place. The same where particles are outside of the window, or nowhere."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.05)
@@ -70,7 +68,7 @@ def test_a_pass_without_room_stays_within_memory(training: bool) -> None:
 
 
 @cpu_only
-def test_pushforward_stays_within_memory() -> None:
+def test_pushforward_stays_within_memory():
     """Simulation after simulation, larger and smaller ones, scenes that are lost among them: every address that an
     update is given holds a whole window (or all materials and obstacles) of a living tensor, and each simulation in the
     same buffers launches what was captured, on the same memory."""

@@ -1,7 +1,5 @@
 """Neighbour lists made on the device, in Triton's interpreter on a CPU, natively on a GPU."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from kernels.engines import device
@@ -13,13 +11,13 @@ from hgn.network.neighbours import neighbour_list
 RADIUS = 0.1
 
 
-def points(count: int, spread: float, scenes: int) -> tuple[torch.Tensor, torch.Tensor]:
+def points(count, spread, scenes):
     generator = torch.Generator().manual_seed(count)
     position_N3 = torch.rand(count, 3, generator=generator) * spread - 0.3
     return position_N3, torch.arange(count, dtype=torch.int32) * scenes // count
 
 
-def built(position_N3: torch.Tensor, scene_N: torch.Tensor, room: int, edges: int) -> DeviceNeighbours:
+def built(position_N3, scene_N, room, edges):
     """With `room` rows more than there are particles, which hold what is left of others."""
     count = len(position_N3)
     more = torch.cat([position_N3, torch.full((room, 3), -0.25)]).to(device())

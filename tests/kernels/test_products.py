@@ -1,7 +1,5 @@
 """The matrix products' rounding of operands."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import triton
@@ -31,14 +29,14 @@ def _finer_product(x, w, y, SIZE: tl.constexpr, PRECISION: tl.constexpr):
     tl.store(y + at, finer_product(tl.load(x + at), tl.load(w + at), PRECISION))
 
 
-def rounded(x: torch.Tensor) -> torch.Tensor:
+def rounded(x):
     """To TF32's nearest, in float64."""
     mantissa, exponent = torch.frexp(x.double())
     steps = 2 * mantissa / LAST_BIT
     return torch.ldexp(torch.sign(steps) * (steps.abs() + 0.5).floor() * LAST_BIT / 2, exponent)
 
 
-def test_numbers_are_rounded_to_the_nearest() -> None:
+def test_numbers_are_rounded_to_the_nearest():
     """Every number becomes the nearest with 10 bits of mantissa, ties away from zero; NaN, infinity and zero stay."""
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(1024, generator=generator) * 2.0 ** torch.randint(-30, 30, (1024,), generator=generator)
@@ -52,7 +50,7 @@ def test_numbers_are_rounded_to_the_nearest() -> None:
     assert torch.equal(found[7:].double(), rounded(x[7:]))
 
 
-def test_a_product_rounds_what_it_is_given() -> None:
+def test_a_product_rounds_what_it_is_given():
     """A TF32 product of activations and weights that come rounded is the product of the rounded ones."""
     generator = torch.Generator().manual_seed(0)
     x, w = torch.randn(2, 16, 16, generator=generator)
@@ -63,7 +61,7 @@ def test_a_product_rounds_what_it_is_given() -> None:
 
 
 @pytest.mark.parametrize("precision", ["fp16", "tf32", "fp32"])
-def test_a_finer_product_keeps_twenty_bits(precision: str) -> None:
+def test_a_finer_product_keeps_twenty_bits(precision):
     """Features and weights of usual size, which rounded to 10 bits would be 3e-4 off."""
     generator = torch.Generator().manual_seed(0)
     x, w = 3 * torch.randn(64, 64, generator=generator), torch.randn(64, 64, generator=generator) / 8

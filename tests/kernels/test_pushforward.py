@@ -1,9 +1,6 @@
 """The pushforward pool on backend triton against that on torch."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,14 +15,10 @@ from training.test_pushforward import falling, training_of, wild_network
 from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
-from hgn.config import DatagenConfig
 from hgn.data.episode_tensors import whole_episode
-from hgn.data.statistics import Statistics
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.packing import pack_network
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample
-from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import read_checkpoint
 from hgn.training.graph_pushforward import GraphPushforwardPool
@@ -38,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("large_tiles")
 CELL_SIZE = 1 / 64
 
 
-def placed(made: Episode, network: HierarchicalGraphNetwork) -> DeviceEpisode:
+def placed(made, network):
     whole, where = whole_episode(made, network.config), device()
     cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3
     obstacles = ObstacleHash.of(cells, normals).to(where) if len(cells) else None
@@ -47,11 +40,11 @@ def placed(made: Episode, network: HierarchicalGraphNetwork) -> DeviceEpisode:
     )
 
 
-def values_of(network: HierarchicalGraphNetwork) -> torch.Tensor:
+def values_of(network):
     return pack_network(network).gather(list(network.parameters())).detach()
 
 
-def assert_same_pools(fast: GraphPushforwardPool, plain: PushforwardPool) -> None:
+def assert_same_pools(fast, plain):
     for name, value in plain.figures.items():
         if name != "pushforward/seconds":
             assert fast.figures[name] == pytest.approx(value, rel=1e-3), name
@@ -62,7 +55,7 @@ def assert_same_pools(fast: GraphPushforwardPool, plain: PushforwardPool) -> Non
 
 
 @pytest.mark.parametrize("inputs", ["absolute", "relative"])
-def test_the_pool_is_that_of_the_plain_path(inputs: str) -> None:
+def test_the_pool_is_that_of_the_plain_path(inputs):
     """Scenes with and without obstacles, first and later frames, one simulation after the other with other weights and
     other numbers of particles, in the same buffers where they suffice: both pools hold the same windows."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, inputs=inputs).to(device())
@@ -89,7 +82,7 @@ def test_the_pool_is_that_of_the_plain_path(inputs: str) -> None:
     assert len({sample.noise_scale for sample in mixed[:2]} | {1.0}) == 3
 
 
-def test_lost_scenes_are_dropped() -> None:
+def test_lost_scenes_are_dropped():
     """A scene that leaves its domain, or is no longer made of numbers, ends alone: the other's frames are the plain
     path's, and the next simulation is whole again."""
     network = wild_network().to(device())
@@ -105,14 +98,14 @@ def test_lost_scenes_are_dropped() -> None:
         assert len(fast._samples) == kept
 
 
-def test_wrong_kernels_are_refused() -> None:
+def test_wrong_kernels_are_refused():
     """Before anything is trained on them, the simulation's kernels are compared with the reference network."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1).to(device())
     fast = GraphPushforwardPool(network, training_of(precision="fp32"), CELL_SIZE, 0)
     starts = [(placed(scene_with_obstacles(i, 5), network), 2) for i in range(2)]
     kept = GraphPushforwardPool._first_scenes
 
-    def another(self: GraphPushforwardPool, *arguments: object) -> object:
+    def another(self, *arguments):
         with torch.no_grad():
             next(network.decode.parameters()).mul_(1.5)
         return kept(self, *arguments)
@@ -123,9 +116,7 @@ def test_wrong_kernels_are_refused() -> None:
             fast.refresh(starts, values_of(network))
 
 
-def test_fast_training_is_the_plain_one(
-    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     """Both paths simulate the same scenes at the same updates and train on the same windows: weights, their average and
     what is logged of the pool agree. The fast one tells where the time of its first updates went."""
     monkeypatch.setattr("hgn.training.graph_trainer.REPORTED_UPDATES", 2)
@@ -135,7 +126,7 @@ def test_fast_training_is_the_plain_one(
     counts = {"maximum_updates": 2, "log_every": 2, "checkpoint_every": 2, "monitor_every": 2}
     original = TrainingModule.set_statistics
 
-    def set_statistics(self: TrainingModule, statistics: Statistics) -> None:
+    def set_statistics(self, statistics):
         original(self, statistics)
         self.network.normaliser.acceleration_std.fill_(1e-3)  # free fall has none, and rounding would be all there is
         self._begin_average()

@@ -1,9 +1,6 @@
 """Training updates of several ranks on backend triton: averaged gradients, the same updates on all."""
 
-from __future__ import annotations
-
 import threading
-from typing import Any
 
 import pytest
 import torch
@@ -11,19 +8,17 @@ from kernels.test_update import episode, updates_of
 from network.states import network_of
 from processes import PATIENCE_S
 
-from hgn.kernels.update.op import Updates
-
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
 
-def run_together(ranks: list[Updates], chunks: list[list[Any]], rates: list[float]) -> list[int]:
+def run_together(ranks, chunks, rates):
     """Runs each rank in a thread, one at a time, until all want their gradients summed; how often each rank did."""
     turn, meeting = threading.Lock(), threading.Barrier(len(ranks), timeout=PATIENCE_S)
     waiting: dict[int, torch.Tensor] = {}
     sums = [0] * len(ranks)
 
-    def run(rank: int) -> None:
-        def reduce(tensor: torch.Tensor) -> None:
+    def run(rank):
+        def reduce(tensor):
             waiting[rank] = tensor
             sums[rank] += 1
             turn.release()
@@ -46,7 +41,7 @@ def run_together(ranks: list[Updates], chunks: list[list[Any]], rates: list[floa
     return sums
 
 
-def test_two_ranks_update_as_one() -> None:
+def test_two_ranks_update_as_one():
     """Two ranks with a scene each have the gradient of one with both (to 1e-6) and stay bitwise equal; where one of
     them lacks room both repeat the update."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1).float()

@@ -1,7 +1,5 @@
 """Symmetry augmentation on backend triton against the plain one."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 
@@ -24,7 +22,6 @@ from hgn.kernels.update.op import DeviceEpisode
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import relative_error
-from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.symmetry import scene_symmetries
 from hgn.training.graph_trainer import GraphTrainer
@@ -35,11 +32,11 @@ pytestmark = pytest.mark.usefixtures("large_tiles")
 FRAME = 6
 
 
-def small_network() -> HierarchicalGraphNetwork:
+def small_network():
     return network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
 
 
-def on_device(network: HierarchicalGraphNetwork, made: Episode) -> DeviceEpisode:
+def on_device(network, made):
     whole = whole_episode(made, network.config)
     hashed = ObstacleHash.of(whole.obstacle_cell_K3, whole.obstacle_normal_K3).to(device())
     obstacles = hashed if len(whole.obstacle_cell_K3) else None
@@ -51,7 +48,7 @@ def on_device(network: HierarchicalGraphNetwork, made: Episode) -> DeviceEpisode
     "kind",
     ["hgn", "relative", pytest.param("gns", marks=pytest.mark.skipif(device().type == "cuda", reason="float32"))],
 )
-def test_an_update_under_symmetries_is_the_plain_one(kind: str) -> None:
+def test_an_update_under_symmetries_is_the_plain_one(kind):
     """An update of eight scenes, each under another symmetry, one without obstacles, one without gravity: positions,
     velocities, targets, normals, loss and gradients are those of backend torch in float64, and the check passes. With
     relative inputs the symmetries are any of the cube's, which turn gravity."""
@@ -105,7 +102,7 @@ def test_an_update_under_symmetries_is_the_plain_one(kind: str) -> None:
     assert relative_error(flat(found), expected) < (1e-3 if kind == "relative" else 1e-4)
 
 
-def test_without_symmetry_nothing_changes() -> None:
+def test_without_symmetry_nothing_changes():
     """With noise and jitter, an update under identities is the one without symmetries, which ignores them: bitwise in
     what the network sees, and on a CPU in what follows; a GPU takes sums in another order each time.
     """
@@ -126,7 +123,7 @@ def test_without_symmetry_nothing_changes() -> None:
         assert torch.equal(found, expected) if device().type == "cpu" else relative_error(found, expected) < 1e-4
 
 
-def test_noise_and_jitter_are_those_without() -> None:
+def test_noise_and_jitter_are_those_without():
     """A sample's noise and grid origin are drawn in the image: they do not depend on the symmetry."""
     network = small_network()
     made = replace(on_device(network, scene_with_obstacles(1, 5)), obstacles=None)

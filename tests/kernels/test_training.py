@@ -1,20 +1,16 @@
 """The training command on backend triton: counts, logs, checkpoints, resume, and the way back to backend torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from ballistic_dataset import MakeConfig, MakeDataset
 from kernels.engines import device
 from training.runs import metrics, train_mapping
 
 from hgn import train
-from hgn.config import DatagenConfig, NetworkConfig, TrainingConfig
+from hgn.config import NetworkConfig, TrainingConfig
 from hgn.network.build import build_network
 from hgn.runtime.backend import choose, pick, training_unsupported_reason, triton_unsupported_reason
 from hgn.schema import ConfigError
@@ -28,22 +24,20 @@ NETWORK = {"width": 16, "levels": 1, "message_passing_steps": 1, "material_embed
 
 
 @pytest.fixture
-def data(make_config: MakeConfig, make_dataset: MakeDataset) -> DatagenConfig:
+def data(make_config, make_dataset):
     config = make_config(training_scenes=2, validation_scenes=1, test_scenes=0)
     make_dataset(config)
     return config
 
 
-def run_mapping(config: DatagenConfig, run: Path, **training: Any) -> dict[str, Any]:
+def run_mapping(config, run, **training):
     values = {"maximum_updates": 4, "log_every": 4, "checkpoint_every": 4, "monitor_every": 4, "monitor_scenes": 1}
     values |= {"backend": "triton", "precision": "fp32", "monitor_frame_stride": 3, "accelerator": "auto"} | training
     mapping = train_mapping(config, run, **values)
     return mapping | {"network": NETWORK}
 
 
-def test_fast_training_is_the_plain_one(
-    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fast_training_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     """Without noise and jitter both backends make the same updates: every count and log line is there, weights,
     their average and moments agree; a training may change backend at any checkpoint, and ends where the others do."""
     monkeypatch.setattr("hgn.runtime.backend.triton_unsupported_reason", lambda *_: None)  # in float32
@@ -86,12 +80,7 @@ def test_fast_training_is_the_plain_one(
 
 
 @pytest.mark.skipif(device().type != "cpu", reason="on a GPU sums are taken in another order each time")
-def test_a_part_of_the_data_is_enough(
-    make_config: MakeConfig,
-    make_dataset: MakeDataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_part_of_the_data_is_enough(make_config, make_dataset, tmp_path, monkeypatch):
     """A training that holds 6 of 14 episodes at a time, into its second epoch, ends with the weights of one that holds
     all, bitwise."""
     config = make_config(training_scenes=14, validation_scenes=1, test_scenes=0, frames=3)
@@ -103,7 +92,7 @@ def test_a_part_of_the_data_is_enough(
     for room in (6, 14):
         sizes: list[int] = []
 
-        def run(trainer: GraphTrainer, *arguments: Any, sizes: list[int] = sizes) -> None:
+        def run(trainer, *arguments, sizes=sizes):
             original(trainer, *arguments)
             sizes.append(len(trainer._episodes))
 
@@ -116,9 +105,7 @@ def test_a_part_of_the_data_is_enough(
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
 
 
-def test_fast_training_of_gns_is_the_plain_one(
-    data: DatagenConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fast_training_of_gns_is_the_plain_one(data, tmp_path, monkeypatch, capsys):
     """GNS with Muon and a moving average: a training that takes backend triton from its second update on ends where a
     plain one does, with the same counts and rates."""
     on_cpu = device().type == "cpu"
@@ -152,7 +139,7 @@ def test_fast_training_of_gns_is_the_plain_one(
     )
 
 
-def stop_at(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
+def stop_at(monkeypatch, update):
     """Lets the next training end once it has made that many updates, or just after."""
     from hgn.training.callbacks import Stopper
 
@@ -165,7 +152,7 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
     monkeypatch.setattr(Stopper, "on_train_batch_end", on_train_batch_end)
 
 
-def test_chunks_end_where_something_is_due() -> None:
+def test_chunks_end_where_something_is_due():
     """Chunks meet every multiple of the log, checkpoint, monitor and rollout intervals and the last update, whatever
     update a training begins at, and the first ones are short."""
     training = TrainingConfig(
@@ -224,7 +211,7 @@ def test_the_backend_is_chosen_and_said(
             pick(keeps, backend, precision, "training.backend")
 
 
-def test_what_a_cpu_takes() -> None:
+def test_what_a_cpu_takes():
     """An HGN compiled C, unless torch is asked for; a GNS PyTorch, in fp16 too, which an HGN is refused."""
     cpu = torch.device("cpu")
     hgn, gns = (build_network(NetworkConfig(width=16, kind=kind, levels=1)) for kind in ("hgn", "gns"))
@@ -239,7 +226,7 @@ def test_what_a_cpu_takes() -> None:
             choose(cpu, network, precision, backend)
 
 
-def test_why_gns_is_not_trained_on_backend_triton() -> None:
+def test_why_gns_is_not_trained_on_backend_triton():
     """Another device, precision or width, static particles, a limit of neighbours and own states are each named."""
     gpu, gns = torch.device("cuda"), NetworkConfig(kind="gns", levels=1)
     assert (
@@ -255,7 +242,7 @@ def test_why_gns_is_not_trained_on_backend_triton() -> None:
     assert "not gns_particles" in str(training_unsupported_reason(gpu, static, "fp16"))
 
 
-def test_why_backend_triton_does_not_run() -> None:
+def test_why_backend_triton_does_not_run():
     """A CPU, GNS, an odd width and too many levels are each named."""
     gpu, hgn = torch.device("cuda"), NetworkConfig()
     assert triton_unsupported_reason(gpu, hgn) is None
@@ -266,7 +253,7 @@ def test_why_backend_triton_does_not_run() -> None:
     assert "at most 8" in str(triton_unsupported_reason(gpu, NetworkConfig(levels=9)))
 
 
-def test_little_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_little_shared_memory(monkeypatch):
     """A GPU with 99 KB of shared memory takes backend torch, which says why; triton where the network is narrower."""
     small = SimpleNamespace(shared_memory_per_block_optin=101_376)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)

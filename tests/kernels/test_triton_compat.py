@@ -1,7 +1,5 @@
 """Triton beyond its documented interface: the versions that are taken, and what this one makes of the kernels."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -17,13 +15,13 @@ SAFE = {("particle_cell_backward", "tf32")}
 
 
 @pytest.fixture(scope="module")
-def lines(warm_python: Path, tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
+def lines(warm_python, tmp_path_factory):
     """Of compiled_program.py, by words."""
     text = run_compiled(warm_python, tmp_path_factory.mktemp("triton"), "kernels/compiled_program.py")
     return [line.split() for line in text.splitlines()]
 
 
-def test_versions_that_were_not_read_are_refused() -> None:
+def test_versions_that_were_not_read_are_refused():
     """The installed Triton is taken; older and newer ones, and AMD's GPUs, are named as the reason; the ceiling in
     pyproject.toml is the list's."""
     assert unsupported_reason() is None and unsupported_reason("3.6.0") is None
@@ -33,12 +31,12 @@ def test_versions_that_were_not_read_are_refused() -> None:
     assert [f"3.{minor}" for minor in range(int(ceiling[0]), int(ceiling[1]))] == list(TESTED_VERSIONS)
 
 
-def test_the_interface_is_as_it_was(lines: list[list[str]]) -> None:
+def test_the_interface_is_as_it_was(lines):
     """Launches can be noted without being made, compiled by what was noted, and the compilation is told of."""
     assert ["CANARY", "_copy"] in lines
 
 
-def test_what_the_interpreter_forgives(lines: list[list[str]]) -> None:
+def test_what_the_interpreter_forgives(lines):
     """All kernels of grids and relative inputs compile, of an update and of a frame: the interpreter takes what Triton
     does not, a constant that is defined twice say."""
     compiled = [line[1] for line in lines if line[0] == "COMPILED"]
@@ -46,7 +44,7 @@ def test_what_the_interpreter_forgives(lines: list[list[str]]) -> None:
     assert set(compiled) > names and len(compiled) > len(set(compiled)), compiled
 
 
-def test_who_starts_early_waits(lines: list[list[str]]) -> None:
+def test_who_starts_early_waits(lines):
     """Every kernel that may start before the one before it has ended waits for that, and those of a forward pass before
     they write; but for three whose writes nobody before them looks at: beside the tables, the encoder, the decoder."""
     early = [(name, int(waits), int(writes)) for name, waits, writes in (x[1:] for x in lines if x[0] == "EARLY")]
@@ -56,7 +54,7 @@ def test_who_starts_early_waits(lines: list[list[str]]) -> None:
     assert writers == {"prepare_particles", "clear_rows", "sum_coarsest"}, early
 
 
-def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines: list[list[str]]) -> None:
+def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines):
     """Of the weights' products tiles are copied to shared memory ahead, and each product is over before the next copy:
     the compiler keeps too few buffers for one that is under way meanwhile."""
     products = [line[1:] for line in lines if line[0] == "PRODUCT"]
@@ -64,7 +62,7 @@ def test_no_tile_is_copied_over_one_that_is_being_multiplied(lines: list[list[st
     assert all(int(ahead) >= 2 and int(pending) == 0 for _, ahead, pending in products), products
 
 
-def test_no_group_overwrites_what_another_still_multiplies(lines: list[list[str]]) -> None:
+def test_no_group_overwrites_what_another_still_multiplies(lines):
     """Kernels of eight warps have a barrier between a product and the next write to shared memory, for Triton's wait
     for products holds four warps alone; but where what is written is nothing that is multiplied."""
     scanned = [line[1:] for line in lines if line[0] == "HAZARDS"]
@@ -78,7 +76,7 @@ def test_no_group_overwrites_what_another_still_multiplies(lines: list[list[str]
     assert {(kernel, precision) for kernel, precision, count in scanned if int(count)} <= SAFE, scanned
 
 
-def test_narrow_networks_fit_into_less_shared_memory(lines: list[list[str]]) -> None:
+def test_narrow_networks_fit_into_less_shared_memory(lines):
     """Compiled for a GPU with 99 KB of it, as those for graphics have, the kernels of width 64 take no more."""
     shared = {kernel: int(size) for what, kernel, size in (line[:3] for line in lines if line[0] == "SHARED")}
     assert shared.keys() >= {"mlp_forward", "edge_forward", "cell_mlp_forward", "particle_cell_forward"}
@@ -86,7 +84,7 @@ def test_narrow_networks_fit_into_less_shared_memory(lines: list[list[str]]) -> 
 
 
 @pytest.mark.parametrize(("between", "count"), [("bar.sync 0;", 0), ("add.s32 %r1, %r1, 1;", 1)])
-def test_a_missing_barrier_is_seen(between: str, count: int) -> None:
+def test_a_missing_barrier_is_seen(between, count):
     """Also behind a branch back, where the write stands before the wait."""
     ptx = f""".reqntid 256
     $L__BB0_1:

@@ -1,13 +1,9 @@
 """A network against the literal definition."""
 
-from __future__ import annotations
-
 import torch
 
-from hgn.network.base import ParticleNetwork
 
-
-def assert_same_function(network: ParticleNetwork, found: torch.Tensor, expected: torch.Tensor) -> None:
+def assert_same_function(network, found, expected):
     """Float64 outputs agree, and so do the gradients, of a random weighting of them, by each of the parameters."""
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
     weight, parameters = torch.randn_like(expected), list(network.parameters())

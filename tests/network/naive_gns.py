@@ -2,22 +2,17 @@
 pair of particles tried. Used only to check the real network.
 """
 
-from __future__ import annotations
-
 import torch
 
-from hgn.network.features import ParticleState
-from hgn.network.gns import GraphNetworkSimulator
 
-
-def naive_edges(position_N3: torch.Tensor, scene_N: torch.Tensor, radius: float) -> set[tuple[int, int]]:
+def naive_edges(position_N3, scene_N, radius):
     """All (sender, receiver) of one scene with a distance below the radius, each particle with itself too."""
     distance_NN = (position_N3[:, None] - position_N3[None]).square().sum(-1)
     near_NN = (distance_NN < radius * radius) & (scene_N[:, None] == scene_N[None])
     return {(sender, receiver) for sender, receiver in torch.nonzero(near_NN).tolist()}
 
 
-def naive_gns_acceleration(network: GraphNetworkSimulator, state: ParticleState) -> torch.Tensor:
+def naive_gns_acceleration(network, state):
     """The network's raw output, [N, 3]; all static particles take part, however far away."""
     config, normaliser = network.config, network.normaliser
     positions, latent, scenes = [], [], []

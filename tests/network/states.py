@@ -1,12 +1,9 @@
 """Random network inputs for the tests."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 
 from hgn.config import NetworkConfig
-from hgn.network.base import ParticleNetwork
 from hgn.network.build import build_network
 from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
@@ -17,7 +14,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 GRAVITY = (0.0, -9.8 / 3600, 0.0)  # domain units per frame squared
 
 
-def random_grid(seed: int, cells: int, cell_size: float = 1 / 64, extent: int = 24) -> ObstacleGrid:
+def random_grid(seed, cells, cell_size=1 / 64, extent=24):
     """Random obstacle cells with random unit normals."""
     rng = np.random.default_rng(seed)
     cell_K3 = np.unique(rng.integers(0, extent, (cells, 3)), axis=0).astype(np.int32)
@@ -26,13 +23,7 @@ def random_grid(seed: int, cells: int, cell_size: float = 1 / 64, extent: int = 
     return ObstacleGrid(cell_size, cell_K3, normal_K3.astype(np.float32))
 
 
-def random_state(
-    counts: tuple[int, ...],
-    seed: int = 0,
-    dtype: torch.dtype = torch.float64,
-    obstacles: bool = True,
-    spread: float = 0.3,
-) -> ParticleState:
+def random_state(counts, seed=0, dtype=torch.float64, obstacles=True, spread=0.3):
     """Particles of several scenes in a box of side `spread`."""
     generator = torch.Generator().manual_seed(seed)
     total = sum(counts)
@@ -48,7 +39,7 @@ def random_state(
     )
 
 
-def scene_of(state: ParticleState, scene: int, grid: ObstacleCells | None) -> ParticleState:
+def scene_of(state, scene, grid):
     """One scene taken out of a batch."""
     mine = state.scene_N == scene
     return ParticleState(
@@ -62,15 +53,15 @@ def scene_of(state: ParticleState, scene: int, grid: ObstacleCells | None) -> Pa
     )
 
 
-def network_of(dtype: torch.dtype = torch.float64, **changes: object) -> HierarchicalGraphNetwork:
+def network_of(dtype=torch.float64, **changes):
     """A small network with random weights, norms included, and a normaliser that is not the identity."""
     values = {"width": 16, "levels": 3, "message_passing_steps": 2} | changes
-    network = _with_random_weights(NetworkConfig(**values), dtype)  # type: ignore[arg-type]
+    network = _with_random_weights(NetworkConfig(**values), dtype)
     assert isinstance(network, HierarchicalGraphNetwork)
     return network
 
 
-def silent(network: HierarchicalGraphNetwork) -> HierarchicalGraphNetwork:
+def silent(network):
     """The network with an output of zero: with relative inputs, free flight."""
     with torch.no_grad():
         for parameter in network.decode.parameters():
@@ -78,16 +69,16 @@ def silent(network: HierarchicalGraphNetwork) -> HierarchicalGraphNetwork:
     return network
 
 
-def gns_of(dtype: torch.dtype = torch.float64, **changes: object) -> GraphNetworkSimulator:
+def gns_of(dtype=torch.float64, **changes):
     """The same of GNS; `kind` may be gns_particles."""
     values = {"kind": "gns", "width": 16, "levels": 1, "message_passing_steps": 3} | changes
     values = {"obstacle_features": values["kind"] == "gns"} | values
-    network = _with_random_weights(NetworkConfig(**values), dtype)  # type: ignore[arg-type]
+    network = _with_random_weights(NetworkConfig(**values), dtype)
     assert isinstance(network, GraphNetworkSimulator)
     return network
 
 
-def _with_random_weights(config: NetworkConfig, dtype: torch.dtype) -> ParticleNetwork:
+def _with_random_weights(config, dtype):
     torch.manual_seed(5)
     network = build_network(config)
     with torch.no_grad():

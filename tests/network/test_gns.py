@@ -1,7 +1,5 @@
 """GNS: the literal definition, batches, translation, obstacles as features and as particles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -12,20 +10,18 @@ from network.states import gns_of, random_state, scene_of
 
 from hgn.config import NetworkConfig
 from hgn.network.build import build_network
-from hgn.network.features import ParticleState
-from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.obstacles import SurfaceParticles
 from hgn.schema import ConfigError
 
 
-def with_surface(state: ParticleState, count: int, spread: float = 0.3) -> ParticleState:
+def with_surface(state, count, spread=0.3):
     """Points of an obstacle in each scene instead of normals."""
     generator = torch.Generator().manual_seed(1)
     points = [(torch.rand(count, 3, generator=generator) * spread + 0.02).numpy() for _ in range(state.scene_count)]
     return replace(state, obstacles=None, surface=SurfaceParticles.of(points))
 
 
-def state_for(network: GraphNetworkSimulator, counts: tuple[int, ...], spread: float = 0.15) -> ParticleState:
+def state_for(network, counts, spread=0.15):
     dtype = network.decode.first.weight.dtype
     state = random_state(counts, obstacles=network.config.obstacle_features, spread=spread, dtype=dtype)
     return with_surface(state, 12, spread) if network.config.obstacle_particles else state

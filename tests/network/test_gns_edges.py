@@ -1,7 +1,5 @@
 """GNS's own gradients by its edges: exact in float64, near it in fp16, whatever the size of the gradients."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from network.comparison import assert_same_function
@@ -9,15 +7,11 @@ from network.naive_gns import naive_gns_acceleration
 from network.states import gns_of, random_state
 from network.test_gns import state_for
 
-from hgn.network.features import ParticleState
-from hgn.network.gns import GraphNetworkSimulator
-from hgn.network.gns_edges import Edges, PlainEdges
+from hgn.network.gns_edges import PlainEdges
 from hgn.runtime.parity import relative_error
 
 
-def output_and_gradients(
-    network: GraphNetworkSimulator, edges: Edges | None, state: ParticleState, weight: float
-) -> tuple[torch.Tensor, torch.Tensor]:
+def output_and_gradients(network, edges, state, weight):
     """The network's output, and the gradients of all parameters of a random weighting of it, divided by `weight`."""
     output = network.normalised_acceleration(state, edges=edges)
     factor = torch.randn(output.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(output)

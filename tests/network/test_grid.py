@@ -1,7 +1,5 @@
 """The sparse grid hierarchy: cells, weights, edges, parents."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

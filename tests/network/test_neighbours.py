@@ -1,26 +1,24 @@
 """Neighbour lists against all pairs, and sums over segments."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from network.naive_gns import naive_edges
 
 from hgn.network.grid import GridRangeError
-from hgn.network.neighbours import NeighbourList, neighbour_list
+from hgn.network.neighbours import neighbour_list
 from hgn.network.segments import Segments
 
 RADIUS = 0.1
 
 
-def pairs_of(found: NeighbourList) -> set[tuple[int, int]]:
+def pairs_of(found):
     """(sender, receiver) in the particles' own order."""
     order = found.order_N.tolist()
     edges = zip(found.sender_E.tolist(), found.receivers.segment_E.tolist(), strict=True)
     return {(order[sender], order[receiver]) for sender, receiver in edges}
 
 
-def points(count: int, spread: float, offset: float = 0.0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+def points(count, spread, offset=0.0, dtype=torch.float64):
     generator = torch.Generator().manual_seed(count)
     return (torch.rand(count, 3, generator=generator, dtype=torch.float64) * spread + offset).to(dtype)
 

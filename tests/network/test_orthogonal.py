@@ -1,14 +1,12 @@
 """Square blocks of the weights and their orthogonalisation, against the singular value decomposition."""
 
-from __future__ import annotations
-
 import torch
 from network.states import network_of
 
 from hgn.network.orthogonal import normalised, orthogonalised, square_blocks
 
 
-def test_singular_values_come_near_one() -> None:
+def test_singular_values_come_near_one():
     """Random matrices of any size: singular vectors stay, singular values end within [0.65, 1.25]."""
     generator = torch.Generator().manual_seed(0)
     matrix = torch.randn(3, 32, 32, generator=generator, dtype=torch.float64)
@@ -20,7 +18,7 @@ def test_singular_values_come_near_one() -> None:
     assert values.min() > 0.65 and values.max() < 1.25
 
 
-def test_blocks_are_the_maps_between_latents() -> None:
+def test_blocks_are_the_maps_between_latents():
     """Every part of width columns, every second layer of width rows; not the encoder's first layer, no offset."""
     network = network_of(width=16, levels=2, message_passing_steps=2, cell_size=0.1)
     flat = torch.cat([parameter.detach().flatten() for parameter in network.parameters()])

@@ -1,7 +1,5 @@
 """scaling_program.py MAPPING: python -m tools.scaling whose ranks are forks of this process, which has all loaded."""
 
-from __future__ import annotations
-
 import json
 import sys
 from functools import partial

@@ -1,12 +1,7 @@
 """python -m tools.bench: its rows, its checks, its states; no assertion on any time."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +34,7 @@ SMALL = {
 }
 
 
-def fake_simulate(fails: bool) -> Callable[..., list[Any]]:
+def fake_simulate(fails):
     def simulate(scenes, config, frames, frame_rate_hz, on_frame):
         for frame in range(frames):
             on_frame(frame)
@@ -50,9 +45,7 @@ def fake_simulate(fails: bool) -> Callable[..., list[Any]]:
     return simulate
 
 
-def test_rows_of_every_case(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_of_every_case(tmp_path, monkeypatch, capsys):
     """Each case gets a row with the report's keys, checked and timed; the table names them all."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate(False))
     path = tmp_path / "reports" / "bench.json"
@@ -69,9 +62,7 @@ def test_rows_of_every_case(
     assert all(row["case"] in printed for row in rows)
 
 
-def test_no_time_where_a_check_is_red(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_time_where_a_check_is_red(tmp_path, monkeypatch, capsys):
     """A path that differs from float64, a wrong gradient and a solver that fails get a reason instead of a time."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate(True))
     step, project = Simulator.step, GraphNetworkSimulator.propagate
@@ -97,7 +88,7 @@ def test_no_time_where_a_check_is_red(
     assert " … " not in capsys.readouterr().out  # no quartiles
 
 
-def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checks_see_small_faults(monkeypatch):
     """Backend torch passes in float32; a 0.01 % error of the output does not."""
     frame = contenders.Frame(NetworkConfig(width=16, levels=2), Workload(50, 1), CPU)
     assert frame.check("fp32") == "pass"
@@ -106,7 +97,7 @@ def test_checks_see_small_faults(monkeypatch: pytest.MonkeyPatch) -> None:
     assert frame.check("fp32").startswith("relative error of acceleration 1.0e-04 exceeds 1e-05")
 
 
-def test_gns_in_half_precision(tmp_path: Path) -> None:
+def test_gns_in_half_precision(tmp_path):
     """Our GNS is checked and timed in fp16 where there is no backend triton either, and nothing else is."""
     path = tmp_path / "bench.json"
     assert main(SMALL | {"scenes": [1], "precisions": ["fp16"], "json": str(path)}) == 0
@@ -115,7 +106,7 @@ def test_gns_in_half_precision(tmp_path: Path) -> None:
     assert all(row["check"] == "pass" and row["precision"] == "fp16" for row in rows)
 
 
-def test_triton_is_checked_like_torch() -> None:
+def test_triton_is_checked_like_torch():
     """Frames, loss and gradients of backend triton pass in float32 (in the interpreter), and a wrong weight not."""
     config = NetworkConfig(width=16, levels=1, message_passing_steps=1)
     frame = TritonFrame("fp32", config, Workload(2, 1), CPU)
@@ -133,7 +124,7 @@ def test_triton_is_checked_like_torch() -> None:
         assert train.check("fp32").startswith("relative error of loss 1.0e-03 exceeds")
 
 
-def test_a_tile_is_like_real_frames() -> None:
+def test_a_tile_is_like_real_frames():
     """A tile has the neighbours and cells that were measured on the paper's obstacle-free scene, within a tenth."""
     position = torch.from_numpy(positions(Workload(TILE_PARTICLES, 1), 0, 0.035))
     scene = torch.zeros(TILE_PARTICLES, dtype=torch.long)
@@ -144,7 +135,7 @@ def test_a_tile_is_like_real_frames() -> None:
 
 
 @pytest.mark.parametrize("particles", [1, 5_000, 40_000])
-def test_states_fill_their_domain(particles: int) -> None:
+def test_states_fill_their_domain(particles):
     """Any number of particles lies inside of its domain, clear of the solver's walls and of the grid's cell borders."""
     work = Workload(particles, 1)
     scene = scene_of(work, 3, 0.035)
@@ -156,12 +147,12 @@ def test_states_fill_their_domain(particles: int) -> None:
     assert not np.array_equal(scene.position_N3, scene_of(work, 4, 0.035).position_N3)
 
 
-def test_contenders_take_turns() -> None:
+def test_contenders_take_turns():
     """After the warm-up samples alternate, a long contender joins now and then, and the median is of the rest."""
     order: list[str] = []
 
-    def sample(name: str) -> Callable[[], list[float]]:
-        def run() -> list[float]:
+    def sample(name):
+        def run():
             order.append(name)
             return [float(len(order))]
 
@@ -189,20 +180,20 @@ def test_contenders_take_turns() -> None:
         ({"cases": ["public_gns_train"]}, "public_gns must be a folder with the public code for public_gns_train"),
     ],
 )
-def test_bad_options(change: dict[str, Any], message: str) -> None:
+def test_bad_options(change, message):
     """Each wrong option is named before anything is timed."""
     with pytest.raises(ConfigError, match=message):
         from_mapping(BenchConfig, change)
 
 
-def test_workloads() -> None:
+def test_workloads():
     """Every number of particles as one scene, then several scenes of the smallest."""
     config = BenchConfig(particles=(400, 40), scenes=(1, 8))
     assert workloads(config, CPU) == [Workload(400, 1), Workload(40, 1), Workload(40, 8)]
     assert workloads(BenchConfig(), CPU) == [Workload(TILE_PARTICLES, 1)]
 
 
-def test_json_option(tmp_path: Path) -> None:
+def test_json_option(tmp_path):
     """The command takes --json FILE as other tools do, beside overrides; without a name it says so."""
     path = tmp_path / "bench.json"
     small = ["cases=[frame]", "particles=[30]", "rounds=5", "network.width=8", "network.levels=1", "device=cpu"]

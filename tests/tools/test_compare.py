@@ -1,11 +1,7 @@
 """python -m tools.compare: trees in turns, rows, the table, and what is refused; no assertion on any time."""
 
-from __future__ import annotations
-
 import json
 import subprocess
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -28,7 +24,7 @@ sys.exit(0 if row["check"] == "pass" else 1)
 """
 
 
-def tree(folder: Path, ms: float | None = 1.0, check: str = "pass", dies: bool = False) -> Path:
+def tree(folder, ms=1.0, check="pass", dies=False):
     """A tree whose bench answers at once, and notes its turn in log.txt beside it."""
     (folder / "tools" / "bench").mkdir(parents=True)
     for package in (folder / "tools", folder / "tools" / "bench"):
@@ -40,7 +36,7 @@ def tree(folder: Path, ms: float | None = 1.0, check: str = "pass", dies: bool =
     return folder
 
 
-def test_trees_take_turns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trees_take_turns(tmp_path, capsys):
     """Every tree runs its own bench once a round, in the other order every other round; ratios are to the first."""
     trees = [str(tree(tmp_path / "a", 2.0)), str(tree(tmp_path / "b", 3.0))]
     out = tmp_path / "reports" / "compare.json"
@@ -56,7 +52,7 @@ def test_trees_take_turns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "| frame, 4 particles, 1 scenes, fp16 | 2.000 (2.000 … 2.000, 1.000) | 3.0" in capsys.readouterr().out
 
 
-def test_no_time_where_a_check_is_red(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_time_where_a_check_is_red(tmp_path, capsys):
     """A tree whose check fails gets the reason instead of a time, one whose bench dies its last line; exit code 1."""
     wrong, dead = tree(tmp_path / "wrong", None, "too wrong"), tree(tmp_path / "dead", dies=True)
     asked = {"trees": [str(wrong), str(dead)], "out": str(tmp_path / "c.json"), "rounds": 1, "bench": ["precision=x"]}
@@ -72,7 +68,7 @@ def test_no_time_where_a_check_is_red(tmp_path: Path, capsys: pytest.CaptureFixt
     ]
 
 
-def test_a_run_that_fails_once_takes_the_time_away() -> None:
+def test_a_run_that_fails_once_takes_the_time_away():
     """A check that is red in one of the runs is red."""
     work = {"case": "train", "particles": 1, "scenes": 1, "precision": "tf32"}
     runs = [{"rows": [work | {"ms": 1.0, "check": "pass"}]}, {"rows": [work | {"ms": None, "check": "late"}]}]
@@ -80,7 +76,7 @@ def test_a_run_that_fails_once_takes_the_time_away() -> None:
     assert (row["ms"], row["check"], row["runs"]) == (None, "late", 2)
 
 
-def test_a_commit_is_a_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_commit_is_a_tree(tmp_path, monkeypatch):
     """Commits and branches of the repository here are taken out of it, and left as they are."""
     repository = tree(tmp_path / "repository")
     for name in ("hgn", "conf", "datagen"):
@@ -106,7 +102,7 @@ def test_a_commit_is_a_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         ({"trees": ["{empty}"]}, r"trees\[0\] must be a tree with tools/bench, got .* name the folder above"),
     ],
 )
-def test_what_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_what_is_refused(tmp_path, change, message):
     """Each wrong option is named before anything is timed."""
     trees = [name.format(empty=tmp_path) for name in change.get("trees", ["."])]
     with pytest.raises(ConfigError, match=message):

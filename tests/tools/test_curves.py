@@ -1,10 +1,7 @@
 """tools.curves: one run, several runs, a run that was stopped, and folders that are none."""
 
-from __future__ import annotations
-
 import io
 import json
-from pathlib import Path
 
 import pytest
 import yaml
@@ -20,7 +17,7 @@ SETTINGS = {
 }
 
 
-def make_run(folder: Path, updates: int = 40, pause: float = 0.0, repeated: int = 0, error: float = 1e-6) -> Path:
+def make_run(folder, updates=40, pause=0.0, repeated=0, error=1e-6):
     """A run that logs each second; `pause` seconds away after half of its updates, the last `repeated` then again."""
     folder.mkdir(parents=True)
     numbers = [*range(updates // 2), *range(updates // 2 - repeated, updates)]
@@ -36,7 +33,7 @@ def make_run(folder: Path, updates: int = 40, pause: float = 0.0, repeated: int 
     return folder
 
 
-def test_figure_and_rows_of_one_run(tmp_path: Path) -> None:
+def test_figure_and_rows_of_one_run(tmp_path):
     run = make_run(tmp_path / "first")
     assert main({"runs": [str(run)], "out": str(tmp_path / "curves")}) == 0
     width, height = Image.open(io.BytesIO((tmp_path / "curves.png").read_bytes())).size
@@ -49,7 +46,7 @@ def test_figure_and_rows_of_one_run(tmp_path: Path) -> None:
     ]
 
 
-def test_several_runs_have_a_colour_and_a_name_each(tmp_path: Path) -> None:
+def test_several_runs_have_a_colour_and_a_name_each(tmp_path):
     runs = [str(make_run(tmp_path / "x")), str(make_run(tmp_path / "y", error=1e-7))]
     assert main({"runs": runs, "names": ["ours", "theirs"], "out": str(tmp_path / "curves")}) == 0
     assert [run["name"] for run in json.loads((tmp_path / "curves.json").read_text())["runs"]] == ["ours", "theirs"]
@@ -58,13 +55,13 @@ def test_several_runs_have_a_colour_and_a_name_each(tmp_path: Path) -> None:
     assert {(31, 119, 180), (255, 127, 14)} <= colours  # both lines are drawn
 
 
-def test_time_of_a_stop_is_no_training(tmp_path: Path) -> None:
+def test_time_of_a_stop_is_no_training(tmp_path):
     records = read_run(make_run(tmp_path / "run", pause=5000, repeated=3), "run").records
     assert [record["update"] for record in records if "loss" in record] == list(range(40))
     assert records[-1]["minutes"] * 60 == pytest.approx(42)  # 43 lines, a second apart; the repeated ones took time too
 
 
-def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_run_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"runs must be folders of python -m hgn.train, got .*empty"):
         read_run(tmp_path / "empty", "empty")
     with pytest.raises(ConfigError, match="names must be one for each of the 1 runs"):

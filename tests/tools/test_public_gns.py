@@ -1,7 +1,5 @@
 """Our GNS against the public PyTorch Geometric code, where PUBLIC_GNS names a copy of github.com/geoelements/gns."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 from dataclasses import replace
@@ -27,7 +25,7 @@ needs_copy = pytest.mark.skipif(
 
 @needs_copy
 @pytest.mark.parametrize("config", [SMALL, replace(SMALL, obstacle_features=False, maximum_neighbours=12)])
-def test_our_gns_with_their_weights_is_their_function(config: NetworkConfig) -> None:
+def test_our_gns_with_their_weights_is_their_function(config):
     """In float32 both give the same output to 1e-5, several scenes at once, and the same loss."""
     assert COPY is not None
     public = PublicGns(Path(COPY), config, Workload(300, 2), CPU)
@@ -44,7 +42,7 @@ def test_our_gns_with_their_weights_is_their_function(config: NetworkConfig) -> 
     assert not torch.equal(train.simulator.state_dict()["_particle_type_embedding.weight"], before)
 
 
-def test_a_folder_without_the_code(tmp_path: Path) -> None:
+def test_a_folder_without_the_code(tmp_path):
     """A wrong folder is named, with where to get the code."""
     with pytest.raises(ConfigError, match=r"public_gns must be a local copy.*geoelements/gns"):
         load_public(tmp_path, None)

@@ -1,13 +1,10 @@
 """python -m tools.render: which files it writes, and what it says of input that does not fit."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
-from ballistic_dataset import MakeConfig, MakeDataset
 from PIL import Image
 
 from hgn.data.lookup import find_episode
@@ -19,7 +16,7 @@ from tools.render import main
 FRAMES = 9
 
 
-def rollout_file(folder: Path, reference: bool) -> Path:
+def rollout_file(folder, reference):
     generator = np.random.default_rng(0)
     start = 0.3 + 0.05 * generator.random((60, 3))
     position = (start - np.linspace(0, 0.2, FRAMES)[:, None, None] * (0, 1, 0)).astype(np.float32)
@@ -37,7 +34,7 @@ def rollout_file(folder: Path, reference: bool) -> Path:
 
 
 @pytest.mark.parametrize("reference", [False, True])
-def test_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str], reference: bool) -> None:
+def test_folder(tmp_path, capsys, reference):
     """A folder gets the grid, the animation and, with ground truth, the error; each path is printed."""
     path = rollout_file(tmp_path, reference)
     main({"rollout": str(path), "out": str(tmp_path / "pictures"), "size": 80})
@@ -51,7 +48,7 @@ def test_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str], reference: b
 
 
 @pytest.mark.parametrize("ending", ["png", "gif", "webp"])
-def test_single_file(tmp_path: Path, ending: str) -> None:
+def test_single_file(tmp_path, ending):
     """A file name as `out` gets that picture alone, with the frames asked for."""
     path = rollout_file(tmp_path, True)
     out = tmp_path / f"one.{ending}"
@@ -61,13 +58,13 @@ def test_single_file(tmp_path: Path, ending: str) -> None:
         assert picture.format == ending.upper()
 
 
-def test_no_gif(tmp_path: Path) -> None:
+def test_no_gif(tmp_path):
     """gif=false leaves the animation out."""
     main({"rollout": str(rollout_file(tmp_path, False)), "out": str(tmp_path / "p"), "size": 80, "gif": False})
     assert [entry.name for entry in (tmp_path / "p").iterdir()] == ["fall.png"]
 
 
-def test_episode_of_a_data_set(tmp_path: Path, make_dataset: MakeDataset, make_config: MakeConfig) -> None:
+def test_episode_of_a_data_set(tmp_path, make_dataset, make_config):
     """An episode is drawn without a rollout; a key that is not there is answered with those that are."""
     folder = make_dataset(make_config(training_scenes=1, validation_scenes=2, test_scenes=1))
     mapping = {"data": str(folder), "out": str(tmp_path / "out"), "size": 80}
@@ -80,7 +77,7 @@ def test_episode_of_a_data_set(tmp_path: Path, make_dataset: MakeDataset, make_c
         main(mapping | {"episode": "validation-000009"})
 
 
-def test_rollouts_beside_an_episode(tmp_path: Path, make_dataset: MakeDataset, make_config: MakeConfig) -> None:
+def test_rollouts_beside_an_episode(tmp_path, make_dataset, make_config):
     """The episode is the truth and comes first; each rollout has a column, and a line in the plot of errors."""
     data = str(make_dataset(make_config(training_scenes=1, validation_scenes=1, test_scenes=1)))
     truth = rollout_of_episode(find_episode(data, "validation-000000"))
@@ -104,7 +101,7 @@ def test_rollouts_beside_an_episode(tmp_path: Path, make_dataset: MakeDataset, m
         main(mapping | {"others": [str(tmp_path / "a.vtkhdf")] * 2, "out": str(tmp_path / "bad")})
 
 
-def test_other_rollouts_stand_beside_it(tmp_path: Path) -> None:
+def test_other_rollouts_stand_beside_it(tmp_path):
     """Each other rollout has a row and a column of its own; one of another scene is refused."""
     path = rollout_file(tmp_path, True)
     (tmp_path / "other").mkdir()

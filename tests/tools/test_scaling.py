@@ -1,11 +1,8 @@
 """python -m tools.scaling: its rows, its checks; no assertion on any time."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +27,7 @@ SMALL: dict[str, Any] = {
 }
 
 
-def test_rows_of_every_case(warm_python: Path, tmp_path: Path) -> None:
+def test_rows_of_every_case(warm_python, tmp_path):
     """Two processes train alone and together, with equal and with unequal scenes, all checked and timed, and
     the table shows them."""
     path = tmp_path / "reports" / "scaling.json"
@@ -55,7 +52,7 @@ def test_rows_of_every_case(warm_python: Path, tmp_path: Path) -> None:
     assert "| torch | fp32 | 2 | 2 | 0.17 | 1, up to 0.0 MB |" in done.stdout
 
 
-def test_scenes_are_balanced() -> None:
+def test_scenes_are_balanced():
     """Ranks have scenes of as many particles at each update, and the same scenes on as many ranks as when measured."""
     config = from_mapping(ScalingConfig, {"particle_spread": 0.17, "batches": 20})
     counts_BRS = measure._particles(config, 4, 0.17)
@@ -67,16 +64,14 @@ def test_scenes_are_balanced() -> None:
 
 
 @pytest.fixture
-def alone(tmp_path: Path) -> Iterator[dist.ProcessGroup]:
+def alone(tmp_path):
     """A group of this process alone."""
     dist.init_process_group("gloo", init_method=f"file://{tmp_path / 'store'}", rank=0, world_size=1)
     yield dist.new_group([0])
     dist.destroy_process_group()
 
 
-def averaged(
-    group: dist.ProcessGroup, make: type[measure.TorchUpdates | measure.TritonUpdates], config: ScalingConfig
-) -> measure.Contender:
+def averaged(group, make, config):
     device = torch.device("cpu")
     updates = make(config, measure._batches(config, 0, 1, 0.1, device), device)
     found = measure.Contender("any", 1, True, 0.1, 80.0, update=updates)
@@ -84,14 +79,14 @@ def averaged(
     return found
 
 
-def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_time_where_a_check_is_red(alone, monkeypatch):
     """Averages that are wrong, and weights that differ between ranks, are found, and get a reason instead of a time."""
     config = from_mapping(ScalingConfig, SMALL)
     contender = averaged(alone, measure.TorchUpdates, config)
     assert contender.check == "pass" and len(contender.messages) == 1
     right = dist.all_reduce
 
-    def wrong_sum(tensor: torch.Tensor, group: dist.ProcessGroup, async_op: bool = False) -> dist.Work | None:
+    def wrong_sum(tensor, group, async_op=False):
         return right(tensor, group=group, async_op=True) if async_op else tensor.mul_(1.1)
 
     with monkeypatch.context() as patch:
@@ -105,7 +100,7 @@ def test_no_time_where_a_check_is_red(alone: dist.ProcessGroup, monkeypatch: pyt
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the interpreter, which takes tensors of the CPU, is off here")
-def test_triton_is_timed_alike(alone: dist.ProcessGroup) -> None:
+def test_triton_is_timed_alike(alone):
     """Its updates are those of backend torch on the same scenes: weights agree after them; averages are checked."""
     small = {"network": {"width": 16, "levels": 1, "message_passing_steps": 1}, "particles": 6}
     config = from_mapping(ScalingConfig, SMALL | small | {"scenes": 1, "batches": 1})
@@ -135,7 +130,7 @@ def test_bad_options(change: dict[str, Any], message: str) -> None:
         from_mapping(ScalingConfig, change)
 
 
-def test_devices_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_that_are_not_there(monkeypatch):
     """More GPUs than the machine has are refused."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="devices must be at most the 0 GPUs of this machine, got 2"):

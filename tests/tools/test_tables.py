@@ -1,10 +1,7 @@
 """python -m tools.tables: pages say what the JSON beside them says, and a page or a file that was changed is named."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -55,7 +52,7 @@ BENCH = {
 }
 
 
-def folder(path: Path, specification: str = SPECIFICATION, page: str = PAGE) -> Path:
+def folder(path, specification=SPECIFICATION, page=PAGE):
     """A repository with one folder of a page, its JSON and its specification; returns the last."""
     results = path / "results" / "bench"
     results.mkdir(parents=True)
@@ -66,12 +63,12 @@ def folder(path: Path, specification: str = SPECIFICATION, page: str = PAGE) -> 
 
 
 @pytest.mark.parametrize("specification", specifications(ROOT), ids=lambda path: str(path.parent.relative_to(ROOT)))
-def test_pages_and_their_json_agree(specification: Path) -> None:
+def test_pages_and_their_json_agree(specification):
     """Every page of the repository is what `python -m tools.tables` makes of the files beside it."""
     assert [page.differences for page in pages(specification) if page.differences] == []
 
 
-def test_an_edited_figure_of_the_repository_is_found(tmp_path: Path) -> None:
+def test_an_edited_figure_of_the_repository_is_found(tmp_path):
     """One digit changed in a copy of a results page, or in its JSON: the page, the table and the file are named."""
     copy = tmp_path / "results"
     shutil.copytree(ROOT / "results" / "public_gns", copy)
@@ -89,9 +86,7 @@ def test_an_edited_figure_of_the_repository_is_found(tmp_path: Path) -> None:
     assert [page.differences for page in pages(specification)] == [(expected,)]
 
 
-def test_writes_tables_and_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_writes_tables_and_figures(tmp_path, monkeypatch, capsys):
     """What stands between markers is replaced, and nothing else; check=true names it and changes nothing."""
     monkeypatch.setattr(tools.tables, "ROOT", tmp_path)
     page = folder(tmp_path).with_name("README.md")
@@ -120,7 +115,7 @@ def test_writes_tables_and_figures(
         (("values:", "values:\n  more: '1'"), "no page has a marker for more"),
     ],
 )
-def test_faulty_specifications(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+def test_faulty_specifications(tmp_path, change, message):
     """An expression that finds nothing, or too much, and names without a counterpart are answered by name."""
     assert change[0] in SPECIFICATION
     with pytest.raises(ConfigError) as error:
@@ -129,14 +124,14 @@ def test_faulty_specifications(tmp_path: Path, change: tuple[str, str], message:
 
 
 @pytest.mark.parametrize("marker", ["<!--/-->", "<!-- end -->\n<!-- table: chosen"])
-def test_a_marker_without_an_end(tmp_path: Path, marker: str) -> None:
+def test_a_marker_without_an_end(tmp_path, marker):
     """An end that was deleted is not searched for in the next table."""
     broken = PAGE.replace(marker, marker.removeprefix("<!--/-->").removeprefix("<!-- end -->\n"))
     with pytest.raises(ConfigError, match=r"README.md: a marker has no end"):
         pages(folder(tmp_path, page=broken))
 
 
-def test_outside_of_a_checkout(tmp_path: Path) -> None:
+def test_outside_of_a_checkout(tmp_path):
     """Without pages there is nothing to write, which is said."""
     with pytest.raises(ConfigError, match="run it from a checkout"):
         specifications(tmp_path)
@@ -161,12 +156,12 @@ def test_outside_of_a_checkout(tmp_path: Path) -> None:
         ("pass", "", "pass"),
     ],
 )
-def test_formats(value: object, form: str, text: str) -> None:
+def test_formats(value, form, text):
     """Figures are shown as pages write them."""
     assert formatted(value, form) == text
 
 
-def test_safetensors_header(tmp_path: Path) -> None:
+def test_safetensors_header(tmp_path):
     """Size, tensors and metadata of a weights file are a source like any other."""
     header = json.dumps({"__metadata__": {"hgn": '{"updates": 7}'}, "a": {"dtype": "F16", "shape": [2, 3]}}).encode()
     specification = folder(
@@ -181,7 +176,7 @@ def test_safetensors_header(tmp_path: Path) -> None:
     assert page.differences == ("table files is not what weights.safetensors says; run python -m tools.tables",)
 
 
-def test_pages_elsewhere(tmp_path: Path) -> None:
+def test_pages_elsewhere(tmp_path):
     """A specification may name the pages that it writes; others beside it are left alone."""
     specification = folder(tmp_path, "pages: [../../READ.md]\n" + SPECIFICATION, "<!--=unknown-->1<!--/-->")
     (tmp_path / "READ.md").write_text(PAGE)

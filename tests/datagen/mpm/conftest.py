@@ -6,5 +6,5 @@ from datagen.mpm.device import initialise
 
 
 @pytest.fixture(scope="session", autouse=True)
-def taichi_on_cpu() -> None:
+def taichi_on_cpu():
     initialise("cpu", 2)

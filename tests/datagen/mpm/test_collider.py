@@ -27,11 +27,11 @@ NO_NODES = {
 }
 
 
-def sheet(y: float, low: float = -0.2, high: float = 1.2) -> Obstacle:
+def sheet(y, low=-0.2, high=1.2):
     return Obstacle("sheet", np.array([[low, y, low], [high, y, low], [high, y, high], [low, y, high]]), QUAD, False)
 
 
-def box(low: tuple, high: tuple, flip: bool = False) -> Obstacle:
+def box(low, high, flip=False):
     """A closed box of twelve triangles; corner number is 4 x + 2 y + z."""
     vertex = np.array([[(low, high)[x][0], (low, high)[y][1], (low, high)[z][2]] for x in (0, 1) for y in (0, 1) for z in (0, 1)])  # fmt: skip # noqa: E501
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -39,12 +39,12 @@ def box(low: tuple, high: tuple, flip: bool = False) -> Obstacle:
     return Obstacle("box", vertex.astype(float), triangle[:, ::-1] if flip else triangle, True)
 
 
-def scene_of(*obstacles: Obstacle, cell_size: float = CELL, **particles) -> Scene:
+def scene_of(*obstacles, cell_size=CELL, **particles):
     empty = {"position_N3": np.zeros((0, 3), np.float32), "velocity_N3": np.zeros((0, 3), np.float32), "material_N": np.zeros(0, np.uint8)}  # fmt: skip # noqa: E501
     return Scene(**{**empty, **particles}, obstacles=obstacles, cell_size=cell_size)
 
 
-def dropped(material: int, y: float, speed: float, *obstacles: Obstacle) -> Scene:
+def dropped(material, y, speed, *obstacles):
     position = np.random.default_rng(0).uniform((0.4, y, 0.4), (0.6, y + 0.15, 0.6), (250, 3)).astype(np.float32)
     velocity = np.tile(np.float32([0, -speed, 0]), (250, 1))
     return scene_of(*obstacles, position_N3=position, velocity_N3=velocity, material_N=np.full(250, material, np.uint8))
@@ -57,7 +57,7 @@ BESIDE = scene_of(
 )  # fmt: skip
 
 
-def test_sheet_nodes() -> None:
+def test_sheet_nodes():
     """All nodes that a particle beyond a sheet reaches have two fields. What does not see the node is stopped, with the
     normal toward the sheet; what sees it up to a quarter of a cell from the sheet, with the normal away from it; both
     from the mass on that a node has where material lies 0.75 cells from the sheet.
@@ -83,7 +83,7 @@ def test_sheet_nodes() -> None:
             assert np.allclose(collider.least_K2[:, field], share, atol=2e-3)
 
 
-def test_nodes_around_a_rim() -> None:
+def test_nodes_around_a_rim():
     """Nodes beyond the rim of a sheet stop what they are hidden from across the sheet, not along it."""
     half = Obstacle("half", np.array([[0.1, 0.33, 0.1], [0.5, 0.33, 0.1], [0.5, 0.33, 0.9], [0.1, 0.33, 0.9]]), QUAD, False)  # fmt: skip # noqa: E501
     collider = build_collider(scene_of(half), 0.5)
@@ -96,7 +96,7 @@ def test_nodes_around_a_rim() -> None:
 
 
 @pytest.mark.parametrize("flip", [False, True], ids=["outward", "inward"])
-def test_body_nodes(flip: bool) -> None:
+def test_body_nodes(flip):
     """A closed body claims its inside and a quarter of a cell around, normals outward, whichever way its faces turn."""
     low, high = 4.2 * CELL, 10.8 * CELL
     collider = build_collider(scene_of(box((low,) * 3, (high,) * 3, flip)), 1.5)
@@ -109,7 +109,7 @@ def test_body_nodes(flip: bool) -> None:
     assert collider.count_inside(np.array([[0.5, 0.5, 0.5], [0.1, 0.5, 0.5]], np.float32)) == 1
 
 
-def test_sheet_nodes_of_a_crumpled_mesh() -> None:
+def test_sheet_nodes_of_a_crumpled_mesh():
     """Of 120 random triangles of mixed size the normal of each node is that of the nearest, as a search over all finds
     it, and every node that one passes within a particle's reach has two fields.
     """
@@ -136,7 +136,7 @@ def test_sheet_nodes_of_a_crumpled_mesh() -> None:
     assert ((toward * normal).sum(axis=1) >= -1.01e-4 * CELL).all()  # nodes nearer than 1e-4 are on one side
 
 
-def test_closest_obstacle_wins() -> None:
+def test_closest_obstacle_wins():
     """Between two sheets each node takes the nearer one."""
     both = build_collider(scene_of(sheet(5.1 * CELL), sheet(7.1 * CELL)), 0.5)
     at = {int(y): both.node_K3[:, 1] == y for y in (4, 6, 7, 8)}
@@ -146,7 +146,7 @@ def test_closest_obstacle_wins() -> None:
     assert [set(both.obstacle_K2[rows, HIDDEN]) for rows in at.values()] == [{0}, {0}, {1}, {1}]
 
 
-def test_odd_meshes() -> None:
+def test_odd_meshes():
     """No triangles, no area, wholly outside the domain: no contacts. Not finite, bad indices: refused."""
     point = Obstacle("point", np.full((3, 3), 0.5), np.array([[0, 1, 2]], np.int32), False)
     line = Obstacle("line", np.array([[0.2, 0.2, 0.2], [0.4, 0.4, 0.4], [0.6, 0.6, 0.6]]), np.array([[0, 1, 2]]), True)
@@ -159,7 +159,7 @@ def test_odd_meshes() -> None:
         build_collider(scene_of(Obstacle("index", np.eye(3), np.array([[0, 1, 3]]), False)), 1.5)
 
 
-def test_one_huge_triangle_and_many_small_ones() -> None:
+def test_one_huge_triangle_and_many_small_ones():
     """A triangle far larger than the domain, and its surface cut in 80,000, give the same contacts."""
     y, cells = 0.51, 200
     huge = Obstacle("huge", np.array([[-90.0, y, -90], [90, y, -90], [0, y, 180]]), np.array([[0, 1, 2]]), False)
@@ -178,7 +178,7 @@ def test_one_huge_triangle_and_many_small_ones() -> None:
 
 @pytest.mark.parametrize("speed", [3.0, 10.0])
 @pytest.mark.parametrize("offset", [0.0, 0.05, 0.3, 0.5, 0.7])
-def test_sheets_do_not_leak(speed: float, offset: float) -> None:
+def test_sheets_do_not_leak(speed, offset):
     """Nothing passes an axis-aligned sheet at 3 and 10 m/s, wherever it lies between the nodes."""
     y = (5 + offset) * CELL
     scenes = [dropped(material, y + 2.5 * CELL, speed, sheet(y)) for material in range(len(MATERIALS))]
@@ -187,7 +187,7 @@ def test_sheets_do_not_leak(speed: float, offset: float) -> None:
         assert outcome.position_TN3[:, :, 1].min() > y, name
 
 
-def test_bodies_keep_particles_out() -> None:
+def test_bodies_keep_particles_out():
     """Nothing enters a closed box, thick or thinner than a cell, and the counters say so."""
     thick = box((0.3, 0.25, 0.3), (0.7, 0.5, 0.7))
     thin = box((0.1, 0.48, 0.1), (0.9, 0.5, 0.9))
@@ -198,7 +198,7 @@ def test_bodies_keep_particles_out() -> None:
         assert outcome.counters["particles_inside_obstacles_at_end"] == 0
 
 
-def test_particles_inside_at_the_start_are_counted() -> None:
+def test_particles_inside_at_the_start_are_counted():
     """Particles that begin inside a body are counted, and the simulation stays finite."""
     scene = dropped(0, 0.4, 0, box((0.3, 0.3, 0.3), (0.7, 0.7, 0.7)))
     outcome, _ = simulate([scene, BESIDE], CONFIG, 3, 60.0)
@@ -207,7 +207,7 @@ def test_particles_inside_at_the_start_are_counted() -> None:
     assert np.isfinite(outcome.position_TN3).all()
 
 
-def test_swept_test_alone_holds() -> None:
+def test_swept_test_alone_holds():
     """Without contact at the nodes particles pass a sheet and a cone; the swept test lets none pass, and counts."""
     cone = shape_obstacle("cone", 0.5, (0.5, 0.4, 0.5))
     obstacles = (sheet(5.3 * CELL), cone)

@@ -34,7 +34,7 @@ CONFIG = MpmConfig(device="cpu")
 BESIDE = [(Setting(0.0, "aligned", CELL), "sheet", material) for material in range(len(MATERIALS))]
 
 
-def test_sheets_release() -> None:
+def test_sheets_release():
     """Below a level sheet and leaving it, at gaps and speeds of all kinds, every material flies freely within 2 %."""
     settings = [Setting(0.0, "aligned", CELL), Setting(0.3, "aligned", CELL), Setting(0.0, "tilted", CELL)]
     cases = [(setting, material) for setting in settings for material in range(len(MATERIALS))]
@@ -42,18 +42,18 @@ def test_sheets_release() -> None:
         assert max(errors.values()) <= FLIGHT_ERROR, (case, errors)
 
 
-def test_nothing_is_glued_below_a_sheet() -> None:
+def test_nothing_is_glued_below_a_sheet():
     """Of all materials that fall onto a small sheet and around it, nothing stays just below it."""
     cases = [(Setting(offset, "aligned", CELL), material) for offset in (0.3, 0.5) for material in (WATER, SAND)]
     cases += [(Setting(0.3, "aligned", CELL), material) for material in (SNOW, ELASTIC)]
     assert glued_below(cases, CONFIG) == [0.0] * len(cases)
 
 
-def test_what_hangs_below_a_sheet_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_hangs_below_a_sheet_is_seen(monkeypatch):
     """Of three particles half a cell below a sheet the one that stays counts; one that falls, one that goes do not."""
     setting = Setting(0.3, "tilted", CELL)
 
-    def drift(scenes: object, config: object, frames: int, rate: float) -> list[SimpleNamespace]:
+    def drift(scenes, config, frames, rate):
         way = np.array([[0, 0, 0], [0, -0.1, 0], [0.1, 0, 0]])  # cells a frame, after the first look
         after = np.maximum(np.arange(frames) - 72, 0)[:, None, None]
         place = (np.array([0, -0.5, 0]) + after * way).reshape(-1, 3)
@@ -64,7 +64,7 @@ def test_what_hangs_below_a_sheet_is_seen(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("friction", FRICTIONS)
-def test_friction_acts_as_set(friction: float) -> None:
+def test_friction_acts_as_set(friction):
     """On a sheet and the domain's floor sand and snow are braked by the coefficient that is set within 5 and 10 %; on a
     flat face sand too, wherever it lies between the nodes.
     """
@@ -78,7 +78,7 @@ def test_friction_acts_as_set(friction: float) -> None:
         assert acting == pytest.approx(friction, rel=FRICTION_ERRORS[case[2]]), case
 
 
-def test_inclined_planes() -> None:
+def test_inclined_planes():
     """A block of snow on a sheet, a body or the domain's floor that slopes by 25 degrees lies still where the surface's
     own friction is more than the slope, and slides by g (sin t - mu cos t), to 3 %, where it is less.
     """

@@ -1,7 +1,5 @@
 """datagen.mpm.device: Taichi starts, works and ends in any environment."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import subprocess
@@ -20,7 +18,7 @@ def faulty():
     ti.no_such_function()
 
 
-def test_a_fault_in_a_kernel_names_its_line() -> None:
+def test_a_fault_in_a_kernel_names_its_line():
     """File, line and function, once; Taichi's drawing of the line is left out, for it draws as many as expressions."""
     initialise("cpu", 2)
     with pytest.raises(ti.TaichiCompilationError) as fault:
@@ -31,7 +29,7 @@ def test_a_fault_in_a_kernel_names_its_line() -> None:
     )
 
 
-def test_kernels_are_defined_without_a_look_through_all_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_defined_without_a_look_through_all_modules(monkeypatch):
     """The frame that imports a kernel's module has no source, and inspect knows of it at once."""
     asked = []
 
@@ -60,7 +58,7 @@ assert numbers[7] == 7
 """
 
 
-def ends(changes: dict[str, str | None], folder: Path) -> None:
+def ends(changes, folder):
     file = folder / "program.py"
     file.write_text(PROGRAM)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])} | changes
@@ -69,13 +67,13 @@ def ends(changes: dict[str, str | None], folder: Path) -> None:
     assert (ended.returncode, ended.stdout) == (0, "Device(kind='cpu', threads=1, processors=1)\n"), ended.stderr
 
 
-def test_without_a_home(tmp_path: Path) -> None:
+def test_without_a_home(tmp_path):
     """Where HOME is not set, as in a system's service, Taichi would abort the process."""
     ends({"HOME": None}, tmp_path)
 
 
 @pytest.mark.parametrize("taken", [False, True])
-def test_a_home_that_cannot_be_written_to(tmp_path: Path, taken: bool) -> None:
+def test_a_home_that_cannot_be_written_to(tmp_path, taken):
     """As of a container's user: compiled kernels are kept among temporary files, where nobody else writes, and
     the process ends well; Taichi would crash then. A link that somebody else has put there is left alone."""
     (tmp_path / "file").touch()

@@ -22,7 +22,7 @@ def _exercise(memory: ti.u64, out: ti.types.ndarray(dtype=ti.f32, ndim=1)):
         out[n] = four[0]
 
 
-def test_reads_writes_and_sums_are_those_of_the_array() -> None:
+def test_reads_writes_and_sums_are_those_of_the_array():
     """Four at once as one by one, at the entries that are named; sums of several threads are whole."""
     values = np.arange(36, dtype=np.float32)
     array, out = ti.ndarray(ti.f32, 36), ti.ndarray(ti.f32, 4)
@@ -36,7 +36,7 @@ def test_reads_writes_and_sums_are_those_of_the_array() -> None:
     assert np.array_equal(array.to_numpy(), expected) and np.array_equal(out.to_numpy(), values[:32:8])
 
 
-def test_the_bitcode_is_that_of_the_source() -> None:
+def test_the_bitcode_is_that_of_the_source():
     """LLVM 14 assembles device_memory.ll into device_memory.bc, byte by byte."""
     source = Path(device_memory.__file__).with_suffix(".ll")
     llvm.initialize()

@@ -18,7 +18,7 @@ RATE_HZ = 60.0
 STOP = 0.15
 
 
-def jet(material: int, face: Face, **scene) -> Scene:
+def jet(material, face, **scene):
     """40 particles of all materials, and far from them what enters through a face in 0.15 s; tests share one kernel."""
     rng = np.random.default_rng(0)
     body = rng.uniform(0.2, 0.28, (40, 3))
@@ -35,7 +35,7 @@ UP = Face((0.5, 0.35, 0.5), (0.3, 2.0, 0.0), radius=0.06)
 ASIDE = Face((0.7, 0.65, 0.45), (-1.5, 0.0, 0.4), edges=(0.15, 0.1))
 
 
-def test_what_enters_flies_freely_and_none_is_lost() -> None:
+def test_what_enters_flies_freely_and_none_is_lost():
     """A face of area A at speed v brings in rho A v t, to a particle at any time and exactly in the end; whatever the
     material, the centre of what entered is where free flight from the face has it, within 2e-4 of its way.
     """
@@ -58,7 +58,7 @@ def test_what_enters_flies_freely_and_none_is_lost() -> None:
                 assert np.linalg.norm(off[mine].mean(axis=0)) < 2e-4 * np.linalg.norm(way[mine], axis=1).mean() + 1e-6
 
 
-def test_emitters_leave_their_batch_alone() -> None:
+def test_emitters_leave_their_batch_alone():
     """A scene that particles enter is the same, bitwise, alone and beside others, and these are what they are alone."""
     emitting = jet(WATER, UP)
     still = dataclasses.replace(emitting, entry_s_N=None)
@@ -70,7 +70,7 @@ def test_emitters_leave_their_batch_alone() -> None:
         assert alone.counters == outcome.counters
 
 
-def test_an_obstacle_in_the_way_is_refused() -> None:
+def test_an_obstacle_in_the_way_is_refused():
     """A sheet between the face and where particles are first seen would let them through."""
     corner = np.array([[0.0, 0.36, 0], [1, 0.36, 0], [1, 0.36, 1], [0, 0.36, 1]])
     sheet = Obstacle("sheet", corner, np.array([[0, 1, 2], [0, 2, 3]], np.int32), False)
@@ -78,7 +78,7 @@ def test_an_obstacle_in_the_way_is_refused() -> None:
         simulate([jet(WATER, UP, obstacles=(sheet,))], CONFIG, 3, RATE_HZ)
 
 
-def test_entry_frames() -> None:
+def test_entry_frames():
     """A particle is seen first in the frame at its time of entry or after it; those of the start in frame 0."""
     scene = Scene(
         np.full((4, 3), 0.5, np.float32), np.zeros((4, 3), np.float32), np.zeros(4, np.uint8),

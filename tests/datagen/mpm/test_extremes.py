@@ -13,7 +13,7 @@ CELL = 1 / 16
 CONFIG = MpmConfig(device="cpu")
 
 
-def scene_of(place_N3: np.ndarray, velocity: tuple, material_N: np.ndarray, **scene) -> Scene:
+def scene_of(place_N3, velocity, material_N, **scene):
     place = np.asarray(place_N3, np.float32)
     return Scene(
         place, np.tile(np.float32(velocity), (len(place), 1)), material_N.astype(np.uint8), cell_size=CELL, **scene
@@ -25,7 +25,7 @@ BESIDE = scene_of(np.array([[x, 0.5, 0.5] for x in (0.3, 0.45, 0.6, 0.75)]), (0,
 
 
 @pytest.mark.parametrize("distance", [1000.0, -1000.0])
-def test_a_scene_a_thousand_away(distance: float) -> None:
+def test_a_scene_a_thousand_away(distance):
     """Coordinates are the scene's own, from 0: particles 1,000 away are refused with the bounds and what to do."""
     place = np.full((4, 3), 0.5)
     place[:, 0] += distance
@@ -33,7 +33,7 @@ def test_a_scene_a_thousand_away(distance: float) -> None:
         simulate([scene_of(place, (0, 0, 0), np.zeros(4))], CONFIG, 2, 60.0)
 
 
-def test_the_far_end_of_a_long_domain() -> None:
+def test_the_far_end_of_a_long_domain():
     """Water 1,000 cells from the origin splashes as it does near it, but for the rounding of its coordinates."""
     place = np.random.default_rng(0).uniform(0, 2, (64, 3)) + np.array([8, 3, 4])
     paths = []
@@ -48,7 +48,7 @@ def test_the_far_end_of_a_long_domain() -> None:
 
 
 @pytest.mark.parametrize("material", [WATER, SAND, SNOW])
-def test_several_cells_a_substep(material: int) -> None:
+def test_several_cells_a_substep(material):
     """At 1,000 m/s the adaptive step crosses 0.3 cells at most; a fixed one of five cells stops the scene or leaves all
     particles inside, never out of range.
     """
@@ -69,7 +69,7 @@ def test_several_cells_a_substep(material: int) -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_not_finite(bad: float) -> None:
+def test_numbers_that_are_not_finite(bad):
     """A position or velocity that is NaN or infinite is refused with the particle's index; so is gravity."""
     place = np.full((3, 3), 0.5, np.float32)
     for field in ("position_N3", "velocity_N3"):

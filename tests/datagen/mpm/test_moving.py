@@ -22,7 +22,7 @@ QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 TILT = euler_rotation((20.0, 0.0, 10.0))
 
 
-def plate(height: float, rotation: np.ndarray, closed: bool) -> Obstacle:
+def plate(height, rotation, closed):
     """A wide level sheet so many cells above the middle, or a box that ends there, turned about the middle."""
     corner = np.array([[x, y, z] for x in (-30, 30) for y in (height - 20, height) for z in (-30, 30)], float)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -32,19 +32,19 @@ def plate(height: float, rotation: np.ndarray, closed: bool) -> Obstacle:
     return Obstacle("plate", rotate(corner, rotation) * CELL + MIDDLE, triangle, closed)
 
 
-def sheet(floor: float) -> Obstacle:
+def sheet(floor):
     """A level one so many cells high, from wall to wall."""
     corner = np.array([[-9, floor, -9], [30, floor, -9], [30, floor, 30], [-9, floor, 30]], float) * CELL
     return Obstacle("sheet", corner, QUAD, False)
 
 
-def moving(obstacle: Obstacle, time: list, translation: list, degrees: list | None = None) -> Obstacle:
+def moving(obstacle, time, translation, degrees=None):
     rotation = np.stack([euler_rotation(angles) for angles in degrees or [(0, 0, 0)] * len(time)])
     motion = Motion(np.array(time, float), np.array(translation, float), rotation, tuple(MIDDLE))
     return dataclasses.replace(obstacle, motion=motion)
 
 
-def block(material: int, low: tuple, size: tuple, rotation: np.ndarray, obstacle: Obstacle, gravity: float) -> Scene:
+def block(material, low, size, rotation, obstacle, gravity):
     count = round(8 * np.prod(size))
     place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * size + low
     return Scene(
@@ -53,7 +53,7 @@ def block(material: int, low: tuple, size: tuple, rotation: np.ndarray, obstacle
     )  # fmt: skip
 
 
-def paths(scenes: list[Scene], seconds: float) -> list[np.ndarray]:
+def paths(scenes, seconds):
     """In cells from the middle; with a moving sheet and all materials beside, tests share one compiled kernel."""
     still = moving(sheet(2.5), [0.0, 1.0], [np.zeros(3)] * 2)
     place = np.float32([[4.5, height, 4.5] for height in (5, 6, 7, 8)]) * np.float32(CELL)
@@ -64,7 +64,7 @@ def paths(scenes: list[Scene], seconds: float) -> list[np.ndarray]:
     return [(outcome.position_TN3.astype(np.float64) - MIDDLE) / CELL for outcome in outcomes]
 
 
-def test_piston() -> None:
+def test_piston():
     """In a tube a sheet that rises hands the momentum m v over to whatever lies on it, within 5 %."""
     speed, start, seconds, wide, floor = 0.5, 0.1, 0.45, 4, 4.0
     size = np.array([wide, 1.5, wide])
@@ -85,7 +85,7 @@ def test_piston() -> None:
         assert (height[-1] - height[-1 - last]) / last * RATE_HZ == pytest.approx(speed, rel=0.05), name
 
 
-def test_tilted_piston() -> None:
+def test_tilted_piston():
     """Less than one in a thousand particles comes through tilted bodies that rise under snow and sand; snow, which does
     not spread meanwhile, goes along with their speed within 5 %.
     """
@@ -102,7 +102,7 @@ def test_tilted_piston() -> None:
         assert (above[-1] < speed * (seconds - start) / CELL).mean() < 1e-3
 
 
-def test_paddle() -> None:
+def test_paddle():
     """A block before a smooth blade that turns ever faster, by a t² / 2, turns with it and slides along it, as a rigid
     body does: R'' = w² R + d a, with R along the blade to its centre and d across. Its angular momentum about the axis,
     w (R² + d² + k²) - d R', k its radius of gyration, is that within 5 %. Sand and water, which spread over the blade,
@@ -142,7 +142,7 @@ def test_paddle() -> None:
             assert found[frame] == pytest.approx(closed[round((frame + 0.5) / RATE_HZ / step)], rel=0.05)
 
 
-def test_poses_between_keyframes() -> None:
+def test_poses_between_keyframes():
     """Translation is linear, turning constant; before and after the obstacle stands. Rates are those of the poses."""
     half = euler_rotation((0, 90, 0))
     motion = Motion(np.array([1.0, 2.0]), np.array([[0.0, 0, 0], [2, 0, 0]]), np.stack([np.eye(3), half]), (1, 0, 0))
@@ -157,7 +157,7 @@ def test_poses_between_keyframes() -> None:
         assert np.allclose(turning(turned(np.array(turn))), turn, atol=1e-8)
 
 
-def test_bad_motion_is_refused() -> None:
+def test_bad_motion_is_refused():
     """Keyframes out of order, obstacles that fly, and a fixed time step: one line each."""
     still = plate(-4.0, np.eye(3), False)
     with pytest.raises(ConfigError, match=r"keyframes must be in order of time.* got \[1.0, 0.5\]"):

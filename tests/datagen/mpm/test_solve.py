@@ -1,7 +1,5 @@
 """python -m datagen.solve: the solver's own simulation of a scene file, to be set beside a network's."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +24,7 @@ groups: [{shape: cube, size: 0.2, position: [0.5, 0.65, 0.5], material: water, v
 RAMP = "v -0.5 0 -0.5\nv 0.5 0 -0.5\nv -0.5 0 0.5\nv 0.5 0 0.5\nf 1 3 2\nf 2 3 4\n"
 
 
-def test_a_scene_file_is_solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_file_is_solved(tmp_path, monkeypatch):
     """The file holds the scene's particles, which fall; drawn beside another simulation of it, it is the truth."""
     monkeypatch.chdir(tmp_path)
     Path("ramp.obj").write_text(RAMP)
@@ -48,7 +46,7 @@ def test_a_scene_file_is_solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         assert moving.width > 160
 
 
-def test_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_input(tmp_path, monkeypatch):
     """What cannot be solved is said, and nothing is written."""
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(SCENE.split("\n")[3])

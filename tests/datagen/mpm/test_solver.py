@@ -24,9 +24,7 @@ ADAPTIVE = MpmConfig(device="cpu")
 FIXED = MpmConfig(device="cpu", time_step="fixed")
 
 
-def block(
-    material: int, low: tuple, high: tuple, velocity: tuple = (0, 0, 0), seed: int = 0, count: int = 0, **scene
-) -> Scene:
+def block(material, low, high, velocity=(0, 0, 0), seed=0, count=0, **scene):
     """A box of particles at random places, eight a cell unless `count` is given."""
     low, high = np.array(low), np.array(high)
     count = count or int(8 * np.prod((high - low) / CELL))
@@ -37,7 +35,7 @@ def block(
     )  # fmt: skip
 
 
-def joined(*scenes: Scene) -> Scene:
+def joined(*scenes):
     return Scene(
         np.concatenate([s.position_N3 for s in scenes]), np.concatenate([s.velocity_N3 for s in scenes]),
         np.concatenate([s.material_N for s in scenes]), scenes[0].obstacles, cell_size=CELL,
@@ -52,11 +50,11 @@ BESIDE = Scene(
 )  # fmt: skip
 
 
-def beside(scene: Scene) -> Scene:
+def beside(scene):
     return Scene(BESIDE.position_N3, BESIDE.velocity_N3, BESIDE.material_N, (), scene.domain_size, CELL)
 
 
-def run(scene: Scene, config: MpmConfig, frames: int) -> Simulated:
+def run(scene, config, frames):
     outcome = simulate([scene, beside(scene)], config, frames, 60.0)[0]
     assert isinstance(outcome, Simulated), outcome
     return outcome
@@ -64,7 +62,7 @@ def run(scene: Scene, config: MpmConfig, frames: int) -> Simulated:
 
 @pytest.mark.parametrize("gravity", [(0.0, -9.8, 0.0), (3.0, 0.0, -4.0), (0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("material", range(len(MATERIALS)), ids=MATERIALS)
-def test_free_fall(material: int, gravity: tuple) -> None:
+def test_free_fall(material, gravity):
     """At each frame a thrown body has moved by v t + g t² / 2, to 2e-4 of the whole way in 0.25 s, whatever gravity."""
     velocity = np.array([0.2, 0.6, -0.1])
     scene = block(material, (0.4, 0.45, 0.4), (0.5, 0.55, 0.5), tuple(velocity), gravity=gravity)
@@ -75,7 +73,7 @@ def test_free_fall(material: int, gravity: tuple) -> None:
     assert np.abs(centre - centre[0] - way).max() < 2e-4 * np.linalg.norm(way[-1])
 
 
-def test_free_fall_with_intervals_that_change() -> None:
+def test_free_fall_with_intervals_that_change():
     """Free fall stays exact where the speed shortens the intervals on the way: thrown up at 9 m/s, it comes back."""
     scene = block(SNOW, (0.4, 0.3, 0.4), (0.5, 0.4, 0.5), (0, 9, 0), count=100, gravity=(0.0, -60.0, 0.0))
     scene = dataclasses.replace(scene, domain_size=(1.0, 2.0, 1.0))
@@ -86,7 +84,7 @@ def test_free_fall_with_intervals_that_change() -> None:
     assert outcome.counters["transfers"] != 18 * round(outcome.counters["transfers"] / 18)  # they did change
 
 
-def test_free_fall_as_taichi_elements_has_it() -> None:
+def test_free_fall_as_taichi_elements_has_it():
     """With a fixed step of its scheme a falling body follows y = -g dt² n (n + 1) / 2 to 1e-4 of the fall."""
     config = dataclasses.replace(FIXED, time_integration="symplectic_euler")
     position = run(block(SAND, (0.4, 0.7, 0.4), (0.5, 0.8, 0.5)), config, 16).position_TN3.astype(float)
@@ -95,14 +93,14 @@ def test_free_fall_as_taichi_elements_has_it() -> None:
     assert np.abs(position[:, :, 1].mean(axis=1) - position[0, :, 1].mean() - fall).max() < 1e-4 * abs(fall[-1])
 
 
-def test_taichi_elements_substeps() -> None:
+def test_taichi_elements_substeps():
     """A fixed step of 3.125e-4 s at 60 Hz takes 54 substeps a frame, Taichi Elements' count."""
     outcome = run(block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=20), FIXED, 3)
     assert outcome.counters["substeps"] == 2 * 54
     assert outcome.counters["smallest_time_step_s"] == pytest.approx(3.125e-4)
 
 
-def test_adaptive_steps_fill_the_frame() -> None:
+def test_adaptive_steps_fill_the_frame():
     """The symplectic scheme is ahead of g t² / 2 by g t / 2 times the interval between transfers."""
     config = dataclasses.replace(ADAPTIVE, time_integration="symplectic_euler")
     outcome = run(block(SNOW, (0.4, 0.7, 0.4), (0.5, 0.8, 0.5), count=200), config, 11)
@@ -114,7 +112,7 @@ def test_adaptive_steps_fill_the_frame() -> None:
 
 
 @pytest.mark.parametrize("config", [ADAPTIVE, FIXED], ids=["adaptive", "fixed"])
-def test_momentum_is_conserved(config: MpmConfig) -> None:
+def test_momentum_is_conserved(config):
     """Without gravity two colliding blocks keep their total momentum to 1e-5 of what each brings in."""
     scene = joined(
         block(WATER, (0.3, 0.4, 0.4), (0.42, 0.55, 0.55), (2, 0.3, 0), gravity=(0.0, 0.0, 0.0)),
@@ -126,7 +124,7 @@ def test_momentum_is_conserved(config: MpmConfig) -> None:
     assert np.abs(moved - expected).max() < 1e-5 * np.abs(scene.velocity_N3).sum() / 60
 
 
-def test_water_comes_to_rest() -> None:
+def test_water_comes_to_rest():
     """Water between walls carries its own weight: it comes to rest, and keeps its level but for half a cell."""
     scene = block(WATER, (2.6 * CELL, 2.6 * CELL, 2.6 * CELL), (13.2 * CELL, 7 * CELL, 13.2 * CELL))
     outcome = run(scene, ADAPTIVE, 91)
@@ -140,7 +138,7 @@ def test_water_comes_to_rest() -> None:
 
 @pytest.mark.parametrize("material", range(len(MATERIALS)), ids=MATERIALS)
 @pytest.mark.parametrize("count", [1, 0], ids=["particle", "block"])
-def test_impact_at_ten_metres_per_second(material: int, count: int) -> None:
+def test_impact_at_ten_metres_per_second(material, count):
     """The adaptive step bears an impact on the floor at 10 m/s, of a block and of a single particle."""
     scene = block(material, (0.4, 0.3, 0.4), (0.6, 0.45, 0.6), (0, -10, 0), count=count)
     outcome = run(scene, ADAPTIVE, 13)
@@ -152,7 +150,7 @@ def test_impact_at_ten_metres_per_second(material: int, count: int) -> None:
     assert outcome.counters["largest_speed"] < 15
 
 
-def test_stiffening_water_bears_thirty_metres_per_second() -> None:
+def test_stiffening_water_bears_thirty_metres_per_second():
     """At 30 m/s linear water is pressed to its floor; stiffening water is not, and both stay finite and inside."""
     scene = block(WATER, (0.4, 0.3, 0.4), (0.55, 0.45, 0.55), (0, -30, 0))
     floors = []
@@ -166,7 +164,7 @@ def test_stiffening_water_bears_thirty_metres_per_second() -> None:
     assert floors[0] > 0 and floors[1] == 0
 
 
-def test_a_million_particles_in_one_cell() -> None:
+def test_a_million_particles_in_one_cell():
     """A cell as full as memory allows: a frame passes, finite, and nothing is lost."""
     position = np.random.default_rng(0).uniform(8 * CELL, 9 * CELL, (1_000_000, 3)).astype(np.float32)
     scene = Scene(position, np.zeros_like(position), np.full(len(position), WATER, np.uint8), cell_size=CELL)
@@ -178,7 +176,7 @@ def test_a_million_particles_in_one_cell() -> None:
     assert fall == pytest.approx(-9.8 / 60**2 / 2, rel=0.15)
 
 
-def test_materials_a_thousand_times_as_stiff_beside_each_other() -> None:
+def test_materials_a_thousand_times_as_stiff_beside_each_other():
     """Particles may differ in stiffness and density by 1000:1 and 3:1: an impact stays finite, inside and bounded."""
     scene = block(SNOW, (0.4, 0.25, 0.4), (0.6, 0.4, 0.6), (0, -3, 0))
     hard = scene.position_N3[:, 0] > 0.5
@@ -195,7 +193,7 @@ def test_materials_a_thousand_times_as_stiff_beside_each_other() -> None:
         simulate([dataclasses.replace(scene, material_parameters=bad)], ADAPTIVE, 2, 60.0)
 
 
-def test_snow_impact_is_converged() -> None:
+def test_snow_impact_is_converged():
     """Halving the step changes the height of a snow block that fell at 4.5 m/s by less than 3 %."""
     scene = block(SNOW, (0.35, 0.25, 0.35), (0.6, 0.5, 0.6), (0, -4.5, 0))
     half = MpmConfig(device="cpu", stability_fraction=0.25)
@@ -205,7 +203,7 @@ def test_snow_impact_is_converged() -> None:
     assert abs(heights[1] / heights[0] - 1) < 0.03
 
 
-def test_walls() -> None:
+def test_walls():
     """Slipping walls keep tangential motion, sticking walls brake it, and neither lets anything through."""
     scene = block(SNOW, (0.2, 2.6 * CELL, 0.3), (0.4, 4.6 * CELL, 0.5), (2, 0, 0))
     moved = []
@@ -219,7 +217,7 @@ def test_walls() -> None:
     assert moved[1] < 0.7 * moved[0]
 
 
-def test_scenes_of_a_batch_equal_scenes_alone() -> None:
+def test_scenes_of_a_batch_equal_scenes_alone():
     """A scene's trajectory is bitwise the same alone and beside scenes of other size, material, obstacles and steps."""
     sheet = Obstacle(
         "sheet", np.array([[0.0, 0.3, 0], [1, 0.3, 0], [1, 0.3, 1], [0, 0.3, 1]]),
@@ -247,7 +245,7 @@ def test_scenes_of_a_batch_equal_scenes_alone() -> None:
     ],
     ids=["not finite", "left", "substeps"],
 )
-def test_a_bad_scene_leaves_its_batch_alone(config: MpmConfig, velocity: tuple, cause: str) -> None:
+def test_a_bad_scene_leaves_its_batch_alone(config, velocity, cause):
     """A scene that blows up is reported with frame and rule; its batch mates keep every bit."""
     good = block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (1, -1, 0))
     bad = block(SNOW, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), velocity)
@@ -261,7 +259,7 @@ def test_a_bad_scene_leaves_its_batch_alone(config: MpmConfig, velocity: tuple, 
 
 
 @pytest.mark.parametrize("material", range(len(MATERIALS)), ids=MATERIALS)
-def test_few_particles(material: int) -> None:
+def test_few_particles(material):
     """One particle, two on one spot, particles on cell faces and corners: finite, and frame 0 is the input."""
     spots = [
         [[0.5, 0.5, 0.5]],
@@ -283,7 +281,7 @@ def test_few_particles(material: int) -> None:
         assert np.isfinite(outcome.position_TN3).all()
 
 
-def test_bounds_themselves_are_inside() -> None:
+def test_bounds_themselves_are_inside():
     """Particles exactly on the bounds start, and stay within them."""
     for wall_cells in (2, 3, 5):
         config = MpmConfig(device="cpu", wall_cells=wall_cells)
@@ -295,7 +293,7 @@ def test_bounds_themselves_are_inside() -> None:
         assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
 
 
-def test_a_domain_that_is_no_cube() -> None:
+def test_a_domain_that_is_no_cube():
     """Sides of 1, 0.75 and 1.375 with nodes that are no multiple of the block size: material spreads to each wall."""
     scene = block(WATER, (0.3, 0.2, 0.3), (0.6, 0.5, 0.6), (3, 0, 4), domain_size=(1.0, 0.75, 1.375))
     position = run(scene, ADAPTIVE, 25).position_TN3
@@ -304,7 +302,7 @@ def test_a_domain_that_is_no_cube() -> None:
     assert (position.max(axis=(0, 1))[[0, 2]] > high[[0, 2]] - 2 * CELL).all()
 
 
-def test_empty() -> None:
+def test_empty():
     """No scenes give no results; scenes without particles give empty trajectories, also beside others."""
     nothing = Scene(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.uint8), cell_size=CELL)
     frames: list[int] = []
@@ -317,7 +315,7 @@ def test_empty() -> None:
     assert len(other.position_TN3) == 2
 
 
-def test_one_frame_is_the_initial_state() -> None:
+def test_one_frame_is_the_initial_state():
     """frames=1 returns the initial positions without a step; on_frame sees each frame once."""
     frames: list[int] = []
     (outcome,) = simulate([BESIDE], ADAPTIVE, 1, 60.0, frames.append)
@@ -326,7 +324,7 @@ def test_one_frame_is_the_initial_state() -> None:
     assert frames == [0, 0, 1, 2]
 
 
-def test_bad_input_is_refused() -> None:
+def test_bad_input_is_refused():
     """Scenes outside the walls, of other grids, not finite, or no frames: an error that names the field."""
     good = block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=4)
     other = Scene(good.position_N3, good.velocity_N3, good.material_N)
@@ -350,10 +348,10 @@ def test_bad_input_is_refused() -> None:
         simulate([good, good], ADAPTIVE, 2, 60.0, stability_fractions=(1.0, 0.0))
 
 
-def test_memory_is_given_back() -> None:
+def test_memory_is_given_back():
     """Fifty simulations leave the process within 20 MB of its size; each holds a grid of 2 MB and more."""
 
-    def resident() -> int:
+    def resident():
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     scenes = [beside(BESIDE)] * 16
@@ -365,7 +363,7 @@ def test_memory_is_given_back() -> None:
     assert resident() - before < 20e6
 
 
-def test_one_runtime_a_process() -> None:
+def test_one_runtime_a_process():
     """A second start with other threads or device is refused; the same, or auto, is not."""
     assert initialise("auto").kind == "cpu"
     assert initialise("cpu", 2).threads == 2
@@ -375,7 +373,7 @@ def test_one_runtime_a_process() -> None:
         initialise("gpu")
 
 
-def test_one_thread_repeats_itself_in_silence() -> None:
+def test_one_thread_repeats_itself_in_silence():
     """In a process of one thread two runs agree bitwise, and Taichi writes nothing to stdout or stderr."""
     program = (
         "import numpy as np; from datagen.mpm.solver import simulate; from hgn.config import MpmConfig;"
@@ -389,7 +387,7 @@ def test_one_thread_repeats_itself_in_silence() -> None:
 
 
 @pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (4.0, 3.0, -12.0)])
-def test_an_episode_keeps_its_scenes_gravity(gravity: tuple) -> None:
+def test_an_episode_keeps_its_scenes_gravity(gravity):
     """A random scene in motion becomes an episode that says its gravity, also as stored bytes; until something is
     met its bodies drift straight, or along that gravity."""
     size = float(np.linalg.norm(gravity))

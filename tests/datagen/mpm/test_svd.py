@@ -19,7 +19,7 @@ def decompose(A: Matrices, U: Matrices, sigma: Vectors, V: Matrices):
         V[n] = v
 
 
-def run(matrix_N33: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def run(matrix_N33):
     count = len(matrix_N33)
     arrays = [ti.Matrix.ndarray(3, 3, ti.f32, count) for _ in range(3)]
     sigma = ti.Vector.ndarray(3, ti.f32, count)
@@ -28,17 +28,17 @@ def run(matrix_N33: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (arrays[1].to_numpy().astype(float), sigma.to_numpy().astype(float), arrays[2].to_numpy().astype(float))
 
 
-def rotations(rng: np.random.Generator, count: int) -> np.ndarray:
+def rotations(rng, count):
     q = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     return q * np.sign(np.linalg.det(q))[:, None, None]
 
 
-def cases() -> dict[str, np.ndarray]:
+def cases():
     rng = np.random.default_rng(0)
     count = 2000
     left, right = rotations(rng, count), rotations(rng, count)
 
-    def of(sigma_N3: np.ndarray) -> np.ndarray:
+    def of(sigma_N3):
         return left @ (sigma_N3[:, :, None] * np.swapaxes(right, 1, 2))
 
     return {
@@ -57,7 +57,7 @@ def cases() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", cases())
-def test_decomposition(name: str) -> None:
+def test_decomposition(name):
     """A = U diag(sigma) Vᵀ and numpy's singular values to 2e-6 of the largest; U, V are rotations to 2e-6."""
     matrix = cases()[name].astype(np.float32).astype(float)
     U, sigma, V = run(matrix)

@@ -21,7 +21,7 @@ SHEET = Obstacle(
 )  # fmt: skip
 
 
-def mixed(count: int, seed: int, velocity: tuple, **scene) -> Scene:
+def mixed(count, seed, velocity, **scene):
     position = np.random.default_rng(seed).uniform((0.3, 0.4, 0.3), (0.5, 0.6, 0.5), (count, 3)).astype(np.float32)
     return Scene(
         position, np.tile(np.float32(velocity), (count, 1)), (np.arange(count) % 4).astype(np.uint8),
@@ -33,7 +33,7 @@ def mixed(count: int, seed: int, velocity: tuple, **scene) -> Scene:
 HEAVY = mixed(90, 1, (1, -1, 0), material_parameters={"density_kg_m3": np.linspace(500, 2000, 90, dtype=np.float32)})
 
 
-def test_teams_agree_with_the_other_launch() -> None:
+def test_teams_agree_with_the_other_launch():
     """Scenes of other sizes, densities and obstacles beside them: one frame agrees to 1e-6, ten to 1e-3 of the
     domain, in the order given; frames come one by one, and a scene that fails leaves the others as they were.
     """
@@ -56,7 +56,7 @@ def test_teams_agree_with_the_other_launch() -> None:
     assert np.abs(alone.position_TN3 - found[1].position_TN3).max() < 1e-3
 
 
-def test_blocks_that_wait_for_each_other_agree_with_the_other_launch() -> None:
+def test_blocks_that_wait_for_each_other_agree_with_the_other_launch():
     """A scene of two blocks ends where one launch a substep does, particles added up one by one, beside one that
     fails.
     """
@@ -68,7 +68,7 @@ def test_blocks_that_wait_for_each_other_agree_with_the_other_launch() -> None:
     assert one[0].counters["substeps"] == other[0].counters["substeps"]
 
 
-def test_a_hundred_thousand_substeps() -> None:
+def test_a_hundred_thousand_substeps():
     """A particle of each material in the smallest domain: after 100,000 substeps all lie still, inside, unfloored."""
     place = np.array([[3.2, 3.5, 2.7], [4.1, 2.8, 3.3], [2.6, 2.9, 4.4], [4.6, 2.9, 4.6]]) * CELL
     density = {"density_kg_m3": np.float32([1000, 1200, 1000, 1000])}
@@ -92,7 +92,7 @@ def test_a_hundred_thousand_substeps() -> None:
 
 @pytest.mark.parametrize("scenes", [1, 2, 7, 32, 132, 133, 264, 800])
 @pytest.mark.parametrize("most", [1, 50, 4_000, 40_000, 1_000_000])
-def test_blocks_that_wait_for_each_other_all_run_at_once(scenes: int, most: int) -> None:
+def test_blocks_that_wait_for_each_other_all_run_at_once(scenes, most):
     """The blocks of a scene, where there are several, find room on a GPU's processors."""
     team = _team(Device("gpu", 1, 132), [most] * scenes)
     assert team.threads % 32 == 0
@@ -100,7 +100,7 @@ def test_blocks_that_wait_for_each_other_all_run_at_once(scenes: int, most: int)
     assert _team(Device("cpu", 2), [most] * scenes) == _team(Device("gpu", 1, 132), [50_000_000]) == Team(0)
 
 
-def test_who_runs_many_scenes() -> None:
+def test_who_runs_many_scenes():
     """One block a scene where all are done at once, else teams that take scenes one after another."""
     gpu = Device("gpu", 1, 132)
     assert _team(gpu, [4_000] * 256) == Team(256)
@@ -110,7 +110,7 @@ def test_who_runs_many_scenes() -> None:
     assert _team(gpu, [4_000]) == Team(128, 264, 1)
 
 
-def test_blocks_that_are_not_at_work_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_that_are_not_at_work_at_once(monkeypatch):
     """Three blocks on two threads, that would wait for ever: all leave, a warning says so, and each substep is a launch
     of its own, with the same result.
     """
@@ -124,13 +124,13 @@ def test_blocks_that_are_not_at_work_at_once(monkeypatch: pytest.MonkeyPatch) ->
     assert np.array_equal(found.position_TN3, expected.position_TN3)
 
 
-def test_more_blocks_than_run_at_once() -> None:
+def test_more_blocks_than_run_at_once():
     """Blocks that would wait for ever are refused."""
     with pytest.raises(ConfigError, match=r"team.blocks must be at most 2, .*, got 3"):
         simulate([mixed(1, 0, (0, 0, 0))], CONFIG, 2, 60.0, team=Team(1, 3))
 
 
-def test_more_particles_than_kernels_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_particles_than_kernels_count(monkeypatch):
     """A batch beyond what int32 counts is refused with the remedy."""
     monkeypatch.setattr(team_launch, "MAXIMUM_PARTICLES", 10)
     with pytest.raises(ConfigError, match=r"at most 10 particles, got 11 of 1 scenes; lower scenes_per_launch"):

@@ -1,9 +1,6 @@
 """python -m tools.studies.power_loss: a few of its folders, and that harm is seen."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -15,7 +12,7 @@ from tools.studies.power_loss import SCENARIOS, Disk, fail, lose_power
 
 
 @pytest.mark.parametrize(("name", "every"), [("generation", 20), ("checkpoints", 5), ("cache", 2)])
-def test_nothing_is_lost(tmp_path: Path, name: str, every: int) -> None:
+def test_nothing_is_lost(tmp_path, name, every):
     """After a loss of power, a kill (all calls before it count) or an error of the disk, before some calls, with reads
     and writes of 1,000 bytes at most: what was published or saved is there, nothing else is taken for whole, and the
     next run makes the same files."""
@@ -25,7 +22,7 @@ def test_nothing_is_lost(tmp_path: Path, name: str, every: int) -> None:
     assert faults == [] and failed > 1
 
 
-def test_what_is_mapped_never_shrinks(tmp_path: Path) -> None:
+def test_what_is_mapped_never_shrinks(tmp_path):
     """No file is written to under a shard's name, in a data set or in a cache: it gets that name when it is whole, and
     loses it whole. So a map of a shard ends a reader (SIGBUS) only where another program truncates it."""
     for name in ("generation", "cache"):
@@ -37,14 +34,14 @@ def test_what_is_mapped_never_shrinks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("skipped", ["sync_file", "sync_folder"])
-def test_harm_is_seen(tmp_path: Path, skipped: str) -> None:
+def test_harm_is_seen(tmp_path, skipped):
     """Without the sync of files, or of folders, saved checkpoints are lost."""
     with mock.patch.object(files, skipped):
         _, _, faults = lose_power(SCENARIOS["checkpoints"], tmp_path, 1, 3, 0)
     assert any("was saved" in fault or "must be a whole checkpoint" in fault for fault in faults)
 
 
-def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command(tmp_path, monkeypatch):
     """The exit code and the report say what was wrong."""
     monkeypatch.setattr(power_loss, "SCENARIOS", {"checkpoints": SCENARIOS["checkpoints"]})
     monkeypatch.setattr(hgn.training.checkpoint_writer, "write_atomically", lambda path, data: path.write_bytes(data))

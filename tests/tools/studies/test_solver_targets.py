@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +13,7 @@ from tools.studies import solver_targets
 from tools.studies.solver_targets import main, table, timed
 
 
-def test_rows_and_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_and_table(tmp_path, monkeypatch):
     """Rows name case, milliseconds and check, the plain prototype's too; what fell elsewhere than ours is red."""
     monkeypatch.setattr(solver_targets, "CUBE_SIZE", 0.03)
     file = tmp_path / "made" / "times.json"
@@ -28,7 +27,7 @@ def test_rows_and_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert main({**given, "cases": ["plain_one_scene_te_step"]}) == 1
 
 
-def test_no_time_for_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_time_for_a_failure(monkeypatch):
     """Scenes that fail, and paths that lead elsewhere than the other launch, have a cause in place of a time."""
     scene = [scene_of(Workload(40, 1), 0, 0.035)]
     row = timed(scene, MpmConfig(device="cpu", maximum_substeps_per_frame=1), 4)
@@ -48,9 +47,7 @@ time.sleep(60 if "slow" in out else 0)
 
 
 @pytest.mark.parametrize(("name", "seconds", "check"), [("quick", 60, "green"), ("slow", 3, "5 scenes after 3 s")])
-def test_a_data_set_that_is_kept(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, seconds: float, check: str
-) -> None:
+def test_a_data_set_that_is_kept(folder, tmp_path, monkeypatch, name, seconds, check):
     """Its episodes stay where they are wanted, also where it is stopped, which has no time; it is not gone on with."""
     monkeypatch.setattr(solver_targets, "GENERATOR", (sys.executable, "-c", MAKES, str(folder)))
     kept, file = tmp_path / name, tmp_path / "times.json"
@@ -63,7 +60,7 @@ def test_a_data_set_that_is_kept(
         main(given)
 
 
-def test_bad_input() -> None:
+def test_bad_input():
     """Cases that there are not are refused by name."""
     with pytest.raises(ConfigError, match=r"cases must be some of one_scene_te_step, .*'two_scenes'"):
         main({"cases": ["two_scenes"]})
