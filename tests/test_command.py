@@ -12,22 +12,6 @@ from hgn.schema import ConfigError
 
 
 @pytest.mark.parametrize(
-    ("command", "arguments"),
-    [
-        ("datagen", ["+experiment=demo", "dataset.frames=7", "scene.materials=[sand]"]),
-        ("train", ["+experiment=small", "training.batch_scenes=2", "run=runs/x"]),
-        ("stability_network", ["cases=[long]"]),
-    ],
-)
-def test_composed_once(command, arguments, monkeypatch):
-    """An option of Hydra's makes it compose in its own way, with the same result."""
-    monkeypatch.setattr("sys.argv", [command, *arguments])
-    once = _compose(command)
-    monkeypatch.setattr("sys.argv", [command, *arguments, "hydra.job.name=x"])
-    assert _compose(command) == once and len(once) == 1
-
-
-@pytest.mark.parametrize(
     ("given", "meant"),
     [
         ("../my data/dé mo", "../my data/dé mo"),
@@ -43,7 +27,7 @@ def test_composed_once(command, arguments, monkeypatch):
         ("'ü'", "ü"),
     ],
 )
-def test_names_that_hydra_refuses(given: str, meant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_that_hydra_refuses(given, meant, monkeypatch):
     """Files and folders are called what people call them; what stands beside them is taken as ever."""
     monkeypatch.setattr("sys.argv", ["error_vs_time", f"data={given}", "out=x", "weights=null", "mpm_steps=[0.1]"])
     (composed,) = _compose("error_vs_time")

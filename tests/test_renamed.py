@@ -1,7 +1,6 @@
 """hgn.renamed: old names are answered with today's, and files of before load."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -56,7 +55,7 @@ def test_old_names_are_answered(monkeypatch):
         ),
     ],
 )
-def test_todays_table(config: type, mapping: dict[str, Any], message: str) -> None:
+def test_todays_table(config, mapping, message):
     """An old key or value is refused in one line that says what it is called now."""
     with pytest.raises(ConfigError, match=message) as caught:
         from_mapping(config, mapping)

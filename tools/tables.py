@@ -44,14 +44,8 @@ SPECIFICATION = "tables.yaml"
 REMEDY = "run python -m tools.tables"
 
 EXPRESSION_ERRORS = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    NameError,
-    OSError,
-    SyntaxError,
-    TypeError,
-    ValueError,
+    *(ArithmeticError, AttributeError, LookupError, NameError, SyntaxError, TypeError, ValueError),
+    OSError,  # a file that is not there
 )
 
 TABLE = re.compile(r"(?P<begin><!-- table: (?P<name>[\w-]+) -->\n)(?P<text>.*?)(?P<end><!-- end -->)", re.DOTALL)

@@ -9,7 +9,7 @@ from hgn.data.statistics import Moments, Statistics, episode_statistics, merge_s
 
 @settings(max_examples=50, deadline=None)
 @given(sizes=st.lists(st.integers(0, 20), max_size=5), offset=st.sampled_from([0.0, 1.0, 1e6]))
-def test_merged_moments_equal_direct_ones(sizes: list[int], offset: float) -> None:
+def test_merged_moments_equal_direct_ones(sizes, offset):
     """However values are split into parts, mean and std are those of all of them, also far from zero."""
     generator = np.random.default_rng(sum(sizes))
     parts = [generator.normal(size=(size, 3)) + offset for size in sizes]

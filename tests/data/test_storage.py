@@ -87,6 +87,24 @@ def serve(folder):
     stop()
 
 
+class Quiet:
+    """Of a server's handler: without a log."""
+
+    def log_message(self, *arguments):
+        pass
+
+
+@contextlib.contextmanager
+def serving(handler):
+    """The URL of a server of its own."""
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+
+
 def same_episodes(one, other):
     pairs = zip(one.episodes, other.episodes, strict=True)
     return all(a.key == b.key and np.array_equal(a.position_TN3, b.position_TN3) for a, b in pairs)
@@ -241,7 +259,7 @@ def test_answers_are_bounded(monkeypatch, attack):
     than any, is cut."""
     monkeypatch.setattr("hgn.data.bounded_http.LARGEST_BYTES", 100_000)
 
-    class Attack(http.server.BaseHTTPRequestHandler):
+    class Attack(Quiet, http.server.BaseHTTPRequestHandler):
         def do_GET(self):
             self.send_response(206 if attack == "long range" else 200)
             if attack == "gzip bomb":
@@ -253,21 +271,14 @@ def test_answers_are_bounded(monkeypatch, attack):
                 for _ in range(0 if attack == "gzip bomb" else 1000):
                     self.wfile.write(bytes(10_000))
 
-        def log_message(self, *arguments):
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Attack) as server:
-        threading.Thread(target=server.serve_forever).start()
-        storage = open_storage(f"http://127.0.0.1:{server.server_port}")
-        try:
-            if attack == "gzip bomb":
-                assert len(storage.manifest("manifest.json")) < 20_000
-            else:
-                limit = 50 if attack == "long range" else 100_000
-                with pytest.raises(ConfigError, match=f"must answer with at most {limit} bytes, got more"):
-                    storage.read("s", 0, 50) if attack == "long range" else storage.manifest("manifest.json")
-        finally:
-            server.shutdown()
+    with serving(Attack) as url:
+        storage = open_storage(url)
+        if attack == "gzip bomb":
+            assert len(storage.manifest("manifest.json")) < 20_000
+        else:
+            limit = 50 if attack == "long range" else 100_000
+            with pytest.raises(ConfigError, match=f"must answer with at most {limit} bytes, got more"):
+                storage.read("s", 0, 50) if attack == "long range" else storage.manifest("manifest.json")
 
 
 def test_proxy_that_remembers(monkeypatch):
@@ -276,7 +287,7 @@ def test_proxy_that_remembers(monkeypatch):
     monkeypatch.setattr("hgn.data.storage._FIRST_PAUSE_S", 0.01)
     answers = iter([(416, b""), (206, b"56"), (206, b"5678")])
 
-    class Proxy(http.server.BaseHTTPRequestHandler):
+    class Proxy(Quiet, http.server.BaseHTTPRequestHandler):
         def do_GET(self):
             status, content = next(answers)
             self.send_response(status)
@@ -284,15 +295,8 @@ def test_proxy_that_remembers(monkeypatch):
             self.end_headers()
             self.wfile.write(content)
 
-        def log_message(self, *arguments):
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Proxy) as server:
-        threading.Thread(target=server.serve_forever).start()
-        try:
-            assert open_storage(f"http://127.0.0.1:{server.server_port}").read("index", 5, 9) == b"5678"
-        finally:
-            server.shutdown()
+    with serving(Proxy) as url:
+        assert open_storage(url).read("index", 5, 9) == b"5678"
 
 
 @pytest.mark.parametrize("full", ["limit", "disk"])
@@ -398,16 +402,11 @@ def test_server_without_ranges(folder, monkeypatch):
     """A plain file server that knows no ranges will do."""
     monkeypatch.setattr(hgn.data.storage, "_CHUNK_BYTES", 4000)
 
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *arguments):
-            pass
+    class Plain(Quiet, http.server.SimpleHTTPRequestHandler):
+        pass
 
-    handler = functools.partial(Quiet, directory=str(folder))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        store = EpisodeStore(f"http://127.0.0.1:{server.server_port}", "train")
-        assert same_episodes(store, EpisodeStore(folder, "train"))
-        server.shutdown()
+    with serving(functools.partial(Plain, directory=str(folder))) as url:
+        assert same_episodes(EpisodeStore(url, "train"), EpisodeStore(folder, "train"))
 
 
 def test_no_data_set_there(serve):

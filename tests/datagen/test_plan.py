@@ -36,14 +36,14 @@ def test_first_validation_and_test_shards_are_single_episodes():
 
 
 @given(split=SPLITS, count=COUNTS, size=st.integers(1, 9))
-def test_ranges_cover_each_episode_once(split: str, count: int, size: int) -> None:
+def test_ranges_cover_each_episode_once(split, count, size):
     """Ranges partition the split in order, whatever its size."""
     covered = [index for shard in shard_ranges(split, count, size) for index in shard.indices]
     assert covered == list(range(count))
 
 
 @given(split=SPLITS, before=COUNTS, after=COUNTS, sizes=st.tuples(st.integers(1, 9), st.integers(1, 9)))
-def test_growth_makes_just_what_is_missing(split: str, before: int, after: int, sizes: tuple[int, int]) -> None:
+def test_growth_makes_just_what_is_missing(split, before, after, sizes):
     """A data set that grows, even with another shard size, gains the new episodes once and no others."""
     present = shard_ranges(split, before, sizes[0])
     missing = missing_ranges(shard_ranges(split, after, sizes[1]), {split: b"\1" * before})
@@ -64,7 +64,7 @@ def generation_order(requested):
 
 
 @given(train=COUNTS, validation=COUNTS, test=COUNTS)
-def test_generation_order_holds_each_episode_once(train: int, validation: int, test: int) -> None:
+def test_generation_order_holds_each_episode_once(train, validation, test):
     """Every episode of every split is made once; within a split in order; test comes last."""
     order = generation_order({"train": train, "validation": validation, "test": test})
     for split, count in (("train", train), ("validation", validation), ("test", test)):
@@ -101,7 +101,7 @@ def test_seeds_are_stable_and_distinct():
 
 
 @given(split=SPLITS, first=st.integers(0, 2_000_000), size=st.integers(1, 9))
-def test_shard_names_parse_back(split: str, first: int, size: int) -> None:
+def test_shard_names_parse_back(split, first, size):
     """A name tells split and range, also past six digits."""
     shard = ShardRange(split, first, first + size)
     assert parse_shard_name(shard.name) == shard

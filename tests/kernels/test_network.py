@@ -1,7 +1,5 @@
 """The kernels' network against the plain one in float64: outputs and all gradients."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -11,17 +9,13 @@ from kernels.rounded import rounded, rounding
 from network.states import network_of, random_state
 
 from hgn.kernels.packing import rounded_to_tf32
-from hgn.network.features import ParticleState
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import OUTPUT_BOUND, relative_error
 
 SEVERAL = (5, 1, 3)  # particles of three scenes
 gpu = pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
 
 
-def reference(
-    network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor, weight_N3: torch.Tensor
-) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def reference(network, state, origin_S3, weight_N3):
     """Output and gradients of the sum of outputs times `weight_N3`."""
     output = network.normalised_acceleration(state, origin_S3)
     found = torch.autograd.grad((output * weight_N3).sum(), list(network.parameters()), allow_unused=True)
@@ -29,27 +23,25 @@ def reference(
     return output.detach(), [torch.zeros_like(p) if gradient is None else gradient for p, gradient in pairs]
 
 
-def flat(tensors: list[torch.Tensor]) -> torch.Tensor:
+def flat(tensors):
     return torch.cat([tensor.double().cpu().flatten() for tensor in tensors])
 
 
-def float32_state(counts: tuple[int, ...], obstacles: bool = True, spread: float = 0.3, seed: int = 3) -> ParticleState:
+def float32_state(counts, obstacles=True, spread=0.3, seed=3):
     """A state whose numbers float32 holds exactly, in float64."""
     state = random_state(counts, seed, torch.float32, obstacles, spread)
     doubled = {name: getattr(state, name).double() for name in ("position_N3", "velocity_NM3", "domain_S3")}
     return replace(state, **doubled)
 
 
-def drawn(network: HierarchicalGraphNetwork, state: ParticleState) -> tuple[torch.Tensor, torch.Tensor]:
+def drawn(network, state):
     """Origins of the scenes' grids, and weights of the outputs."""
     generator = torch.Generator().manual_seed(1)
     origin_S3 = (-network.config.cell_size * torch.rand(state.scene_count, 3, generator=generator)).double()
     return origin_S3, torch.randn(state.position_N3.shape, generator=generator, dtype=torch.float64)
 
 
-def compare(
-    network: HierarchicalGraphNetwork, state: ParticleState, precision: str, loss_scale: float, room: int
-) -> tuple[float, float, list[float]]:
+def compare(network, state, precision, loss_scale, room):
     """Relative errors of the output, of all gradients together, of each gradient."""
     origin_S3, weight_N3 = drawn(network, state)
     output, expected = reference(network, state, origin_S3, weight_N3)
@@ -75,9 +67,7 @@ def compare(
         ((5,), 0.1, {"levels": 1, "message_passing_steps": 1, "materials": ("water", "snow", "sand")}),
     ],
 )
-def test_outputs_and_gradients(
-    counts: tuple[int, ...], spread: float, changes: dict, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_outputs_and_gradients(counts, spread, changes, monkeypatch):
     """In float32 several scenes in one batch, a single particle, and a single level, with odd numbers of particles and
     cells, give the outputs and every gradient of the reference to 1e-5. So few programs run that each takes several
     tiles, and the last has one fewer."""
@@ -92,7 +82,7 @@ def test_outputs_and_gradients(
     assert output < 1e-5 and together < 1e-5 and max(each) < 2e-5
 
 
-def test_half_precision_keeps_small_gradients() -> None:
+def test_half_precision_keeps_small_gradients():
     """Operands rounded to float16 change the output by less than 5e-3, and with a loss scale no gradient is lost."""
     network = network_of(width=16, levels=1, message_passing_steps=1)
     state = float32_state((5,), spread=0.1)
@@ -112,9 +102,7 @@ def test_half_precision_keeps_small_gradients() -> None:
     ("precision", "half_cells", "half_sums", "few_rows"),
     [("tf32", False, False, None), ("fp16", False, False, None), ("fp16", True, False, 0), ("fp16", True, True, 0)],
 )
-def test_inference_alone(
-    precision: str, half_cells: bool, half_sums: bool, few_rows: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_inference_alone(precision, half_cells, half_sums, few_rows, monkeypatch):
     """Where nothing is kept for gradients, operands of TF32 and float16 change the output by less than 5e-3, also with
     the cells in float16 between kernels and so summed, and with the kernels for many rows."""
     if few_rows is not None:
@@ -127,7 +115,7 @@ def test_inference_alone(
     assert relative_error(found, network.normalised_acceleration(state, origin_S3).detach()) < 5e-3
 
 
-def test_cells_on_the_border_of_the_grid() -> None:
+def test_cells_on_the_border_of_the_grid():
     """Particles exactly at cell centres and cell faces activate the cells that the plain grid activates."""
     network = network_of(width=16, levels=2, message_passing_steps=1, cell_size=0.0625)
     state = float32_state((4,), spread=0.2)
@@ -139,7 +127,7 @@ def test_cells_on_the_border_of_the_grid() -> None:
     assert relative_error(found, network.normalised_acceleration(state, origin_S3).detach()) < 1e-5
 
 
-def test_without_obstacles_nothing_is_looked_up() -> None:
+def test_without_obstacles_nothing_is_looked_up():
     """A network with obstacle features gives in a scene without obstacles exactly what it gives when all normals are
     looked up and none is found."""
     network = network_of(width=16, levels=1, message_passing_steps=1)
@@ -154,7 +142,7 @@ def test_without_obstacles_nothing_is_looked_up() -> None:
     assert torch.equal(*outputs)
 
 
-def test_rounded_reference() -> None:
+def test_rounded_reference():
     """What the reference for rounded operands rounds to are TF32's numbers and float16's, halves aside; a network's
     output and gradients then move by as much as such operands move them, not by nothing and not by far more."""
     x = torch.randn(1000, generator=torch.Generator().manual_seed(0))
@@ -177,7 +165,7 @@ def test_rounded_reference() -> None:
         ("tf32", (1,), 9),
     ],
 )
-def test_whole_networks_on_a_gpu(precision: str, counts: tuple[int, ...], draws: int) -> None:
+def test_whole_networks_on_a_gpu(precision, counts, draws):
     """With all levels and steps, in TF32 and float16, the median error of several states is at most 1.5 times that of
     the reference in float64 with operands so rounded (and what float16 keeps rounded): that is what rounding does,
     most of it by activations next to their kink, and how much is chance for each state."""
@@ -199,7 +187,7 @@ def test_whole_networks_on_a_gpu(precision: str, counts: tuple[int, ...], draws:
     assert (middle < bounds).all(), (middle, bounds)
 
 
-def rounding_errors(network: HierarchicalGraphNetwork, state: ParticleState, stored: bool) -> tuple[float, float]:
+def rounding_errors(network, state, stored):
     """Relative errors of output and gradients that rounded operands make in the reference network."""
     origin_S3, weight_N3 = drawn(network, state)
     output, expected = reference(network, state, origin_S3, weight_N3)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -199,9 +198,7 @@ GOLD, HALF = "it needs gold", "it has no fp16"
         ("torch", "fp16", (None, HALF), "got fp16; training.backend=torch was asked for"),
     ],
 )
-def test_the_backend_is_chosen_and_said(
-    backend: str, precision: str, reasons: tuple[str | None, str | None], expected: Any
-) -> None:
+def test_the_backend_is_chosen_and_said(backend, precision, reasons, expected):
     """auto takes backend triton where it runs and says so; what cannot be had is refused, never replaced silently."""
     keeps = dict(zip(("triton", "torch"), reasons, strict=True))
     if isinstance(expected, tuple):

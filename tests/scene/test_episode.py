@@ -55,7 +55,7 @@ def assert_same(left, right):
 
 @settings(max_examples=25, deadline=None)
 @given(frames=st.integers(1, 4), particles=st.integers(0, 9), cells=st.integers(0, 4), seed=st.integers(0, 2**32))
-def test_roundtrip(frames: int, particles: int, cells: int, seed: int) -> None:
+def test_roundtrip(frames, particles, cells, seed):
     """Decoding returns every field bitwise, for any sizes, an empty scene and no obstacles included."""
     episode = make_episode(frames, particles, cells, seed)
     assert_same(episode, decode_episode(episode.key, encode_episode(episode)))

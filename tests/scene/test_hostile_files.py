@@ -201,7 +201,7 @@ def test_decoders_bear_any_bytes(kind):
 
     @settings(max_examples=EXAMPLES, deadline=None, derandomize=EXAMPLES == 25, database=None)
     @given(places, st.integers(0, len(content)), st.integers(0, 3))
-    def damaged(changes: list[tuple[int, int]], cut: int, kind_of_cut: int) -> None:
+    def damaged(changes, cut, kind_of_cut):
         data = bytearray(content)
         for place, value in changes:
             data[place] = value

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -262,46 +263,36 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["rollout.h5"]
 
 
-def test_missing_file(tmp_path):
-    """A missing file is named, with the command that writes one."""
-    with pytest.raises(ConfigError, match=r"existing file, got .*nothing\.h5.*hgn\.rollout"):
-        read_rollout(tmp_path / "nothing.h5")
+def edited(change):
+    def edit(path):
+        with h5py.File(path, "a") as file:
+            change(file)
+
+    return edit
 
 
-def test_not_hdf5(tmp_path):
-    """A file of another kind is refused."""
-    (tmp_path / "text.h5").write_text("not a rollout")
-    with pytest.raises(ConfigError, match="complete HDF5 file"):
-        read_rollout(tmp_path / "text.h5")
+def shorter(file):
+    del file["VTKHDF/Points"]
+    file["VTKHDF/Points"] = np.zeros((5, 3), np.float32)
 
 
-def test_other_format_and_version(tmp_path):
-    """HDF5 files of other programs and of other versions are told apart in the message."""
-    path = tmp_path / "rollout.h5"
-    with h5py.File(path, "w") as file:
-        file["hgn"] = np.zeros(3)
-    with pytest.raises(ConfigError, match="format None"):
-        read_rollout(path)
-    write_rollout(path, make_rollout())
-    with h5py.File(path, "a") as file:
-        file["hgn"].attrs["format_version"] = 99
-    with pytest.raises(ConfigError, match="format_version must be 1 or 2, got 99"):
-        read_rollout(path)
-
-
-def test_damaged_contents(tmp_path):
-    """A missing dataset, and one of the wrong size, are refused."""
-    path = tmp_path / "rollout.h5"
-    write_rollout(path, make_rollout())
-    with h5py.File(path, "a") as file:
-        del file["VTKHDF/Points"]
-        file["VTKHDF/Points"] = np.zeros((5, 3), np.float32)
-    with pytest.raises(ConfigError, match="4 frames of 7 particles"):
-        read_rollout(path)
-    with h5py.File(path, "a") as file:
-        del file["VTKHDF/Points"]
-    with pytest.raises(ConfigError, match=r"must be complete.*Points"):
-        read_rollout(path)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (Path.unlink, r"existing file, got .*a\.vtkhdf.*hgn\.rollout"),
+        (lambda path: path.write_text("not a rollout"), "complete HDF5 file"),
+        (edited(lambda file: file["hgn"].attrs.pop("format")), "format None"),
+        (edited(lambda file: file["hgn"].attrs.update(format_version=99)), "format_version must be 1 or 2, got 99"),
+        (edited(shorter), "4 frames of 7 particles"),
+        (edited(lambda file: file.pop("VTKHDF/Points")), r"must be complete.*Points"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, change, message):
+    """None, files of other programs and versions, and damaged ones are told apart in the message."""
+    write_rollout(tmp_path / "a.vtkhdf", make_rollout())
+    change(tmp_path / "a.vtkhdf")
+    with pytest.raises(ConfigError, match=message):
+        read_rollout(tmp_path / "a.vtkhdf")
 
 
 @pytest.mark.parametrize(

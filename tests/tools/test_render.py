@@ -141,7 +141,7 @@ def test_other_rollouts_stand_beside_it(tmp_path):
         ({"rollout": None, "data": "missing", "episode": "test-000000"}, "missing"),
     ],
 )
-def test_bad_input(tmp_path: Path, change: dict, message: str) -> None:
+def test_bad_input(tmp_path, change, message):
     """Every wrong value is named with its rule, and nothing is written."""
     mapping = {"rollout": str(rollout_file(tmp_path, False)), "out": str(tmp_path / "out"), "size": 80} | change
     with pytest.raises(ConfigError, match=message):

@@ -124,7 +124,7 @@ def test_triton_is_timed_alike(alone):
         ({"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),
     ],
 )
-def test_bad_options(change: dict[str, Any], message: str) -> None:
+def test_bad_options(change, message):
     """Each wrong option is named before anything is started."""
     with pytest.raises(ConfigError, match=message):
         from_mapping(ScalingConfig, change)

@@ -60,9 +60,7 @@ def ranks_of(world_size, batch, published, sampler_state=None):
     st.integers(1, 4),
     st.lists(st.tuples(st.integers(1, 6), st.integers(0, 2)), min_size=1, max_size=8),
 )
-def test_an_epoch_keeps_the_revision_it_began_with(
-    growth: list[int], world_size: int, starts: list[tuple[int, int]]
-) -> None:
+def test_an_epoch_keeps_the_revision_it_began_with(growth, world_size, starts):
     """While a data set grows at every look, and the training is interrupted at any batch, each epoch has exactly the
     episodes that were published when it began, each sample once."""
     published: list[int] = [4, 3, 5]
@@ -138,7 +136,7 @@ def test_feeds_of_all_ranks_resume_anywhere(data):
             max_size=3,
         )
     )
-    def interrupted(starts: list[tuple[int, int, int, int]]) -> None:
+    def interrupted(starts):
         seen: list[int] = []
         sampler_state = SamplerState()
         for world_size, batch_scenes, ahead, count in starts:
@@ -217,7 +215,7 @@ def test_resume_equals_no_interruption(data, stop_at):
 
     @settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
     @given(st.lists(st.integers(1, UPDATES - 1), min_size=1, max_size=2, unique=True).map(sorted))
-    def interrupted(stops: list[int]) -> None:
+    def interrupted(stops):
         with tempfile.TemporaryDirectory() as folder:
             found = trained(Path(folder) / "cut", stops)
         for part in ("state_dict", "optimizer_states", "lr_schedulers", "hgn"):
