@@ -15,6 +15,7 @@ from hgn.scene.material import MATERIAL_NAME, MATERIALS, PAPER_MATERIALS
 from hgn.schema import (
     BelowOne,
     Bound,
+    BoxSize,
     ConfigError,
     FewLayers,
     Fraction,
@@ -23,6 +24,7 @@ from hgn.schema import (
     NonNegative,
     OneOrMore,
     Positive,
+    Vector,
     one_of,
     require,
     require_bounds,
@@ -84,9 +86,9 @@ def require_rollout_name(field: str, name: str | None) -> None:
 class SceneConfig:
     """The distribution that random scenes are drawn from (paper sec. 3.3). Lengths in domain units."""
 
-    domain_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    domain_size: BoxSize = (1.0, 1.0, 1.0)
     cell_size: Positive[float] = 1 / 64  # of the solver
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
+    gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
     obstacle_count: NonNegative[int] = 5
     obstacle_shapes: tuple[str, ...] = OBSTACLE_SHAPES  # or mesh files, scaled so that the longest side is the size
     obstacle_size: tuple[float, float] = (0.1, 0.5)
@@ -109,10 +111,6 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        for axis, length in zip("xyz", self.domain_size, strict=True):
-            require(length > 0 and math.isfinite(length), f"domain_size ({axis})", "a finite number > 0", length)
-        for axis, value in zip("xyz", self.gravity, strict=True):
-            require(math.isfinite(value), f"gravity ({axis})", "finite", value)
         other = self.zero_gravity_fraction + self.tilted_gravity_fraction
         rule = f"at most 1 - zero_gravity_fraction ({self.zero_gravity_fraction:g})"
         require(other <= 1, "tilted_gravity_fraction", rule, self.tilted_gravity_fraction)

@@ -42,6 +42,9 @@ def one_of(*choices: str) -> Bound:
 N = TypeVar("N", int, float)
 Positive = Annotated[N, Bound("a finite number > 0", lambda value: 0 < value < math.inf)]
 NonNegative = Annotated[N, Bound("a finite number >= 0", lambda value: 0 <= value < math.inf)]
+Finite = Annotated[float, Bound("finite", math.isfinite)]
+Vector = tuple[Finite, Finite, Finite]
+BoxSize = tuple[Positive[float], Positive[float], Positive[float]]
 Fraction = Annotated[N, Bound("from 0 to 1", lambda value: 0 <= value <= 1)]
 BelowOne = Annotated[N, Bound("0 or more and below 1", lambda value: 0 <= value < 1)]
 OneOrMore = Annotated[int, Bound("at least 1", lambda value: value >= 1)]
