@@ -1,18 +1,10 @@
 """Whole data sets of the ballistic stand-in, made in this process."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import ballistic_solver
 
 from datagen.pool.shard import stage_episode
 from datagen.pool.worker import MadeScene, make_episode
 from datagen.pool.writer import DatasetWriter
-from hgn.config import DatagenConfig
-
-MakeConfig = Callable[..., DatagenConfig]
-MakeDataset = Callable[[DatagenConfig], Path]
-Stage = Callable[[DatasetWriter, str, int], None]
 
 
 def stage(writer, split, index):

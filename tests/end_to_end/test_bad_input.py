@@ -88,9 +88,6 @@ def content(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-Capture = pytest.CaptureFixture[str]
-
-
 def refused(command, arguments, capsys, monkeypatch):
     """Runs a command as its module would; returns the exit code and the one error line."""
     monkeypatch.setattr(sys, "argv", [command, *arguments])

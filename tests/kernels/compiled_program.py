@@ -3,8 +3,6 @@ COMPILED and a kernel of a grid with relative inputs or the first of a name that
 often it waits, and its writes before, PRODUCT, kernel, tiles copied ahead and products under way meanwhile, HAZARDS,
 kernel, precision and their number, SHARED, kernel and its bytes of shared memory."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

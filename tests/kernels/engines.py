@@ -1,7 +1,5 @@
 """An engine on the particles of a reference state, for the parity tests."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch
@@ -11,23 +9,13 @@ from hgn.kernels.forward import FusedNetwork, feature_columns
 from hgn.kernels.grid.op import DeviceGrid, ObstacleTable, Window
 from hgn.kernels.packing import pack_network
 from hgn.kernels.tuning import Tuning
-from hgn.network.features import ParticleState
-from hgn.network.hgn import HierarchicalGraphNetwork
 
 
-def device() -> torch.device:
+def device():
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def engine_of(
-    network: HierarchicalGraphNetwork,
-    state: ParticleState,
-    precision: str = "fp32",
-    capacities: tuple[int, ...] = (),
-    spare_particles: int = 3,
-    loss_scale: float = 1.0,
-    tuning: Tuning | None = None,
-) -> FusedTrainingNetwork:
+def engine_of(network, state, precision="fp32", capacities=(), spare_particles=3, loss_scale=1.0, tuning=None):
     """All buffers that the forward pass writes are NaN before, so that what nobody writes shows."""
     config, where = network.config, device()
     particles = len(state.position_N3)
@@ -52,31 +40,25 @@ def engine_of(
     return FusedTrainingNetwork(config, packed, values, grid, count, precision, loss_scale, tuning)
 
 
-def inference_of(
-    engine: FusedTrainingNetwork, network: HierarchicalGraphNetwork, half_cells: bool = False, half_sums: bool = False
-) -> FusedNetwork:
+def inference_of(engine, network, half_cells=False, half_sums=False):
     """An engine that keeps nothing, on the same grid: other kernels than those of training."""
     tuning = replace(Tuning.of(engine.precision), half_cells=half_cells, half_sums=half_sums)
     given = (network.config, engine.packed, engine.values, engine.grid, engine.particle_count, engine.precision)
     return FusedNetwork(*given, tuning=tuning)
 
 
-def run_forward(
-    engine: FusedNetwork, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
-) -> torch.Tensor:
+def run_forward(engine, network, state, origin_S3):
     """The engine's normalised accelerations of the state, [N, 3]."""
     prepare(engine, network, state, origin_S3)
     engine.forward()
     return engine.output[: len(state.position_N3), :3].cpu()
 
 
-def prepare(
-    engine: FusedNetwork, network: HierarchicalGraphNetwork, state: ParticleState, origin_S3: torch.Tensor
-) -> None:
+def prepare(engine, network, state, origin_S3):
     """The state's cells and features in the engine's grid."""
     where, grid, config = engine.device, engine.grid, network.config
 
-    def padded(value: torch.Tensor) -> torch.Tensor:
+    def padded(value):
         full = torch.full((grid.particles, *value.shape[1:]), 7, dtype=value.dtype)
         full[: len(value)] = value
         return full.to(where)
@@ -104,7 +86,7 @@ def prepare(
     )
 
 
-def gradients(engine: FusedTrainingNetwork, network: HierarchicalGraphNetwork) -> list[torch.Tensor]:
+def gradients(engine, network):
     """What `backward` left, shaped as the network's parameters."""
     found = [torch.zeros_like(p, dtype=torch.float32) for p in network.parameters()]
     engine.packed.scatter(engine.totals[: engine.packed.size].cpu(), found)

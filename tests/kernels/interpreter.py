@@ -1,10 +1,6 @@
 """Triton's interpreter nearer to a GPU; natively this does nothing."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -12,7 +8,7 @@ import triton
 
 
 @contextmanager
-def dropped_bits() -> Iterator[None]:
+def dropped_bits():
     """TF32 products drop the operands' last 13 bits, as the matrix units do: by itself the interpreter keeps them."""
     if not triton.knobs.runtime.interpret:
         yield
@@ -22,7 +18,7 @@ def dropped_bits() -> Iterator[None]:
 
     multiply = InterpreterBuilder.create_dot
 
-    def create_dot(builder: Any, a: Any, b: Any, total: Any, input_precision: Any, *rest: Any) -> Any:
+    def create_dot(builder, a, b, total, input_precision, *rest):
         if input_precision == ir.INPUT_PRECISION.TF32 and a.data.dtype == np.float32:
             a, b = (TensorHandle((x.data.view(np.int32) & -0x2000).view(np.float32), x.dtype) for x in (a, b))
         return multiply(builder, a, b, total, input_precision, *rest)

@@ -3,9 +3,6 @@
 Launches are seen where Triton makes them: whatever launches a kernel, none is missed.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +12,8 @@ import torch
 from kernels.interpreter import dropped_bits
 from triton.runtime.jit import KernelInterface
 
-from hgn.kernels.forward import FusedNetwork
 from hgn.kernels.gns.op import FusedEdges
-from hgn.kernels.reference import Added, Outputs, ProgramSums, rows
+from hgn.kernels.reference import Added, ProgramSums, rows
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,7 @@ class Launch:
     parameters: dict[int, torch.Tensor]  # float64 and not rounded, by the address of what the kernel reads
     buffers: dict[int, torch.Tensor]  # of the network, by their address
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self):
         """Those of the kernel's reference: numbers in float64, parameters not rounded."""
         result = dict(self.given)
         for name, tensor in self.left.items():
@@ -42,14 +38,14 @@ class Launch:
             result["right"] = {row[1]: self._operand(row[1], row[5]) for row in self.given["jobs"].tolist()}
         return result
 
-    def _operand(self, at: int, width: int) -> torch.Tensor:
+    def _operand(self, at, width):
         """The buffer that lies at an offset from the weights' products' `right`."""
         right = self.left["right"]
         operand = self.buffers[right.data_ptr() + at * right.element_size()]
         assert operand.dtype == right.dtype and operand.shape[-1] == width
         return operand.double()
 
-    def pairs(self, outputs: Outputs) -> Iterator[tuple[str, torch.Tensor, torch.Tensor, float]]:
+    def pairs(self, outputs):
         """Of each output its name, what was left, what should have been, and the size of its summands."""
         for name, output in outputs.items():
             if isinstance(output, Added):
@@ -65,14 +61,12 @@ class Launch:
 
 
 @contextmanager
-def watched(
-    see: Callable[[Launch], None], parameters: dict[int, torch.Tensor], buffers: dict[int, torch.Tensor] | None = None
-) -> Iterator[None]:
+def watched(see, parameters, buffers=None):
     """Every launch is seen as soon as it is over."""
     begin = KernelInterface.__getitem__
 
-    def watching(kernel: Any, grid: Any) -> Callable[..., None]:
-        def launch(**arguments: Any) -> None:
+    def watching(kernel, grid):
+        def launch(**arguments):
             left = {name: value for name, value in arguments.items() if isinstance(value, torch.Tensor)}
             given = arguments | {
                 name: value.clone() for name, value in left.items() if value.data_ptr() not in parameters
@@ -87,7 +81,7 @@ def watched(
 
 
 @contextmanager
-def watched_engine(see: Callable[[Launch], None], engine: FusedNetwork) -> Iterator[None]:
+def watched_engine(see, engine):
     values = engine.values.double()
     parameters = {
         engine.weights.data_ptr(): values,
@@ -99,13 +93,13 @@ def watched_engine(see: Callable[[Launch], None], engine: FusedNetwork) -> Itera
 
 
 @contextmanager
-def watched_edges(see: Callable[[Launch], None]) -> Iterator[None]:
+def watched_edges(see):
     """Of GNS, whose products read copies that are made for each launch."""
     parameters: dict[int, torch.Tensor] = {}
     operands: list[torch.Tensor] = []  # held, or another tensor would come to lie where one was and be taken for it
     copy = FusedEdges._operand
 
-    def noting(edges: FusedEdges, weight: torch.Tensor) -> torch.Tensor:
+    def noting(edges, weight):
         operand = copy(edges, weight)
         parameters[operand.data_ptr()] = weight.detach().double()
         operands.append(operand)
@@ -115,7 +109,7 @@ def watched_edges(see: Callable[[Launch], None]) -> Iterator[None]:
         yield
 
 
-def _encoder(engine: FusedNetwork, values: torch.Tensor) -> torch.Tensor:
+def _encoder(engine, values):
     """Its first layer on features and one-hot materials."""
     first, embedding, bias = engine._encode_views(values)
     used = engine.config.feature_width - engine.config.material_embedding
@@ -125,7 +119,7 @@ def _encoder(engine: FusedNetwork, values: torch.Tensor) -> torch.Tensor:
     return combined
 
 
-def _tensors(value: Any) -> Iterator[torch.Tensor]:
+def _tensors(value):
     if isinstance(value, torch.Tensor):
         yield value
     elif isinstance(value, dict):

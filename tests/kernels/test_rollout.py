@@ -1,7 +1,5 @@
 """The simulation loop on the device against the plain one."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from dataclasses import replace
@@ -24,7 +22,6 @@ from hgn.runtime.parity import relative_error
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
 from hgn.runtime.weights import find_weights, load_weights
-from hgn.scene.symmetry import Vector
 from hgn.schema import ConfigError
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
@@ -32,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("large_tiles")
 GRAVITY = (0.0, -9.8, 0.0)
 
 
-def scene(particles: int, seed: int = 0, gravity: Vector = GRAVITY) -> InitialState:
+def scene(particles, seed=0, gravity=GRAVITY):
     rng = np.random.default_rng(seed)
     return InitialState(
         position_N3=(0.05 + 0.1 * rng.random((particles, 3))).astype(np.float32),
@@ -44,12 +41,12 @@ def scene(particles: int, seed: int = 0, gravity: Vector = GRAVITY) -> InitialSt
     )
 
 
-def network(levels: int = 1, **changes: object) -> HierarchicalGraphNetwork:
+def network(levels=1, **changes):
     return network_of(torch.float32, width=16, levels=levels, message_passing_steps=1, **changes).to(device())
 
 
 @pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "rest_threshold": 2.0}])
-def test_frames_are_those_of_the_plain_loop(changes: dict) -> None:
+def test_frames_are_those_of_the_plain_loop(changes):
     """Two scenes at once, of different gravity, move as in the plain simulator, frame by frame, and each frame is
     announced once."""
     scenes, seen = [scene(5), scene(3, 1, (3.0, -1.0, 2.0))], []
@@ -62,7 +59,7 @@ def test_frames_are_those_of_the_plain_loop(changes: dict) -> None:
 
 
 @pytest.mark.parametrize("precision", ["fp32", "fp16"])
-def test_free_flight_is_not_refused(precision: str) -> None:
+def test_free_flight_is_not_refused(precision):
     """What relative inputs put out in free flight is rounding alone, which differs as a whole; both loops fall with
     gravity to 1e-3 of it. A network whose weights differ is still refused where something happens."""
     thrown = replace(scene(40, gravity=(0.0, -5.0, 0.0)), domain_size=(1.0, 1.0, 1.0))
@@ -84,7 +81,7 @@ def test_free_flight_is_not_refused(precision: str) -> None:
         rollout.require_parity(other, stirred)
 
 
-def test_overflow_loses_nothing() -> None:
+def test_overflow_loses_nothing():
     """A rollout whose cells outgrow its buffers grows them, and its frames equal those of one that had room."""
     spreading = network()
     with torch.no_grad():
@@ -98,7 +95,7 @@ def test_overflow_loses_nothing() -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
-def test_later_simulations_begin_anew() -> None:
+def test_later_simulations_begin_anew():
     """What a simulator has captured it uses again, for a scene of fewer particles, other obstacles and other gravity
     too; the frames are bitwise those of a new simulator, after one that diverged as well."""
     first, second = scene(3), scene(2, 1, (0.0, 2.0, 0.0))
@@ -122,7 +119,7 @@ def test_later_simulations_begin_anew() -> None:
     assert not again.backend.idle
 
 
-def test_scenes_that_change() -> None:
+def test_scenes_that_change():
     """Particles that enter, other obstacles, other gravity and an earlier frame are those of the plain loop; what was
     captured is used for all of them while there is room, and captured anew where there is not."""
     paths, growing = [], []
@@ -147,7 +144,7 @@ def test_scenes_that_change() -> None:
         np.testing.assert_allclose(found_N3, expected_N3, rtol=0, atol=1e-6)
 
 
-def test_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frame_by_frame(monkeypatch):
     """Frames that are asked for one by one are bitwise those of a rollout, beside another simulation of the same
     simulator; the one that ends last is kept. What diverges gives its good frames first."""
     monkeypatch.setattr(triton_rollout, "LOOK_FRAMES", 2)
@@ -168,7 +165,7 @@ def test_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(frames) == raised.value.frame > 1 and all(np.isfinite(frame).all() for frame in frames)
 
 
-def test_first_room() -> None:
+def test_first_room():
     """Groups that fall have room to spread at once, up to what their particles can fill; where cells are many already
     there is twice the room, and where they are so many that memory counts, a quarter more."""
     assert first_capacities((246, 53, 18, 5), 2_763) == (1_657, 276, 96, 40)
@@ -179,7 +176,7 @@ def test_first_room() -> None:
 
 
 @pytest.mark.parametrize(("particles", "side", "most"), [(1_000_000, 128, 2.35e9), (4_296, 48, 0.055e9)])
-def test_memory_of_a_simulation(particles: int, side: int, most: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_a_simulation(particles, side, most, monkeypatch):
     """In fp16 the network of the paper's size simulates a million particles, of which a cell has three as on
     the bench, within 2.35 KB each, and 4,296 within 0.055 GB; what is asked are 3 KB and 0.1 GB. Counted over all
     tensors of a simulation without memory: weights, state and positions on their way to the host too."""
@@ -198,13 +195,13 @@ def test_memory_of_a_simulation(particles: int, side: int, most: float, monkeypa
     assert rollout.fused.precision == "fp16"
 
 
-def on_meta() -> dict[int, int]:
+def on_meta():
     """Bytes of each storage without memory that is alive."""
     found = [thing.untyped_storage() for thing in living_tensors() if thing.device.type == "meta"]
     return {storage._cdata: storage.nbytes() for storage in found}
 
 
-def test_growing_gives_back_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_growing_gives_back_first(monkeypatch):
     """While buffers grow the old ones are gone; where there is no memory for larger ones, the simulation has its old
     ones again and stands where it stood: with memory it goes on as if nothing had been."""
     spreading = network()
@@ -216,12 +213,12 @@ def test_growing_gives_back_first(monkeypatch: pytest.MonkeyPatch) -> None:
     old = [weakref.ref(tight.grid), weakref.ref(tight.fused)]
     build, asked = DeviceGrid.__init__, []
 
-    def refuse(grid: DeviceGrid, window: Window, scenes: int, capacities: tuple[int, ...], *rest: object) -> None:
+    def refuse(grid, window, scenes, capacities, *rest):
         gc.collect()
         asked.append((capacities, [one() for one in old]))
         if len(asked) == 1:
             raise torch.OutOfMemoryError("no room")
-        build(grid, window, scenes, capacities, *rest)  # type: ignore[arg-type]
+        build(grid, window, scenes, capacities, *rest)
 
     monkeypatch.setattr(DeviceGrid, "__init__", refuse)
     with pytest.raises(torch.OutOfMemoryError, match="no room"):
@@ -231,7 +228,7 @@ def test_growing_gives_back_first(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(tight.run(3 - done), expected[done:], rtol=0, atol=1e-6)
 
 
-def test_frames_taken_away_beside_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_taken_away_beside_the_next(monkeypatch):
     """Frames that are started before those before them are looked at are the same bitwise, where buffers grow too: what
     was started in vain moves nothing; and the frame of a divergence is the same."""
     monkeypatch.setattr(triton_rollout, "LOOK_FRAMES", 1)
@@ -256,7 +253,7 @@ def test_frames_taken_away_beside_the_next(monkeypatch: pytest.MonkeyPatch) -> N
     assert growths[0] == growths[1] > 0 and lost[0] == lost[1]
 
 
-def test_divergence_names_the_frame() -> None:
+def test_divergence_names_the_frame():
     """Particles that leave the domain by more than its size end the simulation with backend torch's message."""
     wild = network()
     with torch.no_grad():
@@ -270,7 +267,7 @@ def test_divergence_names_the_frame() -> None:
     assert messages[0] == messages[1] and "4 of 4 particles" in messages[0]
 
 
-def test_wrong_kernels_are_refused() -> None:
+def test_wrong_kernels_are_refused():
     """A rollout whose first output is not the reference network's is refused before it moves anything."""
     plain = network()
     state = Simulator(plain, 60.0, "torch").start([scene(5)])
@@ -283,7 +280,7 @@ def test_wrong_kernels_are_refused() -> None:
         rollout.require_parity(other, state)
 
 
-def block(density: float, cell_size: float, cells: int) -> ParticleState:
+def block(density, cell_size, cells):
     """Water at rest in a cube of so many cells, so many times as dense as the data's: 90 particles in a cell."""
     count = round(90 * density * cells**3)
     state = random_state((count,), obstacles=False, dtype=torch.float32)
@@ -294,13 +291,13 @@ def block(density: float, cell_size: float, cells: int) -> ParticleState:
 
 
 @pytest.mark.skipif(device().type != "cpu", reason="the interpreter's; the next one is a GPU's")
-def test_crowds_are_added_in_float32(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crowds_are_added_in_float32(monkeypatch):
     """Where particles lie twice as densely as in the data, sums of them in float16 would be further off."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.0625).float()
     with torch.no_grad():
         network.particle_to_cell.norm.bias.fill_(3.0)  # sums are large beside what is added
 
-    def error(density: float, careful: bool) -> float:
+    def error(density, careful):
         state = block(density, 0.0625, 1)
         rollout = TritonRollout(network, state, "fp16", (64,))
         assert rollout._careful is careful
@@ -319,7 +316,7 @@ def test_crowds_are_added_in_float32(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(device().type != "cuda", reason="needs a CUDA device")
 @pytest.mark.parametrize("density", [1, 2, 4, 10])
-def test_density(density: float) -> None:
+def test_density(density):
     """Accelerations of the shipped network in half precision are within 1 % of TF32's, up to ten times the data's
     density."""
     network, _ = load_weights(find_weights("obstacles"))

@@ -1,7 +1,5 @@
 """Training updates on the device against the reference network under torch's Adam."""
 
-from __future__ import annotations
-
 import copy
 import math
 
@@ -14,7 +12,6 @@ from hgn.data.episode_tensors import EpisodeTensors
 from hgn.kernels.grid.op import ObstacleHash
 from hgn.kernels.update.op import DeviceEpisode, DeviceSample, Updates, UpdateSettings
 from hgn.network.features import ParticleState
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.network.obstacles import ObstacleCells
 from hgn.network.orthogonal import orthogonalised
 from hgn.schema import ConfigError
@@ -27,7 +24,7 @@ HISTORY = 5
 CELL_SIZE = 1 / 64
 
 
-def episode(seed: int, particles: int, obstacles: bool, spread: float = 0.12) -> tuple[DeviceEpisode, list]:
+def episode(seed, particles, obstacles, spread=0.12):
     """Particles that move at random, and the grids that the reference network asks for the same obstacles."""
     generator = torch.Generator().manual_seed(seed)
     start = torch.rand(1, particles, 3, generator=generator) * spread + 0.2
@@ -43,7 +40,7 @@ def episode(seed: int, particles: int, obstacles: bool, spread: float = 0.12) ->
     return made, [grid] if obstacles else []
 
 
-def one_with_obstacles() -> tuple[list[tuple[DeviceEpisode, int, int]], list[EpisodeTensors]]:
+def one_with_obstacles():
     """A sample of each of two episodes, one among obstacles, and the same episodes as the parity check takes them."""
     made, grids = episode(1, 5, True)
     still, _ = episode(2, 3, False)
@@ -56,13 +53,7 @@ def one_with_obstacles() -> tuple[list[tuple[DeviceEpisode, int, int]], list[Epi
     return [(made, 1, 3), (still, 0, 4)], episodes
 
 
-def plain_updates(
-    network: HierarchicalGraphNetwork,
-    chunk: list,
-    grids: list,
-    rates: list[float],
-    optimizer: torch.optim.Optimizer | None = None,
-) -> list[float]:
+def plain_updates(network, chunk, grids, rates, optimizer=None):
     """The same with autograd and torch's Adam (or `optimizer`), without noise and jitter; the losses."""
     optimizer = optimizer or torch.optim.Adam(network.parameters(), lr=1.0)
     losses = []
@@ -92,9 +83,7 @@ def plain_updates(
     return losses
 
 
-def updates_of(
-    network: HierarchicalGraphNetwork, scenes: int, capacities: tuple[int, ...] = (), **changes: object
-) -> Updates:
+def updates_of(network, scenes, capacities=(), **changes):
     settings = {"noise_std": 0.0, "grid_jitter": False} | changes
     return Updates(
         copy.deepcopy(network).float().to(device()),
@@ -106,7 +95,7 @@ def updates_of(
     )
 
 
-def parameters_of(updates: Updates) -> torch.Tensor:
+def parameters_of(updates):
     found = [torch.zeros_like(p) for p in updates.network.parameters()]
     updates.packed.scatter(updates.values, found)
     return torch.cat([tensor.flatten() for tensor in found]).cpu().double()
@@ -116,7 +105,7 @@ def parameters_of(updates: Updates) -> torch.Tensor:
     ("optimizer", "directions"),
     [("adam", torch.float32), ("muon", torch.float32), ("muon", torch.bfloat16)],
 )
-def test_updates_are_those_of_torch(optimizer: str, directions: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_updates_are_those_of_torch(optimizer, directions, monkeypatch):
     """Two updates of two scenes, with and without obstacles, at different rates, weighted:
     losses and parameters are those of autograd in float64 with torch's Adam or with Muon; an update that needs more
     room than there is gets it, and is repeated. With Muon's directions in bfloat16, as a GPU makes them, parameters are
@@ -153,7 +142,7 @@ def test_updates_are_those_of_torch(optimizer: str, directions: torch.dtype, mon
     assert int(updates.step) == 2 and updates.counters[1] == 2 and updates.counters[2] == 0
 
 
-def test_noise_and_jitter() -> None:
+def test_noise_and_jitter():
     """Noise is a random walk whose last step has the asked standard deviation, positions follow the velocities, the
     target undoes the velocity error; origins lie in [-cell, 0]; the same seed draws the same, another seed another."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
@@ -195,7 +184,7 @@ def test_noise_and_jitter() -> None:
     torch.testing.assert_close(updates.share_N[:700].cpu(), torch.tensor([4 / 800] * 400 + [1 / 600] * 300))
 
 
-def test_a_flat_network_is_shown_no_noise_across() -> None:
+def test_a_flat_network_is_shown_no_noise_across():
     """With two dimensions z and its velocities are the data's bit by bit, and the grid does not move along it."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1, dimensions=2)
     made, _ = episode(1, 64, False, spread=0.3)
@@ -211,7 +200,7 @@ def test_a_flat_network_is_shown_no_noise_across() -> None:
     assert updates.origin_S3[0, 2] == 0 and (updates.origin_S3[0, :2] < 0).all()
 
 
-def test_correlated_noise() -> None:
+def test_correlated_noise():
     """With noise_correlated_fraction=1 a scene gets the sum of its waves for noise, as in backend torch, of the asked
     spread; other scenes have other waves; half of the variance leaves the other half to each particle."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.01)
@@ -246,7 +235,7 @@ def test_correlated_noise() -> None:
     torch.testing.assert_close(walk[400:], walks[1.0][400:] / 2, rtol=0, atol=1e-6)
 
 
-def test_wrong_kernels_are_refused() -> None:
+def test_wrong_kernels_are_refused():
     """Before the first update outputs and gradients are compared with the reference's on the noisy, jittered batch:
     they agree to rounding, and kernels that compute another network are refused with the remedy."""
     network = network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)

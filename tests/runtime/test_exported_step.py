@@ -121,7 +121,7 @@ def test_package_is_the_step(tmp_path, name):
         ({"weights": "obstacles", "arrays": "a"}, "scene must be given with arrays, and only then, got None"),
     ],
 )
-def test_what_is_refused(options: dict[str, str], message: str) -> None:
+def test_what_is_refused(options, message):
     """By name, with the rule, before anything is written."""
     with pytest.raises(ConfigError, match=message):
         export.main(options)

@@ -1,12 +1,8 @@
 """What tools.error_vs_time measures, pairs and draws: errors of frames and rollouts against closed forms."""
 
-from __future__ import annotations
-
 import io
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,11 +31,11 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture
-def data(small_dataset: Path) -> str:
+def data(small_dataset):
     return str(small_dataset)
 
 
-def test_baseline_errors_are_those_of_training(data: str) -> None:
+def test_baseline_errors_are_those_of_training(data):
     """One-step errors agree with what training measures, at every frame."""
     (episode,) = EpisodeStore(data, "test").episodes
     gravity = BaselineContender("fall", lambda e: 0.9 * np.asarray(e.gravity) / e.frame_rate_hz**2, CPU)
@@ -49,7 +45,7 @@ def test_baseline_errors_are_those_of_training(data: str) -> None:
     assert gravity.one_step(episode, 1, 0.0).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
 
 
-def test_the_fast_path_tells_its_own_errors(data: str) -> None:
+def test_the_fast_path_tells_its_own_errors(data):
     """One-step errors of backend triton come from its kernels, several frames at once: in float32 they are the plain
     network's; what is captured serves the next frames, and those of fewer particles too."""
     (episode,) = EpisodeStore(data, "test").episodes
@@ -70,7 +66,7 @@ def test_the_fast_path_tells_its_own_errors(data: str) -> None:
     assert made[0] is made[1] is not made[2]
 
 
-def test_ghost_acceleration_counts_particles_at_rest(data: str) -> None:
+def test_ghost_acceleration_counts_particles_at_rest(data):
     """Only particles that have not moved count, each with the length of what is predicted for it."""
     (episode,) = EpisodeStore(data, "test").episodes
     position_TN3 = np.repeat(np.array(episode.position_TN3[:1]), 9, axis=0)
@@ -86,7 +82,7 @@ def test_ghost_acceleration_counts_particles_at_rest(data: str) -> None:
     assert score.one_step_figures([step])["ghost"] == pytest.approx(5e-3, rel=1e-5)
 
 
-def test_a_diverging_scene_ends_alone(data: str) -> None:
+def test_a_diverging_scene_ends_alone(data):
     """Beside one that diverges a scene goes on to the end; the other is kept as far as it came, with the cause."""
     episodes = EpisodeStore(data, "validation").episodes
     scenes = [InitialState.of_episode(episode) for episode in episodes]
@@ -100,10 +96,10 @@ def test_a_diverging_scene_ends_alone(data: str) -> None:
     assert simulate_scenes(simulator, [], 5) == []
 
 
-def test_sinkhorn_against_closed_forms() -> None:
+def test_sinkhorn_against_closed_forms():
     """Zero for a permuted cloud, the square of the shift for a shifted one, NaN where a position is not finite."""
 
-    def sinkhorn_divergence(first: torch.Tensor, second: torch.Tensor, blur: float) -> float:
+    def sinkhorn_divergence(first, second, blur):
         return sinkhorn_divergences([(first, second)], blur)[0]
 
     generator = torch.Generator().manual_seed(0)
@@ -125,7 +121,7 @@ def test_sinkhorn_against_closed_forms() -> None:
     assert math.isnan(sinkhorn_divergence(cloud, cloud, 0.01))
 
 
-def test_momentum_and_energy_against_closed_forms() -> None:
+def test_momentum_and_energy_against_closed_forms():
     """Free fall keeps its energy and gains momentum as gravity says; standing still loses none and gains none."""
     gravity = np.array([0.0, -1e-3, 0.0])
     time = np.arange(20)[:, None, None]
@@ -138,7 +134,7 @@ def test_momentum_and_energy_against_closed_forms() -> None:
     assert energy_scale(gravity, (1.0, 2.0, 3.0)) == pytest.approx(2e-3) and energy_scale(0 * gravity, (1, 1, 1)) == 1
 
 
-def test_shares_inside_obstacles_and_outside_of_the_domain() -> None:
+def test_shares_inside_obstacles_and_outside_of_the_domain():
     """Closed bodies hold what is within them, sheets nothing; the domain ends at its planes."""
     cone = shape_obstacle("cone", 0.4, (0.5, 0.5, 0.5), np.eye(3), "cone")
     square = shape_obstacle("square", 0.4, (0.5, 0.5, 0.5), np.eye(3), "square")
@@ -147,7 +143,7 @@ def test_shares_inside_obstacles_and_outside_of_the_domain() -> None:
     assert outside_domain(point, (1.0, 1.0, 1.0)) == 0.5 and outside_domain(point[:0], (1.0, 1.0, 1.0)) == 0
 
 
-def test_frames_that_are_told_together_are_timed_together() -> None:
+def test_frames_that_are_told_together_are_timed_together():
     """The clock counts from the end of the first bunch of frames; with one bunch only it tells nothing."""
     clock = FrameClock()
     clock.ends = [1.0, 1.000001, 1.000002, 1.3, 1.300001, 1.300002]
@@ -158,13 +154,13 @@ def test_frames_that_are_told_together_are_timed_together() -> None:
     assert clock.milliseconds() is None
 
 
-def test_other_grids_keep_their_walls() -> None:
+def test_other_grids_keep_their_walls():
     """Three nodes of 1/64 are two of 1/32 at the least, and six of 1/128."""
     cells = [other_grid(MpmConfig(), 1 / n, 1 / 64).wall_cells for n in (32, 48, 64, 128)]
     assert cells == [2, 2, 3, 6]
 
 
-def test_scenes_that_failed_leave_the_means(data: str) -> None:
+def test_scenes_that_failed_leave_the_means(data):
     """Errors at a frame are means over the scenes that reached it, and say over how many."""
     episodes = list(EpisodeStore(data, "validation").episodes)
     config = ErrorVsTimeConfig(data="d", out="x", sinkhorn_points=4)
@@ -178,7 +174,7 @@ def test_scenes_that_failed_leave_the_means(data: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["hgn", "gns"])
-def test_scenes_beside_one_that_diverges_go_their_way(data: str, kind: str) -> None:
+def test_scenes_beside_one_that_diverges_go_their_way(data, kind):
     """Off backend triton they are simulated once, as if it had never been there."""
     episodes = EpisodeStore(data, "validation").episodes
     scenes = [InitialState.of_episode(episode) for episode in (*episodes, episodes[0])]
@@ -195,7 +191,7 @@ def test_scenes_beside_one_that_diverges_go_their_way(data: str, kind: str) -> N
         np.testing.assert_allclose(trial.position_TN3, alone.position_TN3, atol=1e-6)
 
 
-def report_row(system: str, error: float, ms: float | None, **more: Any) -> dict[str, Any]:
+def report_row(system, error, ms, **more):
     one_step = None if system in ("mpm", "chaos") else error
     row = {"system": system, "one_step_mse": one_step, "one_step_quartiles": one_step and [0.5 * error, 2 * error]}
     row |= {"one_step_by_material": one_step and {"water": 2 * error}, "position_mse": {"50": error, "299": 2 * error}}
@@ -207,7 +203,7 @@ def report_row(system: str, error: float, ms: float | None, **more: Any) -> dict
     )
 
 
-def report_rows() -> list[dict[str, Any]]:
+def report_rows():
     return [
         report_row("hgn", 1e-7, 0.5, precision="fp16"),
         report_row("hgn", 1e-7, 2.0, precision="fp32"),
@@ -220,7 +216,7 @@ def report_rows() -> list[dict[str, Any]]:
     ]
 
 
-def test_paired_differences() -> None:
+def test_paired_differences():
     """A constant difference is its own interval; noise about zero carries no word; a few scenes far off take the word
     from the mean and leave it to the median; scenes without a value of either do not count."""
     rng = np.random.default_rng(3)
@@ -241,7 +237,7 @@ def test_paired_differences() -> None:
     assert paired_difference([1.0], [2.0]) is None
 
 
-def test_paired_rows_are_told() -> None:
+def test_paired_rows_are_told():
     """A network stands beside GNS, each setting of the solver and other weights at its precision, in the errors and
     frames that both have of scenes.
     """
@@ -261,7 +257,7 @@ def test_paired_rows_are_told() -> None:
     assert paired_lines([]) == []
 
 
-def test_the_figures_show_what_diverged(tmp_path: Path) -> None:
+def test_the_figures_show_what_diverged(tmp_path):
     """Points beyond the panel, scenes that failed and a report without a single row are drawn too."""
     meta = {"versions": {"torch": "2", "taichi": "1"}, "commit": "c", "date": "2026-01-01", "command": "x " * 200}
     meta |= {"scenes": 2, "split": "test", "data": "d", "device": "a GPU", "reference": "the solver"}

@@ -1,7 +1,5 @@
 """python -m tools.error_vs_time: its rows, its measures, what it does with failures; no assertion on any time."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -55,24 +53,24 @@ def fake_simulate(scenes, config, frames, frame_rate_hz, on_frame=None, collider
     return results
 
 
-def weights_file(path: Path, kind: str) -> Path:
+def weights_file(path, kind):
     network = (network_of if kind == "hgn" else gns_of)(torch.float32, width=8, material_embedding=2)
     save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64, updates=7))
     return path
 
 
 @pytest.fixture
-def data(small_dataset: Path) -> str:
+def data(small_dataset):
     return str(small_dataset)
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def undrawn(monkeypatch):
     """Reports without their figures, which take most of the time."""
     monkeypatch.setattr("tools.error_vs_time.run.draw", lambda *_: [])
 
 
-def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+def test_the_report(data, tmp_path, monkeypatch, capsys):
     """Every contender gets a row with the report's keys on the same scenes; a solver that fails is counted."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
     weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
@@ -122,7 +120,7 @@ def test_the_report(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     )
 
 
-def test_labels_of_the_figures_lie_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_labels_of_the_figures_lie_side_by_side(monkeypatch):
     """No label of a panel reaches into the next one's, nor out of the figure."""
     report = json.loads((RESULTS / "error_vs_time" / "obstacles.json").read_text())
     figures: list[Any] = []
@@ -136,7 +134,7 @@ def test_labels_of_the_figures_lie_side_by_side(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_when_time_is_over(data, tmp_path, monkeypatch):
     """What has not begun by then is named, and the report is written without it; a shorter rollout of the solver is
     scored as far as it goes, and each setting is simulated once."""
     calls: list[tuple[float, list[float], int]] = []
@@ -171,7 +169,7 @@ def test_when_time_is_over(data: str, tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_the_data_can_be_the_reference(data: str, tmp_path: Path) -> None:
+def test_the_data_can_be_the_reference(data, tmp_path):
     """Without a solver the data itself is the reference, and what moves like it has no error."""
     out = tmp_path / "report"
     options = {"data": data, "out": str(out), "split": "validation", "resimulate": False, "device": "cpu"}
@@ -181,7 +179,7 @@ def test_the_data_can_be_the_reference(data: str, tmp_path: Path) -> None:
     assert rows["ballistic motion"]["one_step_mse"] < 1e-13 < rows["constant velocity"]["one_step_mse"]
 
 
-def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_precisions_that_a_path_does_not_know(data, tmp_path, capsys):
     """The HGN in fp16 on backend torch is left out, and that is said; triton must run where it is asked for."""
     files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
     options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": files}
@@ -195,9 +193,7 @@ def test_precisions_that_a_path_does_not_know(data: str, tmp_path: Path, capsys:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_what_counts_most_comes_first(
-    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_counts_most_comes_first(data, tmp_path, monkeypatch, capsys):
     """What is simulated with the reference, networks at the precision that tells most, baselines, coarse grids, then
     other precisions, whose rollouts off backend triton are short; the report keeps its order. What fails is named with
     the cause, the others go on, and only a fault that nobody foresaw makes the exit code 1."""
@@ -247,19 +243,19 @@ def test_what_counts_most_comes_first(
 
 
 @pytest.mark.parametrize(("system", "frames"), [("mpm", 12), ("hgn", 8)])
-def test_the_solver_is_timed_over_whole_rollouts(system: str, frames: int) -> None:
+def test_the_solver_is_timed_over_whole_rollouts(system, frames):
     """Its frames take longest once material has landed, so `timed_frames` is not for it."""
 
     class Recorder:
         row, asked, stepped = {"system": system}, [0], True
 
-        def trials(self, episodes: Any, frames: int, on_frame: Any) -> list[Any]:
+        def trials(self, episodes, frames, on_frame):
             self.asked.append(frames)
             for frame in range(frames):
                 on_frame(frame)
             return []
 
-        def release(self) -> None:
+        def release(self):
             pass
 
     options = {"out": "report", "data": "data", "timed_frames": 8, "mpm_timed_frames": 300, "timed_batches": [2]}
@@ -270,9 +266,7 @@ def test_the_solver_is_timed_over_whole_rollouts(system: str, frames: int) -> No
     assert max(contender.asked) == frames
 
 
-def test_shipped_weights_that_fit(
-    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_shipped_weights_that_fit(data, tmp_path, monkeypatch, capsys):
     """By default all shipped weights are compared that are for such data; what is left out is said."""
     (episode,) = EpisodeStore(data, "test").episodes
     networks = {
@@ -310,15 +304,13 @@ def test_shipped_weights_that_fit(
         ({"split": "all"}, "split must be one of train"),
     ],
 )
-def test_bad_options(change: dict[str, Any], message: str) -> None:
+def test_bad_options(change, message):
     """Each wrong option is named before anything is simulated."""
     with pytest.raises(ConfigError, match=message):
         from_mapping(ErrorVsTimeConfig, {"data": "d", "out": "o"} | change)
 
 
-def test_what_launches_none_of_the_kernels_is_scored_beside_their_compilation(
-    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_launches_none_of_the_kernels_is_scored_beside_their_compilation(data, tmp_path, monkeypatch):
     """Baselines, then coarse grids, as long as it lasts; neither networks nor the data's own grid."""
     order: list[str] = []
     monkeypatch.setattr(
@@ -341,7 +333,7 @@ SHORT = {"split": "validation", "device": "cpu", "frame_stride": 5, "timed_frame
 SHORT |= {"sinkhorn_points": 8, "batch_scenes": 2, "timed_batches": [2], "mpm_timed_frames": 4, "perturbation": 0.0}
 
 
-def test_a_report_goes_on_where_it_was_cut_off(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_report_goes_on_where_it_was_cut_off(data, tmp_path, monkeypatch):
     """Rows of an earlier report are neither simulated nor scored again; those without a run time get one, and where and
     when. Without data they are drawn again and nothing else."""
     simulated: list[set[float]] = []
@@ -389,9 +381,7 @@ def test_a_report_goes_on_where_it_was_cut_off(data: str, tmp_path: Path, monkey
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_what_nobody_foresaw_stops_one_contender(
-    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_nobody_foresaw_stops_one_contender(data, tmp_path, monkeypatch, capsys):
     """The others are scored and timed, the fault is printed whole and named in the report, the exit code is 1."""
     weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
 
@@ -412,9 +402,7 @@ def test_what_nobody_foresaw_stops_one_contender(
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("times_last", [False, True])
-def test_a_run_that_is_killed_leaves_whole_points(
-    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times_last: bool
-) -> None:
+def test_a_run_that_is_killed_leaves_whole_points(data, tmp_path, monkeypatch, times_last):
     """After each contender the file holds its errors and its run times; where all run times come last, none yet."""
     weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
 
@@ -436,7 +424,7 @@ def test_a_run_that_is_killed_leaves_whole_points(
     assert rows["hgn"]["ms"] > 0 and rows["gns"]["ms"] > 0
 
 
-def test_weights_that_do_not_fit_are_told_at_once(data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_that_do_not_fit_are_told_at_once(data, tmp_path, monkeypatch):
     """Before anything is simulated: a name that is not shipped, a file that is not there, weights for other data."""
     monkeypatch.delattr(datagen.mpm.solver, "simulate")
     dry = network_of(torch.float32, materials=("snow",))

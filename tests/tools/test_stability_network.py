@@ -1,11 +1,7 @@
 """python -m tools.stability network: its cases, what counts as held, and the runtime's guard."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,12 +11,10 @@ from network.states import network_of
 from PIL import Image
 
 from hgn.config import MpmConfig, SceneConfig
-from hgn.network.features import ParticleState
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, save_weights
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.scene.scene import Scene
 from hgn.schema import ConfigError, from_mapping
 from tools.measures import neighbours
 from tools.solver_rollouts import solver_trials
@@ -48,7 +42,6 @@ from tools.stability.network_motion import (
     motion_rows,
     turned_rows,
 )
-from tools.stability.row import Row
 
 SCENE = {
     "obstacle_count": 1,
@@ -63,7 +56,7 @@ MATERIAL_NAMES = ("water", "sand", "snow")
 
 
 @pytest.fixture
-def weights(tmp_path: Path) -> str:
+def weights(tmp_path):
     network = network_of(torch.float32, width=8, material_embedding=2, message_passing_steps=1, levels=2)
     with torch.no_grad():  # nothing accelerates: whatever happens is the scene's
         network.decode.second.weight.zero_()
@@ -74,7 +67,7 @@ def weights(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_case_has_a_row(weights, tmp_path, capsys):
     """Each case is simulated and told with the report's keys; what rests holds everywhere."""
     path, picture = tmp_path / "reports" / "stability.json", tmp_path / "reports" / "stability.png"
     assert main(SMALL | {"weights": weights, "json": str(path), "picture": str(picture), "speed_factor": 8.0}) == 0
@@ -123,13 +116,13 @@ def test_every_case_has_a_row(weights: str, tmp_path: Path, capsys: pytest.Captu
 class Repeats(torch.nn.Module):
     """Accelerates as in the frame before, by a factor; adds its velocity times another, and a wind along y."""
 
-    def __init__(self, factor: float, drag: float, wind: float = 0.0) -> None:
+    def __init__(self, factor, drag, wind=0.0):
         super().__init__()
         self.wind = wind
         self.config, self.weight = network_of().config, torch.nn.Parameter(torch.zeros(1))
         self.factor, self.drag = factor, drag
 
-    def forward(self, state: ParticleState) -> torch.Tensor:
+    def forward(self, state):
         velocity_NM3 = state.velocity_NM3
         return (
             self.factor * (velocity_NM3[:, 0] - velocity_NM3[:, 1])
@@ -138,13 +131,13 @@ class Repeats(torch.nn.Module):
         )
 
 
-def motion_of(network: torch.nn.Module, cases: tuple[str, ...], solver: MpmConfig | None = None) -> dict[str, Row]:
-    simulator = Simulator(network, 60.0, "torch")  # type: ignore[arg-type]
+def motion_of(network, cases, solver=None):
+    simulator = Simulator(network, 60.0, "torch")
     scene = SceneConfig(group_size=0.04)
     return {row.case: row for row in motion_rows(simulator, scene, ("sand",), cases, 8, solver)}
 
 
-def test_flight_against_its_closed_form() -> None:
+def test_flight_against_its_closed_form():
     """What goes on accelerating as it did before the start holds in all directions, speeds and gravities; with 5 % less
     a frame it does not, and with a drag of 0.5 % throws do not."""
     exact = motion_of(Repeats(1.0, 0.0), ("throw", "gravity"))
@@ -166,23 +159,23 @@ def test_flight_against_its_closed_form() -> None:
 
 
 @pytest.mark.parametrize(("together", "rollouts"), [(None, [7]), (1, [1] * 7), (8, [8]), (5, [5, 5])])
-def test_scenes_of_a_rollout(together: int | None, rollouts: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenes_of_a_rollout(together, rollouts, monkeypatch):
     """Each rollout of a row has as many scenes as asked for; the row says how many, and has all seven throws."""
     asked: list[int] = []
 
-    def counted(simulator: Simulator, scenes: list[InitialState], frames: int) -> list[RolloutResult]:
+    def counted(simulator, scenes, frames):
         asked.append(len(scenes))
         return simulate_scenes(simulator, scenes, frames)
 
     monkeypatch.setattr(network_motion, "simulate_scenes", counted)
-    simulator = Simulator(Repeats(1.0, 0.0), 60.0, "torch")  # type: ignore[arg-type]
+    simulator = Simulator(Repeats(1.0, 0.0), 60.0, "torch")
     throws = {name: 10 * np.array(way) for name, way in network_motion.DIRECTIONS.items()}
     row = flight_row(simulator, "thrown", SceneConfig(group_size=0.04), "sand", throws, together)
     assert asked == rollouts and row.held and row.more["scenes"] == rollouts[0], row
     assert list(row.more["throws"]) == list(throws) and row.more["particles"] == 135 * rollouts[0]
 
 
-def test_relative_inputs_take_any_gravity() -> None:
+def test_relative_inputs_take_any_gravity():
     """A network in relative inputs whose own answer is nothing flies exactly: the judges are green where they can."""
     network = network_of(torch.float32, inputs="relative", width=8, material_embedding=2, levels=2)
     with torch.no_grad():
@@ -192,7 +185,7 @@ def test_relative_inputs_take_any_gravity() -> None:
     assert len(rows) == 6 and all(row.held for row in rows.values()), rows
 
 
-def test_relative_inputs_keep_momentum_in_a_collision() -> None:
+def test_relative_inputs_keep_momentum_in_a_collision():
     """With any weights two bodies that meet without gravity keep momentum and angular momentum, as the judge has it,
     whatever becomes of them."""
     network = network_of(torch.float32, inputs="relative", message_passing_steps=1)
@@ -200,7 +193,7 @@ def test_relative_inputs_keep_momentum_in_a_collision() -> None:
     assert row.measured < 1e-5 and row.more["met"] > 0.0 and row.more["angular"] < 1e-4
 
 
-def test_flight_ends_before_the_walls() -> None:
+def test_flight_ends_before_the_walls():
     """No particle of the closed form comes within two finest cells of a wall, where it still is on the next frame."""
     for gravity in GRAVITIES.values():
         for way in DIRECTIONS.values():
@@ -213,24 +206,24 @@ def test_flight_ends_before_the_walls() -> None:
                 assert ((place_N3 > 0.07) & (place_N3 < 0.93)).all() == clear or last == 60
 
 
-def test_turned_gravity(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_turned_gravity(monkeypatch):
     """What hangs in the air is as far from a fall whichever way gravity points; with a wind along y it is nearer where
     that is down."""
     path = 0.5 * np.array(GRAVITY) * (np.arange(20)[:, None, None] / 60) ** 2
 
-    def falls(scenes: list[Scene], *_: object) -> list[RolloutResult]:
+    def falls(scenes, *_):
         return [RolloutResult((scene.position_N3 + path).astype(np.float32)) for scene in scenes]
 
     monkeypatch.setattr(network_motion, "solver_trials", falls)
     monkeypatch.setattr(network_motion, "TO_REST_FRAMES", 20)
     for wind, held in ((0.0, True), (-1e-3, False)):
-        simulator = Simulator(Repeats(0.0, 0.0, wind), 60.0, "torch")  # type: ignore[arg-type]
+        simulator = Simulator(Repeats(0.0, 0.0, wind), 60.0, "torch")
         rows = list(turned_rows(simulator, SceneConfig(group_size=0.03), "snow", MpmConfig()))
         assert [row.held for row in rows] == [held] * 2
         assert not held or rows[0].measured == pytest.approx(1.0, rel=1e-3)
 
 
-def test_collisions_against_the_solver() -> None:
+def test_collisions_against_the_solver():
     """The solver's two cubes keep momentum, angular momentum up to the spin within cells, and share their velocities;
     what flies through as if nothing were there keeps both too, and does not hold; nor does what loses its velocity."""
     scene = SceneConfig(group_size=0.04)
@@ -247,12 +240,12 @@ def test_collisions_against_the_solver() -> None:
     assert not brakes.held and brakes.measured > 0.1
 
 
-def row_of(simulator: Simulator, case: Case, energy_bound: float) -> Row:
+def row_of(simulator, case, energy_bound):
     states = initial_states(case)
     return case_row(simulator, case, states, energy_bound, *case_trials(simulator, case, states))
 
 
-def test_failures_are_told(weights: str) -> None:
+def test_failures_are_told(weights):
     """A rollout that diverges says at which frame; energy from nowhere and particles that leave are failures too."""
     config = from_mapping(StabilityNetworkConfig, SMALL | {"weights": weights, "cases": ["single"]})
     network = network_of(torch.float32)
@@ -274,14 +267,14 @@ def test_failures_are_told(weights: str) -> None:
 
 
 @pytest.mark.parametrize("inputs", ["absolute", "relative"])
-def test_the_guard_is_asked(inputs: str) -> None:
+def test_the_guard_is_asked(inputs):
     """A weight that explodes is noticed at the first frame, also where free flight leaves networks no answer."""
     network = network_of(torch.float32, inputs=inputs, width=8, material_embedding=2, levels=2)
-    row = guard_row(Simulator(network, 60.0, "torch"), StabilityNetworkConfig("", scene=SceneConfig()))  # type: ignore[arg-type]
+    row = guard_row(Simulator(network, 60.0, "torch"), StabilityNetworkConfig("", scene=SceneConfig()))
     assert row.held, row
 
 
-def test_a_slope_against_a_closed_form() -> None:
+def test_a_slope_against_a_closed_form():
     """A block that slides without friction is where its case expects it; friction is told as a share of the way. What
     slides meets neither the slope's end nor a wall."""
     made = list(cases(StabilityNetworkConfig("", cases=("slope",)), network_of().config))
@@ -302,7 +295,7 @@ def test_a_slope_against_a_closed_form() -> None:
     assert ((slid.mean(1) >= low - 0.08) & (slid.mean(1) <= high + 0.08)).all()
 
 
-def test_energy_growth_against_a_closed_form() -> None:
+def test_energy_growth_against_a_closed_form():
     """Free fall from rest makes no energy; a throw upwards that was not there makes that of its speed."""
     scene = next(iter(cases(StabilityNetworkConfig("", cases=("single",)), network_of().config))).scenes[0]
     initial = InitialState.of_scene(scene)
@@ -327,7 +320,7 @@ def test_energy_growth_against_a_closed_form() -> None:
         (1.0, 0.12, "cells high, the solver's"),
     ],
 )  # fmt: skip
-def test_rest_beside_the_solver(stretch: float, shift: float, beyond: str | None) -> None:
+def test_rest_beside_the_solver(stretch, shift, beyond):
     """A lattice counts its neighbours by a closed form. It may drift twice as far as the solver's and a cell, keep half
     to twice its neighbours, and lie a tenth of a cell higher; beyond that the case does not hold, and says why."""
     side, cell = 6, 1 / 64
@@ -340,7 +333,7 @@ def test_rest_beside_the_solver(stretch: float, shift: float, beyond: str | None
         lattice_N3, 0 * lattice_N3, np.full(len(lattice_N3), 2), empty, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
     )
 
-    def path(stretch: float, shift_cells: float, sideways_cells: float = 0.0) -> RolloutResult:
+    def path(stretch, shift_cells, sideways_cells=0.0):
         moved_3 = np.array([sideways_cells, shift_cells, 0.0]) * cell
         last_N3 = 0.4 + stretch * (lattice_N3 - 0.4) + moved_3
         return RolloutResult(np.stack([lattice_N3] * 3 + [last_N3]).astype(np.float32))
@@ -354,12 +347,12 @@ def test_rest_beside_the_solver(stretch: float, shift: float, beyond: str | None
     assert not case_row(simulator, case, [scene], 1.0, [own], None, [early]).held
 
 
-def test_the_solver_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_solver_is_asked_once(tmp_path, monkeypatch):
     """Its trajectories are kept for other weights, with the cause where it stopped; others are simulated anew where the
     scene, the frames or the physics differ."""
     asked: list[tuple[int, int]] = []
 
-    def trials(scenes: list[Scene], config: MpmConfig, frames: int, rate: float) -> list[RolloutResult]:
+    def trials(scenes, config, frames, rate):
         asked.append((len(scenes), frames))
         paths = [np.stack([scene.position_N3] * frames) for scene in scenes]
         return [RolloutResult(path[:2] if i else path, "too fast" if i else None) for i, path in enumerate(paths)]
@@ -378,7 +371,7 @@ def test_the_solver_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert asked[1:] == [(3, 5), (1, 6)]
 
 
-def test_scenes_follow_the_network() -> None:
+def test_scenes_follow_the_network():
     """A network that sees no obstacles gets none, and one that knows two materials gets those."""
     blind = network_of(obstacle_features=False, materials=("water", "snow")).config
     config = StabilityNetworkConfig("", cases=("domain", "rest"), scene=SceneConfig(**{"group_size": 0.05}))
@@ -394,7 +387,7 @@ def test_scenes_follow_the_network() -> None:
     assert not any((scene.material_N == 1).any() for case in made for scene in case.scenes)
 
 
-def test_the_solver_has_the_law_that_is_named() -> None:
+def test_the_solver_has_the_law_that_is_named():
     """Weights are held beside sand as in their data, which need not be what new data have."""
     options = {"weights": "w", "solver_device": "cpu", "mpm": {"sand_friction_law": "compression"}}
     asked = solver_of(from_mapping(StabilityNetworkConfig, options))
@@ -415,13 +408,13 @@ def test_the_solver_has_the_law_that_is_named() -> None:
         ({"backend": "quick"}, "backend must be one of auto, torch, triton, cpu"),
     ],
 )
-def test_bad_options(change: dict[str, Any], message: str) -> None:
+def test_bad_options(change, message):
     """Each wrong option is named before anything is simulated."""
     with pytest.raises(ConfigError, match=message):
         from_mapping(StabilityNetworkConfig, {"weights": "w"} | change)
 
 
-def test_the_command_names_its_parts(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_command_names_its_parts(capfd):
     """Help says what parts there are; an unknown one is refused with them; a known one takes the options of its own."""
     assert run_module("tools.stability", ["--help"]) == 0
     told = capfd.readouterr()

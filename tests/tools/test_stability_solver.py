@@ -1,7 +1,6 @@
 """python -m tools.stability solver: its rows, and that a step beyond the formula is seen."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from tools.stability.solver_loads import _sinks_until
 from tools.stability.solver_scenes import front_cells, thickness_cells
 
 
-def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_report(tmp_path, monkeypatch, capsys):
     """The largest step of a single particle lies at the formula; rows and points are in the JSON, and are drawn."""
     monkeypatch.setattr(solver_steps, "STIFFNESS", (1.0,))
     monkeypatch.setattr(solver_steps, "FACTORS", (0.97, 1.1))
@@ -33,20 +32,20 @@ def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert "single particle, water" in capsys.readouterr().out
 
 
-def test_formula() -> None:
+def test_formula():
     """dx sqrt(rho / (3 lambda + 2 mu)): 5.41e-4 s for water and 3.83e-4 s for solids at the default settings."""
     config = MpmConfig()
     assert [round(solver_steps.formula(config, kind), 6) for kind in range(3)] == [5.41e-4, 3.83e-4, 3.83e-4]
 
 
-def test_crossing_paths() -> None:
+def test_crossing_paths():
     """Only a way through the triangle counts: not one beside it, not one that turns back before it."""
     triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]])
     path = np.array([[[0.2, 1, 0.2], [0.9, 1, 0.9], [0.2, 1, 0.2]], [[0.2, -1, 0.2], [0.9, -1, 0.9], [0.2, 0.1, 0.2]]])
     assert crossing_paths(path / 64, triangle / 64) == pytest.approx(1 / 3)
 
 
-def test_crossings_of_a_bent_surface() -> None:
+def test_crossings_of_a_bent_surface():
     """A straight way that cuts a ridge twice ends where it began, outside; long and short ways count alike."""
     ridge = np.array([[[0.0, 0, -9], [0, 0, 9], [3, 3, 0]], [[6.0, 0, -9], [3, 3, 0], [6, 0, 9]]])
     for scale in (1.0, 0.05):
@@ -55,7 +54,7 @@ def test_crossings_of_a_bent_surface() -> None:
         assert found == [0.0, 1.0]
 
 
-def test_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leaks(monkeypatch):
     """Small blocks that hit a sheet, a cone and a bowl: a row for each, with nothing through."""
     monkeypatch.setattr(solver_leak, "OFFSETS", solver_leak.OFFSETS[3:4])
     monkeypatch.setattr(solver_leak, "ORIENTATIONS", {"tilted": solver_leak.ORIENTATIONS["tilted"]})
@@ -65,7 +64,7 @@ def test_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(row.held for row in rows)
 
 
-def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_validation_rows(monkeypatch):
     """Even four cells of water lead the experiment by less than 18 %; columns have run-out and height by each law."""
     monkeypatch.setattr(solver_validation, "DAM_CELLS", (4, 5))
     monkeypatch.setattr(solver_validation, "COLUMN_CELLS", 4)
@@ -88,10 +87,10 @@ def test_validation_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rows[5].measured < rows[11].measured  # so few cells tell heights apart, not run-outs
 
 
-def test_grids(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grids(monkeypatch):
     """Fronts, run-outs and heights on each grid, with what they lead to."""
 
-    def columns(aspect: float, law: str, angle: float, base: MpmConfig, cells: int) -> list[Row]:
+    def columns(aspect, law, angle, base, cells):
         return [Row(f"column, {what}", 3.0, 3 - 2 / cells, True, "") for what in ("run-out", "height")]
 
     monkeypatch.setattr(solver_validation, "column_rows", columns)
@@ -108,12 +107,12 @@ def test_grids(monkeypatch: pytest.MonkeyPatch) -> None:
     ("law", "own", "shears"),
     [("mohr_coulomb", 33.0, (18.9, 28.6, 32.7)), ("matsuoka_nakai", 31.0, (21.2, 29.7, 34.8))],
 )
-def test_rows_of_slopes(law: str, own: float, shears: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_slopes(law, own, shears, monkeypatch):
     """Slopes rest where sand shears along them, tan = sin by Mohr and Coulomb, 2 sin / sqrt(3 + sin²) by Matsuoka and
     Nakai, or still move and do not hold; the quartz sand's angle of repose is a row of its own.
     """
 
-    def rests(angle: float, start: float, *_: object) -> tuple[float, float, float]:
+    def rests(angle, start, *_):
         return start, start if start < angle else {20.0: 20.5, own: 30.8, 40.0: 32.9}[angle], 0.05 * (angle == 20)
 
     monkeypatch.setattr(solver_validation, "repose", rests)
@@ -126,7 +125,7 @@ def test_rows_of_slopes(law: str, own: float, shears: tuple, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 2.0])
-def test_order_of_convergence(order: float) -> None:
+def test_order_of_convergence(order):
     """Values that approach a limit by a power of the cells' size have both told; from what turns round nothing is."""
     cells = (8, 12, 16, 32)
     found, limit = solver_validation.convergence_order(cells, [3 - 2 / count**order for count in cells])
@@ -135,7 +134,7 @@ def test_order_of_convergence(order: float) -> None:
     assert solver_validation.convergence_order(cells, [1.0, 1.1, 1.3, 2.3]) == (None, None)
 
 
-def test_height_is_taken_while_there_is_a_block() -> None:
+def test_height_is_taken_while_there_is_a_block():
     """Until the centre rises or less than two cells are left, whichever comes first."""
     block = np.random.default_rng(0).uniform(0, 8 / 64, (100, 3))
     sinking = np.stack([block * (1, size, 1) for size in (1.0, 0.8, 0.6, 0.1)])
@@ -144,7 +143,7 @@ def test_height_is_taken_while_there_is_a_block() -> None:
     assert _sinks_until(rising) == 2
 
 
-def test_extents() -> None:
+def test_extents():
     """Thickness leaves out a twentieth at each end; the front is counted from the wall."""
     line = np.linspace(0, 1, 101)
     position = np.stack([line, line, line], axis=1)
@@ -152,7 +151,7 @@ def test_extents() -> None:
     assert front_cells(position) == pytest.approx(0.99 * 64 - 2)
 
 
-def test_bad_options_are_refused() -> None:
+def test_bad_options_are_refused():
     """Unknown cases, and a picture without the case that it shows."""
     with pytest.raises(ConfigError, match="cases"):
         main({"cases": ["stesp"]})

@@ -70,19 +70,19 @@ def update_momenta(
         stiffness[n] = k
 
 
-def scalars(values) -> ti.ScalarNdarray:
+def scalars(values):
     out = ti.ndarray(ti.f32, len(values))
     out.from_numpy(np.asarray(values, np.float32))
     return out
 
 
-def counters() -> ti.ScalarNdarray:
+def counters():
     out = ti.ndarray(ti.i64, (1, COUNT.length))
     out.fill(0)
     return out
 
 
-def run(material: int, F_N33: np.ndarray, volume_N: np.ndarray, config: MpmConfig) -> tuple:
+def run(material, F_N33, volume_N, config):
     count = len(F_N33)
     F, stress = (ti.Matrix.ndarray(3, 3, ti.f32, count) for _ in range(2))
     F.from_numpy(F_N33.astype(np.float32))
@@ -95,23 +95,23 @@ def run(material: int, F_N33: np.ndarray, volume_N: np.ndarray, config: MpmConfi
     return F.to_numpy(), volume.to_numpy(), stress.to_numpy(), stiffness.to_numpy(), counter.to_numpy()[0]
 
 
-def deformations(rng: np.random.Generator, count: int, spread: float) -> np.ndarray:
+def deformations(rng, count, spread):
     q = [np.linalg.qr(rng.normal(size=(count, 3, 3)))[0] for _ in range(2)]
     q = [m * np.sign(np.linalg.det(m))[:, None, None] for m in q]
     sigma = np.exp(spread * rng.normal(size=(count, 3)))
     return (q[0] @ (sigma[:, :, None] * np.swapaxes(q[1], 1, 2))).astype(np.float32).astype(float)
 
 
-def compose(U: np.ndarray, diagonal: np.ndarray, Vt: np.ndarray) -> np.ndarray:
+def compose(U, diagonal, Vt):
     return U @ (diagonal[:, :, None] * Vt)
 
 
-def close(got: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
+def close(got, expected, tolerance):
     assert np.abs(got - expected).max() <= tolerance * max(np.abs(expected).max(), 1e-30)
 
 
 @pytest.mark.parametrize("spread", [1e-3, 0.02, 0.2])
-def test_snow(spread: float) -> None:
+def test_snow(spread):
     """Singular values within [0.975, 1.0045], Jp collects the ratio, tau = 2 mu h (F - R) Fᵀ + lambda h J (J - 1)."""
     config, rng = MpmConfig(), np.random.default_rng(1)
     F, Jp = deformations(rng, 500, spread), rng.uniform(0.7, 1.3, 500)
@@ -135,7 +135,7 @@ def test_snow(spread: float) -> None:
 
 
 @pytest.mark.parametrize("spread", [1e-3, 0.3])
-def test_elastic_solid(spread: float) -> None:
+def test_elastic_solid(spread):
     """tau = 2 mu (F - R) Fᵀ + lambda J (J - 1) at any stretch, F as it was; the stiffness that the step follows is at
     least every d(tau) / d(log sigma) in turn, with that of the volume three times.
     """
@@ -165,7 +165,7 @@ def test_elastic_solid(spread: float) -> None:
     ],
 )
 @pytest.mark.parametrize("spread", [1e-3, 0.1])
-def test_sand(correction: str, law: str, spread: float) -> None:
+def test_sand(correction, law, spread):
     """Log strain: no stress in tension, a cone or Mohr-Coulomb's in compression, v_c as each source has it."""
     config = MpmConfig(sand_volume_correction=correction, sand_friction_law=law, sand_grain_diameter_m=0.0)
     rng = np.random.default_rng(2)
@@ -210,7 +210,7 @@ def test_sand(correction: str, law: str, spread: float) -> None:
     close(stiffness, np.full(500, 3 * bulk + 2 * shear), 1e-6)
 
 
-def test_friction_slope() -> None:
+def test_friction_slope():
     """alpha is 0.5036 in compression (Taichi Elements, 45 degrees) and sqrt(2) sin(phi) / 3 in plane strain."""
     slope = [
         sand_alpha(MpmConfig(sand_friction_law=law, sand_friction_angle_deg=45.0))
@@ -219,7 +219,7 @@ def test_friction_slope() -> None:
     assert slope == pytest.approx([0.5036, 1 / 3], abs=1e-4)
 
 
-def test_water() -> None:
+def test_water():
     """J <- J (1 + dt tr C), tau = lambda J (J - 1); J is floored and the floors are counted."""
     config = MpmConfig()
     _, bulk = lame_parameters(config)
@@ -232,7 +232,7 @@ def test_water() -> None:
     assert counter.to_numpy()[0, COUNT.water_volume_floors] == 2
 
 
-def test_volume_updates_of_water() -> None:
+def test_volume_updates_of_water():
     """J *= 1 + dt tr C keeps the volume of turning and purely sheared water; Taichi Elements' determinant does not."""
     rate, step = 50.0, 1e-3
     turning = np.array([[0.0, -rate, 0], [rate, 0, 0], [0, 0, 0]])
@@ -250,7 +250,7 @@ def test_volume_updates_of_water() -> None:
 
 
 @pytest.mark.parametrize("stiffening", [False, True])
-def test_water_without_tension(stiffening: bool) -> None:
+def test_water_without_tension(stiffening):
     """Stretched water bears the share of the tension that it is given, none with 0; J grows, and pressure is back as
     soon as J is below 1. Water under pressure does not know of it.
     """
@@ -268,7 +268,7 @@ def test_water_without_tension(stiffening: bool) -> None:
     assert (pressure[0.0][2:] == pressure[1.0][2:]).all()
 
 
-def test_viscous_stress() -> None:
+def test_viscous_stress():
     """Sheared at a rate, viscous water bears the rate times its viscosity across the shear, and no other stress."""
     rate, step, viscosity, dx = 50.0, 1e-4, 3.0, 0.1
     C = ti.Matrix.ndarray(3, 3, ti.f32, 1)
@@ -291,7 +291,7 @@ def test_viscous_stress() -> None:
     assert stiffness.to_numpy()[0] == pytest.approx(rough**2, rel=1e-4)
 
 
-def test_stiffening_water() -> None:
+def test_stiffening_water():
     """tau = -J lambda / 7 (J^-7 - 1), its stiffness 3 d(tau) / d(log J): near J = 1 both are those of linear water."""
     config = MpmConfig()
     _, bulk = lame_parameters(config)
@@ -307,7 +307,7 @@ def test_stiffening_water() -> None:
 
 
 @pytest.mark.parametrize("material", [SAND, SNOW, ELASTIC])
-def test_elastic_steps_do_not_touch_the_deformation(material: int) -> None:
+def test_elastic_steps_do_not_touch_the_deformation(material):
     """Without plastic flow F is not recomposed: a thousand updates leave every bit as it was."""
     F = np.eye(3) + 1e-3 * np.random.default_rng(3).normal(size=(50, 3, 3)) - 5e-3 * np.eye(3)
     F = F.astype(np.float32)
@@ -318,7 +318,7 @@ def test_elastic_steps_do_not_touch_the_deformation(material: int) -> None:
 
 
 @pytest.mark.parametrize("material", [SAND, SNOW, ELASTIC])
-def test_collapsed_and_inverted_deformations(material: int) -> None:
+def test_collapsed_and_inverted_deformations(material):
     """Singular, inverted, huge F: finite results with every singular value at least 0.05, each floor counted."""
     F = np.array([np.zeros((3, 3)), -np.eye(3), np.diag([1.0, 1, -1]), np.diag([1.0, 0, 0]), 1e6 * np.eye(3)])
     got, volume, stress, stiffness, counter = run(
@@ -336,23 +336,23 @@ def test_collapsed_and_inverted_deformations(material: int) -> None:
 class Element:
     """One particle that is strained step by step, as an element of soil is in a laboratory."""
 
-    def __init__(self, material: int, config: MpmConfig) -> None:
+    def __init__(self, material, config):
         self.material, self.config = material, config
         self.F = np.eye(3)
         self.volume = 0.0 if material == SAND else 1.0
 
-    def answer(self, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    def answer(self, gradient):
         """F, Kirchhoff stress and volume scalar after a step of the gradient (times its time), not yet taken."""
         F, volume, stress, *_ = run(
             self.material, ((np.eye(3) + gradient) @ self.F)[None], np.array([self.volume]), self.config
         )
         return F[0].astype(float), stress[0].astype(float), float(volume[0])
 
-    def step(self, gradient: np.ndarray) -> np.ndarray:
+    def step(self, gradient):
         self.F, stress, self.volume = self.answer(gradient)
         return stress
 
-    def step_against(self, gradient: np.ndarray, direction: np.ndarray, axis: int, pressure: float) -> np.ndarray:
+    def step_against(self, gradient, direction, axis, pressure):
         """A step with as much of `direction` as keeps the stress along `axis` at -pressure (secant method)."""
         tries = [0.0, -0.3 * float(np.abs(gradient).max())]
         errors = [self.answer(gradient + t * direction)[1][axis, axis] + pressure for t in tries]
@@ -365,7 +365,7 @@ class Element:
         return self.step(gradient + tries[1] * direction)
 
 
-def confined(law: str, angle_deg: float, pressure: float = 5e3) -> Element:
+def confined(law, angle_deg, pressure=5e3):
     """Sand under the same pressure from all sides."""
     config = MpmConfig(sand_friction_law=law, sand_friction_angle_deg=angle_deg, sand_grain_diameter_m=0.0)
     shear, bulk = lame_parameters(config)
@@ -382,7 +382,7 @@ LATERAL = {  # what is strained, what gives way so that the pressure on that sid
 }
 
 
-def sheared(law: str, angle_deg: float, path: str, steps: int = 40, size: float = 2e-3) -> tuple[list[float], float]:
+def sheared(law, angle_deg, path, steps=40, size=2e-3):
     """The mobilised sin phi of each step, and the principal stress of the middle over the mean of the others."""
     element = confined(law, angle_deg)
     drive, side = LATERAL[path]
@@ -399,7 +399,7 @@ PLANE_STRAIN_SINE = 2 * np.sin(np.deg2rad(31)) / np.sqrt(3 + np.sin(np.deg2rad(3
 
 @pytest.mark.parametrize("path", LATERAL)
 @pytest.mark.parametrize("law", ["matsuoka_nakai", "mohr_coulomb"])
-def test_sand_has_the_friction_angle_of_its_law(law: str, path: str) -> None:
+def test_sand_has_the_friction_angle_of_its_law(law, path):
     """Sand of 31 degrees yields at 31 degrees in triaxial compression and extension by either law. In plane strain
     Mohr and Coulomb's does, too; Matsuoka and Nakai's (1974) at sin phi = 2 s / sqrt(3 + s²), 34.8 degrees, where the
     middle stress is the mean of the others. Before that it is elastic: in compression the axial stress grows by
@@ -416,7 +416,7 @@ def test_sand_has_the_friction_angle_of_its_law(law: str, path: str) -> None:
         assert mobilised[0] == pytest.approx(q / (q + 2 * 5e3), rel=0.02)
 
 
-def test_cones_have_it_on_one_path() -> None:
+def test_cones_have_it_on_one_path():
     """A cone matched in compression has 31 degrees there, 45.9 in a plane; matched in a plane, 31 there, 22.9 in
     compression. Taichi Elements' own (compression, 45 degrees) never yields in a plane.
     """
@@ -441,7 +441,7 @@ def test_cones_have_it_on_one_path() -> None:
         ("plane_strain", np.sin(np.deg2rad(31))),
     ],
 )
-def test_simple_shear_of_sand(law: str, sine: float) -> None:
+def test_simple_shear_of_sand(law, sine):
     """Sheared between plates under a constant load, sand carries sin phi times the load (phi that of plane strain):
     principal axes turn to 45 degrees, and the stress across the plane of shear is the mean of the others.
     """
@@ -457,7 +457,7 @@ def test_simple_shear_of_sand(law: str, sine: float) -> None:
 
 @pytest.mark.parametrize("law", ["matsuoka_nakai", "mohr_coulomb"])
 @pytest.mark.parametrize("strain", [2e-3, 2e-2, 0.1])
-def test_friction_grows_with_the_rate_of_shear(strain: float, law: str) -> None:
+def test_friction_grows_with_the_rate_of_shear(strain, law):
     """Sheared at a rate r, sand with grains of 5 mm has 1 + 0.685 / (1 + 0.279 / I) times the friction that it has
     without, I = r d sqrt(rho_grain / p) (Jop, Forterre and Pouliquen 2006).
     """
@@ -482,7 +482,7 @@ PUBLISHED_SNOW = MpmConfig(
 )  # fmt: skip
 
 
-def strained(config: MpmConfig, last: float, steps: int = 400) -> Element:
+def strained(config, last, steps=400):
     """Snow strained along one axis, its sides held, to `last` of its length."""
     element = Element(SNOW, config)
     for _ in range(steps):
@@ -491,7 +491,7 @@ def strained(config: MpmConfig, last: float, steps: int = 400) -> Element:
 
 
 @pytest.mark.parametrize("length", [0.985, 0.75, 0.6, 1.005, 1.2])
-def test_snow_hardens_and_breaks_as_published(length: float) -> None:
+def test_snow_hardens_and_breaks_as_published(length):
     """Pressed or stretched along one axis, snow bears exp(xi (1 - Jp)) times the stress at its critical compression or
     stretch (Stomakhin et al. 2013): with Jp the length over the critical one, within 2 %. Pressed to 0.6 it bears 47
     times what it yields at first; stretched to 1.2 a seventh of that. Unloaded it gives way by the hardened modulus.
@@ -511,7 +511,7 @@ def test_snow_hardens_and_breaks_as_published(length: float) -> None:
         assert relieved == pytest.approx(1e-3 * factor * slope, rel=0.03)
 
 
-def test_where_the_cap_of_hardening_begins() -> None:
+def test_where_the_cap_of_hardening_begins():
     """The default cap, 20, leaves the published law where exp(10 (1 - Jp)) does: at Jp = 0.70, 0.683 of the length."""
     capped = dataclasses.replace(PUBLISHED_SNOW, snow_maximum_hardening=MpmConfig().snow_maximum_hardening)
     for length, same in ((0.70, True), (0.65, False)):
@@ -521,7 +521,7 @@ def test_where_the_cap_of_hardening_begins() -> None:
 
 
 @pytest.mark.parametrize("shear_strain", [0.01, 0.5, 2.0])
-def test_simple_shear_of_an_elastic_solid(shear_strain: float) -> None:
+def test_simple_shear_of_an_elastic_solid(shear_strain):
     """Sheared by g without a change of volume, a fixed corotated solid turns by R = [[c, s], [-s, c]] with tan = g / 2:
     it bears 2 mu (g - s) along, 2 mu (1 + g² - c - s g) and 2 mu (1 - c) across (Poynting's effect).
     """
@@ -538,7 +538,7 @@ def test_simple_shear_of_an_elastic_solid(shear_strain: float) -> None:
     assert stress == pytest.approx(2 * shear * expected, abs=3e-5 * shear * (1 + shear_strain**2))
 
 
-def test_stretch_of_an_elastic_solid_with_free_sides() -> None:
+def test_stretch_of_an_elastic_solid_with_free_sides():
     """Pulled by 1 % with free sides it bears Young's modulus times the strain, and narrows by Poisson's ratio."""
     config, element = MpmConfig(), Element(ELASTIC, MpmConfig())
     for _ in range(10):

@@ -18,7 +18,7 @@ CONFIG = MpmConfig(device="cpu")
 EVERY_STEP = dataclasses.replace(CONFIG, transfer_speed_m_s=None)
 
 
-def cube(velocity: tuple, stiffness: float = 1.0, cell: float = CELL) -> Scene:
+def cube(velocity, stiffness=1.0, cell=CELL):
     """200 particles of all materials at random places above the floor; all tests share the kernel compiled for them."""
     place = np.random.default_rng(0).uniform((0.4, 0.25, 0.4), (0.55, 0.4, 0.55), (200, 3)).astype(np.float32)
     kinds = np.arange(200) % 4
@@ -29,13 +29,13 @@ def cube(velocity: tuple, stiffness: float = 1.0, cell: float = CELL) -> Scene:
     )  # fmt: skip
 
 
-def run(scene: Scene, config: MpmConfig, frames: int, rate_hz: float = 60.0) -> Simulated:
+def run(scene, config, frames, rate_hz=60.0):
     (outcome,) = simulate([scene], config, frames, rate_hz)
     assert isinstance(outcome, Simulated), outcome
     return outcome
 
 
-def test_stiffness_changes_steps_and_not_transfers() -> None:
+def test_stiffness_changes_steps_and_not_transfers():
     """Slow scenes take cell_size / transfer_speed_m_s between transfers, eight times a frame here, however many steps
     of stress they need; fast ones transfer more often, so that nothing goes further than a part of a cell.
     """
@@ -48,7 +48,7 @@ def test_stiffness_changes_steps_and_not_transfers() -> None:
     assert fast.counters["transfers"] > 1.5 * 16
 
 
-def test_a_transfer_at_every_step() -> None:
+def test_a_transfer_at_every_step():
     """With intervals no longer than steps each step is a transfer: the same bits as with transfer_speed_m_s none."""
     scene = cube((1, -3, 0))
     none = run(scene, EVERY_STEP, 7)
@@ -60,7 +60,7 @@ def test_a_transfer_at_every_step() -> None:
         MpmConfig(transfer_speed_m_s=0.0)
 
 
-def test_momentum_is_kept_over_intervals() -> None:
+def test_momentum_is_kept_over_intervals():
     """Without gravity blocks that collide keep their momentum to 1e-5 over intervals of many steps of stress."""
     scene = dataclasses.replace(cube((0, 0, 0), 30.0), gravity=(0.0, 0.0, 0.0))
     towards = np.where(scene.position_N3[:, :1] > 0.475, np.float32([[-2, 0.3, 0]]), np.float32([[2, 0, 0.1]]))
@@ -70,7 +70,7 @@ def test_momentum_is_kept_over_intervals() -> None:
     assert np.abs(moved - moved[0]).max() < 1e-5 * np.abs(towards).sum() / 60
 
 
-def test_what_is_stiff_leaves_water_as_it_is() -> None:
+def test_what_is_stiff_leaves_water_as_it_is():
     """Water splashes as it does alone where something far away asks for several times as many steps; with a transfer
     at each step it would be smoothed several times as much.
     """
@@ -97,7 +97,7 @@ def test_what_is_stiff_leaves_water_as_it_is() -> None:
     assert changes[0] < 0.03 < changes[1], changes
 
 
-def with_stiff(soft: Scene, stiff: Scene, times: float) -> Scene:
+def with_stiff(soft, stiff, times):
     """Two scenes in one, the second elastic and so many times as stiff."""
     modulus = np.repeat(np.float32([1e6, 1e6 * times]), [soft.particle_count, stiff.particle_count])
     return dataclasses.replace(
@@ -108,14 +108,14 @@ def with_stiff(soft: Scene, stiff: Scene, times: float) -> Scene:
     )  # fmt: skip
 
 
-def test_particles_take_steps_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_particles_take_steps_of_their_own(monkeypatch):
     """Sand that falls on the floor takes two steps of stress an interval far from a stiff body that takes eight, and
     lands as it does alone, to 1e-5 of the domain.
     """
     acted = np.zeros(2, np.int64)
     one_substep = grid_kernel.substep
 
-    def counted(*arguments) -> None:
+    def counted(*arguments):
         covered = arguments[5].to_numpy()
         one_substep(*arguments)
         changed = arguments[5].to_numpy() != covered
@@ -133,7 +133,7 @@ def test_particles_take_steps_of_their_own(monkeypatch: pytest.MonkeyPatch) -> N
     assert np.abs(beside.position_TN3[:, : sand.particle_count] - alone.position_TN3).max() < 1e-5
 
 
-def test_bodies_of_different_steps_that_meet() -> None:
+def test_bodies_of_different_steps_that_meet():
     """Sand and water that a stiff body falls upon end as with half the step, to 2 % of a cell in the mean (0.37 where
     what is beside the body takes longer steps); without gravity and floor the momentum of all stays what it was.
     """
@@ -155,7 +155,7 @@ def test_bodies_of_different_steps_that_meet() -> None:
         assert np.abs(velocity_T3 - scene.velocity_N3.mean(0)).max() < 1e-4, velocity_T3
 
 
-def test_half_the_step() -> None:
+def test_half_the_step():
     """Half the step changes the height of a block on the floor by less than 3 %, as its transfers stay as many."""
     half = dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / 2)
     blocks = [(SAND, 4.5), (SAND, 10.0), (WATER, 4.5)]

@@ -16,7 +16,6 @@ from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, WATER
 from hgn.scene.scene import Scene
 from tools.stability import solver_validation
-from tools.stability.row import Row
 from tools.stability.solver_validation import column_rows, edge, heights, repose, rest, run_outs
 
 CELL = 1 / 16
@@ -25,9 +24,7 @@ FRAME_RATE_HZ = 60.0
 CONFIG = MpmConfig(device="cpu")
 
 
-def states(
-    scene: Scene, config: MpmConfig, frames: int, *fields: str, rate_hz: float = FRAME_RATE_HZ
-) -> list[np.ndarray]:
+def states(scene, config, frames, *fields, rate_hz=FRAME_RATE_HZ):
     """Fields of all particles as the solver holds them, [frames after the first, N, ...]."""
     nodes = tuple(round(length / CELL) for length in scene.domain_size)
     scenes = [scene]
@@ -38,7 +35,7 @@ def states(
     launch = GridLaunch(initialise("cpu"), scenes, colliders, config, nodes, rate_hz)
     seen: list[list[np.ndarray]] = [[] for _ in fields]
 
-    def keep(frame: int) -> None:
+    def keep(frame):
         for name, values in zip(fields, seen, strict=True):
             if frame:
                 values.append(getattr(launch, name).to_numpy()[: scene.particle_count].astype(np.float64))
@@ -48,7 +45,7 @@ def states(
     return [np.stack(values) for values in seen]
 
 
-def test_spinning_cube() -> None:
+def test_spinning_cube():
     """An elastic cube spins and flies for 1 s without gravity: linear momentum is kept to 1e-5, angular momentum, that
     of the affine motion included, to 1e-4; of the kinetic energy 1 % is lost at most, and it never grows by 0.1 %.
     """
@@ -71,13 +68,13 @@ def test_spinning_cube() -> None:
     assert (energy / np.minimum.accumulate(energy)).max() < 1.001
 
 
-def lattice(cells: tuple[int, int, int]) -> np.ndarray:
+def lattice(cells):
     """Eight places a cell, evenly, in cells from the corner of the box."""
     axes = [np.arange(2 * count) / 2 + 0.25 for count in cells]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def free_body(place_N3: np.ndarray, velocity_N3: np.ndarray, material: int, nodes: tuple[int, int, int]) -> Scene:
+def free_body(place_N3, velocity_N3, material, nodes):
     """Particles at places in cells, without gravity."""
     return Scene(
         (place_N3 * CELL).astype(np.float32), velocity_N3.astype(np.float32),
@@ -86,7 +83,7 @@ def free_body(place_N3: np.ndarray, velocity_N3: np.ndarray, material: int, node
     )  # fmt: skip
 
 
-def frequency_of(mode_T: np.ndarray, rate_hz: float = FRAME_RATE_HZ) -> float:
+def frequency_of(mode_T, rate_hz=FRAME_RATE_HZ):
     """The frequency of an oscillation about 0, from where it crosses; frame 0 is not among those given."""
     time = np.arange(1, len(mode_T) + 1) / rate_hz
     crossings = np.flatnonzero(mode_T[:-1] * mode_T[1:] < 0)
@@ -95,7 +92,7 @@ def frequency_of(mode_T: np.ndarray, rate_hz: float = FRAME_RATE_HZ) -> float:
     return float(0.5 / np.diff(at).mean())
 
 
-def test_elastic_beam() -> None:
+def test_elastic_beam():
     """A free elastic beam, 24 cells long and 4 high, sways in its first mode at the frequency of ASTM E1876 to 5 %.
 
     f = sqrt(E b t³ / (0.9465 m L³ T)), with T for its thickness of a sixth of its length.
@@ -120,7 +117,7 @@ def test_elastic_beam() -> None:
     assert frequency == pytest.approx(expected, rel=0.05)
 
 
-def test_elastic_bar() -> None:
+def test_elastic_bar():
     """A free elastic bar, 24 cells long and 4 thick, rings along itself at sqrt(E / rho) / 2 L, less Rayleigh's share
     of the motion across, (nu pi r / L)² / 2 with r the polar radius of gyration, to 3 %; four times as heavy, at half
     of that.
@@ -140,7 +137,7 @@ def test_elastic_bar() -> None:
 
 
 @pytest.mark.parametrize("cells", [(10, 1, 10), (12, 2, 2)], ids=["sheet", "jet"])
-def test_water_without_tension_flies_on(cells: tuple[int, int, int]) -> None:
+def test_water_without_tension_flies_on(cells):
     """A sheet and a jet of water that fly apart at 1 a second in all directions fly on where water bears no tension:
     after 0.5 s they are 1.5 times as long, to 2 %, and no thinner. Water that bears tension keeps its volume.
     """
@@ -156,7 +153,7 @@ def test_water_without_tension_flies_on(cells: tuple[int, int, int]) -> None:
     assert size[1.0][1] < 0.95
 
 
-def test_viscosity_damps_a_vortex() -> None:
+def test_viscosity_damps_a_vortex():
     """A Taylor-Green vortex between smooth walls decays by exp(-2 nu (pi / L)² t): what viscosity adds to the decay of
     the grid's own is that to 10 %.
     """
@@ -177,7 +174,7 @@ def test_viscosity_damps_a_vortex() -> None:
     assert rates[1] - rates[0] == pytest.approx(expected, rel=0.1)
 
 
-def test_hydrostatic_rest() -> None:
+def test_hydrostatic_rest():
     """Water fills a basin from wall to wall for 5 s: each layer's mean pressure is rho g (H - y) to a tenth of that at
     the floor, where it is compressed by rho g H / lambda, and its level drifts by less than 2 % of its depth.
     """
@@ -203,7 +200,7 @@ def test_hydrostatic_rest() -> None:
     assert 1 - J[60:][layer == 0].mean() == pytest.approx(floor / bulk, rel=0.2)
 
 
-def test_water_at_rest_keeps_its_level(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_water_at_rest_keeps_its_level(monkeypatch):
     """Water that stands in a random filling for 8 s keeps its level within 0.5 %; without regard to its density it
     sinks by more than 1 %, for its J no longer tells its volume.
     """
@@ -215,13 +212,13 @@ def test_water_at_rest_keeps_its_level(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def low_column() -> tuple[Row, Row]:
+def low_column():
     """Run-out and height of a column half as high as wide, eight cells in radius."""
     run_out, height = column_rows(0.5, CONFIG.sand_friction_law, CONFIG.sand_friction_angle_deg, CONFIG, 8)
     return run_out, height
 
 
-def test_sand_column_and_its_laws(low_column: tuple[Row, Row]) -> None:
+def test_sand_column_and_its_laws(low_column):
     """Eight cells are too few for the run-out, but not for the order of the laws: Taichi Elements' cone runs out least,
     the default sand less far than the same without grains, and that less far than a cone that is weaker.
     """
@@ -237,7 +234,7 @@ def test_sand_column_and_its_laws(low_column: tuple[Row, Row]) -> None:
     assert "walls" not in low.beyond
 
 
-def test_what_is_published_of_columns() -> None:
+def test_what_is_published_of_columns():
     """Low columns keep their top, glass beads no more than 0.74; from where it meets a column's own height on, sand's
     is a power of the aspect, a third higher at aspect 4. A cone of glass beads holds what the column held.
     """
@@ -249,13 +246,13 @@ def test_what_is_published_of_columns() -> None:
     assert heights(4.0) == pytest.approx((0.74, 1.109), abs=1e-3)
 
 
-def test_height_of_a_low_column(low_column: tuple[Row, Row]) -> None:
+def test_height_of_a_low_column(low_column):
     """Eight cells are enough for the height of a low column."""
     _, height = low_column
     assert height.held
 
 
-def test_a_room_that_is_too_small_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_room_that_is_too_small_is_said(monkeypatch):
     """A column whose sand reaches the walls of its room is no measurement: the rows say so, and do not hold."""
     monkeypatch.setattr(solver_validation, "COLUMN_ROOM", 0.7)
     monkeypatch.setattr(solver_validation, "COLUMN_WITHIN", 10.0)
@@ -264,7 +261,7 @@ def test_a_room_that_is_too_small_is_said(monkeypatch: pytest.MonkeyPatch) -> No
     assert all("reached the walls of its room, 10 cells wide" in row.beyond for row in rows)
 
 
-def test_edges() -> None:
+def test_edges():
     """The edge of a cliff, wherever it ends in its cell, is found within 0.1 cells, that of a slope within 0.2."""
     for end in np.arange(6.0, 7.0, 0.1):
         cliff = np.clip(end - np.arange(12), 0, 1) * 5.0
@@ -274,13 +271,13 @@ def test_edges() -> None:
             assert edge(depth, 0.25) == pytest.approx(end - 0.25 / steepness, abs=0.2)
 
 
-def test_a_gentle_slope_stands() -> None:
+def test_a_gentle_slope_stands():
     """A slope of 28 degrees of sand with 31 stands."""
     before, after, _ = repose(31.0, 28.0, MpmConfig(device="cpu"), 12)
     assert abs(after - before) < 1.5
 
 
-def test_angle_of_repose() -> None:
+def test_angle_of_repose():
     """A slope of 40 degrees of sand with 31 runs off its platform, and leaves one it can stand at."""
     before, after, _ = repose(31.0, 40.0, MpmConfig(device="cpu"), 12)
     assert after < before - 5
