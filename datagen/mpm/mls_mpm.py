@@ -10,7 +10,8 @@ Transfers come at a rate of their own, since each smooths velocities: an interva
 as the stiffest particle needs. Others take steps of their own, each of several substeps, as long as their own wave
 speed allows (impulse multiple time stepping, Tuckerman et al. 1992; regional steps of the material point method, Fang
 et al. 2018): the impulse of such a step goes to the nodes in its first substep, at once, as does that of gravity where
-all particles of a block of nodes take several; until the next of them acts the block is left as it is.
+all particles of a block of nodes take several; until the next of them acts the block is left as it is. What shares a
+block with stiffer particles takes their step: beside impulses of long steps a stiff body rebounds too fast.
 
 In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
 they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the
