@@ -45,6 +45,7 @@ from datagen.mpm.layout import (
 from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
+SPLIT = 4.0  # substeps of an interval, from which on particles take steps of their own: those of fewer are too uneven
 MANY = 32  # substeps at most that a change of nodes is for
 SLACK = 1e-3  # of a substep, within which times are the same
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
@@ -245,6 +246,8 @@ def own_step(
         longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
         longest /= ti.sqrt(ti.max(stiffness, 1e-3))
         most = ti.max(ti.floor(longest / step + 1e-4), 1.0)
+        if ti.round((begin + step + left) / step) < SPLIT:
+            most = 1.0
         own = ti.ceil(substeps / ti.ceil(substeps / ti.min(most, substeps)))
         now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
         interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
