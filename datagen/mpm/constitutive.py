@@ -9,7 +9,7 @@ volume correction v_c for sand (Tampubolon et al. 2017), the plastic volume rati
 
 import taichi as ti
 
-from datagen.mpm.layout import CONSTANT, COUNT, VARIANT
+from datagen.mpm.layout import CONSTANT, COUNT, VARIANT, is_only_solid
 from datagen.mpm.svd import svd3
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 
@@ -219,7 +219,7 @@ def solid(
     stiffness = 3.0 * bulk + 2.0 * shear
     stress = ti.Vector([0.0, 0.0, 0.0])
     if ti.static(sand):
-        if ti.static(not snow and not elastic) or material == SAND:
+        if ti.static(is_only_solid(variant, VARIANT.sand)) or material == SAND:
             log_strain = ti.log(sigma)
             strain, new_volume_ = _project_sand(log_strain, volume, law, row, step, variant)
             new_volume = new_volume_
@@ -229,7 +229,7 @@ def solid(
                     plastic += 1
             stress = 2.0 * shear * strain + bulk * strain.sum()
     if ti.static(snow):
-        if ti.static(not sand and not elastic) or material == SNOW:
+        if ti.static(is_only_solid(variant, VARIANT.snow)) or material == SNOW:
             h = hardening(volume, law, row)
             ratio = 1.0
             for i in ti.static(range(3)):
@@ -251,7 +251,7 @@ def solid(
             J = new_sigma[0] * new_sigma[1] * new_sigma[2]
             stress = 2.0 * shear * h * (new_sigma - 1.0) * new_sigma + bulk * h * J * (J - 1.0)
     if ti.static(elastic):
-        if ti.static(not sand and not snow) or material == ELASTIC:
+        if ti.static(is_only_solid(variant, VARIANT.elastic)) or material == ELASTIC:
             J = ti.min(sigma[0] * sigma[1] * sigma[2], LARGEST_VOLUME)
             stress = 2.0 * shear * (sigma - 1.0) * sigma + bulk * J * (J - 1.0)
             widest = sigma.max()

@@ -145,7 +145,7 @@ class Variant(NamedTuple):
     moving: int = 2048  # obstacles move
     elastic: int = 4096
     rate_of_sand: int = 8192  # friction grows with the rate of flow
-    parts: int = 16384  # times the number of parts
+    parts: int = 16384  # times the number of parts: the last, so it moves up where a flag is added
 
 
 class Field(NamedTuple):
@@ -190,6 +190,11 @@ SOLID_VARIANTS = sum(bit for material, bit in enumerate(MATERIAL_VARIANTS) if ma
 def has_solid(variant: int) -> bool:
     """Whether a kernel of this variant, of `Variant`'s bits, has particles with a deformation gradient."""
     return variant & SOLID_VARIANTS != 0
+
+
+def is_only_solid(variant: int, kind: int) -> bool:
+    """Whether of all solids a kernel of this variant has the one of bit `kind` alone, so that none needs to be told."""
+    return variant & SOLID_VARIANTS == kind
 
 
 def lame_parameters(config: MpmConfig) -> tuple[float, float]:

@@ -7,8 +7,18 @@ import pytest
 import taichi as ti
 from numpy.polynomial import Polynomial
 
+from datagen.mpm import layout
 from datagen.mpm.constitutive import solid, water
-from datagen.mpm.layout import COUNT, SETTING, SOLID_VARIANTS, VARIANT, constants, lame_parameters, sand_alpha
+from datagen.mpm.layout import (
+    COUNT,
+    SETTING,
+    SOLID_VARIANTS,
+    VARIANT,
+    constants,
+    is_only_solid,
+    lame_parameters,
+    sand_alpha,
+)
 from datagen.mpm.mls_mpm import respond
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
@@ -304,6 +314,15 @@ def test_stiffening_water():
     step = 1e-6
     slope = -bulk / 7 * (((J * (1 + step)) ** -6.0 - J * (1 + step)) - (J**-6.0 - J)) / step
     close(stiffness.to_numpy(), 3 * np.maximum(bulk, slope), 1e-4)
+
+
+def test_a_new_solid_is_told_from_the_others(monkeypatch):
+    """A kernel leaves out the look at a particle's material only where there is one solid, a solid to come included."""
+    assert is_only_solid(VARIANT.sand | VARIANT.water | VARIANT.contact, VARIANT.sand)
+    assert not is_only_solid(VARIANT.sand | VARIANT.snow, VARIANT.sand)
+    clay = 2 * VARIANT.parts
+    monkeypatch.setattr(layout, "SOLID_VARIANTS", SOLID_VARIANTS | clay)
+    assert not is_only_solid(VARIANT.sand | clay, VARIANT.sand)
 
 
 @pytest.mark.parametrize("material", [SAND, SNOW, ELASTIC])
