@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -48,6 +49,8 @@ from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
 from hgn.training.stop import BY_WEIGHT, StopRequest
 from hgn.training.tensorboard import show_rollout
+
+METRICS = "metrics.jsonl"
 
 
 class SameWeights(Callback):
@@ -120,6 +123,7 @@ class Checkpoints(Callback):
         """Keeps the network as the best so far if its one-step validation error is the lowest."""
         if error < self.best_error:
             self.best_error = error
+            self._saved_update = -1  # the last checkpoint is to know it, too
             trainer.save_checkpoint(self.folder / "best.ckpt")
 
     def finish(self, trainer: Trainer) -> None:
@@ -254,6 +258,7 @@ class LogLines(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._time, self._update, self._waited_s = time.monotonic(), trainer.global_step, self.feed.waited_s
         if trainer.is_global_zero:
+            _drop_cut_line(self.run / METRICS)
             total = self.feed.training.maximum_updates
             self._bar = bar("training", total=total, initial=trainer.global_step, unit="update")
 
@@ -331,8 +336,14 @@ def log(trainer: Trainer, run: Path, values: dict[str, float]) -> None:
     for logger in trainer.loggers:
         logger.log_metrics(values, trainer.global_step)
     record = {"update": trainer.global_step, "time": time.time()} | values
-    with (run / "metrics.jsonl").open("a", encoding="utf-8") as file:
+    with (run / METRICS).open("a", encoding="utf-8") as file:
         file.write(json.dumps(record) + "\n")
+
+
+def _drop_cut_line(path: Path) -> None:
+    """Where a full disk or a loss of power cut the last record, the next one begins a line of its own."""
+    if path.exists():
+        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
 
 
 def _reduce(trainer: Trainer, device: torch.device, error: SquaredError, materials: tuple[str, ...]) -> SquaredError:

@@ -68,10 +68,11 @@ def count_updates(trainer: Trainer, count: int) -> None:
         tracker.completed += count
 
 
-def advance_scheduler(scheduler: torch.optim.lr_scheduler.LambdaLR, update: int, rate: float) -> None:
-    """Leaves behind what the scheduler's steps up to this update do, the last of which gave this learning rate."""
+def advance_scheduler(scheduler: torch.optim.lr_scheduler.LambdaLR, base: float, update: int) -> None:
+    """Leaves behind what a scheduler of this base rate does in its steps up to this update."""
+    rate = base * scheduler.lr_lambdas[0](update)
     scheduler.last_epoch, scheduler._step_count = update, update + 1
-    scheduler._last_lr = [rate]
+    scheduler.base_lrs, scheduler._last_lr = [base], [rate]
     scheduler.optimizer.param_groups[0]["lr"] = rate
 
 

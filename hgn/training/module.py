@@ -138,6 +138,8 @@ class TrainingModule(LightningModule):
 
     def on_train_start(self) -> None:
         config = self.training_config
+        # a checkpoint brings the rates that it was trained with, and the configuration's count
+        lightning_compat.advance_scheduler(self._scheduler, config.learning_rate, self.global_step)
         if self.automatic_optimization and config.pushforward_fraction > 0:
             self._pool = PushforwardPool(self.result, config, self.trainer.global_rank)
         if not self.automatic_optimization:
@@ -202,9 +204,13 @@ class TrainingModule(LightningModule):
             print(report, file=sys.stderr)
         self.sampler_state = chunk.sampler_state
         lightning_compat.count_updates(self.trainer, count)
+        lightning_compat.advance_scheduler(self._scheduler, self.training_config.learning_rate, first + count)
+
+    @property
+    def _scheduler(self) -> torch.optim.lr_scheduler.LambdaLR:
         scheduler = self.lr_schedulers()
         assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
-        lightning_compat.advance_scheduler(scheduler, first + count, self._rate(first + count))
+        return scheduler
 
     def _rate(self, update: int) -> float:
         """The learning rate of update number `update`, from 0."""

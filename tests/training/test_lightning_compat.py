@@ -24,7 +24,7 @@ class Manual(LightningModule):
         lightning_compat.count_updates(self.trainer, 3)
         scheduler = self.lr_schedulers()
         assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
-        lightning_compat.advance_scheduler(scheduler, self.global_step, 0.1**self.global_step)
+        lightning_compat.advance_scheduler(scheduler, 1.0, self.global_step)
 
     def configure_optimizers(self):
         optimizer = torch.optim.Adam(self.layer.parameters(), lr=1.0)

@@ -204,6 +204,35 @@ def test_a_finished_run_stays_finished(data, tmp_path):
     assert all(torch.equal(before[name], tensor) for name, tensor in after["state_dict"].items())
 
 
+def test_the_best_network_is_remembered(data, tmp_path):
+    """What is measured at the very end, after a checkpoint of the same update, is the bound that a later start has to
+    beat; so `best.ckpt` is never replaced by a worse one."""
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run, maximum_updates=5, monitor_every=1000)) == 0
+    (error,) = (record["one_step/validation"] for record in metrics(run) if "one_step/validation" in record)
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["callbacks"]["Checkpoints"] == {"best_error": error}
+
+
+def test_a_resumed_run_has_the_rate_it_is_given(data, tmp_path):
+    """Settings that need not be the same count as they are given: here the learning rate."""
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run, maximum_updates=6)) == 0
+    assert train.main(train_mapping(data, run, learning_rate=5e-4)) == 0
+    rates = {record["update"]: record["learning_rate"] for record in metrics(run) if "loss" in record}
+    assert [rates[n] for n in (8, 12)] == pytest.approx([5e-4 * 0.2 ** (n / 12) for n in (8, 12)])
+
+
+def test_a_cut_line_of_metrics_is_dropped(data, tmp_path):
+    """Where a full disk cut the last record, the next start writes the next one on a line of its own."""
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run, maximum_updates=4)) == 0
+    whole = metrics(run)
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"update": 8, "ti')
+    assert train.main(train_mapping(data, run)) == 0
+    assert metrics(run)[: len(whole)] == whole and {8, 12} <= {record["update"] for record in metrics(run)}
+
+
 def test_a_gpu_that_is_left_alone_is_no_warning(data, tmp_path, monkeypatch):
     """Training on a CPU where there is a GPU: training.accelerator=cpu has said so."""
     monkeypatch.setattr("lightning.pytorch.trainer.setup.CUDAAccelerator.is_available", lambda: True)
