@@ -6,7 +6,6 @@ Writes README.md with the Hub's metadata at its head: what is in the file or the
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,6 +50,9 @@ def main(mapping: dict[str, Any]) -> int:
         path, folder = find_weights(config.weights), Path(config.out)
         _, info = load_weights(path)
         text = weights_card(info, config.name or path.stem, path.name, config.license)
+        copy, content = folder / path.name, path.read_bytes()
+        same = not copy.exists() or copy.read_bytes() == content
+        require(same, "out", f"a folder without another {path.name}", str(folder))
     else:
         assert config.data is not None
         require(not is_remote(config.data), "data", "a folder of this machine", config.data)
@@ -59,8 +61,8 @@ def main(mapping: dict[str, Any]) -> int:
     target = folder / CARD
     require(not target.exists(), "out" if config.weights else "data", f"a folder without {CARD}", str(folder))
     folder.mkdir(parents=True, exist_ok=True)
-    if config.weights is not None and not (folder / path.name).exists():
-        shutil.copyfile(path, folder / path.name)
+    if config.weights is not None:
+        write_atomically(copy, content)
     write_atomically(target, text.encode())
     print(target)
     return 0

@@ -127,3 +127,17 @@ def test_cards_are_the_hubs(hub, make_config, make_dataset, tmp_path):
     assert load_weights(find_weights("hf://one/carded"))[1].frame_rate_hz == 60.0
     with pytest.raises(ConfigError, match=r"data must be a folder without README.md"):
         card.main({"data": str(folder)})
+
+
+def test_a_card_is_of_the_weights_beside_it(hub, tmp_path):
+    """Another file of that name is not taken for a copy, were it an older one or one that was cut: nothing is written
+    beside it."""
+    weights = hub.folder / "models" / "one" / "net" / "net.safetensors"
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "net.safetensors").write_bytes(weights.read_bytes()[:100])
+    with pytest.raises(ConfigError, match=r"out must be a folder without another net\.safetensors"):
+        card.main({"weights": str(weights), "out": str(folder)})
+    assert [path.name for path in folder.iterdir()] == ["net.safetensors"]
+    (folder / "net.safetensors").write_bytes(weights.read_bytes())
+    assert card.main({"weights": str(weights), "out": str(folder)}) == 0
