@@ -31,6 +31,7 @@ _MACHINE_ERRORS = {
     errno.EEXIST: "choose another path",
     errno.ENOTDIR: "choose another path",
     errno.EISDIR: "choose another path",
+    errno.ENAMETOOLONG: "choose another path",
     errno.ETIMEDOUT: "see that its server runs",
 }
 

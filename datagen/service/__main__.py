@@ -89,15 +89,14 @@ def _listen(host: str, port: int, token: str | None) -> socket.socket:
                 "environment of the service and of its readers"
             )
         return socket.create_server(address[:2], family=family, backlog=1024)
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # the second for what can be no host's name
+        number, cause = (error.errno, error.strerror) if isinstance(error, OSError) else (None, error)
         remedies = {
             errno.EADDRINUSE: "stop what uses it or choose another port=... (0: any free one)",
             errno.EACCES: "choose a port of 1024 or more",
         }
-        remedy = remedies.get(error.errno or 0, "choose host=127.0.0.1, or an address of this machine")
-        raise ConfigError(
-            f"host and port must be free to serve on, got {host}:{port} ({error.strerror}); {remedy}"
-        ) from None
+        remedy = remedies.get(number or 0, "choose host=127.0.0.1, or an address of this machine")
+        raise ConfigError(f"host and port must be free to serve on, got {host}:{port} ({cause}); {remedy}") from None
 
 
 if __name__ == "__main__":

@@ -359,6 +359,7 @@ def test_bad_input_is_one_line(taken_port, monkeypatch, capsys, tmp_path):
         (["port=70000"], "port must be 0 to 65535, got 70000"),
         (["host=0.0.0.0", "port=0"], "host must be a loopback address without a token, got '0.0.0.0'; set HGN_DATASET"),
         (["host=no.such.host.invalid"], "host and port must be free to serve on, got no.such.host.invalid:8000 ("),
+        (["host=no..host"], "host and port must be free to serve on, got no..host:8000 ("),
         (["out=http://localhost:1"], "out must be a folder to write to, got 'http://localhost:1'"),
         (["hots=1"], "hots is not a known key; did you mean host?"),
     ):

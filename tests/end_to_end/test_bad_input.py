@@ -325,13 +325,14 @@ def test_diverging_scenes_are_told(place, capsys):
     [
         ("rollout", [*ROLLOUT, "out=scene.yaml/rollout.vtkhdf"]),
         ("rollout", [*ROLLOUT, "out=data"]),
+        ("rollout", [*ROLLOUT, f"out={'data' * 80}.vtkhdf"]),
         ("evaluate", [*EVALUATE, "json=scene.yaml/errors.json"]),
         ("export", ["checkpoint=run/checkpoints/last.ckpt", "out=data"]),
         ("train", ["run=scene.yaml"]),
     ],
 )
 def test_output_that_is_in_the_way(place, command, arguments, capsys, monkeypatch):
-    """An output path that leads through a file, or is a folder where a file is to be, is named."""
+    """An output path that leads through a file, is a folder where a file is to be, or too long a name, is named."""
     before = content(place.folder)
     if command == "train":
         arguments = place.train(*arguments)
