@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import MpmConfig, require_rollout_name
+from hgn.config import MpmConfig, RolloutName
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene
@@ -24,14 +24,13 @@ class SolveConfig:
     """`python -m datagen.solve`: a scene file, simulated by the solver."""
 
     scene: str  # a scene file, or the name of one in conf/example, for example funnel
-    out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
+    out: RolloutName | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
     frames: FrameCount = 300
     frame_rate_hz: Positive[float] = 60.0
     mpm: MpmConfig = field(default_factory=MpmConfig)
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require_rollout_name("out", self.out)
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -13,16 +13,19 @@ from typing import Annotated
 
 from hgn.scene.material import MATERIAL_NAME, MATERIALS, PAPER_MATERIALS
 from hgn.schema import (
+    AtMostOne,
     BelowOne,
     Bound,
     BoxSize,
     ConfigError,
     FewLayers,
+    FolderName,
     Fraction,
     FrameCount,
     LayerSize,
     NonNegative,
     OneOrMore,
+    Port,
     Positive,
     Vector,
     one_of,
@@ -45,6 +48,14 @@ Material = Annotated[str, one_of(*MATERIALS)]
 MaterialName = Annotated[
     str,
     Bound("a name of lower-case letters, digits and _", lambda name: MATERIAL_NAME.fullmatch(name) is not None),
+]
+# names of pictures are given where a rollout file is to be
+RolloutName = Annotated[
+    str,
+    Bound(
+        "the name of a rollout file, as in rollout.vtkhdf",
+        lambda name: name != "" and Path(name).suffix not in (".png", ".gif", ".webp"),
+    ),
 ]
 Processor = Annotated[str, one_of("auto", "cpu", "gpu")]
 BackendName = Annotated[str, one_of(*BACKENDS)]
@@ -74,12 +85,6 @@ def config_directory() -> Path:
 def is_mesh_file(name: str | Path) -> bool:
     """Whether a name is that of a mesh file, rather than of a built-in shape."""
     return Path(name).suffix.lower() in MESH_SUFFIXES
-
-
-def require_rollout_name(field: str, name: str | None) -> None:
-    """Refuses names of pictures, which people give where a rollout file is to be."""
-    picture = name is not None and Path(name).suffix in (".png", ".gif", ".webp")
-    require(name != "" and not picture, field, "the name of a rollout file, as in rollout.vtkhdf", name)
 
 
 @dataclass(frozen=True)
@@ -137,9 +142,10 @@ class MpmConfig:
     """The MLS-MPM solver. The defaults correct Taichi Elements; conf/mpm/taichi_elements.yaml restores it."""
 
     youngs_modulus_pa: Positive[float] = 1e6
-    poisson_ratio: float = 0.2
+    poisson_ratio: Annotated[float, Bound("in [0, 0.5)", lambda ratio: 0 <= ratio < 0.5)] = 0.2
     density_kg_m3: Positive[float] = 1000.0
-    sand_friction_angle_deg: NonNegative[float] = 33.0  # of quartz sand at its critical state (Bolton 1986)
+    # of quartz sand at its critical state (Bolton 1986)
+    sand_friction_angle_deg: Annotated[NonNegative[float], Bound("< 90", lambda angle: angle < 90)] = 33.0
     # mohr_coulomb: the angle on every path; matsuoka_nakai: in triaxial compression and extension, more in plane strain
     # (34.8 for 31); or a cone (Drucker-Prager) that has it in triaxial compression alone (Taichi Elements, with 45) or
     # in plane_strain
@@ -149,17 +155,18 @@ class MpmConfig:
     # columns show: those judged are 200 of these in radius; 0: the same friction at any rate
     sand_grain_diameter_m: NonNegative[float] = 0.0025
     snow_hardening: NonNegative[float] = 10.0
-    snow_critical_compression: NonNegative[float] = 0.025
+    snow_critical_compression: BelowOne[float] = 0.025
     snow_critical_stretch: NonNegative[float] = 0.0045
     snow_maximum_hardening: Positive[float] = 20.0  # bound on exp(hardening * (1 - Jp)), counted; beyond 5 m/s raise it
     water_equation: WaterEquation = (
         "linear"  # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
     )
     water_volume_update: WaterVolumeUpdate = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
-    water_tension: NonNegative[float] = 1.0  # fraction of its tension that stretched water bears; 1: Taichi Elements'
+    # fraction of its tension that stretched water bears; 1: Taichi Elements'
+    water_tension: AtMostOne[NonNegative[float]] = 1.0
     water_viscosity_pa_s: NonNegative[float] = 0.0  # beside that of the grid, which is larger than real water's
     # to be as its particles lie, below a free surface: else water at rest sinks in a random filling; null: never
-    water_density_relaxation_s: float | None = 1.0
+    water_density_relaxation_s: Positive[float] | None = 1.0
     water_minimum_volume_ratio: Positive[float] = 0.1  # floor on J; hits are counted
     minimum_singular_value: Positive[float] = 0.05  # floor on the singular values of F; hits are counted
     time_integration: TimeIntegration = (
@@ -167,13 +174,16 @@ class MpmConfig:
     )
     time_step: Annotated[str, one_of("adaptive", "fixed")] = "adaptive"  # or fixed
     fixed_time_step_s: Positive[float] = 0.02 / 64
-    stability_fraction: Positive[float] = 0.875  # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
-    speed_fraction: Positive[float] = 0.3  # of a cell that the fastest particle may cross between two transfers
+    # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
+    stability_fraction: AtMostOne[Positive[float]] = 0.875
+    # of a cell that the fastest particle may cross between two transfers
+    speed_fraction: AtMostOne[Positive[float]] = 0.3
     # particles and grid exchange velocities every cell_size / this: 32 times a frame of 1/60 s at 64 cells,
     # whatever the materials, with as many steps of stress between as they need; null: at every step. Fewer
     # transfers smooth less.
-    transfer_speed_m_s: float | None = 30.0
-    wall_cells: int = 3  # grid nodes at each face of the domain that stop outgoing motion
+    transfer_speed_m_s: Positive[float] | None = 30.0
+    # grid nodes at each face of the domain that stop outgoing motion
+    wall_cells: Annotated[int, Bound("at least 2, the reach of a particle", lambda count: count >= 2)] = 3
     wall_contact: Annotated[str, one_of("slip", "stick")] = "slip"  # or stick
     collider_band_cells: NonNegative[float] = 0.5  # from a sheet, where nodes stop motion; more keeps it further off
     collider_friction: NonNegative[float] = 0.0  # Coulomb coefficient; 0 separates without friction
@@ -184,19 +194,6 @@ class MpmConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        speed = self.transfer_speed_m_s
-        require(speed is None or 0 < speed < math.inf, "transfer_speed_m_s", "> 0 or none", speed)
-        require(self.stability_fraction <= 1, "stability_fraction", "at most 1", self.stability_fraction)
-        require(self.speed_fraction <= 1, "speed_fraction", "at most 1", self.speed_fraction)
-        require(0 <= self.poisson_ratio < 0.5, "poisson_ratio", "in [0, 0.5)", self.poisson_ratio)
-        relaxation = self.water_density_relaxation_s
-        rule = "> 0 or none"
-        require(relaxation is None or 0 < relaxation < math.inf, "water_density_relaxation_s", rule, relaxation)
-        require(self.water_tension <= 1, "water_tension", "at most 1", self.water_tension)
-        compression = self.snow_critical_compression
-        require(compression < 1, "snow_critical_compression", "< 1", compression)
-        require(self.sand_friction_angle_deg < 90, "sand_friction_angle_deg", "< 90", self.sand_friction_angle_deg)
-        require(self.wall_cells >= 2, "wall_cells", "at least 2, the reach of a particle", self.wall_cells)
         if self.sand_volume_correction == "taichi_elements":  # whose strains have no deviator to speak of
             rule = "compression or plane_strain with sand_volume_correction=taichi_elements"
             cone = self.sand_friction_law in ("compression", "plane_strain")
@@ -212,7 +209,7 @@ def _spread(number: int, fraction: float) -> bool:
 class DatasetConfig:
     """How many episodes, how long, where they are kept, and who makes them."""
 
-    folder: str = "data/obstacles"
+    folder: FolderName = "data/obstacles"
     training_scenes: NonNegative[int] = 800
     validation_scenes: NonNegative[int] = 5
     test_scenes: NonNegative[int] = 20
@@ -232,16 +229,14 @@ class DatasetConfig:
     ray_address: str | None = None
     # 0 to array_tasks - 1: of so many generators on one folder, each makes its own shards alone
     array_task: int | None = None
-    array_tasks: int | None = None
+    array_tasks: OneOrMore | None = None
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(self.folder != "", "folder", "a folder name", self.folder)
         require(self.ray_address is None or self.pool == "ray", "ray_address", "left out without pool=ray", self.pool)
         task, tasks = self.array_task, self.array_tasks
         require((task is None) == (tasks is None), "array_task", "given together with array_tasks", [task, tasks])
         if task is not None and tasks is not None:
-            require(tasks >= 1, "array_tasks", "at least 1", tasks)
             require(0 <= task < tasks, "array_task", f"0 to {tasks - 1}, below array_tasks", task)
 
     @property
@@ -276,21 +271,19 @@ class ServiceConfig:
     """`python -m datagen.service`: where the data set is served, beside what `python -m datagen` takes."""
 
     host: str = "127.0.0.1"
-    port: int = 8000  # 0: any free one
-    health_port: int | None = None  # answers /healthz beside `port`, from a process of its own; null: none
+    port: Port = 8000  # 0: any free one
+    health_port: Port | None = None  # answers /healthz beside `port`, from a process of its own; null: none
     connections: Positive[int] = 1024  # at once; more are told to come back
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        for name, port in (("port", self.port), ("health_port", self.health_port or 0)):
-            require(0 <= port < 65536, name, "0 to 65535", port)
 
 
 @dataclass(frozen=True)
 class ImportConfig:
     """`python -m hgn.import_trajectories`, beside `from`: the folder to read."""
 
-    out: str  # a new folder, for a data set
+    out: FolderName  # a new one, for a data set
     # deepmind, geoelements, lagrangebench, neuralmpm or plain; auto: by the files
     format: Annotated[str, one_of("auto", "deepmind", "geoelements", "lagrangebench", "neuralmpm", "plain")] = "auto"
     history: OneOrMore = 5  # first frames, which a network is shown before it predicts; network.velocity_history
@@ -306,7 +299,6 @@ class ImportConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(self.out != "", "out", "a folder name", self.out)
         for kind, name in self.materials.items():
             rule = "a name of lower-case letters, digits and _"
             require(MATERIAL_NAME.fullmatch(name) is not None, f"materials[{kind}]", rule, name)
@@ -338,7 +330,8 @@ class NetworkConfig:
     # what touches and deforms by less than that many |g| a frame rests (hgn.network.rest); 0: nothing does
     rest_threshold: NonNegative[float] = 0.0
     materials: tuple[MaterialName, ...] = PAPER_MATERIALS
-    dimensions: int = 3  # 2: z is that of a plane; imported data alone have it
+    # 2: z is that of a plane; imported data alone have it
+    dimensions: Annotated[int, Bound("2 or 3", lambda count: count in (2, 3))] = 3
     maximum_neighbours: OneOrMore | None = None  # of a particle of GNS, the nearest; null: all within R
     # of gns_particles: how far apart static particles are, at least, in obstacle cells
     static_spacing_cells: Positive[float] = 0.25
@@ -346,7 +339,6 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         require_bounds(self)
         require(len(self.materials) > 0, "materials", "a list with at least one material", [])
-        require(self.dimensions in (2, 3), "dimensions", "2 or 3", self.dimensions)
         if self.relative:
             require(self.kind == "hgn", "inputs", f"absolute for {self.kind}", self.inputs)
             rule = "at least 2 with inputs=relative, which are of differences"
@@ -433,7 +425,7 @@ class TrainingConfig:
     noise_correlated_fraction: Fraction[float] = 0.1
     # in a frame whose rms acceleration is a below noise_std, the noise's scale is drawn down to max(a /
     # noise_std, this); 1: the same noise everywhere
-    noise_min_scale: float = 1.0
+    noise_min_scale: AtMostOne[Positive[float]] = 1.0
     # squared errors of such a frame count by 1 / scale to this power; 2: in units of the noise, so that rest is learned
     # before slow slides; 0: all alike
     noise_weight_power: NonNegative[float] = 2.0
@@ -475,7 +467,6 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(0 < self.noise_min_scale <= 1, "noise_min_scale", "above 0 and at most 1", self.noise_min_scale)
         require(
             self.final_learning_rate <= self.learning_rate,
             "final_learning_rate",
@@ -493,12 +484,12 @@ class TrainConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
-    run: str = "runs/obstacles"
+    run: FolderName = "runs/obstacles"
     # the data set is one of hgn.import_trajectories, which says what `scene` and `dataset` are: +experiment=imported
     imported: bool = False
 
     def __post_init__(self) -> None:
-        require(self.run != "", "run", "a folder name", self.run)
+        require_bounds(self)
         rule, dimensions = "3 for data that are not imported", self.network.dimensions
         require(self.imported or dimensions == 3, "network.dimensions", rule, dimensions)
         upright = self.scene.zero_gravity_fraction == 0 and self.scene.tilted_gravity_fraction == 0

@@ -20,7 +20,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import shipped_weights
 from hgn.scene.rollout_file import read_rollout
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import Positive, from_mapping, require, require_bounds
+from hgn.schema import Port, Positive, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
@@ -36,7 +36,7 @@ class PlayConfig:
     html: str | None = None  # with rollout: write a page that plays it by itself to this file, and end
     every: Positive[int] = 2  # with html: of its frames
     host: str = "127.0.0.1"  # to listen on; 0.0.0.0: whoever reaches this machine and has the token
-    port: int = 8080  # or the next that is free; 0: any
+    port: Port = 8080  # or the next that is free; 0: any
     browser: bool = True  # open the page in this machine's browser
     particles: Positive[int] = 40_000  # at most
     keep_mb: Positive[int] = 1024  # of past frames, to go back to and to save
@@ -46,7 +46,6 @@ class PlayConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        require(0 <= self.port < 65536, "port", "0 to 65535", self.port)
         require(self.html is None or self.rollout is not None, "html", "left out without rollout", self.html)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import BackendName, Precision, SceneConfig, require_rollout_name
+from hgn.config import BackendName, Precision, RolloutName, SceneConfig
 from hgn.data.lookup import find_episode
 from hgn.render.exchange import require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
@@ -42,7 +42,7 @@ class RolloutConfig:
 
     weights: str = "obstacles"  # a file of python -m hgn.export, or the name of shipped weights
     # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
-    out: str | None = None
+    out: RolloutName | None = None
     surface: bool = False  # water also as a closed surface, in USD and PLY
     render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene …
@@ -65,7 +65,6 @@ class RolloutConfig:
             "for example data=data/obstacles episode=validation-000000",
         )
         require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
-        require_rollout_name("out", self.out)
 
 
 def main(mapping: dict[str, Any]) -> int:

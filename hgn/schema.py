@@ -46,8 +46,11 @@ Finite = Annotated[float, Bound("finite", math.isfinite)]
 Vector = tuple[Finite, Finite, Finite]
 BoxSize = tuple[Positive[float], Positive[float], Positive[float]]
 Fraction = Annotated[N, Bound("from 0 to 1", lambda value: 0 <= value <= 1)]
+AtMostOne = Annotated[N, Bound("at most 1", lambda value: value <= 1)]
 BelowOne = Annotated[N, Bound("0 or more and below 1", lambda value: 0 <= value < 1)]
 OneOrMore = Annotated[int, Bound("at least 1", lambda value: value >= 1)]
+Port = Annotated[int, Bound("0 to 65535", lambda value: 0 <= value < 65536)]
+FolderName = Annotated[str, Bound("a folder name", bool)]
 FrameCount = Annotated[
     int,
     Bound("at least 2", lambda value: value >= 2),
