@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -56,27 +57,15 @@ class Graph:
 
     neighbours: NeighbourList
     position_N3: torch.Tensor  # in radii, in the list's order
-    _scale: torch.Tensor | None = field(default=None, repr=False)
-    _by_sender: tuple[torch.Tensor, torch.Tensor] | None = field(default=None, repr=False)
+    # on the device, a power of two; known as soon as gradients reach the particles' last state
+    scale: torch.Tensor = field(init=False)
 
-    @property
-    def scale(self) -> torch.Tensor:
-        """On the device, a power of two; known as soon as gradients reach the particles' last state."""
-        assert self._scale is not None
-        return self._scale
-
-    @scale.setter
-    def scale(self, value: torch.Tensor) -> None:
-        self._scale = value
-
-    @property
+    @cached_property
     def by_sender(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The edges in the order of their senders [E], and where each sender's begin [N + 1]."""
-        if self._by_sender is None:
-            sender_E, order_E = torch.sort(self.neighbours.sender_E, stable=True)
-            count = torch.arange(len(self.position_N3) + 1, device=sender_E.device)
-            self._by_sender = order_E, torch.searchsorted(sender_E, count)
-        return self._by_sender
+        sender_E, order_E = torch.sort(self.neighbours.sender_E, stable=True)
+        count = torch.arange(len(self.position_N3) + 1, device=sender_E.device)
+        return order_E, torch.searchsorted(sender_E, count)
 
 
 class Edges(ABC):
@@ -137,15 +126,15 @@ class PlainEdges(Edges):
     ) -> tuple[torch.Tensor, Weights]:
         sender_E, receivers = graph.neighbours.sender_E, graph.neighbours.receivers
         second = self._rounded(weights.second)
-        found, bias_W = _zeros(weights), torch.zeros_like(first_bias_W)
+        sums, bias_W = _zeros(weights), torch.zeros_like(first_bias_W)
         for first, last in self._blocks(len(sender_E), second.device):
             offset_E4 = _offsets(graph.position_N3, sender_E[first:last], receivers.segment_E[first:last])
             a = self._rounded(torch.addmm(first_bias_W, offset_E4, weights.own.T).relu_())
             dm = gradient_EW[first:last].to(second.dtype)
-            dh = self._hidden_gradient(weights, second, a, dm, found)
-            found.own.addmm_(dh.T, offset_E4)
+            dh = self._hidden_gradient(weights, second, a, dm, sums)
+            sums.own.addmm_(dh.T, offset_E4)
             bias_W += dh.sum(0)
-        return bias_W / graph.scale, Weights(*(total / graph.scale for total in found))
+        return bias_W / graph.scale, Weights(*(total / graph.scale for total in sums))
 
     def step(
         self, graph: Graph, ends: Ends, weights: Weights, edge_EW: torch.Tensor, last: bool, in_place: bool
@@ -175,7 +164,7 @@ class PlainEdges(Edges):
     ) -> tuple[Ends, Weights, torch.Tensor]:
         sender_E, receivers = graph.neighbours.sender_E, graph.neighbours.receivers
         own, second, send_NW = (self._rounded(x) for x in (weights.own, weights.second, ends.send_NW))
-        found, found_ends = _zeros(weights), Ends(torch.zeros_like(send_NW), torch.zeros_like(ends.receive_NW))
+        sums, end_sums = _zeros(weights), Ends(torch.zeros_like(send_NW), torch.zeros_like(ends.receive_NW))
         sum_gradient_NW = sum_gradient_NW * graph.scale
         result_EW = torch.empty_like(edge_EW)
         for first, end in self._blocks(len(edge_EW), edge_EW.device):
@@ -185,15 +174,15 @@ class PlainEdges(Edges):
             dm = sum_gradient_NW.index_select(0, receiver)
             if gradient_EW is not None:
                 dm += gradient_EW[first:end]
-            dh = self._hidden_gradient(weights, second, a, dm, found)
-            found_ends.receive_NW.index_add_(0, receiver, dh)
-            found_ends.send_NW.index_add_(0, sender, dh)
+            dh = self._hidden_gradient(weights, second, a, dm, sums)
+            end_sums.receive_NW.index_add_(0, receiver, dh)
+            end_sums.send_NW.index_add_(0, sender, dh)
             dh = self._rounded(dh)
-            found.own.addmm_(dh.T, edge)
+            sums.own.addmm_(dh.T, edge)
             de = dh @ own
             result_EW[first:end] = de if gradient_EW is None else de.add_(gradient_EW[first:end])
-        undone = Weights(*(total / graph.scale for total in found))
-        return Ends(*(total / graph.scale for total in found_ends)), undone, result_EW
+        undone = Weights(*(total / graph.scale for total in sums))
+        return Ends(*(total / graph.scale for total in end_sums)), undone, result_EW
 
     def _hidden(
         self, graph: Graph, ends: Ends, own: torch.Tensor, edge: torch.Tensor, first: int, end: int
@@ -204,19 +193,19 @@ class PlainEdges(Edges):
         return h.addmm_(edge, own.T)
 
     def _hidden_gradient(
-        self, weights: Weights, second: torch.Tensor, a: torch.Tensor, dm: torch.Tensor, found: Weights
+        self, weights: Weights, second: torch.Tensor, a: torch.Tensor, dm: torch.Tensor, sums: Weights
     ) -> torch.Tensor:
-        """The gradient before the activation from the messages' `dm`; adds those of the layers behind it to `found`."""
+        """The gradient before the activation from the messages' `dm`; adds those of the layers behind it to `sums`."""
         z = torch.addmm(weights.bias, a, second.T)
         _, mean, scale = torch.native_layer_norm(z, z.shape[1:], weights.gain, weights.shift, EPSILON)
         dz, gain, shift = torch.ops.aten.native_layer_norm_backward(
             dm, z, z.shape[1:], mean, scale, weights.gain, weights.shift, [True, True, True]
         )
-        found.gain.add_(gain)
-        found.shift.add_(shift)
-        found.bias.add_(dz.sum(0))
+        sums.gain.add_(gain)
+        sums.shift.add_(shift)
+        sums.bias.add_(dz.sum(0))
         dz = self._rounded(dz)
-        found.second.addmm_(dz.T, a)
+        sums.second.addmm_(dz.T, a)
         return (dz @ second).masked_fill_(a <= 0, 0.0)
 
     def _rounded(self, value: torch.Tensor) -> torch.Tensor:
@@ -240,13 +229,11 @@ def passed_messages(
     edges: Edges, graph: Graph, ends: Ends, weights: Weights, edge_EW: torch.Tensor, last: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Each receiver's sum of messages, and the edges with their messages added (as they were, if `last`)."""
-    if not torch.is_grad_enabled():
+    if torch.is_grad_enabled():
+        sum_NW, out_EW = _Step.apply(edges, graph, last, *ends, *weights, edge_EW)
+    else:
         sum_NW, out_EW = edges.step(graph, ends, weights, edge_EW, last, in_place=True)
-        return sum_NW, edge_EW if out_EW is None else out_EW
-    if last:
-        return _LastStep.apply(edges, graph, *ends, *weights, edge_EW), edge_EW
-    sum_NW, out_EW = _Step.apply(edges, graph, *ends, *weights, edge_EW)
-    return sum_NW, out_EW
+    return sum_NW, edge_EW if out_EW is None else out_EW
 
 
 def scaling_gradients(graph: Graph, value_NW: torch.Tensor) -> torch.Tensor:
@@ -280,40 +267,24 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def backward(context, gradient_EW):  # type: ignore[no-untyped-def]
         first_bias_W, *weights = context.saved_tensors
-        bias, found = context.edges.encode_backward(context.graph, first_bias_W, Weights(*weights), gradient_EW)
-        return None, None, bias, *found
+        bias, gradients = context.edges.encode_backward(context.graph, first_bias_W, Weights(*weights), gradient_EW)
+        return None, None, bias, *gradients
 
 
 class _Step(torch.autograd.Function):
     @staticmethod
-    def forward(context, edges, graph, *tensors):  # type: ignore[no-untyped-def]
+    def forward(context, edges, graph, last, *tensors):  # type: ignore[no-untyped-def]
         context.edges, context.graph = edges, graph
         context.save_for_backward(*tensors)
-        return edges.step(graph, Ends(*tensors[:2]), Weights(*tensors[2:7]), tensors[7], last=False, in_place=False)
+        return edges.step(graph, Ends(*tensors[:2]), Weights(*tensors[2:7]), tensors[7], last, in_place=False)
 
     @staticmethod
     def backward(context, sum_gradient_NW, gradient_EW):  # type: ignore[no-untyped-def]
-        return _step_backward(context, sum_gradient_NW, gradient_EW)
-
-
-class _LastStep(torch.autograd.Function):
-    @staticmethod
-    def forward(context, edges, graph, *tensors):  # type: ignore[no-untyped-def]
-        context.edges, context.graph = edges, graph
-        context.save_for_backward(*tensors)
-        return edges.step(graph, Ends(*tensors[:2]), Weights(*tensors[2:7]), tensors[7], last=True, in_place=False)[0]
-
-    @staticmethod
-    def backward(context, sum_gradient_NW):  # type: ignore[no-untyped-def]
-        return _step_backward(context, sum_gradient_NW, None)
-
-
-def _step_backward(context, sum_gradient_NW, gradient_EW):  # type: ignore[no-untyped-def]
-    tensors = context.saved_tensors
-    ends, weights, edge_EW = context.edges.step_backward(
-        context.graph, Ends(*tensors[:2]), Weights(*tensors[2:7]), tensors[7], sum_gradient_NW, gradient_EW
-    )
-    return None, None, *ends, *weights, edge_EW
+        tensors = context.saved_tensors
+        ends, weights, edge_EW = context.edges.step_backward(
+            context.graph, Ends(*tensors[:2]), Weights(*tensors[2:7]), tensors[7], sum_gradient_NW, gradient_EW
+        )
+        return None, None, None, *ends, *weights, edge_EW
 
 
 def _offsets(position_N3: torch.Tensor, sender_E: torch.Tensor, receiver_E: torch.Tensor) -> torch.Tensor:
