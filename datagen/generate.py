@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from types import FrameType
 from typing import Any
 
-from datagen.pool.pool import LocalWorkerFactory, Pool, Stopped, plan_workers, visible_gpus
+from datagen.pool.local_workers import LocalWorkerFactory
+from datagen.pool.pool import Pool, Stopped
 from datagen.pool.progress import Progress
-from datagen.pool.worker import Backend
+from datagen.pool.worker import Backend, WorkerFactory
+from datagen.pool.worker_plan import plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
 from hgn.command import section
 from hgn.config import DatagenConfig
@@ -94,14 +97,8 @@ def generate(
     with DatasetWriter(config, progress.message) as writer:
         if not writer.complete:
             try:
-                if config.dataset.pool == "ray":
-                    from datagen.pool.ray_workers import RayWorkerFactory
-
-                    with RayWorkerFactory(config, backend) as crew:
-                        Pool(config, writer, progress, crew.plan, crew, should_stop).run()
-                else:
-                    plan = plan_workers(config, visible_gpus(), available_cpus(), available_memory())
-                    Pool(config, writer, progress, plan, LocalWorkerFactory(config, backend, plan), should_stop).run()
+                with _workers(config, backend) as factory:
+                    Pool(writer, progress, factory, should_stop).run()
             except Stopped:
                 progress.message(
                     f"stopped; {writer.done} of {writer.total} episodes are kept in {writer.folder}: run the same "
@@ -110,6 +107,15 @@ def generate(
                 return False
         progress.message(_summary(config, writer))
     return True
+
+
+def _workers(config: DatagenConfig, backend: Backend) -> AbstractContextManager[WorkerFactory]:
+    if config.dataset.pool == "ray":
+        from datagen.pool.ray_workers import RayWorkerFactory
+
+        return RayWorkerFactory(config, backend)
+    plan = plan_workers(config, visible_gpus(), available_cpus(), available_memory())
+    return nullcontext(LocalWorkerFactory(config, backend, plan))
 
 
 def _summary(config: DatagenConfig, writer: DatasetWriter) -> str:

@@ -30,6 +30,10 @@ class SceneTask:
     def key(self) -> str:
         return episode_key(self.split, self.index)
 
+    @property
+    def place(self) -> tuple[bool, int, bool]:
+        return generation_place(self.split, self.index)
+
 
 @dataclass(frozen=True)
 class ShardRange:

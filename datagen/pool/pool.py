@@ -2,129 +2,31 @@
 
 The pool hands out work, publishes shards and replaces workers that die. A scene whose worker dies is tried again,
 alone; after `maximum_attempts` it is quarantined and the next seed takes its place. Workers are processes of this
-machine, or of a Ray cluster (datagen/pool/ray_workers.py).
+machine (datagen/pool/local_workers.py) or of a Ray cluster (datagen/pool/ray_workers.py).
 """
 
 from __future__ import annotations
 
 import math
-import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Protocol
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
-from datagen.pool.plan import SceneTask, generation_place
+from datagen.pool.plan import SceneTask
 from datagen.pool.progress import Progress
-from datagen.pool.worker import (
-    Backend,
-    BuiltGrid,
-    GridTask,
-    LocalWorker,
-    MadeScene,
-    Worker,
-    receive,
-    start_maker,
-    start_solver,
-)
+from datagen.pool.worker import BuiltGrid, GridTask, MadeScene, Worker, WorkerFactory
 from datagen.pool.writer import DatasetWriter
-from hgn.config import DatagenConfig
 from hgn.schema import ConfigError
 
 _WAIT_SECONDS = 0.2  # at most until a stop request is seen
 _PACKING_SECONDS = 0.02  # at most until a packed shard is published
 _LOOK_SECONDS = 1.0  # between looks at what other generators have published or left behind
-GPU_SCENES_PER_LAUNCH = 208  # so that scenes are made, and episodes staged, while others are simulated
-GPU_NODES_PER_LAUNCH = 832 * 64**3  # of the grids of all scenes, about 50 bytes each
-GPU_EARLY_LAUNCH = 2  # where episodes are wanted early: such a launch has the whole GPU for each substep
 _LAUNCH_GROWTH = 32  # from one launch to the next, up to the full size
-MAXIMUM_MAKERS = 32
 
 
 class Stopped(Exception):  # noqa: N818 - a request, not an error
     """The run was asked to stop; what is staged is kept."""
-
-
-@dataclass(frozen=True)
-class WorkerPlan:
-    """How many processes of each kind, and how much each takes at once."""
-
-    solvers: int
-    threads: int | None  # of each solver; none on a GPU
-    makers: int
-    scenes_per_launch: int
-    first_launch: int
-    gpus: tuple[str, ...] = ()  # CUDA devices, dealt out to the solvers in turn
-
-
-def plan_workers(config: DatagenConfig, gpus: tuple[str, ...], cpu_count: int, memory_bytes: float) -> WorkerPlan:
-    """One solver for two cores on a CPU; one for each GPU, with scene makers on the cores."""
-    workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
-    if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
-        solvers = workers or max(1, len(gpus))
-        launch = launch or gpu_scenes_per_launch(config, memory_bytes / solvers)
-        makers = max(1, min(MAXIMUM_MAKERS, cpu_count - 1))
-        return WorkerPlan(solvers, None, makers, launch, gpu_first_launch(config, launch), gpus)
-    solvers = workers or max(1, cpu_count // 2)
-    threads = max(1, cpu_count // solvers)
-    return WorkerPlan(solvers, threads, 1, launch or 1, launch or 1)
-
-
-def gpu_scenes_per_launch(config: DatagenConfig, memory_bytes: float) -> int:
-    """As many as give every part of a GPU work; fewer where their grids are large, or their frames, which the host
-    holds until they are published, would take more than half of its memory.
-    """
-    scene = config.scene
-    nodes = math.prod(math.ceil(length / scene.cell_size) for length in scene.domain_size)
-    particles = scene.group_count * scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3
-    held = memory_bytes / 2 / (12 * config.dataset.most_frames * max(particles, 1))
-    return max(1, int(min(GPU_SCENES_PER_LAUNCH, GPU_NODES_PER_LAUNCH // nodes, held)))
-
-
-def gpu_first_launch(config: DatagenConfig, launch: int) -> int:
-    """Few scenes where something waits for the first episodes; else all: a launch of few lasts as long as its longest
-    scene, which costs more than it takes to make the others.
-    """
-    return min(launch, GPU_EARLY_LAUNCH) if config.dataset.early_episodes else launch
-
-
-def visible_gpus() -> tuple[str, ...]:
-    """The CUDA devices of this machine that CUDA_VISIBLE_DEVICES leaves, without starting CUDA."""
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    count = len(list(Path("/dev").glob("nvidia[0-9]*"))) or int(Path("/dev/dxg").exists())
-    if visible is None:
-        return tuple(str(i) for i in range(count))
-    devices = tuple(device.strip() for device in visible.split(",") if device.strip())
-    return () if count == 0 or "-1" in devices or "NoDevFiles" in devices else devices
-
-
-class WorkerFactory(Protocol):
-    """Where workers come from."""
-
-    def start_maker(self) -> Worker: ...
-
-    def start_solver(self, number: int) -> Worker: ...
-
-    def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]: ...
-
-
-class LocalWorkerFactory:
-    """Processes of this machine."""
-
-    def __init__(self, config: DatagenConfig, backend: Backend, plan: WorkerPlan) -> None:
-        self._config, self._backend, self._plan = config, backend, plan
-
-    def start_maker(self) -> Worker:
-        return start_maker(self._config, self._backend)
-
-    def start_solver(self, number: int) -> Worker:
-        gpus = self._plan.gpus
-        gpu = gpus[number % len(gpus)] if self._plan.solvers > 1 and gpus else None
-        return start_solver(self._config, self._backend, self._plan.threads, gpu, self._plan.first_launch)
-
-    def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
-        return receive([worker for worker in workers if isinstance(worker, LocalWorker)], timeout)
 
 
 class Pool:
@@ -132,16 +34,14 @@ class Pool:
 
     def __init__(
         self,
-        config: DatagenConfig,
         writer: DatasetWriter,
         progress: Progress,
-        plan: WorkerPlan,
-        crew: WorkerFactory,
+        factory: WorkerFactory,
         should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._config, self._writer, self._progress = config, writer, progress
-        self._plan, self._crew, self._should_stop = plan, crew, should_stop
-        self._launch_size = self._largest_launch = plan.first_launch
+        self._writer, self._progress, self._factory, self._should_stop = writer, progress, factory, should_stop
+        self._settings, self._plan = writer.config.dataset, factory.plan
+        self._launch_size = self._largest_launch = self._plan.first_launch
         self._launches = 0
         self._deaths_in_a_row = 0
         self._alone: dict[str, int] = {}  # keys whose worker died: how often while they ran alone
@@ -160,7 +60,7 @@ class Pool:
         self._solvers: list[Worker] = []
         self._counted, self._next_look, self._said_waiting = self._writer.done, 0.0, False
         self._awake_at = time.monotonic()
-        self._progress.start(self._writer.done, self._writer.total, self._config.dataset.frames)
+        self._progress.start(self._writer.done, self._writer.total, self._settings.frames)
         try:
             while True:
                 if self._should_stop():
@@ -183,8 +83,8 @@ class Pool:
     def _start_workers(self) -> None:
         missing = self._writer.total - self._writer.done
         # a solver needs seconds to start, so all start before the first scene is asked for
-        self._solvers = [self._crew.start_solver(i) for i in range(min(self._plan.solvers, missing))]
-        self._makers = [self._crew.start_maker() for _ in range(min(self._plan.makers, missing))]
+        self._solvers = [self._factory.start_solver(i) for i in range(min(self._plan.solvers, missing))]
+        self._makers = [self._factory.start_maker() for _ in range(min(self._plan.makers, missing))]
         self._launch_size = min(self._largest_launch, self._share(0))
 
     def _share(self, taken: int) -> int:
@@ -198,17 +98,17 @@ class Pool:
             return
         self._writer.refresh()
         while len(self._todo) < self._plan.makers:
-            known = set(self._writer.remaining())
+            before = set(self._writer.remaining())
             shard = self._writer.claim_next()
             if shard is None:
                 self._next_look = time.monotonic() + _LOOK_SECONDS
                 break
             for split, index in self._writer.remaining():
-                if (split, index) not in known:
+                if (split, index) not in before:
                     self._put_back(self._writer.task(split, index))
-        found, self._counted = self._writer.done - self._counted, self._writer.done
-        if found > 0:
-            self._progress.found(found)
+        of_others, self._counted = self._writer.done - self._counted, self._writer.done
+        if of_others > 0:
+            self._progress.found(of_others)
         if not self._writer.holds and not self._writer.complete and not self._said_waiting:
             self._said_waiting = True
             self._progress.message("other generators make the rest; waiting for them")
@@ -252,7 +152,7 @@ class Pool:
 
     def _next_batch(self, solver: Worker) -> list[MadeScene]:
         """The next scenes to simulate; empty when it is better to wait for more of them."""
-        self._ready.sort(key=lambda made: self._place(made.task))
+        self._ready.sort(key=lambda made: made.task.place)
         for made in self._ready:
             group = self._group.get(made.task.key)
             if group is not None:
@@ -267,7 +167,7 @@ class Pool:
             return []
         # training waits for the first shards in order, so small launches must not overtake a scene still being made
         growing = self._largest_launch < self._plan.scenes_per_launch
-        if growing and any(self._place(task) < self._place(self._ready[size - 1].task) for task in unmade):
+        if growing and any(task.place < self._ready[size - 1].task.place for task in unmade):
             return []
         batch, self._ready = self._ready[:size], self._ready[size:]
         self._launches += 1
@@ -277,7 +177,7 @@ class Pool:
         return batch
 
     def _receive(self, timeout: float) -> None:
-        for worker, message in self._crew.receive((*self._makers, *self._solvers), timeout):
+        for worker, message in self._factory.receive((*self._makers, *self._solvers), timeout):
             worker.heard_at = time.monotonic()
             if message is not None:
                 self._handle(worker, *message)
@@ -285,13 +185,13 @@ class Pool:
                 raise Stopped
             else:
                 self._replace(worker, worker.cause_of_death())
-        # a process that is stopped, or waits for a device for ever; actors of a cluster speak at the end alone
-        silence, now = self._config.dataset.worker_silence_s, time.monotonic()
+        # a process that is stopped, or waits for a device for ever
+        silence, now = self._settings.worker_silence_s, time.monotonic()
         slept, self._awake_at = now - self._awake_at > silence / 2, now
         for worker in (*self._makers, *self._solvers):
             if slept:  # this process was stopped itself (Ctrl-Z, a frozen container), and they with it
                 worker.heard_at = now
-            elif isinstance(worker, LocalWorker) and worker.tasks and now - worker.heard_at > silence:
+            elif worker.speaks and worker.tasks and now - worker.heard_at > silence:
                 self._replace(worker, f"it said nothing for {silence:.0f} s")
 
     def _handle(self, worker: Worker, kind: str, *values: Any) -> None:
@@ -355,12 +255,12 @@ class Pool:
 
     def _put_back(self, task: SceneTask) -> None:
         self._todo.append(task)
-        self._todo.sort(key=self._place)
+        self._todo.sort(key=lambda task: task.place)
 
     def _replace(self, worker: Worker, cause: str) -> None:
         blamable = worker.blamable()
         self._deaths_in_a_row += blamable
-        attempts = self._config.dataset.maximum_attempts
+        attempts = self._settings.maximum_attempts
         halvings = self._plan.scenes_per_launch.bit_length()
         if self._deaths_in_a_row > 3 * attempts + self._plan.solvers + halvings:
             raise RuntimeError(f"workers keep dying before they finish any scene, the last because {cause}")
@@ -370,9 +270,9 @@ class Pool:
         if worker in self._solvers:
             number = self._solvers.index(worker)
             self._progress.frame(number, 0, 0)
-            self._solvers[number] = self._crew.start_solver(number)
+            self._solvers[number] = self._factory.start_solver(number)
         else:
-            self._makers[self._makers.index(worker)] = self._crew.start_maker()
+            self._makers[self._makers.index(worker)] = self._factory.start_maker()
         groups = max(self._group.values(), default=0) + 1
         for place, item in enumerate(lost):
             task = _task(item)
@@ -396,13 +296,10 @@ class Pool:
 
     def _grid_lost(self, item: GridTask, cause: str, blamable: bool) -> None:
         deaths = self._grid_deaths[item.task] = self._grid_deaths.get(item.task, 0) + blamable
-        if deaths >= self._config.dataset.maximum_attempts:
+        if deaths >= self._settings.maximum_attempts:
             self._grid_built(BuiltGrid(item.task, cause))
         else:
             self._gridless.insert(0, MadeScene(item.task, item.scene, None))
-
-    def _place(self, task: SceneTask) -> tuple[bool, int, bool]:
-        return generation_place(task.split, task.index)
 
 
 def _task(item: SceneTask | MadeScene | GridTask) -> SceneTask:

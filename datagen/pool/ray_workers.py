@@ -9,15 +9,13 @@ it: machines may leave while the pool runs, and others may take their place.
 from __future__ import annotations
 
 import logging
-import math
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from datagen.pool.plan import SceneTask
-from datagen.pool.pool import MAXIMUM_MAKERS, WorkerPlan, gpu_first_launch, gpu_scenes_per_launch
 from datagen.pool.shard import pack_episode, stage_parts
 from datagen.pool.worker import (
     Backend,
@@ -29,31 +27,15 @@ from datagen.pool.worker import (
     make_scene,
     simulate_batch,
 )
+from datagen.pool.worker_plan import plan_cluster
 from hgn.config import DatagenConfig
 from hgn.data.identity import dataset_identity, identity_hash
 from hgn.schema import ConfigError
 
-_SOLVER_THREADS = 2
 _CONNECT_REMEDY = (
     "start one with `ray start --head` on one machine and `ray start --address=...` on the others, and name it with "
     "dataset.ray_address=... or RAY_ADDRESS"
 )
-
-
-def plan_cluster(config: DatagenConfig, nodes: Sequence[Mapping[str, float]]) -> WorkerPlan:
-    """One solver for each GPU of the cluster; without one, for each two cores of a node."""
-    workers, launch = config.dataset.workers, config.mpm.scenes_per_launch
-    gpus = int(sum(node.get("GPU", 0) for node in nodes))
-    if config.mpm.device == "gpu" or (config.mpm.device == "auto" and gpus):
-        memory = min((node["memory"] for node in nodes if "memory" in node), default=math.inf)
-        launch = launch or gpu_scenes_per_launch(config, memory)
-        solvers, threads, first = workers or max(1, gpus), None, gpu_first_launch(config, launch)
-    else:
-        cores = [int(node["CPU"]) for node in nodes if node.get("CPU", 0) >= 1]
-        threads = min(_SOLVER_THREADS, *cores) if cores else 1
-        solvers, launch = workers or max(1, sum(count // threads for count in cores)), launch or 1
-        first = launch
-    return WorkerPlan(solvers, threads, min(MAXIMUM_MAKERS, solvers), launch, first)
 
 
 class RayWorkerFactory:

@@ -74,7 +74,7 @@ class DatasetWriter:
         self._report = report
         tasks, task = config.dataset.array_tasks or 1, config.dataset.array_task or 0
         self._share = work_order(self.requested, config.dataset.episodes_per_shard)[task::tasks]
-        self._total = sum(len(shard.indices) for shard in self._share)
+        self.total = sum(len(shard.indices) for shard in self._share)  # episodes
         self._in_share = {split: bytearray(count) for split, count in self.requested.items()}  # a byte an episode
         for shard in self._share:
             self._in_share[shard.split][shard.first : shard.stop] = b"\1" * len(shard.indices)
@@ -128,7 +128,7 @@ class DatasetWriter:
                 continue
             # whoever had it may have published it, or ended before it could list it
             with self._locks.manifest():
-                self._reload()
+                self.refresh()
                 self._list_unlisted(self._packed_names(shard))
             if missing_ranges([shard], self._published) != [shard]:
                 self._locks.free(shard)
@@ -143,19 +143,10 @@ class DatasetWriter:
         wanted = {(shard.split, index) for shard in self._claimed for index in shard.indices} - self._staged
         return sorted(wanted, key=lambda item: generation_place(*item))
 
-    def refresh(self) -> None:
-        """Takes notice of what other generators have published."""
-        self._reload()
-
     @property
     def holds(self) -> bool:
         """Whether there are claimed shards that are not published yet."""
         return bool(self._claimed)
-
-    @property
-    def total(self) -> int:
-        """How many episodes the share has."""
-        return self._total
 
     @property
     def done(self) -> int:
@@ -165,7 +156,7 @@ class DatasetWriter:
     @property
     def complete(self) -> bool:
         """Whether the share is published, by whomever."""
-        return self._published_of_share == self._total
+        return self._published_of_share == self.total
 
     def task(self, split: str, index: int) -> SceneTask:
         """The scene to simulate for an episode: the first seed that is not quarantined.
@@ -188,7 +179,7 @@ class DatasetWriter:
         """Records that a scene could not be simulated and returns the one that takes its place."""
         failure = QuarantinedScene(task.key, task.attempt, task.seed, cause)
         with self._locks.manifest():
-            self._reload()
+            self.refresh()
             self._publish_list(quarantined=(failure,))
         return self.task(task.split, task.index)
 
@@ -257,7 +248,7 @@ class DatasetWriter:
 
     def _winner(self, shard: ShardRange) -> ShardEntry | None:
         """What another generator has published of a claimed shard: only where a file system's locks do not hold."""
-        self._reload()
+        self.refresh()
         if missing_ranges([shard], self._published) == [shard]:
             return None
         other = next(other for other in self.manifest.shards if _overlap(shard, other))
@@ -266,7 +257,7 @@ class DatasetWriter:
 
     def _recover(self) -> None:
         if (self.folder / MANIFEST_NAME).exists():
-            self._reload()
+            self.refresh()
             require_same_dataset(self.manifest.config, self.config, self.folder)
         shards = list(self.manifest.shards)
         present = [shard for shard in shards if self._is_present(shard)]
@@ -366,7 +357,8 @@ class DatasetWriter:
             published[shard.first : shard.stop] = b"\1" * (shard.stop - shard.first)
         self._listed = len(self.manifest.shards)
 
-    def _reload(self) -> None:
+    def refresh(self) -> None:
+        """Takes notice of what other generators have published."""
         try:
             content = read_replaced(self.folder / MANIFEST_NAME)
         except FileNotFoundError:  # removed by hand: it is written anew with the next shard

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datagen.pool.local_workers import LocalWorker, LocalWorkerFactory
 from datagen.pool.plan import SceneTask, scene_seed
-from datagen.pool.pool import LocalWorkerFactory, Pool, Stopped, WorkerPlan, plan_workers, visible_gpus
+from datagen.pool.pool import Pool, Stopped
 from datagen.pool.progress import Progress
-from datagen.pool.worker import Backend, LocalWorker, MadeScene, Worker
+from datagen.pool.worker import Backend, MadeScene, Worker
+from datagen.pool.worker_plan import WorkerPlan, plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest
@@ -46,7 +48,7 @@ def generate(config, backend, plan=ONE, **options):
     recorder = Recorder()
     try:
         with DatasetWriter(config, recorder.message) as writer:
-            Pool(config, writer, recorder, plan, LocalWorkerFactory(config, backend, plan), **options).run()
+            Pool(writer, recorder, LocalWorkerFactory(config, backend, plan), **options).run()
     finally:
         assert not multiprocessing.active_children()
     return recorder
@@ -121,7 +123,7 @@ def test_scenes_are_spread_over_solvers(make_config, backend, control):
         batches.clear()
         plan = WorkerPlan(3, None, 1, 9, first)
         with DatasetWriter(config) as writer:
-            Pool(config, writer, Recorder(), plan, WorkerFactory(config, backend, plan)).run()
+            Pool(writer, Recorder(), WorkerFactory(config, backend, plan)).run()
         assert batches == expected
 
 
@@ -183,8 +185,8 @@ def test_stop_keeps_what_is_staged(make_config, backend, control):
     config = make_config()
     recorder = Recorder()
     with pytest.raises(Stopped), DatasetWriter(config) as writer:
-        crew = LocalWorkerFactory(config, backend, ONE)
-        Pool(config, writer, recorder, ONE, crew, lambda: len(recorder.episodes) >= 3).run()
+        factory = LocalWorkerFactory(config, backend, ONE)
+        Pool(writer, recorder, factory, lambda: len(recorder.episodes) >= 3).run()
     assert not multiprocessing.active_children()
     # the episode in flight may or may not have been staged when its worker ended
     done = len(recorder.episodes)
@@ -200,8 +202,8 @@ def test_workers_that_die_while_stopping(make_config, backend, control):
     (control / f"kill-{scene_seed(0, 'train', 0, 0)}").write_text("1")
     recorder = Recorder()
     with pytest.raises(Stopped), DatasetWriter(config) as writer:
-        crew = LocalWorkerFactory(config, backend, ONE)
-        Pool(config, writer, recorder, ONE, crew, lambda: (control / "simulated.log").exists()).run()
+        factory = LocalWorkerFactory(config, backend, ONE)
+        Pool(writer, recorder, factory, lambda: (control / "simulated.log").exists()).run()
     assert recorder.messages == [] and len(simulated(control)) == 1
 
 
@@ -226,7 +228,7 @@ def test_full_disk_in_a_worker_reaches_the_parent(make_config, backend, tmp_path
         staging.rmdir()
         staging.write_text("in the way")
         with pytest.raises(NotADirectoryError):
-            Pool(config, writer, Recorder(), ONE, LocalWorkerFactory(config, backend, ONE)).run()
+            Pool(writer, Recorder(), LocalWorkerFactory(config, backend, ONE)).run()
         staging.unlink()
         staging.mkdir()
 
@@ -328,6 +330,8 @@ def test_stopped_solver_is_replaced(make_config, monkeypatch):
     solvers: list[StoppedWorker] = []
 
     class Workers:
+        plan = ONE
+
         def start_maker(self):
             return StoppedWorker()
 
@@ -344,6 +348,6 @@ def test_stopped_solver_is_replaced(make_config, monkeypatch):
 
     config, recorder = make_config(training_scenes=1, validation_scenes=0, test_scenes=0), Recorder()
     with DatasetWriter(config) as writer, pytest.raises(TimeoutError):
-        Pool(config, writer, recorder, ONE, Workers()).run()
+        Pool(writer, recorder, Workers()).run()
     assert recorder.messages[0].startswith("a worker died (it said nothing for 600 s); it is replaced")
     assert solvers[0].killed and solvers[0].heard_at > 1000 and list(passes) == [250]

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from processes import PATIENCE_S
 
-from datagen.pool.pool import WorkerPlan
-from datagen.pool.ray_workers import RayWorkerFactory, plan_cluster
+from datagen.pool.ray_workers import RayWorkerFactory
 from datagen.pool.worker import Backend
+from datagen.pool.worker_plan import WorkerPlan, plan_cluster
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
 from hgn.schema import ConfigError
 
