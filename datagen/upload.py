@@ -16,7 +16,7 @@ from typing import Any
 from datagen.generate import StopSignal
 from hgn.command import run_command
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
-from hgn.data.storage import is_remote, open_storage, verify_file, write_remote
+from hgn.data.storage import is_remote, open_storage, write_remote
 from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds
 from hgn.system.progress import bar
 
@@ -79,7 +79,7 @@ class Target:
         """Copies the shards that are not there yet, then the index and the manifest; leaves these out when asked to
         stop before.
 
-        Raises: ConfigError when another data set is there, a shard here is altered, or nothing can be written;
+        Raises: ConfigError when another data set is there, a shard here is altered or gone, or nothing can be written;
         UnreachableError.
         """
         try:
@@ -97,8 +97,7 @@ class Target:
             for shard in manifest.shards.since(known):
                 if stop.requested():
                     return
-                path = folder / shard.name
-                verify_file(path, shard.sha256, shard.bytes, "delete it and run the generator again")
+                path = open_storage(folder).shard(shard.name, shard.sha256, shard.bytes)
                 write_remote(self._url, shard.name, path)
                 progress.update(shard.bytes)
         if there is None or (there.revision, there.requested) != (manifest.revision, manifest.requested):

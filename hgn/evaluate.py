@@ -66,6 +66,8 @@ def main(mapping: dict[str, Any]) -> int:
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     require_frame_rate(info, episodes[0].frame_rate_hz)
+    for episode in episodes:
+        simulator.require_fits(InitialState.of_episode(episode))
     rows = one_step_rows(simulator.backend, episodes, config)
     trials: list[RolloutResult] = []
     if config.rollout_frames >= 2:

@@ -24,7 +24,7 @@ from hgn.network.obstacles import ObstacleCells
 from hgn.runtime.stepped_rollout import advanced
 from hgn.runtime.weights import WeightsInfo
 from hgn.schema import require, to_mapping
-from hgn.system.files import sync_folder, sync_written, write_atomically
+from hgn.system.files import make_folder, sync_folder, sync_written, write_atomically
 
 INPUTS = ("position", "velocity", "material", "domain_size", "gravity", "obstacle_cell", "obstacle_normal")
 OUTPUTS = ("next_position", "next_velocity")
@@ -126,6 +126,7 @@ def write_onnx(path: Path, program: torch.export.ExportedProgram, info: WeightsI
         exported = torch.onnx.export(program, (), dynamo=True, input_names=INPUTS, output_names=OUTPUTS, verbose=False)
     assert exported is not None
     exported.model.metadata_props["hgn"] = _description(info)
+    make_folder(path.parent)
     write_atomically(path, exported.model_proto.SerializeToString())
 
 
@@ -140,7 +141,7 @@ def _added_in_order(
 
 def write_package(path: Path, program: torch.export.ExportedProgram, info: WeightsInfo) -> None:
     """The graph compiled for the device it was traced on, as PyTorch's C++ loads it; minutes, with a C++ compiler."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     temporary = path.with_name(f".{path.stem}.pt2")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

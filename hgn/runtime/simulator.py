@@ -160,7 +160,7 @@ class Simulator:
     def _start(self, scenes: Sequence[InitialState]) -> ParticleState:
         config = self.network.config
         for scene in scenes:
-            self._require_scene_fits(scene)
+            self.require_fits(scene)
         gravity_S3 = np.array([scene.gravity for scene in scenes], np.float64).reshape(-1, 3) / self.frame_rate_hz**2
         velocities = [scene.velocities(config.velocity_history, self.frame_rate_hz) for scene in scenes]
         material_N = torch.cat([material_rows(s.material_N, config.materials, s.materials) for s in scenes])
@@ -238,7 +238,8 @@ class Simulator:
         inputs = Inputs(position_N3, velocity_N3, gravity_3, domain_size_3, poses, smoothing)
         return simulate(self.network, self.start([scene]), scene, self.frame_rate_hz, frames, inputs)
 
-    def _require_scene_fits(self, scene: InitialState) -> None:
+    def require_fits(self, scene: InitialState) -> None:
+        """Raises ConfigError where weights that were loaded cannot take a scene; of its materials `start` says so."""
         info, cell_size = self._info, scene.obstacle_grid.cell_size
         dimensions = self.network.config.dimensions
         require(scene.dimensions == dimensions, "dimensions", f"the network's {dimensions}", scene.dimensions)

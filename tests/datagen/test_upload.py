@@ -91,7 +91,7 @@ def test_following_a_data_set_that_grows(make_config, make_dataset, monkeypatch)
 
 
 def test_what_is_refused(make_config, make_dataset, tmp_path, monkeypatch):
-    """Another data set at the URL, one made anew, an altered shard, and places that cannot be written to."""
+    """Another data set at the URL, one made anew, an altered or missing shard, and places that cannot be written to."""
     folder = make_dataset(make_config())
     main({"data": str(folder), "to": "memory://there"})
     other = make_dataset(make_config(folder=str(tmp_path / "other"), seed=7))
@@ -103,6 +103,9 @@ def test_what_is_refused(make_config, make_dataset, tmp_path, monkeypatch):
     shard = folder / "train-000001-000002.tar"
     shard.write_bytes(shard.read_bytes()[:-1] + b"?")
     with pytest.raises(ConfigError, match=r"must have sha256 .* it was altered"):
+        main({"data": str(folder), "to": "memory://elsewhere"})
+    shard.unlink()
+    with pytest.raises(ConfigError, match=r"train-000001-000002.tar is listed in the manifest but missing"):
         main({"data": str(folder), "to": "memory://elsewhere"})
     for mapping, message in (
         ({"data": str(folder), "to": str(tmp_path)}, "to must be a URL, got"),

@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -291,6 +291,22 @@ def test_weights(place, command, arguments, case, capsys, monkeypatch):
         save_weights(path, network, WeightsInfo(network.config, 60.0, 1 / 64))
         message = "material must be one of the network's (snow), got "
     check(place, command, arguments, message, capsys, monkeypatch)
+    assert not place.path("made").exists()
+
+
+@pytest.mark.parametrize(
+    ("info", "message"),
+    [
+        ({"gravity": (0.0, -1.6, 0.0)}, "gravity must be the weights' (0.0, -1.6, 0.0), which a network of absolute"),
+        ({"obstacle_cell_size": 1 / 32}, "cell_size must be the weights' 0.03125, the size of the cells"),
+    ],
+)
+def test_data_of_other_weights(place, info, message, capsys, monkeypatch):
+    """Data that weights cannot be rolled out on are refused before their one-step errors are measured."""
+    path = place.path("weights.safetensors")
+    network, own = load_weights(path)
+    save_weights(path, network, replace(own, **info))
+    check(place, "evaluate", [*EVALUATE, "rollout_frames=0"], message, capsys, monkeypatch)
     assert not place.path("made").exists()
 
 

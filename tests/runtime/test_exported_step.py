@@ -42,7 +42,7 @@ SCENE = str(config_directory() / "example/own_mesh.yaml")
 
 
 class Written(NamedTuple):
-    """A network, and the file that holds its step; beside it the folder `arrays`."""
+    """A network, and the file that holds its step; beside its folder the folder `arrays`."""
 
     network: HierarchicalGraphNetwork
     path: Path
@@ -82,7 +82,7 @@ def test_onnx_is_the_step(onnx_step):
     assert declared["frame_rate_hz"] == 60.0 and declared["network"] == to_mapping(network.config)
     compare(network, lambda arrays: session.run(None, arrays))
     simulate = runpy.run_path(str(EXAMPLES / "step_onnx.py"))["simulate"]
-    assert_rollout(network, simulate(str(path), str(path.parent / "arrays"), FRAMES))
+    assert_rollout(network, simulate(str(path), str(path.parents[1] / "arrays"), FRAMES))
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def exported(folder, name, kind):
     """What the command writes of a small network, and beside it a scene's arrays."""
     network = network_of(torch.float32, levels=2, message_passing_steps=1, **NETWORKS[name])
     save_weights(folder / "w.safetensors", network, WeightsInfo(network.config, 60.0, 1 / 64))
-    path = folder / ("step.onnx" if kind == "onnx" else "step.pt2")
+    path = folder / "made" / ("step.onnx" if kind == "onnx" else "step.pt2")
     options = {kind: str(path), "scene": SCENE, "arrays": str(folder / "arrays"), "device": "cpu"}
     assert export.main({"weights": str(folder / "w.safetensors"), **options}) == 0
     return Written(network, path)
@@ -153,7 +153,7 @@ def assert_rollout(network, found_TN3):
 
 def built_and_run(program, model, options):
     """Positions that a C++ example writes."""
-    folder = model.parent
+    folder = model.parents[1]
     subprocess.run(["cmake", "-S", EXAMPLES, "-B", folder / "build", *options], check=True, capture_output=True)
     subprocess.run(["cmake", "--build", folder / "build", "--target", program], check=True, capture_output=True)
     arguments = [folder / "build" / program, model, folder / "arrays", str(FRAMES), folder / "out.npy"]
