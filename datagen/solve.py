@@ -50,7 +50,7 @@ def main(mapping: dict[str, Any]) -> int:
         )
     if isinstance(result, SceneFailure):
         raise ConfigError(f"{file} must be a scene that the solver keeps together, got {result.cause}")
-    made = Rollout(
+    rollout = Rollout(
         position_TN3=result.position_TN3,
         material_N=scene.material_N,
         obstacles=scene.obstacles,
@@ -62,7 +62,7 @@ def main(mapping: dict[str, Any]) -> int:
         entry_frame_N=entry_frames(scene, config.frame_rate_hz) if scene.emits else None,
     )
     out = Path(config.out if config.out is not None else f"rollout/{file.stem}_solver.vtkhdf")
-    write_rollout(out, made)
+    write_rollout(out, rollout)
     print(out)
     return 0
 

@@ -75,12 +75,7 @@ def average(config: AverageConfig) -> None:
     save_weights(Path(config.out), network, mean_info, config.stored_precision)
 
 
-def _require_same(
-    first: tuple[ParticleNetwork, WeightsInfo],
-    other: tuple[ParticleNetwork, WeightsInfo],
-    names: tuple[str, ...],
-    i: int,
-) -> None:
+def _require_same(first: Loaded, other: Loaded, names: tuple[str, ...], i: int) -> None:
     for field in SHARED:
         expected, other_value = getattr(first[1], field), getattr(other[1], field)
         if expected != other_value:

@@ -25,13 +25,11 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(ImportConfig, mapping)
     with bar("importing", total=None, unit="episode") as progress:
         manifest = import_set(Path(str(source)), config, lambda _: progress.update())
-    found = manifest.config["imported"]
+    own = manifest.config["imported"]
     counts = ", ".join(f"{count} {split}" for split, count in manifest.requested.items())
-    gravity = ", ".join(f"{value:.4g}" for value in found["gravity"])
-    print(
-        f"{found['format']}, {found['dimensions']}D, {', '.join(found['materials'])}; {counts} episodes in {config.out}"
-    )
-    print(f"gravity ({gravity}), obstacles: {'yes' if found['obstacles'] else 'none'}, radius {found['radius']:g}")
+    gravity = ", ".join(f"{value:.4g}" for value in own["gravity"])
+    print(f"{own['format']}, {own['dimensions']}D, {', '.join(own['materials'])}; {counts} episodes in {config.out}")
+    print(f"gravity ({gravity}), obstacles: {'yes' if own['obstacles'] else 'none'}, radius {own['radius']:g}")
     print(f"to train: python -m hgn.train +experiment=imported dataset.folder={config.out}")
     return 0
 

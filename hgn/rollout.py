@@ -116,11 +116,11 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         obstacles = obstacles_of_episode(episode)
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": config.episode}
-    known, fastest = simulator.info.maximum_initial_speed, _fastest(initial)
-    if known is not None and fastest > known:
+    limit, fastest = simulator.info.maximum_initial_speed, _fastest(initial)
+    if limit is not None and fastest > limit:
         print(
             f"velocity: groups begin with up to {fastest:.3g} domain units per second, those of the data of "
-            f"{weights.stem} with up to {known:g}; beyond that collisions and contacts are a guess",
+            f"{weights.stem} with up to {limit:g}; beyond that collisions and contacts are a guess",
             file=sys.stderr,
         )
     print(simulator.backend.note, file=sys.stderr)

@@ -21,9 +21,8 @@ from typing import Annotated, Any, TypeVar
 from hgn.renamed import KEYS, current_names, gone_remedy, key_remedy, value_remedy
 
 T = TypeVar("T")
-_Path = (
-    str | tuple[Any, str | int]
-)  # of a value: its owner's and its own name or place, joined where a message needs it
+# of a value: its owner's and its own name or place, joined where a message needs it
+_Path = str | tuple[Any, str | int]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +63,7 @@ class ConfigError(ValueError):
     """A value that a user can mend: the message names field, rule, value and remedy."""
 
 
-def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
+def from_mapping(cls: type[T], mapping: object, path: _Path = "") -> T:
     """Builds dataclass `cls` from `mapping`, recursively.
 
     Integers are accepted where floats are asked for; nothing else is converted silently. Lists become tuples
@@ -72,10 +71,6 @@ def from_mapping(cls: type[T], mapping: object, path: str = "") -> T:
 
     Raises: ConfigError.
     """
-    return _build(cls, mapping, path)
-
-
-def _build(cls: type[T], mapping: object, path: _Path) -> T:
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{_text(path) or cls.__name__} must be a mapping of keys to values, got {mapping!r}")
     hints, fields = _fields(cls)  # type: ignore[arg-type]
@@ -230,7 +225,7 @@ def _convert(hint: Any, value: Any, path: _Path) -> Any:
                 continue
         raise ConfigError(f"{_text(path)} must be {_name(hint)}, got {value!r}")
     if is_dataclass:
-        return _build(hint, value, path)
+        return from_mapping(hint, value, path)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
             raise ConfigError(f"{_text(path)} must be a list, got {value!r}")

@@ -37,7 +37,7 @@ class LiveSimulation:
         Raises: ConfigError as `Simulator.start`.
         """
         self.simulator, self.room, self.frame = simulator, room, 0
-        self.scene = InitialState.of_scene(scene) if isinstance(scene, Scene) else scene
+        self.scene = InitialState.of(scene)
         self._entered = ExitStack()
         self._rollout: Rollout | None = None
         self._state = simulator.start([self.scene])
@@ -108,7 +108,7 @@ class LiveSimulation:
 
         Raises: ConfigError as `Simulator.start`.
         """
-        other = InitialState.of_scene(scene) if isinstance(scene, Scene) else scene
+        other = InitialState.of(scene)
         self._change_scene(replace(self.scene, obstacle_grid=other.obstacle_grid, sampled=other.sampled))
 
     def set_gravity(self, gravity: tuple[float, float, float]) -> None:
@@ -140,8 +140,9 @@ class LiveSimulation:
         )
 
     def _change_scene(self, scene: InitialState) -> None:
-        nobody = replace(scene, **{name: getattr(scene, name)[:0] for name in _OF_PARTICLES})
-        new = self.simulator.start([nobody])
+        of_particles = ("position_N3", "velocity_N3", "material_N")
+        nobody: dict[str, Any] = {name: getattr(scene, name)[:0] for name in of_particles}
+        new = self.simulator.start([replace(scene, **nobody)])
         self.scene = scene
         self._go_on_with(replace(self.state, gravity_S3=new.gravity_S3, obstacles=new.obstacles, surface=new.surface))
 
@@ -178,6 +179,3 @@ def run_scene(
             if on_frame is not None:
                 on_frame(frame)
     return position_TN3
-
-
-_OF_PARTICLES = ("position_N3", "velocity_N3", "material_N")

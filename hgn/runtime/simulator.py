@@ -87,6 +87,11 @@ class InitialState:
             lambda spacing_cells: _surface(scene.obstacles, scene.cell_size, spacing_cells),
         )
 
+    @staticmethod
+    def of(scene: InitialState | Scene) -> InitialState:
+        """A scene's, where it is not given itself."""
+        return InitialState.of_scene(scene) if isinstance(scene, Scene) else scene
+
     def velocities(self, history: int, frame_rate_hz: float) -> np.ndarray:
         """Displacements in the frames up to now, newest first, float32 [N, history, 3], domain units per frame.
 
@@ -155,27 +160,24 @@ class Simulator:
         loaded, a gravity that they cannot take (absolute inputs: another, relative: a huge one) or obstacle cells of
         another size.
         """
-        return self._start(_initial(scenes))
-
-    def _start(self, scenes: Sequence[InitialState]) -> ParticleState:
-        config = self.network.config
-        for scene in scenes:
-            self.require_fits(scene)
-        gravity_S3 = np.array([scene.gravity for scene in scenes], np.float64).reshape(-1, 3) / self.frame_rate_hz**2
-        velocities = [scene.velocities(config.velocity_history, self.frame_rate_hz) for scene in scenes]
-        material_N = torch.cat([material_rows(s.material_N, config.materials, s.materials) for s in scenes])
-        counts = [len(scene.position_N3) for scene in scenes]
-        position_N3 = np.concatenate([scene.position_N3 for scene in scenes]).astype(np.float32)
-        obstacles = ObstacleCells.of([scene.obstacle_grid for scene in scenes]) if config.obstacle_features else None
+        config, states = self.network.config, [InitialState.of(scene) for scene in scenes]
+        for state in states:
+            self.require_fits(state)
+        gravity_S3 = np.array([state.gravity for state in states], np.float64).reshape(-1, 3) / self.frame_rate_hz**2
+        velocities = [state.velocities(config.velocity_history, self.frame_rate_hz) for state in states]
+        material_N = torch.cat([material_rows(s.material_N, config.materials, s.materials) for s in states])
+        counts = [len(state.position_N3) for state in states]
+        position_N3 = np.concatenate([state.position_N3 for state in states]).astype(np.float32)
+        obstacles = ObstacleCells.of([state.obstacle_grid for state in states]) if config.obstacle_features else None
         surface = None
         if config.obstacle_particles:
-            surface = SurfaceParticles.of([scene.surface(config.static_spacing_cells) for scene in scenes])
+            surface = SurfaceParticles.of([state.surface(config.static_spacing_cells) for state in states])
         return ParticleState(
             position_N3=torch.from_numpy(position_N3).to(self.device),
             velocity_NM3=torch.from_numpy(np.concatenate(velocities)).to(self.device),
             material_N=material_N.to(self.device),
-            scene_N=torch.from_numpy(np.repeat(np.arange(len(scenes)), counts)).to(self.device),
-            domain_S3=torch.tensor([scene.domain_size for scene in scenes], dtype=torch.float32).to(self.device),
+            scene_N=torch.from_numpy(np.repeat(np.arange(len(states)), counts)).to(self.device),
+            domain_S3=torch.tensor([state.domain_size for state in states], dtype=torch.float32).to(self.device),
             gravity_S3=torch.from_numpy(gravity_S3.astype(np.float32)).to(self.device),
             obstacles=obstacles and obstacles.to(self.device),
             surface=surface and surface.to(self.device),
@@ -197,11 +199,11 @@ class Simulator:
         then.
         """
         require(frames >= 1, "frames", "at least 1", frames)
-        scenes = _initial(scenes)
-        state = self._start(scenes)
+        states = [InitialState.of(scene) for scene in scenes]
+        state = self.start(states)
         with self.backend.rollout(state) as rollout:
             positions = [state.position_N3[None].cpu().numpy(), rollout.run(frames - 1, on_frame)]
-        counts = [len(scene.position_N3) for scene in scenes]
+        counts = [len(initial.position_N3) for initial in states]
         return np.split(np.concatenate(positions), np.cumsum(counts)[:-1], axis=1)
 
     def frames(self, scene: InitialState | Scene) -> Iterator[np.ndarray]:
@@ -257,10 +259,6 @@ class Simulator:
         if info.network.sees_obstacles:
             rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"
             require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)
-
-
-def _initial(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
-    return [InitialState.of_scene(scene) if isinstance(scene, Scene) else scene for scene in scenes]
 
 
 def _surface(obstacles: Sequence[Obstacle], cell_size: float, spacing_cells: float) -> np.ndarray:

@@ -16,10 +16,9 @@ from hgn.network.features import ParticleState
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.gns_edges import Edges
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.parity import GRADIENT_BOUND, OUTPUT_BOUND, relative_error
+from hgn.runtime.parity import GRADIENT_BOUND, OUTPUT_BOUND, relative_error, require_bound
 from hgn.runtime.torch_backend import Backend, GnsBackend
 from hgn.runtime.triton_rollout import CHECKED_PARTICLES, TritonRollout
-from hgn.schema import ConfigError
 
 IDLE_ROLLOUTS = 2  # kept for the next simulations, of different numbers of scenes
 LEAST_FILLING = 0.5  # of the particles that one has room for: launches are as large as the room
@@ -96,12 +95,7 @@ class TritonGnsBackend(GnsBackend):
         expected = self._output_and_gradients(state, None, gradients)
         bounds = (OUTPUT_BOUND, GRADIENT_BOUND)
         for name, bound, a, b in zip(("outputs", "gradients"), bounds, computed, expected, strict=False):
-            error = relative_error(a, b)
-            if not error <= bound:  # NaN fails
-                raise ConfigError(
-                    f"{field} must be tf32 on this machine, got fp16: its {name} differ by {error:.1e} from "
-                    f"PyTorch's (at most {bound}); set {field}=tf32, and report device and versions"
-                )
+            require_bound(relative_error(a, b), bound, name, field, "tf32", "fp16")
 
     def _output_and_gradients(self, state: ParticleState, edges: Edges | None, gradients: bool) -> list[torch.Tensor]:
         with torch.set_grad_enabled(gradients):

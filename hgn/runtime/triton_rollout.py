@@ -29,9 +29,8 @@ from hgn.network.features import ParticleState
 from hgn.network.grid import build_hierarchy
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.divergence import DivergedError, describe_diverged, diverged
-from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error
+from hgn.runtime.parity import LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
 from hgn.runtime.triton_host import kernel_precision
-from hgn.schema import ConfigError
 
 LOOK_FRAMES, FEWEST_FRAMES = 32, 4
 CROWDED = 140  # particles in a cell of the finest level, half again as many as in the data's bodies
@@ -246,11 +245,7 @@ class TritonRollout:
         output_N3 = self.fused.output[: len(state.position_N3), :3]
         with torch.no_grad():
             error = relative_error(output_N3, network.normalised_acceleration(state), LEAST_OUTPUT)
-        if not error <= OUTPUT_BOUND:  # NaN fails
-            raise ConfigError(
-                f"{field} must be torch on this machine, got triton: its output differs by {error:.1e} "
-                f"from PyTorch's (at most {OUTPUT_BOUND}); set {field}=torch, and report device and versions"
-            )
+        require_bound(error, OUTPUT_BOUND, "outputs", field, "torch", "triton")
 
     def frame_launches(self) -> None:
         """All launches of one frame: what the graph holds."""

@@ -59,7 +59,10 @@ class GraphTrainer:
         self._take_over()
         self.updates = updates_of(network)(network, settings, precision, loss_sum, counters, reduce, ranks)
         self._read_moments()
-        self._averaged = None if averaged is None else self._take_over_average(averaged)
+        self._averaged = None
+        if averaged is not None:
+            self._averaged = _flattened(averaged)
+            self.updates.average = self._packed(self._averaged)
         self._episodes: dict[int, DeviceEpisode] = {}
         self.pool: GraphPushforwardPool | None = None
         if training.pushforward_fraction > 0:
@@ -150,29 +153,18 @@ class GraphTrainer:
     def _take_over(self) -> None:
         """Makes parameters and moments views of flat buffers, so that one launch copies all of them."""
         parameters = list(self.network.parameters())
-        counts = [parameter.numel() for parameter in parameters]
-        self._flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
-        self._moments = torch.zeros(2, sum(counts), device=self.device)
+        self._flat = _flattened(self.network)
+        self._moments = torch.zeros(2, len(self._flat), device=self.device)
         self._steps = torch.zeros(len(parameters), device=self.device)
-        first, second = (flat.split(counts) for flat in self._moments)
-        for i, (parameter, view) in enumerate(zip(parameters, self._flat.split(counts), strict=True)):
+        first, second = (flat.split([parameter.numel() for parameter in parameters]) for flat in self._moments)
+        for i, parameter in enumerate(parameters):
             state = self.optimizer.state[parameter]
             if state:
                 first[i].copy_(state["exp_avg"].reshape(-1))
                 second[i].copy_(state["exp_avg_sq"].reshape(-1))
                 self._steps[i] = state["step"]
-            parameter.data = view.view(parameter.shape)
             state["step"] = self._steps[i]
             state["exp_avg"], state["exp_avg_sq"] = (m[i].view(parameter.shape) for m in (first, second))
-
-    def _take_over_average(self, averaged: ParticleNetwork) -> torch.Tensor:
-        """Makes its parameters views of a flat buffer, which it returns."""
-        parameters = list(averaged.parameters())
-        flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
-        for parameter, view in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
-            parameter.data = view.view(parameter.shape)
-        self.updates.average = self._packed(flat)
-        return flat
 
     def _packed(self, flat: torch.Tensor) -> torch.Tensor:
         return self.updates.packed.gather([flat])
@@ -196,3 +188,12 @@ class GraphTrainer:
             assert updates.average is not None
             torch.index_select(updates.average, 0, self._place, out=self._averaged)
         self._steps.copy_(updates.step.expand_as(self._steps))
+
+
+def _flattened(network: ParticleNetwork) -> torch.Tensor:
+    """Makes a network's parameters views of a flat buffer, which it returns."""
+    parameters = list(network.parameters())
+    flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
+    for parameter, view in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
+        parameter.data = view.view(parameter.shape)
+    return flat

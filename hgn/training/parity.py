@@ -17,9 +17,8 @@ from hgn.kernels.update.op import Updates
 from hgn.network.cell_keys import pack
 from hgn.network.features import ParticleState
 from hgn.network.obstacles import ObstacleCells
-from hgn.runtime.parity import GRADIENT_BOUND, LEAST_OUTPUT, OUTPUT_BOUND, relative_error
+from hgn.runtime.parity import GRADIENT_BOUND, LEAST_OUTPUT, OUTPUT_BOUND, relative_error, require_bound
 from hgn.scene.symmetry import Symmetry
-from hgn.schema import ConfigError
 from hgn.training.symmetry import obstacles_under
 
 
@@ -51,12 +50,8 @@ def require_parity(
             [(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, expected, strict=True)]
         ),
     )
-    if not (output_error <= OUTPUT_BOUND and gradient_error <= GRADIENT_BOUND):  # NaN fails
-        raise ConfigError(
-            f"training.backend must be torch on this machine, got triton: its outputs differ by {output_error:.1e} "
-            f"from PyTorch's (at most {OUTPUT_BOUND}), its gradients by {gradient_error:.1e} (at most "
-            f"{GRADIENT_BOUND}); set training.backend=torch, and report device and versions"
-        )
+    require_bound(output_error, OUTPUT_BOUND, "outputs", "training.backend", "torch", "triton")
+    require_bound(gradient_error, GRADIENT_BOUND, "gradients", "training.backend", "torch", "triton")
     if updates.device.type == "cuda":
         del output_N3, expected
         torch.cuda.empty_cache()  # what is free decides where episodes are kept

@@ -77,7 +77,7 @@ def test_free_flight_is_not_refused(precision):
     other = network(2, inputs="relative")
     with torch.no_grad():
         other.decode.second.weight.mul_(1.5)
-    with pytest.raises(ConfigError, match="its output differs by"):
+    with pytest.raises(ConfigError, match="its outputs differ by"):
         rollout.require_parity(other, stirred)
 
 
