@@ -134,8 +134,13 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
         prim.GetExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(points), time)
 
     moving = []
-    for obstacle in rollout.obstacles:
-        prim = mesh(f"obstacles/{_identifier(obstacle.name)}", OBSTACLE_COLOR)
+    names: set[str] = set()
+    for index, obstacle in enumerate(rollout.obstacles):
+        name = _identifier(obstacle.name)
+        while name in names:  # a mesh that is placed twice
+            name = f"{name}_{index}"
+        names.add(name)
+        prim = mesh(f"obstacles/{name}", OBSTACLE_COLOR)
         fill(prim, obstacle.vertex_V3, obstacle.triangle_F3, Usd.TimeCode.Default())
         if obstacle.motion is not None:
             moving.append((prim.AddTransformOp(), obstacle.motion))

@@ -71,6 +71,19 @@ def test_usd_is_read_back(tmp_path, rollout):
     np.testing.assert_allclose(last.mean(0) - first.mean(0), (0.02, -0.004, 0), atol=SPACING / 2)
 
 
+def test_obstacles_of_one_name_stay_apart(tmp_path, rollout):
+    """A mesh placed twice, and names that USD writes alike, are a prim each."""
+    names = ("ramp", "ramp", "a b", "a-b", "a_b")
+    shapes = [
+        replace(rollout.obstacles[0], name=name, vertex_V3=rollout.obstacles[0].vertex_V3 + i)
+        for i, name in enumerate(names)
+    ]
+    stage = Usd.Stage.Open(str(save_rollout(tmp_path / "a.usda", replace(rollout, obstacles=tuple(shapes)))))
+    prims = stage.GetPrimAtPath("/World/obstacles").GetChildren()
+    for prim, obstacle in zip(prims, shapes, strict=True):
+        np.testing.assert_allclose(UsdGeom.Mesh(prim).GetPointsAttr().Get(), obstacle.vertex_V3, rtol=1e-6)
+
+
 def test_what_enters_and_what_moves(tmp_path, rollout):
     """USD and PLY hold the particles that are there, and obstacles at each frame where their motion has them."""
     position_TN3 = rollout.position_TN3.copy()
