@@ -6,16 +6,18 @@ What networks learn from, for a scene of one's own. Beside a network's rollout o
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import MpmConfig, RolloutName
+from hgn.config import MpmConfig
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, write_rollout
-from hgn.scene.scene_file import find_scene, load_scene
+from hgn.scene.scene_file import find_scene, load_scene, notes_on_meshes
 from hgn.schema import ConfigError, FrameCount, Positive, from_mapping, require_bounds, to_mapping
+from hgn.system.files import require_place
 from hgn.system.progress import bar
 
 
@@ -24,13 +26,14 @@ class SolveConfig:
     """`python -m datagen.solve`: a scene file, simulated by the solver."""
 
     scene: str  # a scene file, or the name of one in conf/example, for example funnel
-    out: RolloutName | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
+    out: str | None = None  # the file to write; null: rollout/NAME_solver.vtkhdf
     frames: FrameCount = 300
     frame_rate_hz: Positive[float] = 60.0
     mpm: MpmConfig = field(default_factory=MpmConfig)
 
     def __post_init__(self) -> None:
         require_bounds(self)
+        require_rollout_name("out", self.out)
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -40,7 +43,11 @@ def main(mapping: dict[str, Any]) -> int:
     """
     config = from_mapping(SolveConfig, mapping)
     file = find_scene(config.scene)
+    out = Path(config.out if config.out is not None else f"rollout/{file.stem}_solver.vtkhdf")
+    require_place(out)
     scene = load_scene(file)
+    for note in notes_on_meshes(scene):
+        print(note, file=sys.stderr)
     # Taichi takes seconds to load, and bad input is answered before.
     from datagen.mpm.solver import SceneFailure, simulate
 
@@ -61,7 +68,6 @@ def main(mapping: dict[str, Any]) -> int:
         source={"scene": config.scene, "solver": to_mapping(config.mpm)},
         entry_frame_N=entry_frames(scene, config.frame_rate_hz) if scene.emits else None,
     )
-    out = Path(config.out if config.out is not None else f"rollout/{file.stem}_solver.vtkhdf")
     write_rollout(out, rollout)
     print(out)
     return 0

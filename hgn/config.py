@@ -35,6 +35,7 @@ from hgn.schema import (
 
 OBSTACLE_SHAPES = ("half_box", "square", "half_sphere", "cone", "pyramid")
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
+ROLLOUT_ENDINGS = (".vtkhdf", ".hdf", ".hdf5", ".h5")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
 SYMMETRIES = ("none", "gravity")
@@ -48,14 +49,6 @@ Material = Annotated[str, one_of(*MATERIALS)]
 MaterialName = Annotated[
     str,
     Bound("a name of lower-case letters, digits and _", lambda name: MATERIAL_NAME.fullmatch(name) is not None),
-]
-# names of pictures are given where a rollout file is to be
-RolloutName = Annotated[
-    str,
-    Bound(
-        "the name of a rollout file, as in rollout.vtkhdf",
-        lambda name: name != "" and Path(name).suffix not in (".png", ".gif", ".webp"),
-    ),
 ]
 Processor = Annotated[str, one_of("auto", "cpu", "gpu")]
 BackendName = Annotated[str, one_of(*BACKENDS)]
@@ -85,6 +78,17 @@ def config_directory() -> Path:
 def is_mesh_file(name: str | Path) -> bool:
     """Whether a name is that of a mesh file, rather than of a built-in shape."""
     return Path(name).suffix.lower() in MESH_SUFFIXES
+
+
+def require_rollout_name(field: str, name: str | None, *more: str) -> None:
+    """Refuses names of folders, pictures and other formats, which people give where a rollout file is to be; `more` are
+    endings of formats that are written beside ROLLOUT_ENDINGS.
+    """
+    *some, last = (*ROLLOUT_ENDINGS, *more)
+    made = "pictures" if more else "pictures, USD and PLY"
+    ends = name is None or Path(name).suffix in (*some, last)
+    rule = f"a name that ends in {', '.join(some)} or {last}"
+    require(ends, field, rule, name, f"tools.render makes {made} of a rollout file")
 
 
 @dataclass(frozen=True)

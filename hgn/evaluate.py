@@ -23,7 +23,7 @@ from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.schema import NonNegative, Positive, from_mapping, require_bounds
-from hgn.system.files import write_json
+from hgn.system.files import require_place, write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance
 from hgn.training.errors import (
@@ -61,6 +61,8 @@ class EvaluateConfig:
 def main(mapping: dict[str, Any]) -> int:
     """Prints a table, and writes JSON where asked to; returns the exit code."""
     config = from_mapping(EvaluateConfig, mapping)
+    if config.json is not None:
+        require_place(Path(config.json))
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     info = simulator.info
     store = EpisodeStore(config.data, config.split)

@@ -9,6 +9,7 @@ import hgn.system.threads  # noqa: F401  # isort: skip  # before torch is loaded
 
 import hashlib
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.config import BackendName, Precision, RolloutName, SceneConfig
+from hgn.config import BackendName, Precision, SceneConfig, require_rollout_name
 from hgn.data.lookup import find_episode
-from hgn.render.exchange import require_exchange, save_rollout
+from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, require_exchange, save_rollout
 from hgn.render.pictures import animate, compare_picture, spread, write_picture
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.live import run_scene
@@ -28,8 +29,9 @@ from hgn.scene.emission import at_start, entry_frames
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.scene.scene import Scene
-from hgn.scene.scene_file import find_scene, load_scene, sheets_of_meshes
+from hgn.scene.scene_file import find_scene, load_scene, notes_on_meshes
 from hgn.schema import ConfigError, FrameCount, NonNegative, from_mapping, require, require_bounds
+from hgn.system.files import require_place
 from hgn.system.progress import bar
 
 PICTURES = 4  # in the PNG
@@ -42,7 +44,7 @@ class RolloutConfig:
 
     weights: str = "obstacles"  # a file of python -m hgn.export, or the name of shipped weights
     # the file to write: .vtkhdf, .usdc, .usda, .usd (one stage) or .ply (one a frame); null: rollout/NAME.vtkhdf
-    out: RolloutName | None = None
+    out: str | None = None
     surface: bool = False  # water also as a closed surface, in USD and PLY
     render: bool | None = None  # also draw pictures beside it, a PNG and a GIF; null: where out is null
     # a scene file, or the name of one in conf/example, for example funnel; null: a random scene …
@@ -65,6 +67,7 @@ class RolloutConfig:
             "for example data=data/obstacles episode=validation-000000",
         )
         require(self.scene is None or self.data is None, "scene", "left out where data is given", self.scene)
+        require_rollout_name("out", self.out, *USD_ENDINGS, PLY_ENDING)
 
 
 def main(mapping: dict[str, Any]) -> int:
@@ -88,6 +91,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
     Raises: ConfigError for bad input, weights that let the simulation diverge among them; nothing is written then.
     """
     require_exchange(Path(config.out or "rollout.vtkhdf"), config.surface)
+    require_place(Path(config.out or "rollout/rollout.vtkhdf"))
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
     weights = find_weights(config.weights)
     source = {"weights": weights.name, "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest()}
@@ -97,14 +101,8 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         name, scene = _scene(config, simulator.info)
         initial = InitialState.of_scene(at_start(scene))
         obstacles = scene.obstacles
-        for sheet in sheets_of_meshes(scene):
-            print(f"a sheet, not a solid, for it is not watertight: {sheet}", file=sys.stderr)
-        if scene.material_parameters:
-            names = ", ".join(scene.material_parameters)
-            print(
-                f"not used: {names} of groups, which are the solver's; {weights.stem} knows one of each material",
-                file=sys.stderr,
-            )
+        for note in (*notes_on_meshes(scene), *_not_used(scene, weights.stem)):
+            print(note, file=sys.stderr)
         source["scene"] = config.scene or f"random, seed {config.seed}"
     else:
         assert config.episode is not None  # RolloutConfig saw to it
@@ -146,6 +144,15 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         materials=initial.materials,
     )
     return save_rollout(config.out or f"rollout/{name}.vtkhdf", result, config.surface), result
+
+
+def _not_used(scene: Scene, weights: str) -> Iterator[str]:
+    """What a scene says to the solver alone, a line each."""
+    if scene.material_parameters:
+        names = ", ".join(scene.material_parameters)
+        yield f"not used: {names} of groups, which are the solver's; {weights} knows one of each material"
+    if any(scene.wall_friction) or any(obstacle.friction for obstacle in scene.obstacles):
+        yield f"not used: friction of surfaces, which is the solver's; {weights} knows that of its data alone"
 
 
 def _fastest(initial: InitialState) -> float:

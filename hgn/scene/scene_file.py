@@ -245,7 +245,7 @@ _Loader.add_implicit_resolver(
 def find_scene(name: str) -> Path:
     """The file that `name` means: a path, or an example by its name, as in `funnel`."""
     example = config_directory() / "example" / f"{name}.yaml"
-    return example if re.fullmatch(r"\w+", name) and not Path(name).exists() and example.is_file() else Path(name)
+    return example if re.fullmatch(r"\w+", name) and not Path(name).is_file() and example.is_file() else Path(name)
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -270,14 +270,26 @@ def load_scene(path: str | Path) -> Scene:
         raise ConfigError(f"{path}: {error}") from error
 
 
-def sheets_of_meshes(scene: Scene) -> list[str]:
-    """The mesh files of a scene file that are not closed, and so count as sheets."""
+def notes_on_meshes(scene: Scene) -> list[str]:
+    """What may surprise about the mesh files of a scene file, a line each: which are sheets, and which, in another unit
+    perhaps, no particle can touch or are smaller than a cell.
+    """
+    notes = []
     entries = scene.specification.get("obstacles", ())
-    return [
-        entry["mesh"]
-        for entry, obstacle in zip(entries, scene.obstacles, strict=False)
-        if entry.get("mesh") is not None and not obstacle.closed
-    ]
+    for entry, obstacle in zip(entries, scene.obstacles, strict=False):
+        name = entry.get("mesh")
+        if name is None:
+            continue
+        if not obstacle.closed:
+            notes.append(f"a sheet, not a solid, for it is not watertight: {name}")
+        low_3, high_3 = obstacle.vertex_V3.min(axis=0), obstacle.vertex_V3.max(axis=0)
+        place = f"x {low_3[0]:.3g} to {high_3[0]:.3g}, y {low_3[1]:.3g} to {high_3[1]:.3g}, "
+        place += f"z {low_3[2]:.3g} to {high_3[2]:.3g}"
+        if obstacle.motion is None and ((low_3 > scene.domain_size) | (high_3 < 0)).any():
+            notes.append(f"outside of the domain, so that nothing touches it: {name} ({place}); see scale and position")
+        elif (high_3 - low_3).max() < scene.cell_size:
+            notes.append(f"smaller than a cell of {scene.cell_size:.3g}: {name} ({place}); see scale")
+    return notes
 
 
 def _build(file: SceneFile, folder: Path) -> Scene:

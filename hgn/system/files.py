@@ -104,6 +104,21 @@ def held(path: Path, field: str, refusal: str) -> Iterator[None]:
         yield
 
 
+def require_place(path: Path) -> None:
+    """Asked before long work whose result is to be written to `path`; makes nothing.
+
+    Raises: OSError, as writing would, where `path` is a folder, leads through a file, or its folder is closed to us.
+    """
+    folder = next(folder for folder in path.absolute().parents if folder.exists())
+    for wrong, number, place in (
+        (path.is_dir(), errno.EISDIR, path),
+        (not folder.is_dir(), errno.ENOTDIR, folder),
+        (not os.access(folder, os.W_OK | os.X_OK), errno.EACCES, folder),
+    ):
+        if wrong:
+            raise OSError(number, os.strerror(number), str(place))
+
+
 def make_folder(path: Path) -> None:
     """Makes a folder where it is missing, and those above it; a loss of power does not take them away again."""
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]

@@ -20,6 +20,7 @@ import datagen.__main__
 from hgn import evaluate, export, rollout, train
 from hgn.command import EXIT_INPUT, EXIT_MACHINE, run_command
 from hgn.config import DatagenConfig
+from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from tools import render
 
@@ -355,6 +356,27 @@ def test_output_that_is_in_the_way(place, command, arguments, capsys, monkeypatc
     code, line = refused(command, arguments, capsys, monkeypatch)
     assert code in (EXIT_INPUT, EXIT_MACHINE) and ("scene.yaml" in line or "data" in line)
     assert content(place.folder) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        ("rollout", [*ROLLOUT, "out=scene.yaml/rollout.vtkhdf"], "Not a directory: "),
+        ("rollout", [*ROLLOUT, "out=folder.vtkhdf"], "Is a directory: folder.vtkhdf"),
+        ("rollout", [*ROLLOUT, "out=closed/new/rollout.vtkhdf"], "Permission denied: "),
+        ("evaluate", [*EVALUATE, "json=scene.yaml/errors.json"], "Not a directory: "),
+    ],
+)
+def test_output_is_looked_at_before_the_work(place, command, arguments, message, capsys, monkeypatch):
+    """Minutes of simulation do not end at a place that cannot be written to: it is named at the start."""
+    place.path("folder.vtkhdf").mkdir()
+    place.path("closed").mkdir()
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "closed" and access(path, mode))
+    monkeypatch.setattr(Simulator, "load", lambda *_: pytest.fail("the simulation began"))
+    code, line = refused(command, arguments, capsys, monkeypatch)
+    assert code == EXIT_MACHINE and message in line
+    assert not place.path("closed/new").exists()
 
 
 def test_errors_file_makes_its_folder(place, monkeypatch):

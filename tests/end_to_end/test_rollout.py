@@ -71,27 +71,30 @@ def test_a_network_without_obstacles_gets_none(tmp_path):
 
 
 def test_scenes(tmp_path, weights, monkeypatch):
-    """Seeds draw different scenes, an example has its name, a file of that name wins; with out nothing is drawn unless
-    asked."""
+    """Seeds draw different scenes, an example has its name, a file of that name wins and a folder does not; with out
+    nothing is drawn unless asked."""
     monkeypatch.chdir(tmp_path)
     sizes = set()
     for seed in (1, 2):
         assert rollout.main({"weights": weights, "frames": 2, "seed": seed, "out": "a.vtkhdf"}) == 0
         sizes.add(read_rollout("a.vtkhdf").position_TN3[0].tobytes())
     assert len(sizes) == 2 and not Path("a.png").exists()
+    Path("funnel").mkdir()  # as hgn.export arrays=funnel scene=funnel makes one
     assert rollout.main({"weights": weights, "frames": 2, "scene": "funnel", "out": "b/f.vtkhdf", "render": True}) == 0
     assert sorted(path.name for path in Path("b").iterdir()) == ["f.gif", "f.png", "f.vtkhdf"]
     assert len(read_rollout("b/f.vtkhdf").obstacles) == 5
+    Path("funnel").rmdir()
     Path("funnel").write_text("groups: [{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand}]\n")
     assert rollout.main({"weights": weights, "frames": 2, "scene": "funnel", "out": "c.vtkhdf"}) == 0
     assert not read_rollout("c.vtkhdf").obstacles
 
 
 def test_what_may_surprise_is_said(tmp_path, weights, capsys):
-    """A network knows one water; a scene file's constants are the solver's, and a line says so. Another says which of
-    its meshes is no solid."""
+    """A network knows one water and one friction; a scene file's are the solver's, and a line says so. Others say which
+    of its meshes is no solid, which lies outside of the domain, in millimetres say, and which within a cell."""
     (tmp_path / "open.obj").write_text("v 0.2 0.2 0.2\nv 0.4 0.2 0.2\nv 0.2 0.2 0.4\nf 1 2 3\n")
-    obstacles = "{shape: square, size: 0.1, position: [0.8, 0.2, 0.5]}, {mesh: open.obj}"
+    obstacles = "{shape: square, size: 0.1, position: [0.8, 0.2, 0.5], friction: 0.2}, {mesh: open.obj}"
+    obstacles += ", {mesh: open.obj, scale: 200, position: [500, 0, 0]}, {mesh: open.obj, scale: 0.01}"
     group = "{shape: cube, size: 0.05, position: [0.5, 0.5, 0.5], material: sand, youngs_modulus_pa: 1e5}"
     (tmp_path / "stiff.yaml").write_text(f"groups: [{group}]\nobstacles: [{obstacles}]\n")
     out = str(tmp_path / "a.vtkhdf")
@@ -99,6 +102,9 @@ def test_what_may_surprise_is_said(tmp_path, weights, capsys):
     said = capsys.readouterr().err
     assert "not used: youngs_modulus_pa of groups" in said
     assert "a sheet, not a solid, for it is not watertight: open.obj" in said and "square" not in said
+    assert "not used: friction of surfaces, which is the solver's; still knows that of its data alone" in said
+    assert said.count("outside of the domain, so that nothing touches it: open.obj (x 540 to 580, y 40 to 40") == 1
+    assert said.count("smaller than a cell of 0.0156: open.obj (x 0.002 to 0.004, ") == 1
 
 
 def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
@@ -120,7 +126,11 @@ def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
     [
         ({"data": "data"}, "data must be given together with episode, got 'data'"),
         ({"scene": "funnel", "data": "d", "episode": "e"}, "scene must be left out where data is given, got 'funnel'"),
-        ({"out": "a.png"}, "out must be the name of a rollout file, as in rollout.vtkhdf, got 'a.png'"),
+        (
+            {"out": "a.png"},
+            r"out must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, got 'a.png'",
+        ),
+        ({"out": "pictures"}, r"out must be a name that ends in .vtkhdf, .* or .ply, got 'pictures'"),
         ({"seed": -1}, "seed must be a finite number >= 0, got -1"),
     ],
 )

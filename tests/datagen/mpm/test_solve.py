@@ -53,7 +53,8 @@ def test_bad_input(tmp_path, monkeypatch):
     for change, message in (
         ({"scene": "none.yaml"}, "scene must be an existing YAML file, got none.yaml"),
         ({"frames": 1}, "frames must be at least 2, got 1"),
-        ({"out": "a.png"}, "out must be the name of a rollout file"),
+        ({"out": "a.png"}, "out must be a name that ends in .vtkhdf, .hdf, .hdf5 or .h5, got 'a.png'; tools.render"),
+        ({"out": "a.usdc"}, "got 'a.usdc'; tools.render makes pictures, USD and PLY of a rollout file"),
         ({"mpm": {"snow_hardning": 5.0}}, "mpm.snow_hardning is not a known key; did you mean snow_hardening?"),
         (
             {"mpm": {"device": "cpu", "maximum_substeps_per_frame": 1}},
