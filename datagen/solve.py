@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hgn.command import run_command
-from hgn.config import MpmConfig
+from hgn.config import MpmConfig, require_rollout_name
 from hgn.scene.emission import entry_frames
 from hgn.scene.rollout_file import Rollout, write_rollout
 from hgn.scene.scene_file import find_scene, load_scene, notes_on_meshes

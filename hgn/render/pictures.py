@@ -5,6 +5,7 @@ Shape legend: T frames, N particles.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import io
 import json
@@ -61,6 +62,7 @@ def compare_picture(
         x = left + column * (width + gap)
         seconds = f"t = {frame / rollout.frame_rate_hz:.2f} s"
         _write(picture, (x + width / 2, header / 2), seconds, _text_size(size))
+        _place_obstacles(stage, rollout, frame)
         for row, (_, position_TN3) in enumerate(rows):
             panel = _panel(stage, position_TN3, frame, rollout)
             picture.paste(panel, (x, header + row * (height + gap)))
@@ -282,6 +284,21 @@ def _stage(rollout: Rollout, size: int) -> Stage:
     return Stage(rollout.domain_size, rollout.obstacles, radius, size)
 
 
+def _place_obstacles(stage: Stage, rollout: Rollout, frame: int) -> None:
+    """Obstacles that move are drawn where they are in a frame."""
+    if all(obstacle.motion is None for obstacle in rollout.obstacles):
+        return
+    time_s = frame / rollout.frame_rate_hz
+    stage.place(
+        [
+            obstacle
+            if obstacle.motion is None
+            else dataclasses.replace(obstacle, vertex_V3=obstacle.motion.place(obstacle.vertex_V3, time_s))
+            for obstacle in rollout.obstacles
+        ]
+    )
+
+
 def _panel(stage: Stage, position_TN3: np.ndarray, frame: int, rollout: Rollout) -> Image.Image:
     present = rollout.present(frame)
     if frame < len(position_TN3):
@@ -315,6 +332,7 @@ def _animation_picture(
     width, height = stage.size
     gap, header, text = size // 30, _header_height(size), _text_size(size)
     picture = Image.new("RGB", (len(versions) * (width + gap) - gap, height + 2 * header), _background())
+    _place_obstacles(stage, rollout, frame)
     for column, (label, position_TN3) in enumerate(versions):
         x = column * (width + gap)
         picture.paste(_panel(stage, position_TN3, frame, rollout), (x, header))

@@ -89,7 +89,7 @@ class Camera:
 
 
 class Stage:
-    """Draws frames of particles in one domain with fixed obstacles.
+    """Draws frames of particles in one domain, among obstacles that stay until `place` is called.
 
     domain_size and particle_radius in domain units; size is the width of the picture in pixels, its height
     follows from the domain.
@@ -106,9 +106,14 @@ class Stage:
         self.camera = Camera(domain_size, size)
         self.radius = particle_radius
         self._prepare_shadow_map(domain_size)
+        self._prepare_room(domain_size)
+        self.place(obstacles)
+
+    def place(self, obstacles: Sequence[Obstacle]) -> None:
+        """These obstacles, as they lie, are there from now on."""
         self._prepare_obstacles(obstacles)
-        self._prepare_background(domain_size)
-        self._prepare_box(domain_size)
+        self._prepare_background()
+        self._prepare_box(self.domain_size)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -128,7 +133,7 @@ class Stage:
         picture.paste(self.front_box, (0, 0), self.front_box)
         return picture
 
-    # the parts that stay the same in every frame
+    # the parts that stay the same in every frame without moving obstacles
 
     def _prepare_shadow_map(self, domain_size: tuple[float, float, float]) -> None:
         self.map_cell = max(domain_size[0], domain_size[2]) / SHADOW_CELLS
@@ -211,7 +216,8 @@ class Stage:
             edge[inner] |= np.abs(np.diff(depth, 2, axis=axis)) > 6.0 / self.camera.scale * depth.min()
         self.layer_shade_LP[0, edge.ravel() & (triangle_P >= 0)] *= 0.45
 
-    def _prepare_background(self, domain_size: tuple[float, float, float]) -> None:
+    def _prepare_room(self, domain_size: tuple[float, float, float]) -> None:
+        """Floor and walls, without obstacles and shadows."""
         camera = self.camera
         ray_P3 = camera.rays()
         color_P3 = np.tile(BACKGROUND_COLOR, (len(ray_P3), 1))
@@ -231,20 +237,24 @@ class Stage:
             if axis == 1:
                 self.floor_P = pixel_P
                 floor_hit = hit
-        through_P = np.ones(len(ray_P3), np.float32)
-        gathered_P3 = np.zeros((len(ray_P3), 3), np.float32)
+        self.room_P3 = color_P3.astype(np.float32)
+        rows, columns = self.map_shape
+        column = np.clip((floor_hit[:, 0] / self.map_cell).astype(np.int64), 0, columns - 1)
+        row = np.clip((floor_hit[:, 1] / self.map_cell).astype(np.int64), 0, rows - 1)
+        self.floor_cell_P = row * columns + column
+
+    def _prepare_background(self) -> None:
+        """The room behind the obstacles' layers, with their shadow on the floor."""
+        pixel_count = len(self.room_P3)
+        through_P = np.ones(pixel_count, np.float32)
+        gathered_P3 = np.zeros((pixel_count, 3), np.float32)
         for layer in range(LAYERS):
             present_P = np.isfinite(self.layer_depth_LP[layer])
             gathered_P3 += (present_P * through_P * OBSTACLE_OPACITY * self.layer_shade_LP[layer])[:, None] * (
                 OBSTACLE_COLOR
             )
             through_P *= np.where(present_P, np.float32(1 - OBSTACLE_OPACITY), np.float32(1))
-        self.background_P3 = color_P3.astype(np.float32)
-
-        rows, columns = self.map_shape
-        column = np.clip((floor_hit[:, 0] / self.map_cell).astype(np.int64), 0, columns - 1)
-        row = np.clip((floor_hit[:, 1] / self.map_cell).astype(np.int64), 0, rows - 1)
-        self.floor_cell_P = row * columns + column
+        self.background_P3 = self.room_P3.copy()
         obstacle_shadow = self.map_obstacle.ravel()[self.floor_cell_P]
         self.background_P3[self.floor_P] *= (1 - 0.20 * obstacle_shadow)[:, None]
         self.empty_P3 = to_bytes(gathered_P3 + through_P[:, None] * self.background_P3)

@@ -128,7 +128,7 @@ def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
         ({"scene": "funnel", "data": "d", "episode": "e"}, "scene must be left out where data is given, got 'funnel'"),
         (
             {"out": "a.png"},
-            r"out must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, got 'a.png'",
+            r"out must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, got .a.png.",
         ),
         ({"out": "pictures"}, r"out must be a name that ends in .vtkhdf, .* or .ply, got 'pictures'"),
         ({"seed": -1}, "seed must be a finite number >= 0, got -1"),

@@ -19,8 +19,10 @@ from hgn.render.pictures import (
 )
 from hgn.render.renderer import Stage
 from hgn.scene.episode import Episode
+from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.scene.rollout_file import Rollout, read_rollout, write_rollout
+from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
@@ -90,6 +92,25 @@ def test_grid_of_frames():
     middle = np.asarray(alone).astype(np.int64)
     step = 124
     assert (middle[:, 30:140] != middle[:, 30 + step : 140 + step]).any()
+
+
+def test_obstacles_that_move_are_drawn_where_they_are(tmp_path):
+    """Each frame shows an obstacle with keyframes as one at rest in that frame's place, in pictures and animations."""
+    rollout = falling_blobs(7)
+    (box,) = rollout.obstacles
+    turns = np.stack([np.eye(3), euler_rotation((0, 0, 40))])
+    motion = Motion(np.array([0.0, 0.1]), np.array([[0, 0, 0], [-0.3, 0.1, 0.2]]), turns, (0.7, 0.2, 0.3))
+    moving = dataclasses.replace(rollout, obstacles=(dataclasses.replace(box, motion=motion),))
+    for frame in (0, 6):
+        placed = dataclasses.replace(box, vertex_V3=motion.place(box.vertex_V3, frame / 60))
+        still = dataclasses.replace(rollout, obstacles=(placed,))
+        seen, expected = (np.asarray(compare_picture(one, [frame], size=100)) for one in (moving, still))
+        np.testing.assert_array_equal(seen, expected)
+    animate(moving, tmp_path / "a.webp", every=6, size=100)
+    with Image.open(tmp_path / "a.webp") as film:
+        first, last = (np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(film))
+    grey = np.abs(first - last).max(axis=-1) > 25
+    assert grey[:, :50].sum() > 50  # where the box came to
 
 
 def test_pictures_are_reproducible():
