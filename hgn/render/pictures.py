@@ -266,6 +266,7 @@ def rollout_of_episode(episode: Episode, predicted_TN3: np.ndarray | None = None
         cell_size=episode.obstacle_grid.cell_size,
         source={"episode": episode.key, "seed": episode.seed, "specification": episode.specification},
         reference_TN3=None if predicted_TN3 is None else episode.position_TN3,
+        materials=episode.materials,
     )
 
 

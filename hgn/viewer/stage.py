@@ -5,13 +5,14 @@ Shape legend: N particles.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from hgn.render.renderer import BOX_COLOR, MATERIAL_COLORS, OBSTACLE_COLOR, box_corners, to_bytes
+from hgn.render.renderer import BOX_COLOR, OBSTACLE_COLOR, PARTICLE_COLORS, box_corners, to_bytes
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Obstacle
 
@@ -36,6 +37,7 @@ class StageView:
         domain_size: Vector,
         spacing: float,
         precision: Literal["float16", "float32"] = "float32",
+        materials: Sequence[str] = MATERIALS,
     ) -> None:
         """`spacing` of particles at rest, domain units. With float16 positions are 2^-12 of the domain apart."""
         self.scene, self.domain_size = server.scene, domain_size
@@ -61,7 +63,7 @@ class StageView:
                 precision=precision,
                 position=tuple(self.middle_3),
             )
-            for name, colour in zip(MATERIALS, MATERIAL_COLORS, strict=True)
+            for name, colour in zip(materials, PARTICLE_COLORS, strict=False)
         ]
 
     def show(self, position_N3: np.ndarray, material_N: np.ndarray) -> None:

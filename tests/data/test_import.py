@@ -374,7 +374,8 @@ def flat_simulations(count=24):
     path = start + np.array([0.3, 0.0]) * time_T11 - 0.5 * np.array([0.0, 9.8]) * time_T11**2
     floor = np.stack([np.arange(0.1, 0.9, 0.005), np.full(160, 0.12)], -1)
     types = np.where(np.arange(count) % 2, 5, 7)
-    return {"train": [(path.astype(np.float32), types, floor.astype(np.float32))] * 2}
+    one = path.astype(np.float32), types, floor.astype(np.float32)
+    return {"train": [one] * 2, "valid": [one]}
 
 
 @pytest.fixture
@@ -503,11 +504,13 @@ def test_an_own_layout_may_bring_obstacle_cells(tmp_path):
 
 
 def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
-    """Training with noise, mirrors and pushforward, evaluation in both conventions, a rollout file with the set's
-    names, and a picture of it."""
+    """Training with noise, mirrors, pushforward and pictures of its rollouts, evaluation in both conventions, a rollout
+    file with the set's names, and a picture of it."""
     symmetric = {"symmetry": "gravity", "noise_correlated_fraction": 0.3, "pushforward_fraction": 0.5}
-    mapping = train_mapping(make_config(folder=str(flat)), tmp_path / "run", **symmetric, pushforward_frames=4)
+    monitored = {"pushforward_frames": 4, "monitor_rollout_frames": 4}
+    mapping = train_mapping(make_config(folder=str(flat)), tmp_path / "run", **symmetric, **monitored)
     assert train.main(mapping | {"imported": True}) == 0
+    assert list((tmp_path / "run" / "pictures").glob("*.png"))
     weights = tmp_path / "flat.safetensors"
     export(tmp_path / "run" / "checkpoints" / "last.ckpt", weights)
     network, _ = load_weights(weights)

@@ -18,7 +18,9 @@ import yaml
 from network.states import network_of, silent
 from PIL import Image
 
+from hgn.render.renderer import PARTICLE_COLORS, to_bytes
 from hgn.runtime.simulator import Simulator
+from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import read_rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import load_scene
@@ -29,7 +31,8 @@ from hgn.schema import ConfigError
 from hgn.viewer.film import film_html
 from hgn.viewer.page import PlayPage
 from hgn.viewer.session import PlaySession
-from hgn.viewer.viser_compat import start_server
+from hgn.viewer.stage import StageView
+from hgn.viewer.viser_compat import start_server, stop_server
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SIZE = (900, 600)
@@ -264,6 +267,18 @@ def test_without_the_token_there_is_nothing(browser, play):
         connect(bare.replace("http", "ws"))
     with pytest.raises(ConfigError, match=r"host must be an address of this machine, got '192.0.2.1'"):
         start_server("192.0.2.1", 0, "HGN")
+
+
+def test_materials_of_imported_sets_are_shown():
+    """Particles of a name that the set brought are drawn in the colour that pictures have for it."""
+    server, _ = start_server("127.0.0.1", 0, "stage")
+    try:
+        stage = StageView(server, (1.0, 1.0, 1.0), 0.01, materials=(*MATERIALS, "goop"))
+        stage.show(np.full((3, 3), 0.5, np.float32), np.array([0, 4, 4]))
+        assert [len(cloud.points) for cloud in stage.clouds] == [1, 0, 0, 0, 2]
+        np.testing.assert_array_equal(stage.clouds[4].colors.reshape(-1, 3)[0], to_bytes(PARTICLE_COLORS[4]))
+    finally:
+        stop_server(server)
 
 
 def test_a_film_plays_by_itself(browser, play, tmp_path):
