@@ -6,6 +6,7 @@ Writes README.md with the Hub's metadata at its head: what is in the file or the
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,7 @@ def weights_card(info: WeightsInfo, name: str, file: str, licence: str) -> str:
         "cells": f"{network.cell_size:g}",
         "obstacles": "seen" if network.sees_obstacles else "not seen",
         "frames a second": f"{info.frame_rate_hz:g}",
-        "gravity": "any" if network.relative else str(list(info.gravity)),
+        "gravity": "any" if network.relative else _vector(info.gravity),
         "updates": str(info.updates),
     }
     use = f"python -m hgn.rollout weights=hf://USER/NAME/{file}"
@@ -100,17 +101,21 @@ def data_card(manifest: Manifest, name: str, licence: str) -> str:
     }
     own = manifest.config.get("imported")
     scene = own or manifest.config["scene"]
-    rows = {split: f"{number} episodes" for split, number in episodes.items()}
+    rows = {split: f"{number} episode{'s' * (number > 1)}" for split, number in episodes.items()}
     rows |= {
         "frames a second": f"{manifest.config['frame_rate_hz']:g}",
         "materials": ", ".join(scene["materials"]),
-        "gravity": str(list(scene["gravity"])),
+        "gravity": _vector(scene["gravity"]),
         "made by": f"an import of {own['format']} files" if own else "HGN's solver",
         "configuration": manifest.config_hash[:12],
     }
     kind = "imported" if own else "EXPERIMENT"
     use = f"python -m hgn.train +experiment={kind} dataset.folder=hf://datasets/USER/NAME"
     return _page(metadata, name, "Trajectories of particles: WebDataset shards, a manifest and an index.", rows, use)
+
+
+def _vector(value: Sequence[float]) -> str:
+    return ", ".join(f"{component:.6g}" for component in value)
 
 
 def _page(metadata: dict[str, Any], name: str, what: str, rows: dict[str, str], use: str) -> str:

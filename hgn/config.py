@@ -297,8 +297,8 @@ class ImportConfig:
     # of metadata.json where null; the set's own unit of length, seconds
     bounds: tuple[tuple[float, float], ...] | None = None  # low and high of each axis
     dimensions: int | None = None
-    dt: float | None = None  # between frames
-    radius: float | None = None  # of neighbours: the networks' cells
+    dt: Positive[float] | None = None  # between frames
+    radius: Positive[float] | None = None  # of neighbours: the networks' cells
     gravity: tuple[float, ...] | None = None  # length per second squared; null: the metadata's, or estimated
 
     def __post_init__(self) -> None:

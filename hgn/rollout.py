@@ -26,6 +26,7 @@ from hgn.runtime.live import run_scene
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, require_frame_rate
 from hgn.scene.emission import at_start, entry_frames
+from hgn.scene.material import MATERIALS
 from hgn.scene.random_scene import generate_scene
 from hgn.scene.rollout_file import Rollout, obstacles_of_episode
 from hgn.scene.scene import Scene
@@ -36,6 +37,7 @@ from hgn.system.progress import bar
 
 PICTURES = 4  # in the PNG
 EVERY = 3  # frames of the rollout for one picture of the GIF
+SAME_SPEED = 1e-5  # of it: velocities are stored in float32
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def rollout(config: RolloutConfig) -> tuple[Path, Rollout]:
         reference_TN3 = episode.position_TN3[:frames]
         source |= {"data": Path(config.data).name, "episode": config.episode}
     limit, fastest = simulator.info.maximum_initial_speed, _fastest(initial)
-    if limit is not None and fastest > limit:
+    if limit is not None and fastest > limit * (1 + SAME_SPEED):
         print(
             f"velocity: groups begin with up to {fastest:.3g} domain units per second, those of the data of "
             f"{weights.stem} with up to {limit:g}; beyond that collisions and contacts are a guess",
@@ -164,6 +166,10 @@ def _scene(config: RolloutConfig, info: WeightsInfo) -> tuple[str, Scene]:
     if config.scene is not None:
         path = find_scene(config.scene)
         return path.stem, load_scene(path)
+    own = [name for name in info.network.materials if name not in MATERIALS]
+    rule = "given with weights of imported data, which random scenes are not like"
+    imported = info.network.dimensions != 3 or bool(own)
+    require(not imported, "data", rule, None, "for example data=data/mine episode=validation-000000")
     drawn = SceneConfig(gravity=info.gravity, cell_size=info.obstacle_cell_size, materials=info.network.materials)
     if not info.network.sees_obstacles:
         drawn = replace(drawn, obstacle_count=0, group_shapes=("cube",))  # as conf/scene/no_obstacles.yaml says

@@ -244,7 +244,8 @@ class Simulator:
         """Raises ConfigError where weights that were loaded cannot take a scene; of its materials `start` says so."""
         info, cell_size = self._info, scene.obstacle_grid.cell_size
         dimensions = self.network.config.dimensions
-        require(scene.dimensions == dimensions, "dimensions", f"the network's {dimensions}", scene.dimensions)
+        rule, remedy = f"the network's {dimensions}", f"take weights of {scene.dimensions}D data, or such an episode"
+        require(scene.dimensions == dimensions, "dimensions", rule, scene.dimensions, remedy)
         if info is None:
             return
         if info.network.relative:

@@ -378,6 +378,13 @@ def flat_simulations(count=24):
     return {"train": [one] * 2, "valid": [one]}
 
 
+def test_options_are_refused_by_their_own_names(tmp_path):
+    """What the command line says wrong is not told of metadata.json."""
+    for name in ("radius", "dt"):
+        with pytest.raises(ConfigError, match=f"^{name} must be a finite number > 0, got -1.0"):
+            import_trajectories.main({"from": str(tmp_path), "out": str(tmp_path / "new"), name: -1.0})
+
+
 @pytest.fixture
 def flat(tmp_path):
     info = metadata(2, bounds=[[0.1, 0.9], [0.1, 0.9]], dt=0.0025, default_connectivity_radius=0.015)
@@ -531,3 +538,9 @@ def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
     assert [result.materials[i] for i in np.unique(result.material_N)] == ["water", "goop"]
     assert len(np.unique(result.position_TN3[..., 2])) == 1
     assert compare_picture(result, [0, 8]).width > 100
+    for scene, message in (
+        ("funnel", "dimensions must be the network's 2, got 3; take weights of 3D data"),
+        (None, "data must be given with weights of imported data, which random scenes are not like"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            rollout(RolloutConfig(str(weights), str(tmp_path / "out.vtkhdf"), scene=scene, frames=2, device="cpu"))
