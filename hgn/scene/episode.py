@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from hgn.scene.material import MATERIALS, require_materials
+from hgn.scene.npz import read_header
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.schema import ConfigError, from_mapping
+from hgn.schema import BoxSize, ConfigError, Positive, Vector, from_mapping, require, require_bounds
 
 SCHEMA_VERSION = 1
 
@@ -50,9 +51,9 @@ class Episode:
     initial_velocity_N3: np.ndarray  # float32, domain units per second
     material_N: np.ndarray  # uint8, index into `materials`
     obstacle_grid: ObstacleGrid
-    domain_size: tuple[float, float, float]
-    gravity: tuple[float, float, float]  # domain units per second squared
-    frame_rate_hz: float
+    domain_size: BoxSize
+    gravity: Vector  # domain units per second squared
+    frame_rate_hz: Positive[float]
     seed: int
     specification: dict[str, Any]  # how the scene was made
     solver: dict[str, Any]  # settings and counters: substeps, projections, floors hit
@@ -78,23 +79,17 @@ class Episode:
             if not _NAME.fullmatch(name):
                 raise ConfigError(f"{self.key}: parameter names must be letters, digits, - and _, got {name!r}")
             self._check_array(PARAMETER_PREFIX + name, value, np.float32, (count,))
-        for name, array, shape in (
-            ("past", self.past_HN3, (-1, count, 3)),
-            ("boundary", self.boundary_P3, (-1, 3)),
-        ):
-            if array is not None:
-                self._check_array(name, array, np.float32, (len(array), *shape[1:]))
+        if self.past_HN3 is not None:
+            self._check_array("past", self.past_HN3, np.float32, (len(self.past_HN3), count, 3))
+        if self.boundary_P3 is not None:
+            self._check_array("boundary", self.boundary_P3, np.float32, (len(self.boundary_P3), 3))
         require_materials(f"{self.key}: material", self.material_N, self.materials)
-        for name, number in (
-            ("frame_rate_hz", self.frame_rate_hz),
-            ("cell_size", self.obstacle_grid.cell_size),
-        ):
-            if not (number > 0 and math.isfinite(number)):
-                raise ConfigError(f"{self.key}: {name} must be a finite number > 0, got {number!r}")
-        if not all(length > 0 and math.isfinite(length) for length in self.domain_size):
-            raise ConfigError(f"{self.key}: domain_size must be finite and > 0, got {self.domain_size!r}")
-        if not all(math.isfinite(value) for value in self.gravity):
-            raise ConfigError(f"{self.key}: gravity must be finite, got {self.gravity!r}")
+        try:
+            require_bounds(self)
+        except ConfigError as error:
+            raise ConfigError(f"{self.key}: {error}") from None
+        cell_size = self.obstacle_grid.cell_size
+        require(0 < cell_size < math.inf, f"{self.key}: cell_size", "a finite number > 0", cell_size)
 
     @property
     def imported(self) -> bool:
@@ -133,8 +128,8 @@ class _Description:
     seed: int
     specification: dict[str, Any]
     solver: dict[str, Any]
-    domain_size: tuple[float, float, float]
-    gravity: tuple[float, float, float]
+    domain_size: Vector
+    gravity: Vector
     frame_rate_hz: float
     cell_size: float
     materials: tuple[str, ...] = MATERIALS
@@ -251,21 +246,19 @@ def decode_array(name: str, data: bytes | np.ndarray, dtype: str, dimensions: in
     """
     raw = np.frombuffer(data, dtype=np.uint8) if isinstance(data, bytes) else data
     head = io.BytesIO(raw[:4096].tobytes())
-    try:
-        if np.lib.format.read_magic(head) != (1, 0):
-            raise ValueError("not version 1.0")
-        shape, fortran_order, found = np.lib.format.read_array_header_1_0(head)
-    except (ValueError, EOFError, OSError) as error:
-        raise ConfigError(f"{name} must be a plain .npy file, got {error}") from None
-    if found != np.dtype(dtype) or fortran_order:
+    shape, fortran_order, stored = read_header(head, name, newest=(1, 0))
+    if stored != np.dtype(dtype) or fortran_order:
         order = ", Fortran order" if fortran_order else ""
-        raise ConfigError(f"{name} must be of type {dtype} in C order, got {found.str}{order}")
+        raise ConfigError(f"{name} must be of type {dtype} in C order, got {stored.str}{order}")
     if len(shape) != dimensions:
         raise ConfigError(f"{name} must have {dimensions} dimensions, got shape {shape}")
-    start, size = head.tell(), math.prod(shape) * found.itemsize
+    start, size = head.tell(), math.prod(shape) * stored.itemsize
     if len(raw) - start != size:
         raise ConfigError(f"{name} must hold {size} bytes for shape {shape}, got {len(raw) - start}")
-    return raw[start:].view(found).reshape(shape)
+    try:
+        return raw[start:].view(stored).reshape(shape)
+    except ValueError as error:  # one length is 0, another beyond all bounds
+        raise ConfigError(f"{name} must have another shape, got {shape} ({error})") from None
 
 
 def _decode_description(key: str, text: bytes) -> _Description:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 
 MATERIALS: tuple[str, ...] = ("water", "sand", "snow", "elastic")
 WATER, SAND, SNOW, ELASTIC = range(4)
@@ -48,9 +48,11 @@ MATERIAL_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")  # of an imported set's mate
 
 
 def require_materials(owner: str, material_N: np.ndarray, materials: Sequence[str]) -> None:
-    """Raises ConfigError unless the indices of field `owner` stay below the number of `materials`, which are names."""
+    """Raises ConfigError unless field `owner` holds indices into `materials`, and these are names."""
     for name in materials:
         if MATERIAL_NAME.fullmatch(name) is None:
             raise ConfigError(f"{owner}: materials must be names of lower-case letters, digits and _, got {name!r}")
-    if len(material_N) and int(material_N.max()) >= len(materials):
-        raise ConfigError(f"{owner} must be below {len(materials)}, got {int(material_N.max())}")
+    require(material_N.dtype.kind in "iu", owner, "whole numbers", str(material_N.dtype))
+    for material in (material_N.min(), material_N.max()) if len(material_N) else ():
+        rule = f"0 to {len(materials) - 1} ({', '.join(materials)})"
+        require(0 <= material < len(materials), owner, rule, int(material))

@@ -19,8 +19,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,14 +28,15 @@ import numpy as np
 
 from hgn.config import is_mesh_file
 from hgn.scene.episode import Episode
+from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.scene.obstacle_grid import ObstacleGrid, surface_points
 from hgn.scene.rotation import quaternion_rotation
 from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import mesh_sha256, shape_obstacle
-from hgn.schema import ConfigError
-from hgn.system.files import sync_folder, temporary_path
+from hgn.schema import BoxSize, ConfigError, Positive, Vector, require, require_bounds
+from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file
 
 FORMAT_NAME = "hgn rollout"
 FORMAT_VERSION = 2  # 1 had no obstacles in /VTKHDF
@@ -54,16 +53,16 @@ class Rollout:
     Positions may hold NaN: a rollout that diverged is kept as it is. The ground truth may be shorter or
     longer than the rollout.
 
-    Raises: ConfigError on shapes or materials that do not fit together.
+    Raises: ConfigError on shapes or materials that do not fit together, and on numbers out of bounds.
     """
 
     position_TN3: np.ndarray  # float32, domain units
     material_N: np.ndarray  # uint8, index into `materials`
     obstacles: tuple[Obstacle, ...]
-    domain_size: tuple[float, float, float]
-    frame_rate_hz: float
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
-    cell_size: float = 1 / 64  # of the obstacle cells
+    domain_size: BoxSize
+    frame_rate_hz: Positive[float]
+    gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
+    cell_size: Positive[float] = 1 / 64  # of the obstacle cells
     # JSON-able: weights and their sha256, the scene's specification, settings
     source: dict[str, Any] = field(default_factory=dict)
     reference_TN3: np.ndarray | None = None  # float32 [R, N, 3], ground truth at the same frame rate
@@ -73,22 +72,21 @@ class Rollout:
     materials: tuple[str, ...] = MATERIALS
 
     def __post_init__(self) -> None:
+        require_bounds(self)
         shape = self.position_TN3.shape
         if len(shape) != 3 or shape[0] < 1 or shape[2] != 3:
             raise ConfigError(f"position_TN3 must have shape (frames >= 1, particles, 3), got {shape}")
         if self.material_N.shape != shape[1:2]:
             raise ConfigError(f"material_N must have shape ({shape[1]},), got {self.material_N.shape}")
         require_materials("material_N", self.material_N, self.materials)
-        if not (self.frame_rate_hz > 0 and math.isfinite(self.frame_rate_hz)):
-            raise ConfigError(f"frame_rate_hz must be a finite number > 0, got {self.frame_rate_hz}")
         if self.entry_frame_N is not None:
             entry_N = self.entry_frame_N
             if entry_N.shape != shape[1:2] or (np.diff(entry_N, prepend=0) < 0).any():
                 raise ConfigError(f"entry_frame_N must have shape ({shape[1]},), >= 0 and in order, got {entry_N}")
         if self.reference_TN3 is not None:
-            found = self.reference_TN3.shape
-            if len(found) != 3 or found[0] < 1 or found[1:] != shape[1:]:
-                raise ConfigError(f"reference_TN3 must have shape (frames >= 1, {shape[1]}, 3), got {found}")
+            truth = self.reference_TN3.shape
+            if len(truth) != 3 or truth[0] < 1 or truth[1:] != shape[1:]:
+                raise ConfigError(f"reference_TN3 must have shape (frames >= 1, {shape[1]}, 3), got {truth}")
 
     @property
     def frame_count(self) -> int:
@@ -194,24 +192,15 @@ def write_rollout(path: str | Path, rollout: Rollout) -> None:
     Folders are made as needed.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_path(path)
-    try:
+    make_folder(path.parent)
+    with temporary_file(path) as temporary:
         with temporary.open("x+b") as raw:
             with h5py.File(raw, "w") as file:
                 _write_vtkhdf(file.create_group("VTKHDF"), rollout)
                 _write_own(file.create_group("hgn"), rollout)
-            raw.flush()
-            os.fsync(raw.fileno())
+            sync_file(raw)
         temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
     sync_folder(path.parent)
-
-
-_DEPTH = 8  # of groups
-# what h5py raises for damaged files
-_DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, ArithmeticError, MemoryError)
 
 
 def read_rollout(path: str | Path) -> Rollout:
@@ -222,19 +211,13 @@ def read_rollout(path: str | Path) -> Rollout:
     path = Path(path)
     if not path.is_file():
         raise ConfigError(f"rollout must be an existing file, got {path}; python -m hgn.rollout writes one")
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise ConfigError(f"rollout must be a complete HDF5 file, got {path}: {error}; write it again") from error
-    with file:
+    rule, remedy = f"{path}: rollout must be a complete HDF5 file", "write it again"
+    with open_hdf5(path, rule, remedy) as file, damage_named(rule, remedy):
         _check_format(file, path)
         try:
-            require_own_data(file)
             return _read(file)
         except ConfigError as error:
-            raise ConfigError(f"rollout must be consistent, got {path}: {error}; write it again") from error
-        except _DAMAGE as error:
-            raise ConfigError(f"rollout must be complete, got {path}: {error}; write it again") from error
+            raise ConfigError(f"{path}: rollout must be consistent, got {error}; {remedy}") from error
 
 
 def _write_vtkhdf(group: h5py.Group, rollout: Rollout) -> None:
@@ -332,28 +315,16 @@ def _write_own(group: h5py.Group, rollout: Rollout) -> None:
         group["reference"] = rollout.reference_TN3.astype(np.float32, copy=False)
 
 
-def require_own_data(group: h5py.Group, depth: int = 0) -> None:
-    """Raises ConfigError where a file names others, which HDF5 would read with this one's reader's rights."""
-    for name in group:
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink) or depth > _DEPTH:
-            raise ConfigError(f"{group.name} must hold its data itself, got a link in {name}")
-        item = group[name]
-        if isinstance(item, h5py.Group):
-            require_own_data(item, depth + 1)
-        elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
-            raise ConfigError(f"{item.name} must lie in the file itself, got data of another file")
-
-
 def _check_format(file: h5py.File, path: Path) -> None:
     own = file.get("hgn")
-    name = own.attrs.get("format") if isinstance(own, h5py.Group) else None
-    if name != FORMAT_NAME:
+    attributes = own.attrs if isinstance(own, h5py.Group) else {}
+    name, version = attributes.get("format"), attributes.get("format_version")
+    if not isinstance(name, str) or name != FORMAT_NAME:
         raise ConfigError(
             f"rollout must be a file that python -m hgn.rollout wrote, with format {FORMAT_NAME!r} "
             f"in group /hgn; got {path} with format {name!r}"
         )
-    version = int(own.attrs.get("format_version", -1))
-    if version not in (1, FORMAT_VERSION):
+    if not isinstance(version, np.integer) or version not in (1, FORMAT_VERSION):
         raise ConfigError(
             f"rollout format_version must be 1 or {FORMAT_VERSION}, got {version} in {path}; "
             "read it with the version of hgn that wrote it, or write it again"
@@ -373,29 +344,34 @@ def _read(file: h5py.File) -> Rollout:
         raise ConfigError(f"Points must hold {shape[0]} frames of {shape[1]} particles, got shape {points.shape}")
     position_TP3 = np.full((*shown_TP.shape, 3), np.nan, np.float32)
     position_TP3[shown_TP] = points[()]
-    obstacles = tuple(
-        Obstacle(
-            name=str(entry.attrs["name"]),
-            vertex_V3=entry["vertices"][()],
-            triangle_F3=entry["triangles"][()],
-            closed=bool(entry.attrs["closed"]),
-            motion=_read_motion(entry) if "time" in entry else None,
-        )
-        for _, entry in sorted(own["obstacles"].items())
-    )
+    source = json.loads(own["source"][()])
+    require(isinstance(source, dict), "source", "a mapping", source)
     return Rollout(
         position_TN3=position_TP3[:, vertices:],
         material_N=material_N,
-        obstacles=obstacles,
-        domain_size=tuple(float(length) for length in own.attrs["domain_size"]),  # type: ignore[arg-type]
+        obstacles=tuple(_read_obstacle(entry) for _, entry in sorted(own["obstacles"].items())),
+        domain_size=_triple(own.attrs["domain_size"]),
         frame_rate_hz=float(own.attrs["frame_rate_hz"]),
-        gravity=tuple(float(value) for value in own.attrs["gravity"]),  # type: ignore[arg-type]
+        gravity=_triple(own.attrs["gravity"]),
         cell_size=float(own.attrs["cell_size"]),
-        source=json.loads(own["source"][()]),
+        source=source,
         reference_TN3=own["reference"][()] if "reference" in own else None,
         entry_frame_N=entry_N if "entry_frame" in own else None,
         materials=tuple(json.loads(own.attrs["materials"])),
     )
+
+
+def _read_obstacle(entry: h5py.Group) -> Obstacle:
+    vertex_V3, triangle_F3 = entry["vertices"][()], entry["triangles"][()]
+    for name, array, kinds in (("vertices", vertex_V3, "f"), ("triangles", triangle_F3, "iu")):
+        if array.dtype.kind not in kinds or array.ndim != 2 or array.shape[1] != 3:
+            raise ConfigError(f"{entry.name}: {name} must be numbers [any, 3], got {array.dtype} {array.shape}")
+    require(bool(np.isfinite(vertex_V3).all()), f"{entry.name}: vertices", "finite", float("nan"))
+    low, high = triangle_F3.min(initial=0), triangle_F3.max(initial=-1)
+    if low < 0 or high >= len(vertex_V3):
+        raise ConfigError(f"{entry.name}: triangles must be of {len(vertex_V3)} vertices, got vertices {low} to {high}")
+    motion = _read_motion(entry) if "time" in entry else None
+    return Obstacle(str(entry.attrs["name"]), vertex_V3, triangle_F3, bool(entry.attrs["closed"]), motion=motion)
 
 
 def _read_motion(entry: h5py.Group) -> Motion:
@@ -405,5 +381,9 @@ def _read_motion(entry: h5py.Group) -> Motion:
     for (name, value), shape in zip(arrays.items(), shapes, strict=True):
         if value.shape != shape:
             raise ConfigError(f"{entry.name}: {name} must have shape {shape}, got {value.shape}")
-    x, y, z = (float(value) for value in entry.attrs["pivot"])
-    return Motion(**arrays, pivot=(x, y, z))
+    return Motion(**arrays, pivot=_triple(entry.attrs["pivot"]))
+
+
+def _triple(values: Any) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

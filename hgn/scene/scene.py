@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS
+from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, require_materials
 from hgn.scene.motion import Motion
 from hgn.schema import ConfigError, require
 
@@ -58,21 +58,14 @@ class Scene:
 
     def __post_init__(self) -> None:
         count = len(self.position_N3)
-        for name in ("position_N3", "velocity_N3", "material_N"):
-            require(
-                isinstance(getattr(self, name), np.ndarray), name, "a NumPy array", type(getattr(self, name)).__name__
-            )
-        for name, shape in (
-            ("position_N3", (count, 3)),
-            ("velocity_N3", (count, 3)),
-            ("material_N", (count,)),
-        ):
-            if getattr(self, name).shape != shape:
-                raise ConfigError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
-        for name in ("position_N3", "velocity_N3"):
-            bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(axis=1))
+        for name, shape in (("position_N3", (count, 3)), ("velocity_N3", (count, 3)), ("material_N", (count,))):
+            array = getattr(self, name)
+            require(isinstance(array, np.ndarray), name, "a NumPy array", type(array).__name__)
+            if array.shape != shape:
+                raise ConfigError(f"{name} must have shape {shape}, got {array.shape}")
+            bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
             if len(bad):
-                raise ConfigError(f"{name} must be finite, got {getattr(self, name)[bad[0]]} for particle {bad[0]}")
+                raise ConfigError(f"{name} must be finite, got {array[bad[0]]} for particle {bad[0]}")
         frictions = {f"obstacles[{i}].friction": o.friction for i, o in enumerate(self.obstacles)}
         frictions |= {f"wall_friction[{i}]": friction for i, friction in enumerate(self.wall_friction)}
         for name, friction in frictions.items():
@@ -86,10 +79,7 @@ class Scene:
             require(self.entry_s_N.shape == (count,), "entry_s_N", f"of shape {(count,)}", self.entry_s_N.shape)
             ordered = bool((np.diff(self.entry_s_N, prepend=0.0) >= 0).all()) and np.isfinite(self.entry_s_N).all()
             require(bool(ordered), "entry_s_N", "finite, >= 0 and in order", self.entry_s_N)
-        require(self.material_N.dtype.kind in "iu", "material_N", "whole numbers", str(self.material_N.dtype))
-        for material in (self.material_N.min(), self.material_N.max()) if count else ():
-            rule = f"0 to {len(MATERIALS) - 1} ({', '.join(MATERIALS)})"
-            require(0 <= material < len(MATERIALS), "material_N", rule, int(material))
+        require_materials("material_N", self.material_N, MATERIALS)
 
     @property
     def moves(self) -> bool:

@@ -8,8 +8,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +22,7 @@ from hgn.scene.emission import Face
 from hgn.scene.group import WALL_CELLS, Region, fill, particle_count, region_of
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, material_index
 from hgn.scene.motion import Motion
+from hgn.scene.npz import read_npz
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
@@ -295,18 +294,19 @@ def notes_on_meshes(scene: Scene) -> list[str]:
 def _build(file: SceneFile, folder: Path) -> Scene:
     obstacles = tuple(_obstacle(entry, index, folder) for index, entry in enumerate(file.obstacles))
     stored = {i: _read_particles(entry, i, folder, file) for i, entry in enumerate(file.groups) if entry.particles}
-    counts = [
-        len(stored[i][0]) if i in stored else particle_count(entry.region, file.particles_per_cell, file.cell_size)
-        for i, entry in enumerate(file.groups)
-    ]
-    entering = [e.face.count(e.stop - e.start, file.particles_per_cell, file.cell_size) for e in file.emitters]
-    require(
-        sum(counts) + sum(entering) <= MAXIMUM_PARTICLES,
-        "groups",
-        f"at most {MAXIMUM_PARTICLES} particles together, with those of emitters",
-        sum(counts) + sum(entering),
-        "lower size or particles_per_cell",
-    )
+    filling = file.particles_per_cell, file.cell_size
+    total: float
+    try:
+        counts = [
+            len(stored[i][0]) if i in stored else particle_count(entry.region, *filling)
+            for i, entry in enumerate(file.groups)
+        ]
+        entering = [e.face.count(e.stop - e.start, *filling) for e in file.emitters]
+        total = sum(counts) + sum(entering)
+    except ArithmeticError:  # of sizes or cells that leave the range of floats
+        total = math.inf
+    rule = f"at most {MAXIMUM_PARTICLES} particles together, with those of emitters"
+    require(total <= MAXIMUM_PARTICLES, "groups", rule, total, "lower size or particles_per_cell")
     positions, times = [], [np.zeros(sum(counts))]
     for index, (entry, count) in enumerate(zip(file.groups, counts, strict=True)):
         if index in stored:
@@ -365,15 +365,14 @@ def _read_particles(entry: GroupEntry, index: int, folder: Path, file: SceneFile
     require(
         path.suffix == ".npz" and path.is_file(), field, "an existing .npz file", path, "relative to the scene file"
     )
-    arrays = {}
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            for name in ("position", "velocity"):
-                if name in stored:
-                    arrays[name] = np.asarray(stored[name], np.float32)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, TypeError) as error:
-        raise ConfigError(f"{field} must be a readable .npz file, got {path}: {error}") from error
+        arrays = {name: array for name, array in read_npz(path) if name in ("position", "velocity")}
+    except ConfigError as error:
+        raise ConfigError(f"{field} must be a readable .npz file, got {error}") from error
     require("position" in arrays, field, "a file with an array named position", path)
+    for name, value in arrays.items():
+        require(value.dtype.kind in "fiu", f"{field}: {name}", "of numbers", value.dtype.name)
+        arrays[name] = value.astype(np.float32)
     shape = (arrays["position"].size // 3, 3)
     for name, value in arrays.items():
         require(value.shape == shape, f"{field}: {name}", f"of shape {shape}", value.shape)
@@ -397,7 +396,10 @@ def _obstacle(entry: ObstacleEntry, index: int, folder: Path) -> Obstacle:
     if entry.mesh is None:
         assert entry.shape is not None and entry.size is not None and entry.position is not None
         name = f"obstacle_{index}_{entry.shape}"
-        obstacle = shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name)
+        with np.errstate(over="ignore"):
+            obstacle = shape_obstacle(entry.shape, entry.size, entry.position, euler_rotation(entry.rotation), name)
+        finite = bool(np.isfinite(obstacle.vertex_V3).all())
+        require(finite, f"obstacles[{index}].size", "in the range of float32", entry.size)
     else:
         # trimesh takes a second to load
         from hgn.scene.mesh import load_mesh

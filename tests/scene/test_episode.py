@@ -108,10 +108,10 @@ BROKEN_FIELDS: list[tuple[dict[str, Any], str]] = [
     ({"initial_velocity_N3": np.zeros((4, 3), np.float32)}, "velocity must have shape"),
     ({"initial_velocity_N3": np.full((5, 3), np.nan, np.float32)}, "velocity must be finite, got nan at"),
     ({"material_N": np.zeros(5, np.int64)}, "material must be of type uint8"),
-    ({"material_N": np.full(5, 4, np.uint8)}, "material must be below 4, got 4"),
+    ({"material_N": np.full(5, 4, np.uint8)}, r"material must be 0 to 3 \(.*\), got 4"),
     ({"frame_rate_hz": float("nan")}, "frame_rate_hz must be a finite number > 0"),
-    ({"domain_size": (1.0, 0.0, 1.0)}, "domain_size must be finite and > 0"),
-    ({"gravity": (0.0, float("inf"), 0.0)}, "gravity must be finite"),
+    ({"domain_size": (1.0, 0.0, 1.0)}, r"domain_size\[1\] must be a finite number > 0"),
+    ({"gravity": (0.0, float("inf"), 0.0)}, r"gravity\[1\] must be finite"),
     ({"material_parameters": {"e": np.zeros(4, np.float32)}}, "parameter_e must have shape"),
     ({"material_parameters": {"a.b": np.zeros(5, np.float32)}}, "parameter names must be"),
 ]
@@ -165,6 +165,12 @@ def description(**changes):
     return json.dumps({key: value for key, value in mapping.items() if value is not None}).encode()
 
 
+def headed(header):
+    """A .npy file with any header, and nothing behind it."""
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
+
+
+SHAPED = "{'descr': '<f4', 'fortran_order': False, 'shape': %s, }"
 BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
     ({"json": None}, "member json is missing"),
     ({"position.npy": None}, "member position.npy is missing"),
@@ -192,6 +198,11 @@ BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
     ({"position.npy": npy(np.zeros((4, 5, 3), np.float32, order="F"))}, "got <f4, Fortran order"),
     ({"position.npy": npy(np.zeros((4, 15), np.float32))}, "position.npy must have 3 dimensions"),
     ({"velocity.npy": npy(np.zeros((5, 3), np.float32), version=(2, 0))}, "not version 1.0"),
+    ({"velocity.npy": headed("{'descr': ((((")}, "velocity.npy must be a plain .npy file"),
+    ({"velocity.npy": headed("{'descr': " + 3000 * "-" + "1}")}, "velocity.npy must be a plain .npy file"),
+    ({"velocity.npy": headed(SHAPED % "(-2, -3)")}, "velocity.npy must be a plain .npy file"),
+    ({"velocity.npy": headed(SHAPED % "(True, 0)")}, "velocity.npy must be a plain .npy file"),
+    ({"velocity.npy": headed(SHAPED % f"(0, {2**63})")}, "velocity.npy must have another shape"),
 ]
 
 

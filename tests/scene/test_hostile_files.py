@@ -1,5 +1,6 @@
 """Files from anywhere: what is wrong with them ends in one line, never in a traceback, a hang or foreign data."""
 
+import io
 import json
 import os
 import resource
@@ -10,21 +11,25 @@ import zipfile
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 import torch
 import trimesh
+from data.foreign_writers import metadata, write
 from data.test_index import shard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scene.test_rollout_file import make_rollout
 
 from datagen.solve import SolveConfig
-from hgn.config import NetworkConfig
+from hgn.config import ImportConfig, NetworkConfig
+from hgn.data.foreign.formats import read_split, set_info
 from hgn.data.identity import identity_hash
 from hgn.data.index import SPLITS, ListedIndex, QuarantinedScene, parse_json
 from hgn.data.manifest import Manifest
 from hgn.data.shard import locate_members
 from hgn.scene.mesh import load_mesh
+from hgn.scene.npz import read_npz
 from hgn.scene.rollout_file import read_rollout, write_rollout
 from hgn.scene.scene_file import load_scene
 from hgn.schema import ConfigError, from_mapping
@@ -122,6 +127,32 @@ def test_rollout_with_data_of_other_files(tmp_path):
             read_rollout(path)
 
 
+def test_pickled_arrays_come_back():
+    """Arrays of arrays, numbers, tuples and lists, in either byte order, are what they were."""
+    entry, buffer = np.empty((2, 1), object), io.BytesIO()
+    entry[:, 0] = [np.arange(6.0).reshape(2, 3).T, (np.float32(2), [np.array([True]), np.arange(3, dtype=">i8")])]
+    np.savez(buffer, a=entry)
+    ((_, array),) = read_npz(buffer, objects=True)
+    assert array.shape == (2, 1) and array[0, 0].tolist() == [[0, 3], [1, 4], [2, 5]]
+    number, (flag, order) = array[1, 0]
+    assert number == 2 and flag.tolist() == [True] and order.tolist() == [0, 1, 2] and order.dtype == np.dtype(">i8")
+
+
+def test_pickled_array_with_a_state_that_none_has():
+    """A type that says that its numbers are objects is refused: NumPy's own would take it, and write beyond memory."""
+    entry, buffer = np.empty(1, object), io.BytesIO()
+    entry[0] = np.arange(3.0)
+    np.save(buffer, entry)
+    content = buffer.getvalue()
+    for old, new in ((b"f8", b"O8"), (b"K\x03\x85", b"K\x7f\x85"), (b"f8", b"V8")):
+        assert content.count(old) == 1
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w") as whole:
+            whole.writestr("a.npy", content.replace(old, new))
+        with pytest.raises(ConfigError, match="a must be an array, or a pickle of arrays alone, got"):
+            list(read_npz(file, objects=True))
+
+
 def mesh(suffix):
     content = trimesh.creation.box().export(file_type=suffix)
     return f"box.{suffix}", content.encode() if isinstance(content, str) else content, load_mesh
@@ -148,6 +179,43 @@ def hdf5():
     with tempfile.TemporaryDirectory() as folder:
         write_rollout(Path(folder) / "rollout.vtkhdf", make_rollout())
         return "rollout.vtkhdf", (Path(folder) / "rollout.vtkhdf").read_bytes(), read_rollout
+
+
+def archive():
+    """Plain arrays."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, position=np.zeros((9, 3), np.float32), velocity=np.zeros((9, 3), np.float32))
+    return "a.npz", buffer.getvalue(), lambda path: list(read_npz(path))
+
+
+def pickles():
+    """An array of arrays, as geoelements/gns has them: its bytes in an archive that is whole."""
+    entry, buffer = np.empty(2, object), io.BytesIO()
+    entry[:] = [np.zeros((4, 2, 3)), np.array([5, 6])]
+    np.save(buffer, entry)
+
+    def decode(path):
+        whole = path.with_suffix(".npz")
+        with zipfile.ZipFile(whole, "w") as file:
+            file.writestr("a.npy", path.read_bytes())
+        for _, array in read_npz(whole, objects=True):
+            assert str(array) is not None and np.zeros(1, np.float32)[0] == 0
+
+    return "a.npy", buffer.getvalue(), decode
+
+
+def foreign(name):
+    """A set of particles in another program's HDF5."""
+    walk = np.full((9, 2, 3), 0.5, np.float32), np.array([5, 5]), np.full((2, 3), 0.3, np.float32)
+    folder = write(Path(LISTED.name, name), name, {"train": [walk]}, metadata(write_every=1))
+    (path,) = folder.rglob("*.h5")
+    info = set_info(folder, name, ImportConfig(out="mine"))
+
+    def decode(damaged):
+        path.write_bytes(damaged.read_bytes())
+        list(read_split(folder, "train", info))
+
+    return path.name, path.read_bytes(), decode
 
 
 LISTED = tempfile.TemporaryDirectory()  # data sets without their shards
@@ -182,6 +250,9 @@ FILES = {
     "segment": index("*-000000.jsonl"),
     "quarantined": index("*-quarantined.jsonl"),
     **{suffix: mesh(suffix) for suffix in ("stl", "ply", "glb", "obj")},
+    **{name: foreign(name) for name in ("lagrangebench", "neuralmpm")},
+    "npz": archive(),
+    "pickles": pickles(),
     "checkpoint": checkpoint(),
     "tar": tar(),
     "yaml": ("s.yaml", b"groups:\n- {shape: cube, size: 0.1, position: [0.5, 0.5, 0.5], material: sand}\n", load_scene),

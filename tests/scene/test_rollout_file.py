@@ -88,7 +88,7 @@ def test_files_of_other_materials(tmp_path):
         with h5py.File(path, "a") as file:
             file["hgn"].attrs["materials"] = json.dumps(names)
         if len(set(names)) < 3:
-            with pytest.raises(ConfigError, match=r"material_N must be below 1|materials must be names of lower-case"):
+            with pytest.raises(ConfigError, match=r"material_N must be 0 to 0|materials must be names of lower-case"):
                 read_rollout(path)
         else:
             assert read_rollout(path).materials == tuple(names)
@@ -284,7 +284,7 @@ def shorter(file):
         (edited(lambda file: file["hgn"].attrs.pop("format")), "format None"),
         (edited(lambda file: file["hgn"].attrs.update(format_version=99)), "format_version must be 1 or 2, got 99"),
         (edited(shorter), "4 frames of 7 particles"),
-        (edited(lambda file: file.pop("VTKHDF/Points")), r"must be complete.*Points"),
+        (edited(lambda file: file.pop("VTKHDF/Points")), r"must be a complete HDF5 file, got .*Points"),
     ],
 )
 def test_other_files_are_refused(tmp_path, change, message):
@@ -295,12 +295,54 @@ def test_other_files_are_refused(tmp_path, change, message):
         read_rollout(tmp_path / "a.vtkhdf")
 
 
+def attribute(name, value):
+    return lambda file: file["hgn"].attrs.__setitem__(name, value)
+
+
+def array(name, value):
+    def change(file):
+        del file[name]
+        file[name] = value
+
+    return change
+
+
+SHEET = "hgn/obstacles/0000"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (attribute("format", np.array([1, 2])), "with format array"),
+        (attribute("format_version", "x"), "format_version must be 1 or 2, got x"),
+        (attribute("domain_size", np.array([np.nan, 1, 1])), r"domain_size\[0\] must be a finite number > 0, got nan"),
+        (attribute("domain_size", np.array([1.0, 1.0])), "must be a complete HDF5 file, got not enough values"),
+        (attribute("gravity", np.array([0, np.inf, 0])), r"gravity\[1\] must be finite, got inf"),
+        (attribute("cell_size", 0.0), "cell_size must be a finite number > 0"),
+        (array("hgn/source", "3"), "source must be a mapping, got 3"),
+        (array("hgn", h5py.SoftLink("/hgn")), "must hold its data itself"),
+        (array("VTKHDF/PointData/material", np.full(14, 0.5)), "material_N must be whole numbers, got 'float64'"),
+        (array("VTKHDF/PointData/material", np.full(14, -3)), r"material_N must be 0 to 3 \(.*\), got -3"),
+        (array(f"{SHEET}/triangles", np.array([[0, 1, 99]])), "triangles must be of 3 vertices, got vertices 0 to 99"),
+        (array(f"{SHEET}/triangles", np.array([0, 1, 2])), r"triangles must be numbers \[any, 3\]"),
+        (array(f"{SHEET}/vertices", np.zeros((3, 2))), r"vertices must be numbers \[any, 3\]"),
+        (array(f"{SHEET}/vertices", np.full((3, 3), np.nan)), "vertices must be finite"),
+    ],
+)
+def test_whole_files_that_hold_no_rollout(tmp_path, change, message):
+    """HDF5 files without damage, in which a number, a shape or an index is none that can be drawn."""
+    write_rollout(tmp_path / "a.vtkhdf", make_rollout())
+    edited(change)(tmp_path / "a.vtkhdf")
+    with pytest.raises(ConfigError, match=message):
+        read_rollout(tmp_path / "a.vtkhdf")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"position_TN3": np.zeros((2, 3), np.float32)}, "position_TN3 must have shape"),
         ({"material_N": np.zeros(3, np.uint8)}, r"material_N must have shape \(7,\)"),
-        ({"material_N": np.full(7, 9, np.uint8)}, "material_N must be below 4, got 9"),
+        ({"material_N": np.full(7, 9, np.uint8)}, r"material_N must be 0 to 3 \(.*\), got 9"),
         ({"frame_rate_hz": float("nan")}, "frame_rate_hz must be a finite number > 0"),
         ({"entry_frame_N": np.array([0, 0, 0, 0, 0, 2, 1])}, r"entry_frame_N must .* in order"),
         ({"reference_TN3": np.zeros((2, 6, 3), np.float32)}, "reference_TN3 must have shape"),

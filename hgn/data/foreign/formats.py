@@ -20,19 +20,17 @@ import h5py
 import numpy as np
 
 from hgn.config import ImportConfig
-from hgn.data.foreign.npz import read_npz
 from hgn.data.foreign.tfrecord import parse_sequence_example, read_records
 from hgn.data.foreign.trajectory import FLUID, SetInfo, Trajectory, checked, floats
+from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIAL_NAME
-from hgn.scene.rollout_file import require_own_data
+from hgn.scene.npz import read_npz
 from hgn.schema import ConfigError, require
 
 SPLIT_NAMES = {"train": ("train",), "validation": ("valid", "validation"), "test": ("test",)}
 # types of particles: of DeepMind's sets, which geoelements and NeuralMPM keep, and of LagrangeBench's
 _DEEPMIND = {0: "rigid", FLUID: "fluid", 5: "water", 6: "sand", 7: "goop"}
 _LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # the last three: its copies of DeepMind's
-# what h5py raises, and NumPy for a size that is claimed
-_DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, MemoryError)
 
 
 def find_format(folder: Path, asked: str) -> str:
@@ -44,7 +42,7 @@ def find_format(folder: Path, asked: str) -> str:
     if any((folder / name).is_dir() for name in SPLIT_NAMES["train"]):
         found.append("neuralmpm")
     if archive := _file(folder, "train", ".npz"):
-        _, first = next(read_npz(archive), ("", np.zeros(0)))
+        _, first = next(read_npz(archive, objects=True), ("", np.zeros(0)))
         found.append("geoelements" if first.dtype.hasobject else "plain")
     if _file(folder, "train", ".h5"):
         metadata = _metadata(folder)
@@ -174,7 +172,7 @@ def _joined(name: str, parts: list[bytes] | None, dtype: str) -> np.ndarray:
 
 def _read_geoelements(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
     path = _file(folder, split, ".npz")
-    for member, array in read_npz(path) if path else ():
+    for member, array in read_npz(path, objects=True) if path else ():
         several = member == "gns_data"
         for number, entry in enumerate(array if several else [array]):
             name = f"{path}: {member}" + (f"[{number}]" if several else "")
@@ -196,8 +194,10 @@ def _read_hdf5(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
         return
     with _opened(path) as file:
         for key in sorted(file):
-            require(isinstance(file[key], h5py.Group), f"{path}: {key}", "a group with position", str(file[key]))
-            members = {name: _dataset(f"{path}: {key}", file[key], name) for name in file[key]}
+            with damage_named(f"{path}: {key} must be whole", _AGAIN):
+                group = file[key]
+                require(isinstance(group, h5py.Group), f"{path}: {key}", "a group with position", str(group))
+                members = {name: _dataset(f"{path}: {key}", group, name) for name in group}
             yield _of_members(f"{path}: {key}", members, info)
 
 
@@ -307,30 +307,20 @@ _READERS: dict[str, Callable[[Path, str, SetInfo], Iterator[Trajectory]]] = {
     "neuralmpm": _read_neuralmpm,
     "plain": _read_hdf5,
 }
+_AGAIN = "fetch it again"
 _MOST_CELLS = 1 << 16  # along an axis
 _EXAMPLES = {"bounds": "[[0.1,0.9],[0.1,0.9]]", "dt": "0.0025", "radius": "0.015"}
 
 
 def _opened(path: Path) -> h5py.File:
-    try:
-        file = h5py.File(path, "r")
-        require_own_data(file)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
-    except OSError as error:
-        raise ConfigError(f"{path} must be a whole HDF5 file, got {error}; fetch it again") from None
-    return file
+    return open_hdf5(path, f"{path} must be a whole HDF5 file", _AGAIN)
 
 
 def _dataset(name: str, group: h5py.Group, key: str) -> np.ndarray:
-    try:
-        found = group[key]
-        require(isinstance(found, h5py.Dataset), f"{name}: {key}", "a dataset", type(found).__name__)
-        return np.asarray(found[()])
-    except _DAMAGE as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{name}: {key} is missing or damaged; {' '.join(str(error).split())}") from None
+    with damage_named(f"{name}: {key} must be there, and whole", _AGAIN):
+        dataset = group[key]
+        require(isinstance(dataset, h5py.Dataset), f"{name}: {key}", "a dataset", type(dataset).__name__)
+        return np.asarray(dataset[()])
 
 
 def _file(folder: Path, split: str, ending: str) -> Path | None:

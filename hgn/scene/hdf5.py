@@ -1,0 +1,50 @@
+"""HDF5 files from anywhere: none of their data may lie in other files, and damage ends in one message."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+
+from hgn.schema import ConfigError
+
+_DEPTH = 8  # of groups
+# what h5py raises for damage, and NumPy for a size that is claimed
+_DAMAGE = (LookupError, OSError, ValueError, RuntimeError, TypeError, AttributeError, ArithmeticError, MemoryError)
+
+
+@contextlib.contextmanager
+def damage_named(rule: str, remedy: str) -> Iterator[None]:
+    """While it is entered, what reading raises of a damaged file becomes a ConfigError `<rule>, got <cause>; <remedy>`.
+
+    `rule` names the file, as in `a.h5: position must be whole`.
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except _DAMAGE as error:
+        raise ConfigError(f"{rule}, got {' '.join(str(error).split())}; {remedy}") from error
+
+
+def open_hdf5(path: Path, rule: str, remedy: str) -> h5py.File:
+    """A file, open for reading, that holds all its data itself. Raises: ConfigError, as `damage_named` does."""
+    with damage_named(rule, remedy), contextlib.ExitStack() as stack:
+        file = stack.enter_context(h5py.File(path, "r"))
+        _require_own_data(file, path)
+        stack.pop_all()
+    return file
+
+
+def _require_own_data(group: h5py.Group, path: Path, depth: int = 0) -> None:
+    """Raises ConfigError where a file names others, which HDF5 would read with this one's reader's rights."""
+    for name in group:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink) or depth > _DEPTH:
+            raise ConfigError(f"{path}: {group.name} must hold its data itself, got a link in {name}")
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            _require_own_data(item, path, depth + 1)
+        elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
+            raise ConfigError(f"{path}: {item.name} must lie in the file itself, got data of another file")

@@ -1,0 +1,137 @@
+"""NumPy's files, read without trusting them: what a header claims is checked, and pickles make arrays alone.
+
+geoelements/gns keeps trajectories as object arrays, which NumPy pickles. To load such a file in the usual way would run
+whatever its writer put there, and a state that no array has makes NumPy write beyond its memory.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import re
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from hgn.schema import ConfigError
+
+_MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
+_PLAIN_TYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
+# of a header, which NumPy evaluates as Python, and of sizes that it claims
+_HEADER_ERRORS = (
+    *(ValueError, TypeError, OverflowError, EOFError, OSError, SyntaxError, tokenize.TokenError),
+    *(RecursionError, MemoryError),
+)
+# whatever a damaged or hostile pickle makes of the few pieces it is given
+_PICKLE_ERRORS = (
+    *(pickle.UnpicklingError, ValueError, TypeError, OverflowError, EOFError, AttributeError, LookupError),
+    *(RecursionError, MemoryError),
+)
+
+
+class _Type:
+    """The type of a pickled array: NumPy's own would take any state, and is shared by the whole process."""
+
+    def __init__(self, name: str, *_: Any) -> None:
+        if _PLAIN_TYPE.fullmatch(name) is None:
+            raise pickle.UnpicklingError(f"the type {name!r}, which is no number")
+        self.plain = np.dtype(name)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.plain = self.plain.newbyteorder(state[1])
+
+
+class _Array(np.ndarray):
+    """An array that takes no state but one of its own size."""
+
+    def __setstate__(self, state: Any) -> None:
+        _, shape, kind, fortran_order, content = state
+        size, plain = math.prod(shape), kind.plain
+        if plain.hasobject:
+            fits = isinstance(content, list) and len(content) == size
+        else:
+            fits = isinstance(content, bytes) and len(content) == size * plain.itemsize
+        if not fits or min(shape, default=0) < 0:
+            raise pickle.UnpicklingError(f"an array of shape {shape} with other contents")
+        super().__setstate__((1, tuple(shape), plain, bool(fortran_order), content))  # type: ignore[arg-type]
+
+
+class _ArraysAlone(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if module in _MULTIARRAY and name in ("_reconstruct", "scalar"):
+            return _empty_array if name == "_reconstruct" else _scalar
+        if module == "numpy" and name in ("ndarray", "dtype"):
+            return _Type if name == "dtype" else name  # of arrays all are _Array
+        raise pickle.UnpicklingError(f"{module}.{name}, which is no part of an array")
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise pickle.UnpicklingError(f"a reference to an object outside ({pid!r})")
+
+
+def _empty_array(*_: Any) -> _Array:
+    return np.empty(0, np.uint8).view(_Array)
+
+
+def _scalar(kind: _Type, content: bytes) -> Any:
+    return np.frombuffer(content, kind.plain, 1)[0]
+
+
+def read_npz(path: Path | BinaryIO, objects: bool = False) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and arrays of an archive, one after the other, read-only. With `objects` arrays may hold arrays, numbers,
+    tuples and lists.
+
+    Raises: ConfigError naming the file and the array that is cut, altered, or holds anything else.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist():
+                member = info.filename.removesuffix(".npy")
+                kinds = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+                if member == info.filename or info.compress_type not in kinds:
+                    raise ConfigError(f"{path}: {member} must be an array (.npy), as numpy.savez writes it")
+                yield member, _read_array(archive.read(info), f"{path}: {member}", objects)
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+        raise ConfigError(f"{path} must be a whole NumPy archive, got {error}; fetch it again") from None
+
+
+def read_header(
+    file: BinaryIO, name: str, newest: tuple[int, int] = (2, 0)
+) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether in Fortran order, and type of a `.npy` file's array, which follows.
+
+    Raises: ConfigError in the name of `name` for what is no such file, or of a version after the `newest` to be read.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        if version > newest:
+            raise ValueError(f"not version {'.'.join(map(str, newest))}")
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read(file)
+        if any(type(length) is not int or length < 0 for length in shape):
+            raise ValueError(f"the shape {shape}")
+    except _HEADER_ERRORS as error:
+        raise ConfigError(f"{name} must be a plain .npy file, got {error}") from None
+    return shape, fortran_order, dtype
+
+
+def _read_array(data: bytes, name: str, objects: bool) -> np.ndarray:
+    file = io.BytesIO(data)
+    shape, fortran_order, dtype = read_header(file, name)
+    try:
+        if not dtype.hasobject:
+            flat = np.frombuffer(data, dtype, math.prod(shape), file.tell()) if 0 not in shape else np.empty(0, dtype)
+            return flat.reshape(shape, order="F" if fortran_order else "C")
+        if not objects:
+            raise pickle.UnpicklingError("a pickle")
+        array = _ArraysAlone(file).load()
+    except _PICKLE_ERRORS as error:
+        raise ConfigError(f"{name} must be an array, or a pickle of arrays alone, got {error}") from None
+    if not isinstance(array, np.ndarray) or array.shape != shape:
+        raise ConfigError(f"{name} must be an array of shape {shape}, got {type(array).__name__}")
+    return array.view(np.ndarray)
