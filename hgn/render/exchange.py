@@ -8,7 +8,7 @@ Shape legend: T frames, N particles, V vertices, F triangles.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from hgn.render.renderer import MATERIAL_COLORS, OBSTACLE_COLOR, PARTICLE_COLORS
 from hgn.scene.material import FLUIDS
 from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import Rollout, rollout_velocity, write_rollout
+from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 from hgn.system.extras import require_installed
 from hgn.system.files import sync_folder, sync_written
@@ -134,12 +135,7 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
         prim.GetExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(points), time)
 
     moving = []
-    names: set[str] = set()
-    for index, obstacle in enumerate(rollout.obstacles):
-        name = _identifier(obstacle.name)
-        while name in names:  # a mesh that is placed twice
-            name = f"{name}_{index}"
-        names.add(name)
+    for name, obstacle in zip(_identifiers(rollout.obstacles), rollout.obstacles, strict=True):
         prim = mesh(f"obstacles/{name}", OBSTACLE_COLOR)
         fill(prim, obstacle.vertex_V3, obstacle.triangle_F3, Usd.TimeCode.Default())
         if obstacle.motion is not None:
@@ -178,15 +174,22 @@ def _write_usd(path: Path, rollout: Rollout, surface: bool, progress: Callable[[
 
 def _row_matrix(motion: Motion, time: float) -> list[list[float]]:
     """The pose at a time for row vectors, as USD multiplies: (x, 1) M."""
-    rotation_33, _ = motion.pose(time)
-    (origin_3,) = motion.place(np.zeros((1, 3)), time)
+    rotation_33, origin_3 = motion.transform(time)
     return [[*row, 0.0] for row in rotation_33.T.tolist()] + [[*origin_3.tolist(), 1.0]]
 
 
-def _identifier(name: str) -> str:
+def _identifiers(obstacles: Sequence[Obstacle]) -> list[str]:
+    """Names of prims, of which no two are alike: of a mesh file that is there several times all but the first have
+    their number behind."""
     from pxr import Tf
 
-    return str(Tf.MakeValidIdentifier(name))
+    names: list[str] = []
+    for index, obstacle in enumerate(obstacles):
+        name = str(Tf.MakeValidIdentifier(obstacle.name))
+        while name in names:
+            name = f"{name}_{index}"
+        names.append(name)
+    return names
 
 
 def _write_ply(path: Path, rollout: Rollout, surface: bool, progress: Callable[[], Any]) -> None:

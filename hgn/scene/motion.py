@@ -53,6 +53,10 @@ class Motion:
         rotation, translation = self.pose(time)
         return rotate(np.asarray(point_P3, np.float64) - self.pivot, rotation) + self.pivot + translation
 
+    def transform(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """R, float64 [3, 3], and t, float64 [3], that take a point x of the obstacle to R x + t at a time."""
+        return self.pose(time)[0], self.place(np.zeros((1, 3)), time)[0]
+
     def rates(self, begin: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean rates from one time to another: angular velocity, rad/s [3]; velocity [3] of the pivot, and its place
         [3] at the beginning.

@@ -5,18 +5,18 @@ Shape legend: T frames.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-from dataclasses import replace
+from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import viser
 
 from hgn.render.pictures import rollout_spacing
 from hgn.scene.rollout_file import Rollout
 from hgn.schema import require
-from hgn.viewer.stage import Quaternion, StageView, Vector, quaternion
+from hgn.viewer.stage import StageView, quaternion
 from hgn.viewer.viser_compat import start_server, stop_server
 
 REST = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
@@ -30,7 +30,7 @@ class _Film:
         self.stage = StageView(server, rollout.domain_size, rollout_spacing(rollout), "float16", rollout.materials)
         self.moving = []
         for index, obstacle in enumerate(rollout.obstacles):
-            mesh = self.stage.add_obstacle(f"{index}_{obstacle.name}", replace(obstacle, motion=None), *REST)
+            mesh = self.stage.add_obstacle(f"{index}_{obstacle.name}", obstacle, *REST)
             if obstacle.motion is not None:
                 self.moving.append((mesh, obstacle.motion))
 
@@ -38,25 +38,25 @@ class _Film:
         present = self.rollout.present(frame)
         self.stage.show(self.rollout.position_TN3[frame, :present], self.rollout.material_N[:present])
         for mesh, motion in self.moving:
-            mesh.position, mesh.wxyz = self._place(motion, frame / self.rollout.frame_rate_hz)
-
-    @staticmethod
-    def _place(motion: Any, time_s: float) -> tuple[Vector, Quaternion]:
-        rotation_33, _ = motion.pose(time_s)
-        x, y, z = motion.place(np.zeros((1, 3)), time_s)[0].tolist()
-        return (x, y, z), quaternion(rotation_33)
+            rotation_33, place_3 = motion.transform(frame / self.rollout.frame_rate_hz)
+            mesh.position, mesh.wxyz = tuple(place_3.tolist()), quaternion(rotation_33)
 
 
-def _record(rollout: Rollout, every: int) -> tuple[viser.ViserServer, Any]:
+@contextlib.contextmanager
+def _recorded(rollout: Rollout, every: int) -> Iterator[Any]:
+    """Viser's serializer of a scene, with every `every`-th frame."""
     require(every >= 1, "every", "at least 1", every)
     server, _ = start_server("127.0.0.1", 0, "HGN")
-    film = _Film(server, rollout)
-    film.show(0)
-    serializer = server.get_scene_serializer()
-    for frame in range(0, rollout.frame_count, every):
-        film.show(frame)
-        serializer.insert_sleep(every / rollout.frame_rate_hz)
-    return server, serializer
+    try:
+        film = _Film(server, rollout)
+        film.show(0)
+        serializer = server.get_scene_serializer()
+        for frame in range(0, rollout.frame_count, every):
+            film.show(frame)
+            serializer.insert_sleep(every / rollout.frame_rate_hz)
+        yield serializer
+    finally:
+        stop_server(server)
 
 
 def film_html(rollout: Rollout, every: int = 2) -> str:
@@ -64,11 +64,8 @@ def film_html(rollout: Rollout, every: int = 2) -> str:
 
     Raises: ConfigError for `every` below 1; ModuleNotFoundError without the extra `play`.
     """
-    server, serializer = _record(rollout, every)
-    try:
+    with _recorded(rollout, every) as serializer:
         return str(serializer.as_html())
-    finally:
-        stop_server(server)
 
 
 def show_film(rollout: Rollout, every: int = 2, height: int = 480) -> None:
@@ -76,11 +73,8 @@ def show_film(rollout: Rollout, every: int = 2, height: int = 480) -> None:
 
     Raises: as `film_html`.
     """
-    server, serializer = _record(rollout, every)
-    try:
+    with _recorded(rollout, every) as serializer:
         serializer.show(height=height)
-    finally:
-        stop_server(server)
 
 
 class FilmPage:

@@ -23,6 +23,7 @@ import viser
 from hgn.config import MESH_SUFFIXES, OBSTACLE_SHAPES
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.simulator import Simulator
+from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import write_rollout
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.schema import ConfigError, require
@@ -169,8 +170,7 @@ class PlayPage:
         back = gui.add_button_group("Back by", tuple(BACK_S))
         restart = gui.add_button("Restart")
         with gui.add_folder("Pour"):
-            known = session.simulator.network.config.materials
-            self.material = gui.add_dropdown("Material", tuple(known), initial_value=known[0])
+            self.material = gui.add_dropdown("Material", self._materials())
             self.diameter = gui.add_slider("Diameter", 0.02, 0.3, 0.01, 0.08)
             self.speed = gui.add_slider("Speed", 0.0, 3.0, 0.1, 1.0)
             self.height = gui.add_slider("Height", 0.1, 1.0, 0.05, 0.75)
@@ -244,8 +244,11 @@ class PlayPage:
         except ConfigError:
             self.weights.value = self.session.weights
             raise
-        known = self.session.simulator.network.config.materials
-        self.material.options = tuple(known)
+        self.material.options = self._materials()
+
+    def _materials(self) -> tuple[str, ...]:
+        """What can be poured: what the weights know of the materials that scenes are made of."""
+        return tuple(name for name in self.session.simulator.network.config.materials if name in MATERIALS)
 
     def _middle(self) -> Vector:
         x, y, z = self.session.domain_size

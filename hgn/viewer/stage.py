@@ -39,7 +39,9 @@ class StageView:
         precision: Literal["float16", "float32"] = "float32",
         materials: Sequence[str] = MATERIALS,
     ) -> None:
-        """`spacing` of particles at rest, domain units. With float16 positions are 2^-12 of the domain apart."""
+        """`spacing` of particles at rest, domain units. With float16 positions are 2^-12 of the domain apart.
+        `materials` are what particles' indices mean.
+        """
         self.scene, self.domain_size = server.scene, domain_size
         self.scene.set_up_direction("+y")
         self.middle_3 = 0.5 * np.array(domain_size)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hmac
 import http
-import http.cookies
 import io
 import secrets
 import socket
@@ -65,12 +64,11 @@ def guarded(process: Process, token: str) -> Process:
     def answer(connection: Any, request: Request) -> Response | None:
         port = connection.local_address[1]
         name = f"{COOKIE}_{port}"  # cookies know no ports
-        cookies: http.cookies.SimpleCookie = http.cookies.SimpleCookie()
-        for header in request.headers.get_all("Cookie"):
-            cookies.load(header)
-        given = [*parse_qs(urlsplit(request.path).query).get("token", [])]
-        given += [cookies[name].value] if name in cookies else []
-        if not any(hmac.compare_digest(value.encode(), token.encode()) for value in given):
+        # other programs' cookies for this host come too, with any names and values, so no parser that refuses some
+        cookies = [part.strip() for header in request.headers.get_all("Cookie") for part in header.split(";")]
+        tokens = [cookie.removeprefix(f"{name}=") for cookie in cookies if cookie.startswith(f"{name}=")]
+        tokens += parse_qs(urlsplit(request.path).query).get("token", [])
+        if not any(hmac.compare_digest(value.encode(), token.encode()) for value in tokens):
             headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(REFUSAL))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, REFUSAL)
         response = process(connection, request)

@@ -115,6 +115,16 @@ def test_what_enters_and_what_moves(tmp_path, rollout):
         np.testing.assert_allclose(ply.vertices, expected_V3, atol=1e-6)
 
 
+def test_one_mesh_twice(tmp_path, rollout):
+    """Obstacles of one mesh file have one name: each is there, at its place."""
+    box, _ = rollout.obstacles
+    twin = replace(box, vertex_V3=box.vertex_V3 + 0.25)
+    stage = Usd.Stage.Open(str(save_rollout(tmp_path / "a.usdc", replace(rollout, obstacles=(box, twin, box)))))
+    meshes = [UsdGeom.Mesh(prim) for prim in stage.GetPrimAtPath("/World/obstacles").GetChildren()]
+    for mesh, obstacle in zip(meshes, (box, twin, box), strict=True):
+        np.testing.assert_allclose(mesh.GetPointsAttr().Get(), obstacle.vertex_V3, rtol=1e-6)
+
+
 def test_ply_is_read_back(tmp_path, rollout):
     """A file a frame with places, velocities and materials; the obstacles once; the water's surface a frame."""
     first = save_rollout(tmp_path / "scene.ply", rollout, surface=True)

@@ -10,6 +10,7 @@ import urllib.request
 import zipfile
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ from hgn.viewer.film import film_html
 from hgn.viewer.page import PlayPage
 from hgn.viewer.session import PlaySession
 from hgn.viewer.stage import StageView
-from hgn.viewer.viser_compat import start_server, stop_server
+from hgn.viewer.viser_compat import COOKIE, start_server, stop_server
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SIZE = (900, 600)
@@ -267,6 +268,18 @@ def test_without_the_token_there_is_nothing(browser, play):
         connect(bare.replace("http", "ws"))
     with pytest.raises(ConfigError, match=r"host must be an address of this machine, got '192.0.2.1'"):
         start_server("192.0.2.1", 0, "HGN")
+
+
+def test_cookies_of_other_programs(play):
+    """What other programs on this machine have left in the browser, in any form, does not close the page."""
+    (token,) = parse_qs(urlsplit(play.address).query)["token"]
+    bare = play.address.split("?")[0]
+    own = f"{COOKIE}_{urlsplit(bare).port}={token}"
+    for others in ("user@host=1", "a/b=1", 'x={"a":1,"b":2}', "path=1", "flag"):
+        for cookies in (f"{others}; {own}", f"{own}; {others}"):
+            request = urllib.request.Request(bare, headers={"Cookie": cookies})
+            with urllib.request.urlopen(request) as answer:
+                assert answer.status == 200
 
 
 def test_materials_of_imported_sets_are_shown():
