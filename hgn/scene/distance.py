@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hgn.scene.scene import Obstacle
+from hgn.scene.surface import area_vectors
 
 PAIRS_PER_CHUNK = 1 << 17  # bounds the temporaries of the dense solid-angle sums to some 20 MiB
 DIRECT_TRIANGLES = 1024  # above it the tree is faster than the dense sum
@@ -37,11 +38,11 @@ def closest_points(point_P3: np.ndarray, triangle_P33: np.ndarray) -> np.ndarray
         best, best_square = _nearer(point, best, best_square, candidate, np.ones(len(point), bool))
 
     ab, ac, ap = b - a, c - a, point - a
-    normal = _cross(ab, ac)
+    normal = np.cross(ab, ac)
     normal_square = _square(normal)
     divisor = np.where(normal_square > 0, normal_square, 1.0)
-    u = _dot(_cross(ap, ac), normal) / divisor
-    v = _dot(_cross(ab, ap), normal) / divisor
+    u = _dot(np.cross(ap, ac), normal) / divisor
+    v = _dot(np.cross(ab, ap), normal) / divisor
     inside = (normal_square > 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
     # measured from the corner, not the point, so that a sliver's poor normal cannot leave the triangle
     foot = np.where(inside[:, None], a + u[:, None] * ab + v[:, None] * ac, a)
@@ -115,19 +116,11 @@ def _solid_angles(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     Seen from a point in its own plane a triangle has solid angle 0 outside and is undefined inside.
     """
     a, b, c = (triangle[..., corner, :] - point for corner in range(3))
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    cx, cy, cz = c[..., 0], c[..., 1], c[..., 2]
-    la = np.sqrt(ax * ax + ay * ay + az * az)
-    lb = np.sqrt(bx * bx + by * by + bz * bz)
-    lc = np.sqrt(cx * cx + cy * cy + cz * cz)
+    la, lb, lc = (np.sqrt(_square(side)) for side in (a, b, c))
+    # np.cross takes twice the time
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = (np.moveaxis(side, -1, 0) for side in (a, b, c))
     determinant = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-    cosines = (
-        la * lb * lc
-        + (ax * bx + ay * by + az * bz) * lc
-        + (bx * cx + by * cy + bz * cz) * la
-        + (cx * ax + cy * ay + cz * az) * lb
-    )
+    cosines = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
     return 2 * np.arctan2(determinant, cosines)
 
 
@@ -168,13 +161,12 @@ def _build_tree(triangle_F33: np.ndarray) -> _Tree:
         level = grown
     first_T, last_T = np.array(first), np.array(last)
     sorted_F33 = triangle_F33[order]
-    area_vector = 0.5 * _cross(sorted_F33[:, 1] - sorted_F33[:, 0], sorted_F33[:, 2] - sorted_F33[:, 0])
+    area_vector = area_vectors(sorted_F33)
     area = np.sqrt(_square(area_vector)) + np.finfo(np.float64).tiny
     dipole = _slice_sums(area_vector, first_T, last_T)
     weight = _slice_sums(area[:, None], first_T, last_T)
     centre = _slice_sums(area[:, None] * sorted_F33.mean(axis=1), first_T, last_T) / weight
     # the box of the corners bounds the sphere about the centre
-    radius = np.empty(len(first_T))
     low, high = np.empty_like(centre), np.empty_like(centre)
     for node in range(len(first_T) - 1, -1, -1):  # children come after their parent
         if children[node][0] < 0:
@@ -234,14 +226,3 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _square(a: np.ndarray) -> np.ndarray:
     return _dot(a, a)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )

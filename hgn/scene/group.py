@@ -73,8 +73,5 @@ def points_in_ball(count: int, dimensions: int, rng: np.random.Generator) -> np.
     accepted = np.zeros((0, dimensions))
     while len(accepted) < count:
         candidate = 2 * rng.random((max(count, 16), dimensions)) - 1
-        square = candidate[:, 0] * candidate[:, 0]
-        for axis in range(1, dimensions):
-            square = square + candidate[:, axis] * candidate[:, axis]
-        accepted = np.concatenate([accepted, candidate[square <= 1]])
+        accepted = np.concatenate([accepted, candidate[(candidate * candidate).sum(axis=1) <= 1]])
     return accepted[:count]

@@ -105,7 +105,7 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
     for _ in range(SHAPES_PER_ITEM):
         shape = _choice(config.obstacle_shapes, rng)
         size = smallest + (largest - smallest) * rng.random()
-        quaternion = _random_quaternion(rng)
+        quaternion = _random_direction(rng, 4).tolist()
         rotation = quaternion_rotation(quaternion)
         turned = shape_obstacle(shape, size, rotation_33=rotation)
         low, high = turned.vertex_V3.min(axis=0), turned.vertex_V3.max(axis=0)
@@ -123,7 +123,7 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
             if any(_too_near(obstacle, point, gap, other, clearance) for other in placed):
                 continue
             record: dict[str, Any] = {"shape": shape, "size": size}
-            record |= {"position": list(position), "quaternion": list(quaternion)}
+            record |= {"position": list(position), "quaternion": quaternion}
             if is_mesh_file(shape):
                 record["sha256"] = mesh_sha256(shape)
             return _Placed(obstacle, point, gap, point_tree(point), low + centre, high + centre, record)
@@ -333,22 +333,13 @@ def _unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
     return centroid, float(np.sqrt((offset * offset).sum(axis=2).max())) + ROUNDING
 
 
-def _random_quaternion(rng: np.random.Generator) -> tuple[float, float, float, float]:
-    """A uniformly random unit quaternion, by rejection in the 4-ball."""
+def _random_direction(rng: np.random.Generator, dimensions: int = 3) -> np.ndarray:
+    """A uniformly random unit vector, by rejection in the ball; of four dimensions a rotation's quaternion."""
     while True:
-        w, x, y, z = points_in_ball(1, 4, rng)[0].tolist()
-        length = float(np.sqrt(w * w + x * x + y * y + z * z))
+        point = points_in_ball(1, dimensions, rng)[0]
+        length = float(np.sqrt((point * point).sum()))
         if length > 0.1:  # dividing by less would magnify rounding
-            return w / length, x / length, y / length, z / length
-
-
-def _random_direction(rng: np.random.Generator) -> np.ndarray:
-    """A uniformly random unit vector, by rejection in the ball."""
-    while True:
-        point_3 = points_in_ball(1, 3, rng)[0]
-        length = float(np.sqrt((point_3 * point_3).sum()))
-        if length > 0.1:  # dividing by less would magnify rounding
-            return point_3 / length
+            return point / length
 
 
 def _choice(options: tuple[str, ...], rng: np.random.Generator) -> str:
