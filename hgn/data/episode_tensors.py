@@ -26,7 +26,7 @@ class EpisodeTensors:
     material_N: torch.Tensor  # int32, index into the network's materials
     obstacle_cell_K3: torch.Tensor  # int32; empty where the network sees none
     obstacle_normal_K3: torch.Tensor
-    domain_size: tuple[float, float, float]
+    domain_size: Vector
     gravity: Vector  # domain units per frame squared
     symmetries: tuple[Symmetry, ...] = ()  # what training may show instead of the scene
 

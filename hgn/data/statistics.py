@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-Vector = tuple[float, float, float]
+from hgn.schema import Vector
+
 _BLOCK_PARTICLES = 1 << 18  # particles times frames handled at once
 _ROWS_ABREAST = 512
 

@@ -17,7 +17,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_filter
 
-from hgn.scene.scene import Obstacle
+from hgn.scene.scene import Obstacle, all_corners
+from hgn.scene.surface import area_vectors
+from hgn.schema import Vector
 
 # colours as sRGB in [0, 1]; one a material, in the order of hgn.scene.material.MATERIALS
 MATERIAL_COLORS = np.array([(0.13, 0.45, 0.86), (0.87, 0.60, 0.20), (0.70, 0.81, 0.93), (0.36, 0.66, 0.38)], np.float32)
@@ -50,7 +52,7 @@ class Camera:
     `width` and `height` are those of the supersampled picture.
     """
 
-    def __init__(self, domain_size: tuple[float, float, float], size: int) -> None:
+    def __init__(self, domain_size: Vector, size: int) -> None:
         azimuth, elevation = math.radians(AZIMUTH_DEG), math.radians(ELEVATION_DEG)
         back = np.array(
             (
@@ -97,7 +99,7 @@ class Stage:
 
     def __init__(
         self,
-        domain_size: tuple[float, float, float],
+        domain_size: Vector,
         obstacles: Sequence[Obstacle],
         particle_radius: float,
         size: int,
@@ -135,7 +137,7 @@ class Stage:
 
     # the parts that stay the same in every frame without moving obstacles
 
-    def _prepare_shadow_map(self, domain_size: tuple[float, float, float]) -> None:
+    def _prepare_shadow_map(self, domain_size: Vector) -> None:
         self.map_cell = max(domain_size[0], domain_size[2]) / SHADOW_CELLS
         # light slants, so the shadows of high particles land beside the floor; the map need not hold those
         self.map_shape = tuple(math.ceil(domain_size[axis] / self.map_cell) for axis in (2, 0))
@@ -159,10 +161,10 @@ class Stage:
         self.layer_shade_LP = np.zeros((LAYERS, pixel_count), np.float32)
         self.map_top = np.full(self.map_shape[0] * self.map_shape[1], -np.inf)
         self.map_obstacle = np.zeros(self.map_shape, np.float32)
-        corner_F33 = obstacle_triangles(obstacles)
+        corner_F33 = all_corners(obstacles)
         if not len(corner_F33):
             return
-        normal_F33 = smooth_normals(corner_F33)
+        unit_F3, normal_F33 = smooth_normals(corner_F33)
 
         xy, depth = camera.project(corner_F33.reshape(-1, 3))
         triangle_S, pixel_S, weight_S3 = fragments(xy.reshape(-1, 3, 2), camera.width, camera.height)
@@ -180,7 +182,7 @@ class Stage:
         self.layer_shade_LP[rank_S[shown], pixel_S[shown]] = shade_S[shown]
         triangle_P = np.full(pixel_count, -1)
         triangle_P[pixel_S[rank_S == 0]] = triangle_S[order][rank_S == 0]
-        self._darken_outlines(triangle_P, face_normals(corner_F33))
+        self._darken_outlines(triangle_P, unit_F3)
 
         rows, columns = self.map_shape
         xy = self._to_map(corner_F33.reshape(-1, 3)).reshape(-1, 3, 2)
@@ -216,7 +218,7 @@ class Stage:
             edge[inner] |= np.abs(np.diff(depth, 2, axis=axis)) > 6.0 / self.camera.scale * depth.min()
         self.layer_shade_LP[0, edge.ravel() & (triangle_P >= 0)] *= 0.45
 
-    def _prepare_room(self, domain_size: tuple[float, float, float]) -> None:
+    def _prepare_room(self, domain_size: Vector) -> None:
         """Floor and walls, without obstacles and shadows."""
         camera = self.camera
         ray_P3 = camera.rays()
@@ -261,27 +263,20 @@ class Stage:
         # what a floor pixel loses when the floor turns black there
         self.floor_share_P3 = 255 * through_P[self.floor_P, None] * self.background_P3[self.floor_P]
 
-    def _prepare_box(self, domain_size: tuple[float, float, float]) -> None:
+    def _prepare_box(self, domain_size: Vector) -> None:
         """The box's edges: the far ones under everything, the near ones over the finished picture."""
         camera = self.camera
         corner_83 = box_corners(domain_size)
         xy, _ = camera.project(corner_83)
-        seen_from_front = (1, 1, 1)  # the corner (x, y, z) nearest to the eye, as bits
         front = Image.new("RGBA", (camera.width, camera.height), (*BOX_COLOR, 0))
         back = Image.fromarray(self.empty_P3.reshape(camera.height, camera.width, 3), "RGB")
-        for near, target, color in (
-            (True, ImageDraw.Draw(front), (*BOX_COLOR, 120)),
-            (False, ImageDraw.Draw(back), BOX_COLOR),
-        ):
-            for a in range(8):
-                for axis in range(3):
-                    b = a | (1 << axis)
-                    if a == b:
-                        continue
-                    touches = sum(((a >> other) & 1) == seen_from_front[other] for other in range(3) if other != axis)
-                    # edges that bound only faces turned away from the eye, or the silhouette, lie behind
-                    if (touches == 2) == near:
-                        target.line([tuple(xy[a]), tuple(xy[b])], fill=color, width=SUPERSAMPLING)
+        over, under = ImageDraw.Draw(front), ImageDraw.Draw(back)
+        for a, b in BOX_EDGES:
+            # the eye is nearest to the corner at all far ends: other edges bound only faces turned away from it, or
+            # the silhouette
+            near = a.bit_count() == 2
+            target, color = (over, (*BOX_COLOR, 120)) if near else (under, BOX_COLOR)
+            target.line([tuple(xy[a]), tuple(xy[b])], fill=color, width=SUPERSAMPLING)
         self.front_box = front.reduce(SUPERSAMPLING)
         self.empty_P3 = np.asarray(back).reshape(-1, 3).copy()
 
@@ -326,14 +321,15 @@ class Stage:
         offset_O2 = offset_O2[(np.maximum(np.abs(offset_O2) - 1, 0) ** 2).sum(axis=1) <= reach**2]
 
         winner_P = np.full(camera.width * camera.height, -1, np.int32)
-        for first in range(0, len(order), max(1, FRAGMENTS_AT_ONCE // len(offset_O2))):
-            some = slice(first, first + max(1, FRAGMENTS_AT_ONCE // len(offset_O2)))
-            center = np.floor(xy_N2[some]).astype(np.int32)
+        at_once = max(1, FRAGMENTS_AT_ONCE // len(offset_O2))
+        for first in range(0, len(order), at_once):
+            batch = slice(first, first + at_once)
+            center = np.floor(xy_N2[batch]).astype(np.int32)
             x = center[:, None, 0] + offset_O2[:, 0].astype(np.int32)
             y = center[:, None, 1] + offset_O2[:, 1].astype(np.int32)
-            away = (x + np.float32(0.5) - xy_N2[some, None, 0]) ** 2
-            away += (y + np.float32(0.5) - xy_N2[some, None, 1]) ** 2
-            drawn = away < radius_N[some, None] ** 2
+            away = (x + np.float32(0.5) - xy_N2[batch, None, 0]) ** 2
+            away += (y + np.float32(0.5) - xy_N2[batch, None, 1]) ** 2
+            drawn = away < radius_N[batch, None] ** 2
             drawn &= (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
             index = np.broadcast_to(np.arange(len(center), dtype=np.int32)[:, None] + first, x.shape)
             winner_P[(y * camera.width + x)[drawn]] = index[drawn]
@@ -368,7 +364,11 @@ class Stage:
         picture_P3[pixel_S] = to_bytes(color_S3)
 
 
-def box_corners(domain_size: tuple[float, float, float]) -> np.ndarray:
+# of its corners' numbers, see below: the second has one more coordinate at its far end
+BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
+
+
+def box_corners(domain_size: Vector) -> np.ndarray:
     """The corners of [0, domain_size], [8, 3]; corner i has coordinate axis at its far end where bit axis is set."""
     return np.array([[(i >> axis) & 1 for axis in range(3)] for i in range(8)]) * np.array(domain_size)
 
@@ -378,25 +378,14 @@ def to_bytes(color: np.ndarray) -> np.ndarray:
     return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def obstacle_triangles(obstacles: Sequence[Obstacle]) -> np.ndarray:
-    """The corners of all triangles, float64 [F, 3, 3]."""
-    parts = [obstacle.vertex_V3[obstacle.triangle_F3] for obstacle in obstacles]
-    return np.concatenate(parts).astype(np.float64) if parts else np.empty((0, 3, 3))
-
-
-def face_normals(corner_F33: np.ndarray) -> np.ndarray:
-    """Unit normals of triangles, float64 [F, 3]; zero for triangles without area."""
-    area_F3 = np.cross(corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0])
-    return area_F3 / np.maximum(np.linalg.norm(area_F3, axis=1, keepdims=True), 1e-30)
-
-
-def smooth_normals(corner_F33: np.ndarray) -> np.ndarray:
-    """Normals at triangle corners, float64 [F, 3, 3]: averaged over the neighbours that bend less than a crease.
+def smooth_normals(corner_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals of triangles, float64 [F, 3], zero for those without area, and normals at their corners, float64
+    [F, 3, 3]: averaged over the neighbours that bend less than a crease.
 
     Corners at the same place count as shared, so meshes need not share vertices.
     """
-    area_F3 = np.cross(corner_F33[:, 1] - corner_F33[:, 0], corner_F33[:, 2] - corner_F33[:, 0])
-    unit_F3 = face_normals(corner_F33)
+    area_F3 = area_vectors(corner_F33)
+    unit_F3 = area_F3 / np.maximum(np.linalg.norm(area_F3, axis=1, keepdims=True), 1e-30)
     _, place = np.unique(np.round(corner_F33.reshape(-1, 3), 9), axis=0, return_inverse=True)
     order = np.argsort(place.ravel(), kind="stable")
     start = np.flatnonzero(np.diff(place.ravel()[order], prepend=-1))
@@ -413,7 +402,7 @@ def smooth_normals(corner_F33: np.ndarray) -> np.ndarray:
         other = order[first_of[have] + (rank[have] + shift) % size_of[have]]
         close = (unit_F3[mine // 3] * unit_F3[other // 3]).sum(axis=1) >= math.cos(math.radians(CREASE_DEG))
         smooth[mine[close]] += area_F3[other[close] // 3]
-    return smooth.reshape(-1, 3, 3)
+    return unit_F3, smooth.reshape(-1, 3, 3)
 
 
 def fragments(corner_F32: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -427,7 +416,7 @@ def fragments(corner_F32: np.ndarray, width: int, height: int) -> tuple[np.ndarr
     area_F = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     span = high - low
     count_F = np.where(np.abs(area_F) > 1e-9, span[:, 0] * span[:, 1], 0)
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    batches = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))]
     batch_F = np.cumsum(count_F) // FRAGMENTS_AT_ONCE
     for batch in np.unique(batch_F[count_F > 0]):
         chosen = np.flatnonzero((batch_F == batch) & (count_F > 0))
@@ -442,10 +431,8 @@ def fragments(corner_F32: np.ndarray, width: int, height: int) -> tuple[np.ndarr
         )
         weight_S3 /= area_F[triangle_S, None]
         inside = (weight_S3 >= 0).all(axis=1)
-        found.append((triangle_S[inside], (y_S * width + x_S)[inside], weight_S3[inside]))
-    if not found:
-        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))
-    triangle, pixel, weight = (np.concatenate(part) for part in zip(*found, strict=True))
+        batches.append((triangle_S[inside], (y_S * width + x_S)[inside], weight_S3[inside]))
+    triangle, pixel, weight = (np.concatenate(part) for part in zip(*batches, strict=True))
     return triangle, pixel, weight
 
 

@@ -80,7 +80,7 @@ def contains(point_P3: np.ndarray, obstacle: Obstacle) -> np.ndarray:
     inside = np.zeros(len(point), bool)
     if not obstacle.closed or len(obstacle.triangle_F3) == 0 or len(point) == 0:
         return inside
-    triangle = np.asarray(obstacle.vertex_V3, np.float64)[obstacle.triangle_F3]
+    triangle = obstacle.corners
     low, high = triangle.min(axis=(0, 1)), triangle.max(axis=(0, 1))
     near = np.flatnonzero(((point >= low) & (point <= high)).all(axis=1))
     inside[near] = np.abs(winding_numbers(point[near], triangle)) > 0.5

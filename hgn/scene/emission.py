@@ -13,7 +13,7 @@ import numpy as np
 
 from hgn.scene.group import points_in_ball
 from hgn.scene.scene import Scene
-from hgn.schema import require
+from hgn.schema import Vector, require
 
 WAYS = 256  # of particles that enter, that are tried for obstacles
 
@@ -22,8 +22,8 @@ WAYS = 256  # of particles that enter, that are tried for obstacles
 class Face:
     """A disc, or a rectangle where `edges` are not zero, across a velocity. Domain units."""
 
-    centre: tuple[float, float, float]
-    velocity: tuple[float, float, float]  # domain units per second, of what enters
+    centre: Vector
+    velocity: Vector  # domain units per second, of what enters
     radius: float = 0.0
     edges: tuple[float, float] = (0.0, 0.0)  # the first is level, along x where the velocity is upright
 
@@ -57,8 +57,9 @@ class Face:
 
         One enters in each of `count` equal parts of the time.
         """
-        place = points_in_ball(count, 2, rng) * self.radius if self.radius else None
-        if place is None:
+        if self.radius:
+            place = points_in_ball(count, 2, rng) * self.radius
+        else:
             place = (rng.random((count, 2)) - 0.5) * np.array(self.edges)
         time = start + (stop - start) * (np.arange(count) + rng.random(count)) / max(count, 1)
         return (np.array(self.centre) + place @ self.axes).astype(np.float32), time
@@ -109,12 +110,11 @@ def require_free_entries(scene: Scene, entered: Scene) -> None:
     late = late[:: -(-len(late) // WAYS) or 1]
     start, way = scene.position_N3[late].astype(np.float64), (entered.position_N3 - scene.position_N3)[late]
     for obstacle in scene.obstacles:
-        hit = np.zeros(len(late), bool)
-        corner = obstacle.vertex_V3[obstacle.triangle_F3]
-        for index in range(len(late)):
-            hit[index] = _crosses(start[index], way[index].astype(np.float64), corner)
+        corner_F33 = obstacle.corners
+        hits = sum(_crosses(point, step.astype(np.float64), corner_F33) for point, step in zip(start, way, strict=True))
         rule = "clear of obstacles for the first frame of what enters"
-        require(not hit.any(), "emitters", rule, f"{hit.mean():.0%} of it through {obstacle.name}", "move one of them")
+        share = f"{hits / max(len(late), 1):.0%} of it through {obstacle.name}"
+        require(not hits, "emitters", rule, share, "move one of them")
 
 
 def _crosses(start_3: np.ndarray, way_3: np.ndarray, corner_F33: np.ndarray) -> bool:

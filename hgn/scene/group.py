@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hgn.schema import Vector
+
 WALL_CELLS = 3  # thickness of the solver's walls (MpmConfig.wall_cells); no particle starts inside them
 
 
@@ -18,8 +20,8 @@ WALL_CELLS = 3  # thickness of the solver's walls (MpmConfig.wall_cells); no par
 class Region:
     """An axis-aligned box, or a ball where `half_width` is zero and `radius` is not. Domain units."""
 
-    centre: tuple[float, float, float]
-    half_width: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre: Vector
+    half_width: Vector = (0.0, 0.0, 0.0)
     radius: float = 0.0
 
     @property
@@ -39,7 +41,7 @@ class Region:
         return float(np.sqrt((outside * outside).sum())) - self.radius - other.radius
 
 
-def region_of(shape: str, size: tuple[float, float, float], centre: tuple[float, float, float]) -> Region:
+def region_of(shape: str, size: Vector, centre: Vector) -> Region:
     """The region of a cube, box (edges) or sphere (diameter, three times)."""
     if shape == "sphere":
         return Region(centre, radius=0.5 * size[0])

@@ -17,7 +17,7 @@ from hgn.config import MESH_SUFFIXES, is_mesh_file
 from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.surface import area_vectors
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, Vector, require
 
 # what trimesh raises for damaged files of these formats
 _READ_ERRORS = (
@@ -41,8 +41,8 @@ def load_mesh(
     field: str = "mesh",
     *,
     scale: float = 1.0,
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    translation: Vector = (0.0, 0.0, 0.0),
+    rotation: Vector = (0.0, 0.0, 0.0),
 ) -> Obstacle:
     """Reads a mesh file: scaled, then turned about the fixed x, y and z axes (degrees, in this order), then moved.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hgn.scene.rotation import rotate
-from hgn.schema import require
+from hgn.schema import Vector, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Motion:
     time_T: np.ndarray  # float64, seconds, increasing
     translation_T3: np.ndarray  # float64, domain units
     rotation_T33: np.ndarray  # float64
-    pivot: tuple[float, float, float]
+    pivot: Vector
 
     def __post_init__(self) -> None:
         times = np.asarray(self.time_T, np.float64)

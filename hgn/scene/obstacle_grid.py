@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hgn.scene.scene import Obstacle
+from hgn.scene.scene import Obstacle, all_corners
 from hgn.scene.surface import area_vectors, sample_surface, split_long_edges
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, Vector, require
 
 CANCELLED = 0.25  # below this mean length the normals of a cell cancel; three faces of a corner give 0.58
 NORMAL_SPACING_CELLS = 0.25  # of the samples that normals are made from
@@ -34,7 +34,7 @@ def build_obstacle_grid(
     obstacles: Sequence[Obstacle],
     cell_size: float,
     seed: int,
-    domain_size: tuple[float, float, float] | None = None,
+    domain_size: Vector | None = None,
 ) -> ObstacleGrid:
     """The mean obstacle normal of every cell that a surface passes through (Paper sec. 3).
 
@@ -54,7 +54,7 @@ def surface_samples(
     obstacles: Sequence[Obstacle],
     cell_size: float,
     seed: int,
-    domain_size: tuple[float, float, float] | None = None,
+    domain_size: Vector | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The points that `build_obstacle_grid` takes normals from, float64 [S, 3], and their triangles' unit normals.
 
@@ -93,7 +93,7 @@ def surface_points(
     obstacles: Sequence[Obstacle],
     cell_size: float,
     seed: int,
-    domain_size: tuple[float, float, float] | None = None,
+    domain_size: Vector | None = None,
     spacing_cells: float = NORMAL_SPACING_CELLS,
 ) -> np.ndarray:
     """Points on obstacles no closer than `spacing_cells` cells, float32 [S, 3]: GNS's static particles.
@@ -108,15 +108,12 @@ def _samples(
     obstacles: Sequence[Obstacle],
     cell_size: float,
     seed: int,
-    domain_size: tuple[float, float, float] | None,
+    domain_size: Vector | None,
     spacing_cells: float = NORMAL_SPACING_CELLS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangle corners, surface points no closer than `spacing_cells` cells, and the triangle of each."""
     require(0 < cell_size < np.inf, "cell_size", "a finite number > 0", cell_size, "the paper uses 1/64")
-    corner_F33 = np.concatenate(
-        [np.zeros((0, 3, 3))]
-        + [np.asarray(item.vertex_V3, np.float64)[np.asarray(item.triangle_F3)] for item in obstacles]
-    )
+    corner_F33 = all_corners(obstacles)
     if domain_size is not None:
         box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
         corner_F33, _ = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)

@@ -22,12 +22,11 @@ from hgn.scene.rotation import quaternion_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import mesh_sha256, shape_obstacle, unit_shape
 from hgn.scene.surface import point_tree, split_long_edges
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, Vector, require
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-Vector = tuple[float, float, float]
 
 REPORT_SEED = 1_000_000  # the first of scenes that reports draw for themselves: a data set's seeds are hashes
 LAYOUTS = 5  # whole scenes begun afresh before giving up

@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from hgn.schema import Vector
+
 _QUARTER_TURNS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
 
 
@@ -21,7 +23,7 @@ def quaternion_rotation(quaternion: tuple[float, float, float, float]) -> np.nda
     )
 
 
-def euler_rotation(degrees: tuple[float, float, float]) -> np.ndarray:
+def euler_rotation(degrees: Vector) -> np.ndarray:
     """The matrix, float64 [3, 3], that turns about the fixed x axis, then y, then z.
 
     Quarter turns are exact: an axis-aligned mesh stays axis-aligned.

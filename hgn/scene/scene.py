@@ -7,6 +7,7 @@ Shape legend: N particles, V vertices, F triangles.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from hgn.scene.material import MATERIAL_PARAMETERS, MATERIALS, require_materials
 from hgn.scene.motion import Motion
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, Vector, require
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +32,16 @@ class Obstacle:
     friction: float | None = None  # Coulomb coefficient; None: mpm.collider_friction
     motion: Motion | None = None  # None: at rest
 
+    @property
+    def corners(self) -> np.ndarray:
+        """Of its triangles, float64 [F, 3, 3]."""
+        return np.asarray(self.vertex_V3, np.float64)[self.triangle_F3]
+
+
+def all_corners(obstacles: Sequence[Obstacle]) -> np.ndarray:
+    """Those of all triangles of several obstacles, float64 [F, 3, 3]."""
+    return np.concatenate([np.zeros((0, 3, 3)), *(obstacle.corners for obstacle in obstacles)])
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -40,9 +51,9 @@ class Scene:
     velocity_N3: np.ndarray  # float32, domain units per second
     material_N: np.ndarray  # uint8, index into MATERIALS
     obstacles: tuple[Obstacle, ...] = ()
-    domain_size: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    domain_size: Vector = (1.0, 1.0, 1.0)
     cell_size: float = 1 / 64  # spacing of the solver's grid and of the obstacle cells
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)  # domain units per second squared
+    gravity: Vector = (0.0, -9.8, 0.0)  # domain units per second squared
     seed: int = 0  # of the obstacle surface samples
     specification: dict[str, Any] = field(default_factory=dict)  # JSON-able: how the scene was made
     # float32 [N] by name (hgn.scene.material.MATERIAL_PARAMETERS), where they differ from the solver's settings;
@@ -51,7 +62,7 @@ class Scene:
     # of material at rest, where its filling is known: the solver then holds water to it
     particles_per_cell: float | None = None
     # Coulomb coefficients of the domain's walls across x, y (floor and ceiling) and z
-    wall_friction: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wall_friction: Vector = (0.0, 0.0, 0.0)
     # float64 [N], seconds, in order: when each particle enters, at the position and with the velocity given; 0: it is
     # there from the start. None: all are
     entry_s_N: np.ndarray | None = None

@@ -150,7 +150,7 @@ class GroupEntry(MaterialEntry):
         assert self.position is not None
 
     @property
-    def edges(self) -> tuple[float, float, float]:
+    def edges(self) -> Vector:
         """The three edges, or three times the side or diameter."""
         assert self.size is not None
         return self.size if isinstance(self.size, tuple) else (self.size, self.size, self.size)

@@ -16,6 +16,7 @@ import numpy as np
 from hgn.config import is_mesh_file
 from hgn.scene.rotation import rotate, round_to_float32
 from hgn.scene.scene import Obstacle
+from hgn.schema import Vector
 
 CLOSED_SHAPES = frozenset({"cone", "pyramid"})
 SEGMENTS = 32  # around a cone
@@ -25,7 +26,7 @@ SPHERE_SEGMENTS, SPHERE_RINGS = 24, 6  # facets stay within 0.9 % of the radius 
 def shape_obstacle(
     shape: str,
     size: float,
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    position: Vector = (0.0, 0.0, 0.0),
     rotation_33: np.ndarray | None = None,
     name: str | None = None,
 ) -> Obstacle:
@@ -77,7 +78,7 @@ def mesh_sha256(shape: str) -> str:
     return hashlib.sha256(Path(shape).read_bytes()).hexdigest()
 
 
-Mesh = tuple[list[tuple[float, float, float]], list[tuple[int, int, int]]]
+Mesh = tuple[list[Vector], list[tuple[int, int, int]]]
 
 
 def _square() -> Mesh:

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import permutations, product
 
+from hgn.schema import Vector
 from hgn.system.splitmix import splitmix64
 
 CELL_BITS = 17  # as in a cell's key
 CODE_BITS = 3 + CELL_BITS  # of an axis: where it comes from in two bits, whether mirrored, the box's cells
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from hgn.runtime.simulator import Simulator
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import write_rollout
 from hgn.scene.scene_file import ObstacleEntry
-from hgn.schema import ConfigError, require
-from hgn.viewer.placed import PlacedObstacle, Vector
+from hgn.schema import ConfigError, Vector, require
+from hgn.viewer.placed import PlacedObstacle
 from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
 from hgn.viewer.viser_compat import start_server, stop_server

@@ -24,8 +24,8 @@ from hgn.scene.rotation import euler_rotation, rotate, round_to_float32
 from hgn.scene.scene import Obstacle
 from hgn.scene.scene_file import ObstacleEntry
 from hgn.scene.shapes import shape_obstacle
+from hgn.schema import Vector
 
-Vector = tuple[float, float, float]
 _numbers = itertools.count()
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from hgn.scene.motion import Motion
 from hgn.scene.rollout_file import Rollout
-from hgn.schema import require
-from hgn.viewer.placed import PlacedObstacle, Vector
+from hgn.schema import Vector, require
+from hgn.viewer.placed import PlacedObstacle
 
 
 @dataclass(frozen=True, eq=False)

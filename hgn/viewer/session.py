@@ -26,8 +26,8 @@ from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
 from hgn.scene.scene_file import ObstacleEntry, SceneFile
-from hgn.schema import from_mapping, require, to_mapping
-from hgn.viewer.placed import PlacedObstacle, Vector, placed_at_rest, placed_by, with_obstacles
+from hgn.schema import Vector, from_mapping, require, to_mapping
+from hgn.viewer.placed import PlacedObstacle, placed_at_rest, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
 
 CLEARANCE = 1.25  # spacings of particles at rest, within which no drop enters

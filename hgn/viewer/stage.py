@@ -12,13 +12,13 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from hgn.render.renderer import BOX_COLOR, OBSTACLE_COLOR, PARTICLE_COLORS, box_corners, to_bytes
+from hgn.render.renderer import BOX_COLOR, BOX_EDGES, OBSTACLE_COLOR, PARTICLE_COLORS, box_corners, to_bytes
 from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Obstacle
+from hgn.schema import Vector
 
 DIAMETER_IN_SPACINGS = 1.2  # points that overlap a little look like a body
 ROOM_COLOR = (236, 238, 242)
-Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
@@ -52,9 +52,7 @@ class StageView:
         self.room = self.scene.add_mesh_simple(
             "/room", *_box(domain_size), color=ROOM_COLOR, side="back", flat_shading=True, cast_shadow=False
         )
-        edges = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
-        corner_83 = box_corners(domain_size)
-        self.scene.add_line_segments("/edges", np.array([corner_83[list(edge)] for edge in edges]), BOX_COLOR)
+        self.scene.add_line_segments("/edges", box_corners(domain_size)[np.array(BOX_EDGES)], BOX_COLOR)
         self.clouds = [
             self.scene.add_point_cloud(
                 f"/particles/{name}",

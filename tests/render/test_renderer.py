@@ -52,11 +52,11 @@ def test_smooth_normals():
     """A sphere's normals point outwards from its centre; a cube keeps the normals of its faces."""
     sphere = trimesh.creation.icosphere(subdivisions=3)
     corner = sphere.vertices[sphere.faces]
-    normal = smooth_normals(corner)
+    _, normal = smooth_normals(corner)
     normal /= np.linalg.norm(normal, axis=2, keepdims=True)
     assert (normal * corner).sum(axis=2).min() > 0.999
     box = trimesh.creation.box()
-    normal = smooth_normals(box.vertices[box.faces])
+    _, normal = smooth_normals(box.vertices[box.faces])
     normal /= np.linalg.norm(normal, axis=2, keepdims=True)
     np.testing.assert_allclose(normal, np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-9)
 

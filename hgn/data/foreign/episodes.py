@@ -19,7 +19,7 @@ from hgn.data.foreign.trajectory import SetInfo, Trajectory
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.obstacle_grid import ObstacleGrid
-from hgn.schema import ConfigError, require
+from hgn.schema import ConfigError, Vector, require
 
 CELL_OF_RADIUS = 1 / 64 / NetworkConfig.cell_size  # the paper's obstacle cells, in its networks' cells
 AT_REST = 1e-3  # of the radius: by so much particles of the boundary may move
@@ -35,7 +35,7 @@ class Converter:
     history: int
     obstacle_cell_size: float
     present: set[str] = field(default_factory=set)  # materials
-    gravities: set[tuple[float, float, float]] = field(default_factory=set)
+    gravities: set[Vector] = field(default_factory=set)
     maximum_initial_speed: float = 0.0  # length per second
     with_obstacles: bool = False
 
