@@ -14,7 +14,7 @@ from hgn.schema import ConfigError
 
 
 def first_indices(store: AnyStore, count: int, published: int | None = None) -> list[int]:
-    """Where in the store the episodes of lowest index among the first `known` published (all of them if absent) are."""
+    """Where in the store the episodes of lowest index among the first `published` (all if absent) are."""
     places = ((entry.index, place) for place, entry in enumerate(islice(store.entries, published)))
     return [place for _, place in nsmallest(count, places)]
 
@@ -26,7 +26,7 @@ def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
     """
     if not len(store):
         raise ConfigError(f"data must hold episodes of the split {store.split}, got none in {store.folder}")
-    return [store.episodes[i] for i in first_indices(store, count)]
+    return [store.open(i) for i in first_indices(store, count)]
 
 
 def find_episode(folder: Path | str, key: str) -> Episode:
@@ -40,5 +40,5 @@ def find_episode(folder: Path | str, key: str) -> Episode:
     store = EpisodeStore(folder, split)
     for place, entry in enumerate(store.entries):
         if entry.key == key:
-            return store.episodes[place]
+            return store.open(place)
     raise ConfigError(f"episode must be one of the {len(store)} {split} episodes in {folder}, got {key!r}")

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from hgn.data.manifest import EpisodeEntry, Manifest
-from hgn.data.reader import EpisodeSequence, EpisodeStore
+from hgn.data.reader import Episodes, EpisodeStore
 from hgn.data.statistics import Statistics, merge_statistics
 from hgn.scene.episode import Episode
 
 
-class PooledStore:
+class PooledStore(Episodes):
     """One split of `own`, behind the same of `others`: of these what was published when they were opened.
 
     Read as an EpisodeStore is: places of episodes count over all of them, and only ever `own` grows.
@@ -78,11 +78,6 @@ class PooledStore:
         """How many each of these has, by the indices."""
         return [store.particles([place])[0] for store, place in map(self._place, episodes)]
 
-    @property
-    def episodes(self) -> Sequence[Episode]:
-        """The episodes, opened on first use."""
-        return EpisodeSequence(self)
-
     def statistics(self) -> Statistics:
         """Velocity and acceleration of all sets together, in frame units."""
         return merge_statistics(store.statistics() for store in (*self.others, self.own))
@@ -101,13 +96,11 @@ class PooledStore:
             return self.own, index - self._still
         return self.others[number], index - int(self._ends[number]) + len(self.others[number])
 
-    def _by_store(self, indices: Sequence[int]) -> list[tuple[EpisodeStore, list[int]]]:
-        places: dict[int, list[int]] = defaultdict(list)
-        stores: dict[int, EpisodeStore] = {}
+    def _by_store(self, indices: Sequence[int]) -> Iterable[tuple[EpisodeStore, list[int]]]:
+        places: dict[EpisodeStore, list[int]] = defaultdict(list)
         for store, place in map(self._place, indices):
-            stores[id(store)] = store
-            places[id(store)].append(place)
-        return [(stores[key], some) for key, some in places.items()]
+            places[store].append(place)
+        return places.items()
 
 
 AnyStore = EpisodeStore | PooledStore

@@ -10,11 +10,12 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, overload
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,28 @@ from hgn.schema import ConfigError, require
 MAPPED_SHARDS = 256  # at once; a process may have 1,024 files open where nothing else is said
 
 
-class EpisodeStore:
+class Episodes(Sequence[Episode], ABC):
+    """What reads as the list of its episodes, each opened on access."""
+
+    @abstractmethod
+    def open(self, index: int) -> Episode:
+        """The episode at a place, from 0 on, below the number of them."""
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self.open(i) for i in range(len(self))[index]]
+        return self.open(range(len(self))[index])
+
+    @property
+    def episodes(self) -> Sequence[Episode]:
+        """The episodes, in publication order; each is opened, and its shard verified, on first use.
+
+        `position_TN3` is a read-only `np.memmap`. Raises on access: ConfigError when a shard is missing or altered.
+        """
+        return self
+
+
+class EpisodeStore(Episodes):
     """The published episodes of one split of a data set, in a folder or at a URL; it only grows.
 
     Picklable for spawned workers: the folder, split and manifest travel, open files and maps do not.
@@ -87,17 +109,17 @@ class EpisodeStore:
                 f"{self.folder} must keep the {self.split} shards already published, got a manifest (revision "
                 f"{manifest.revision}) without some of them; start again"
             )
-        known, self.manifest = len(self), manifest
-        return len(self) > known
+        before, self.manifest = len(self), manifest
+        return len(self) > before
 
     def within_reach(self, indices: Sequence[int], patience_s: float) -> bool:
         """Whether these episodes can be read without waiting longer for a server; their shards are brought here.
 
         Raises: ConfigError when a shard is missing or altered.
         """
-        for shard in {shard.name: shard for shard, _ in map(self._locate, indices)}.values():
+        for shard in self._shards(indices):
             try:
-                open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, patience_s)
+                self._bring(shard, patience_s=patience_s)
             except UnreachableError:
                 return False
         return True
@@ -112,7 +134,7 @@ class EpisodeStore:
             return
         with self._lock:
             if episodes is not None:
-                self._wanted = list({shard.name: shard for shard, _ in map(self._locate, episodes)}.values())
+                self._wanted = self._shards(episodes)
                 self._spared = frozenset(shard.sha256 for shard in self._wanted)
             elif self._fetched == len(self.manifest.shards):
                 return
@@ -127,7 +149,7 @@ class EpisodeStore:
         with contextlib.suppress(ConfigError, OSError):
             for shard in self.manifest.shards.since(self._fetched):
                 if shard.split == self.split:
-                    open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, spared=None)
+                    self._bring(shard, spared=None)
                 self._fetched += 1
 
     def _fetch_wanted(self) -> None:
@@ -138,7 +160,7 @@ class EpisodeStore:
                         self._fetcher = None
                         return
                     shard, spared = self._wanted.pop(0), self._spared
-                open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, spared=spared)
+                self._bring(shard, spared=spared)
 
     def digest(self, count: int) -> str | None:
         """Tells the first `count` episodes from any others; none where no shard ends with the last of them."""
@@ -168,14 +190,6 @@ class EpisodeStore:
         """How many each of these has, by the index."""
         return self.manifest.shards.particles(self.split, episodes)
 
-    @property
-    def episodes(self) -> Sequence[Episode]:
-        """The episodes, in publication order; each is opened, and its shard verified, on first use.
-
-        `position_TN3` is a read-only `np.memmap`. Raises on access: ConfigError when a shard is missing or altered.
-        """
-        return self._episodes
-
     def statistics(self) -> Statistics:
         """Velocity and acceleration of this split in frame units."""
         return self.manifest.statistics(self.split)
@@ -192,7 +206,6 @@ class EpisodeStore:
 
     def _reset(self) -> None:
         self._open_shards: OrderedDict[str, _OpenShard] = OrderedDict()
-        self._episodes = EpisodeSequence(self)
         self._fetcher = None
         self._frames: list[int] = []  # of the episodes of the data set's first shards, where they may differ
         self._measured = 0  # how many shards these are
@@ -201,16 +214,23 @@ class EpisodeStore:
         self._lock = threading.Lock()
         holders.add(self)
 
+    def _bring(self, shard: ShardEntry, **options: Any) -> Path:
+        """A shard's verified file on this machine; options and errors are those of `Storage.shard`."""
+        return open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes, **options)
+
     def _locate(self, index: int) -> tuple[ShardEntry, EpisodeEntry]:
         return self.manifest.shards.locate(self.split, index)
 
+    def _shards(self, indices: Sequence[int]) -> list[ShardEntry]:
+        """Those of some episodes, once each, in their order."""
+        return list({shard.name: shard for shard, _ in map(self._locate, indices)}.values())
+
     def open(self, index: int) -> Episode:
-        """The episode at a place in publication order, below the number of them."""
         shard, entry = self._locate(index)
         while True:
             opened = self._open_shards.get(shard.name)
             if opened is None:  # outside of the lock: this may wait for a server
-                opened = _OpenShard(open_storage(self.folder).shard(shard.name, shard.sha256, shard.bytes))
+                opened = _OpenShard(self._bring(shard))
             with self._lock:
                 opened = self._open_shards.setdefault(shard.name, opened)
                 self._open_shards.move_to_end(shard.name)
@@ -237,16 +257,16 @@ class EpisodeStore:
 
     def _read(self, content: np.ndarray, shard: ShardEntry, entry: EpisodeEntry) -> Episode:
         episode = read_episode(content, shard.name, entry.key, entry.members)
-        found = (episode.seed, episode.particle_count, episode.frame_count)
+        actual = (episode.seed, episode.particle_count, episode.frame_count)
         expected = (entry.seed, entry.particles, entry.frames)
         config = self.manifest.config
         # imported episodes are of any length
         frames = config.get("frames", entry.frames)
         lengths = {frames, config.get("long_frames", frames)}
-        if found != expected or entry.frames not in lengths:
+        if actual != expected or entry.frames not in lengths:
             raise ConfigError(
                 f"{self.folder}/{shard.name}: {entry.key} must have seed, particles, frames {expected}, and as many "
-                f"frames as the data set's ({lengths}), got {found}; delete manifest.json and run the generator again"
+                f"frames as the data set's ({lengths}), got {actual}; delete manifest.json and run the generator again"
             )
         return episode
 
@@ -254,49 +274,18 @@ class EpisodeStore:
 class _OpenShard:
     """One map a shard, not one an episode."""
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        # of an empty file there is no map
+        self.content = np.memmap(path, np.uint8, mode="r") if path.stat().st_size else np.zeros(0, np.uint8)
+        self.episodes: dict[str, Episode] = {}
+
     def size(self) -> int | None:
         """Of the file now; none where it is gone."""
         try:
             return self.path.stat().st_size
         except FileNotFoundError:
             return None
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.content = np.memmap(path, dtype=np.uint8, mode="r")
-        self.episodes: dict[str, Episode] = {}
-
-
-class _Opens(Protocol):
-    """What an episode is opened by."""
-
-    def __len__(self) -> int: ...
-
-    def open(self, index: int) -> Episode: ...
-
-
-class EpisodeSequence(Sequence[Episode]):
-    """The list of episodes of a store, opened on access."""
-
-    def __init__(self, store: _Opens) -> None:
-        self._store = store
-
-    @overload
-    def __getitem__(self, index: int) -> Episode: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Episode]: ...
-
-    def __getitem__(self, index: int | slice) -> Episode | list[Episode]:
-        if isinstance(index, slice):
-            return [self._store.open(i) for i in range(len(self))[index]]
-        return self._store.open(range(len(self))[index])
-
-    def __len__(self) -> int:
-        return len(self._store)
-
-    def __iter__(self) -> Iterator[Episode]:
-        return (self._store.open(i) for i in range(len(self)))
 
 
 def read_episode(
