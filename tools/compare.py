@@ -26,9 +26,8 @@ from hgn.command import run_command
 from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds, to_mapping
 from hgn.system.files import write_json
 from hgn.system.provenance import provenance, without_folders
-from tools.bench.contenders import PASS
+from tools.report import EXIT_RED, PASS
 
-EXIT_RED = 1
 SOURCES = ("hgn", "tools", "conf", "datagen", "pyproject.toml")  # of a commit
 WORK = ("case", "particles", "scenes", "precision")  # what is the same work in two trees
 

@@ -1,10 +1,9 @@
-"""Simulating test scenes with the solver, to the end or to its failure, and how long a frame takes."""
+"""Simulating test scenes with the solver, to the end or to its failure."""
 
 from __future__ import annotations
 
 import hashlib
 import pickle
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,27 +17,6 @@ from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.scene import Scene
 from hgn.system.files import make_folder, temporary_file
-
-TOGETHER_S = 20e-6  # frames that are reported less than this apart were computed together
-
-
-class FrameClock:
-    """Notes when frames are done; a simulator may report several at once."""
-
-    def __init__(self) -> None:
-        self.ends: list[float] = []
-
-    def __call__(self, frame: int) -> None:
-        self.ends.append(time.perf_counter())
-
-    def milliseconds(self) -> float | None:
-        """Mean time of a frame behind the first ones, which start things up; none where there are too few."""
-        gaps = np.diff(self.ends)
-        later = np.flatnonzero(gaps > TOGETHER_S)
-        if not len(later):
-            return None
-        first = int(later[0])
-        return 1e3 * float(gaps[first:].sum()) / (len(self.ends) - 1 - first)
 
 
 def solver_scene(episode: Episode, cell_size: float | None = None) -> Scene:

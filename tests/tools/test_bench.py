@@ -17,12 +17,12 @@ from hgn.network.grid import build_hierarchy
 from hgn.network.neighbours import neighbour_list
 from hgn.runtime.simulator import Simulator
 from hgn.schema import ConfigError, from_mapping
-from tools.bench import contenders, triton_contenders
+from tools.bench import contenders
 from tools.bench.__main__ import main, workloads
 from tools.bench.config import BenchConfig
 from tools.bench.states import TILE_PARTICLES, Workload, positions, scene_of
-from tools.bench.timing import Timed, alternate
 from tools.bench.triton_contenders import TritonFrame, TritonTrain
+from tools.timing import Timed, alternate, median_and_quartiles
 
 CPU = torch.device("cpu")
 SMALL = {
@@ -109,18 +109,18 @@ def test_gns_in_half_precision(tmp_path):
 def test_triton_is_checked_like_torch():
     """Frames, loss and gradients of backend triton pass in float32 (in the interpreter), and a wrong weight not."""
     config = NetworkConfig(width=16, levels=1, message_passing_steps=1)
-    frame = TritonFrame("fp32", config, Workload(2, 1), CPU)
+    frame = TritonFrame(config, Workload(2, 1), CPU, "fp32")
     assert frame.check("fp32") == "pass"
     frame.rollout.values.mul_(1.001)
     frame.rollout._build(frame.rollout.grid.capacities)
     assert frame.check("fp32").startswith("relative error of acceleration")
-    train = TritonTrain("fp32", config, Workload(2, 2), CPU)
+    train = TritonTrain(config, Workload(2, 2), CPU, "fp32")
     assert train.check("fp32") == "pass"
     with torch.no_grad():
         train.network.decode.second.bias += 0.1
     expected = contenders.reference_gradients(train.network, train.batch)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(triton_contenders, "reference_gradients", lambda *_: (1.001 * expected[0], expected[1]))
+        patch.setattr(contenders, "reference_gradients", lambda *_: (1.001 * expected[0], expected[1]))
         assert train.check("fp32").startswith("relative error of loss 1.0e-03 exceeds")
 
 
@@ -151,21 +151,19 @@ def test_contenders_take_turns():
     """After the warm-up samples alternate, a long contender joins now and then, and the median is of the rest."""
     order: list[str] = []
 
-    def sample(name):
-        def run():
-            order.append(name)
-            return [float(len(order))]
+    class Named(Timed):
+        def __init__(self, name, rounds=None):
+            self.name, self.rounds = name, rounds
 
-        return run
+        def sample(self):
+            order.append(self.name)
+            return float(len(order))
 
-    contenders_ = [Timed(sample("a")), Timed(sample("b")), Timed(sample("c"), rounds=2)]
-    alternate(contenders_, 6, 60.0)
+    times = alternate([Named("a"), Named("b"), Named("c", rounds=2)], 6, 60.0)
     assert "".join(order) == "aaabbbc" + "abc" + "ab" * 2 + "abc" + "ab" * 2
-    assert [len(timed.milliseconds) for timed in contenders_] == [6, 6, 2]
-    low, middle, high = contenders_[0].quartiles()
-    assert low < middle < high
-    alternate(short := [Timed(sample("d"))], 100, 0.0)
-    assert len(short[0].milliseconds) == 5
+    assert [len(milliseconds) for milliseconds in times] == [6, 6, 2]
+    assert median_and_quartiles([4.0, 1.0, 2.0, 3.0, 5.0]) == {"ms": 3.0, "ms_quartiles": [2.0, 4.0], "samples": 5}
+    assert len(alternate([Named("d")], 100, 0.0)[0]) == 5
 
 
 @pytest.mark.parametrize(

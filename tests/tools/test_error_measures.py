@@ -25,7 +25,8 @@ from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import energies, energy_scale, momentum_error, outside_domain
-from tools.solver_rollouts import FrameClock, other_grid
+from tools.solver_rollouts import other_grid
+from tools.timing import FrameClock
 
 CPU = torch.device("cpu")
 
@@ -42,7 +43,7 @@ def test_baseline_errors_are_those_of_training(data):
     network = network_of(torch.float32, obstacle_features=False)
     batches = frame_batches([episode], network, 1, 100)
     expected = one_step_errors({"fall": lambda b: 0.9 * ballistic(b)}, batches, CPU, network.config.materials)
-    assert gravity.one_step(episode, 1, 0.0).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
+    assert gravity.one_step(episode, 1).error.mse == pytest.approx(expected["fall"].mse, rel=1e-5)
 
 
 def test_the_fast_path_tells_its_own_errors(data):
@@ -77,7 +78,7 @@ def test_ghost_acceleration_counts_particles_at_rest(data):
         initial_velocity_N3=np.zeros_like(episode.initial_velocity_N3),
         gravity=(0.0, 0.0, 0.0),
     )
-    step = BaselineContender("push", lambda e: np.array([3e-3, 0.0, 4e-3]), CPU).one_step(still, 1, 1e-4)
+    step = BaselineContender("push", lambda e: np.array([3e-3, 0.0, 4e-3]), CPU).one_step(still, 1)
     assert step.rest_count == 8 * (position_TN3.shape[1] - 1)
     assert score.one_step_figures([step])["ghost"] == pytest.approx(5e-3, rel=1e-5)
 
@@ -163,7 +164,7 @@ def test_other_grids_keep_their_walls():
 def test_scenes_that_failed_leave_the_means(data):
     """Errors at a frame are means over the scenes that reached it, and say over how many."""
     episodes = list(EpisodeStore(data, "validation").episodes)
-    config = ErrorVsTimeConfig(data="d", out="x", sinkhorn_points=4)
+    config = ErrorVsTimeConfig(data="d", out="x")
     paths = [np.array(episode.position_TN3) for episode in episodes]
     trials = [RolloutResult(paths[0] + np.float32(0.1)), RolloutResult(paths[1][:3] + np.float32(0.2), "why")]
     row = score.rollout_figures(trials, episodes, config, CPU)

@@ -84,7 +84,7 @@ def test_the_report(data, tmp_path, monkeypatch, capsys):
         "timed_batches": [2],
         "timed_scenes": 1,
     }
-    options |= {"sinkhorn_points": 8, "device": "cpu"}
+    options |= {"device": "cpu"}
     assert main(options) == 0
     report = json.loads(Path(f"{out}.json").read_text())
     assert {"device", "versions", "commit", "date", "command", "convention", "reference"} <= report["meta"].keys()
@@ -199,6 +199,7 @@ def test_what_counts_most_comes_first(data, tmp_path, monkeypatch, capsys):
     the cause, the others go on, and only a fault that nobody foresaw makes the exit code 1."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
     monkeypatch.setattr("tools.error_vs_time.__main__.GNS_ORDER", ("fp32", "fp16", "tf32"))
+    monkeypatch.setattr("tools.error_vs_time.contenders.REPEATED_FRAMES", 3)
     files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("gns", "hgn")]
     order: list[str] = []
 
@@ -218,7 +219,7 @@ def test_what_counts_most_comes_first(data, tmp_path, monkeypatch, capsys):
         "timed_batches": [2],
         "sinkhorn_scenes": 0,
     }
-    options |= {"mpm_grids": [48, 64], "mpm_steps": [0.5], "precisions": ["tf32", "fp32"], "repeated_frames": 3}
+    options |= {"mpm_grids": [48, 64], "mpm_steps": [0.5], "precisions": ["tf32", "fp32"]}
     assert main(options) == 0
     assert [name.split(" (")[0] for name in order] == [
         *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
@@ -330,7 +331,7 @@ def test_what_launches_none_of_the_kernels_is_scored_beside_their_compilation(da
 
 
 SHORT = {"split": "validation", "device": "cpu", "frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1}
-SHORT |= {"sinkhorn_points": 8, "batch_scenes": 2, "timed_batches": [2], "mpm_timed_frames": 4, "perturbation": 0.0}
+SHORT |= {"batch_scenes": 2, "timed_batches": [2], "mpm_timed_frames": 4, "perturbation": 0.0}
 
 
 def test_a_report_goes_on_where_it_was_cut_off(data, tmp_path, monkeypatch):

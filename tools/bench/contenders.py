@@ -7,7 +7,6 @@ on one scene of a tile, by the same code.
 from __future__ import annotations
 
 import copy
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +25,8 @@ from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
 from tools.bench.config import BenchConfig
 from tools.bench.states import SPEED, TILE_PARTICLES, Workload, batch_of, scene_of, state_of
-from tools.bench.timing import Timed, once
+from tools.report import PASS
+from tools.timing import FrameClock, Timed, once
 
 BOUNDS = {"fp32": 1e-5, "tf32": 2e-3, "fp16": 2e-3}  # relative error of accelerations and loss, of the norm
 # Of all gradients together. Looser, for rounding turns the activations that lie next to their kink: of millions of
@@ -35,7 +35,8 @@ GRADIENT_BOUNDS = {"fp32": 1e-3, "tf32": 5e-2, "fp16": 5e-2}
 FRAME_RATE_HZ = 60.0
 CHECKED_AT_MOST = {"frame": 50_000, "train": TILE_PARTICLES}  # particles of all scenes
 MPM_ROUNDS = 5
-PASS = "pass"
+OBSTACLE_CELL_SIZE = 1 / 64
+DATA = DataInfo("", FRAME_RATE_HZ, OBSTACLE_CELL_SIZE)
 
 
 def checked_workload(work: Workload, what: str) -> Workload:
@@ -54,19 +55,30 @@ def bench_network(config: NetworkConfig, device: torch.device) -> ParticleNetwor
     return network.to(device).eval()
 
 
-class TimedRun:
-    """What is timed run by run."""
+def training_module(config: NetworkConfig, scenes: int, device: torch.device) -> TrainingModule:
+    """The training of the bench's network, the same weights in every process."""
+    network = bench_network(config, device).train()
+    return TrainingModule(network, TrainingConfig(batch_scenes=scenes), DATA).to(device)
+
+
+class Contender(Timed):
+    """What is timed run by run, once it was checked."""
 
     device: torch.device
+    at_once = 1  # so many times what is told in one run
 
     def run(self) -> object:
         raise NotImplementedError
 
-    def timed(self) -> Timed:
-        return Timed(lambda: [once(self.run, self.device)])
+    def check(self, precision: str) -> str:
+        """`pass`, or by how much what it computes differs."""
+        raise NotImplementedError
+
+    def sample(self) -> float:
+        return once(self.run, self.device) / self.at_once
 
 
-class Frame(TimedRun):
+class Frame(Contender):
     """One frame of a simulation: features, grid or neighbours, network, integration."""
 
     def __init__(
@@ -87,20 +99,15 @@ class Frame(TimedRun):
         return self.simulator.step(self.state)
 
     def check(self, precision: str) -> str:
-        """`pass`, or by how much the accelerations differ from float64."""
-        found_N3 = self.run().velocity_NM3[:, 0].double() - self.state.velocity_NM3[:, 0].double()
-        with torch.no_grad():
-            expected_N3 = reference_acceleration(self.network, self.state)
-        return verdict("acceleration", relative_error(found_N3, expected_N3), BOUNDS[precision])
+        return check_acceleration(self.run().velocity_NM3[:, 0], self.network, self.state, precision)
 
 
-class Train(TimedRun):
+class Train(Contender):
     """One training step on data that is on the device: noise, jitter, forward, backward, Adam."""
 
     def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
         self.device = device
-        training = TrainingConfig(batch_scenes=work.scenes)
-        self.module = TrainingModule(bench_network(config, device).train(), training, _data_info()).to(device)
+        self.module = training_module(config, work.scenes, device)
         self.module.backend = with_gradients(self.module.network, precision)
         self.batch = batch_of(work, config, device)
         self.optimizer = self.module.configure_optimizers()["optimizer"]
@@ -111,23 +118,16 @@ class Train(TimedRun):
         self.optimizer.step()
 
     def check(self, precision: str) -> str:
-        """`pass`, or by how much loss or gradients differ from float64, without noise and jitter."""
         plain = replace(self.module.training_config, noise_std=0.0, grid_jitter=False)
-        module = TrainingModule(self.module.network, plain, _data_info())
+        module = TrainingModule(self.module.network, plain, DATA)
         module.backend = self.module.backend
         module.network.zero_grad()
         loss = module.loss(self.batch)
         loss.backward()
-        gradients = [_gradient(p) for p in module.network.parameters()]
-        expected_loss, expected = reference_gradients(module.network, self.batch)
-        first = verdict("loss", relative_error(loss.detach().double(), expected_loss), BOUNDS[precision])
-        if first != PASS:
-            return first
-        error = relative_error(torch.cat(gradients).double(), expected)
-        return verdict("gradient", error, GRADIENT_BOUNDS[precision])
+        return check_update(loss.detach(), _gradients(module.network), module.network, self.batch, precision)
 
 
-class MpmFrame:
+class MpmFrame(Timed):
     """One frame of the solver that makes the data, at its converged step: of the same particles at rest. What it takes
     with landed and random scenes is measured by tools.studies.solver_targets.
     """
@@ -137,21 +137,18 @@ class MpmFrame:
         self.config = MpmConfig(device="gpu" if device.type == "cuda" else "cpu", scenes_per_launch=work.scenes)
         self.frames = config.mpm_frames
         self.particles = sum(scene.particle_count for scene in self.scenes) // work.scenes
-        self.failure: str | None = None
-        self.warm = False
+        self.rounds, self.warm = MPM_ROUNDS, False
         self.substeps = 0.0  # of a frame, mean over particles
 
-    def sample(self) -> list[float]:
+    def sample(self) -> float:
         """Milliseconds a frame of a short simulation: frames may come several at once."""
         from datagen.mpm.solver import SceneFailure, simulate
 
         if not self.warm:  # compilation is no part of it
             simulate(self.scenes, self.config, 2, FRAME_RATE_HZ, lambda _: None)
             self.warm = True
-        ends: list[float] = []
-        results = simulate(
-            self.scenes, self.config, self.frames, FRAME_RATE_HZ, lambda _: ends.append(time.perf_counter())
-        )
+        clock = FrameClock()
+        results = simulate(self.scenes, self.config, self.frames, FRAME_RATE_HZ, clock)
         steps = 0
         for scene, result in zip(self.scenes, results, strict=True):
             if isinstance(result, SceneFailure):
@@ -162,40 +159,41 @@ class MpmFrame:
                 steps += result.counters["substeps"] * scene.particle_count
         particles = sum(scene.particle_count for scene in self.scenes)
         self.substeps = steps / particles / (self.frames - 1)
-        return [(ends[-1] - ends[0]) * 1e3 / (self.frames - 1)]
-
-    def timed(self) -> Timed:
-        return Timed(self.sample, MPM_ROUNDS)
+        return (clock.ends[-1] - clock.ends[0]) * 1e3 / (self.frames - 1)
 
 
-def _data_info() -> DataInfo:
-    return DataInfo("", FRAME_RATE_HZ, 1 / 64)
+def check_acceleration(
+    velocity_N3: torch.Tensor, network: ParticleNetwork, state: ParticleState, precision: str
+) -> str:
+    """`pass`, or by how much the velocities after a frame differ from what float64 gives."""
+    reference = copy.deepcopy(network).double()
+    with torch.no_grad():
+        expected_N3 = reference.restored_acceleration(reference_output(reference, state), state)
+    error = relative_error(velocity_N3.double() - state.velocity_NM3[:, 0].double(), expected_N3)
+    return verdict("acceleration", error, BOUNDS[precision])
 
 
-def _double(batch: Batch) -> Batch:
-    return replace(batch, window_WN3=batch.window_WN3.double(), domain_S3=batch.domain_S3.double())
+def check_update(
+    loss: torch.Tensor, gradient: torch.Tensor, network: ParticleNetwork, batch: Batch, precision: str
+) -> str:
+    """`pass`, or by how much loss or gradients, without noise and jitter, differ from float64."""
+    expected_loss, expected = reference_gradients(network, batch)
+    check = verdict("loss", relative_error(loss.double(), expected_loss), BOUNDS[precision])
+    if check == PASS:
+        check = verdict("gradient", relative_error(gradient.double(), expected), GRADIENT_BOUNDS[precision])
+    return check
 
 
 def reference_gradients(network: ParticleNetwork, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
     """The float64 network's loss without noise and jitter, and the gradients of all parameters, end to end."""
-    reference = _reference(network)
+    reference = copy.deepcopy(network).double()
     reference.zero_grad()
-    target_N3 = reference.target(_double(batch).acceleration(), batch.gravity_S3[batch.scene_N])
+    double = replace(batch, window_WN3=batch.window_WN3.double(), domain_S3=batch.domain_S3.double())
+    target_N3 = reference.target(double.acceleration(), batch.gravity_S3[batch.scene_N])
     predicted_N3 = reference_output(reference, batch.state())
     loss = batch.mean_over_scenes((predicted_N3 - target_N3).square().mean(-1))
     loss.backward()
-    return loss.detach(), torch.cat([_gradient(p) for p in reference.parameters()])
-
-
-def reference_acceleration(network: ParticleNetwork, state: ParticleState) -> torch.Tensor:
-    """What the float64 network predicts."""
-    reference = _reference(network)
-    return reference.restored_acceleration(reference_output(reference, state), state)
-
-
-def _reference(network: ParticleNetwork) -> ParticleNetwork:
-    """A copy in float64."""
-    return copy.deepcopy(network).double()
+    return loss.detach(), _gradients(reference)
 
 
 def reference_output(reference: ParticleNetwork, state: ParticleState) -> torch.Tensor:
@@ -216,5 +214,7 @@ def verdict(what: str, error: float, bound: float) -> str:
     return PASS if error <= bound else f"relative error of {what} {error:.1e} exceeds {bound:.0e}"  # NaN fails
 
 
-def _gradient(parameter: torch.Tensor) -> torch.Tensor:
-    return torch.zeros_like(parameter).flatten() if parameter.grad is None else parameter.grad.flatten()
+def _gradients(network: torch.nn.Module) -> torch.Tensor:
+    """Of all parameters, end to end; zero where there is none."""
+    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in network.parameters()]
+    return torch.cat([gradient.flatten() for gradient in gradients])

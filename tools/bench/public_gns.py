@@ -31,7 +31,7 @@ from hgn.network.neighbours import neighbour_list
 from hgn.runtime.parity import relative_error
 from hgn.schema import ConfigError, require
 from hgn.training.noise import perturbed_window
-from tools.bench.contenders import BOUNDS, TimedRun, bench_network, reference_output, verdict
+from tools.bench.contenders import BOUNDS, Contender, bench_network, reference_output, verdict
 from tools.bench.states import Workload, batch_of
 
 MODULE = "gns.learned_simulator"
@@ -117,10 +117,12 @@ def copy_weights(simulator: nn.Module, network: GraphNetworkSimulator) -> None:
     _copy([theirs._decoder.node_fn], network.decode)
 
 
-class PublicGns(TimedRun):
+class PublicGns(Contender):
     """Their simulator on the bench's states, and ours with the same weights to check it against."""
 
-    def __init__(self, folder: Path, config: NetworkConfig, work: Workload, device: torch.device) -> None:
+    def __init__(
+        self, folder: Path, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32"
+    ) -> None:
         network = bench_network(config, device)
         assert isinstance(network, GraphNetworkSimulator)
         self.device, self.network = device, network
@@ -166,10 +168,9 @@ class PublicFrame(PublicGns):
 class PublicTrain(PublicGns):
     """One of their training steps: noise, forward, backward, Adam."""
 
-    def __init__(self, folder: Path, config: NetworkConfig, work: Workload, device: torch.device) -> None:
-        super().__init__(folder, config, work, device)
-        self.noise_std = TrainingConfig().noise_std
-        self.optimizer = torch.optim.Adam(self.simulator.parameters(), lr=TrainingConfig().learning_rate)
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.optimizer = torch.optim.Adam(self.simulator.parameters(), lr=TrainingConfig.learning_rate)
 
     def loss(self, batch: Batch) -> torch.Tensor:
         """Their loss: the squared error summed over axes."""
@@ -177,7 +178,7 @@ class PublicTrain(PublicGns):
         return (found_N3 - target_N3).square().sum(-1).mean()
 
     def run(self) -> None:
-        noisy = replace(self.batch, window_WN3=perturbed_window(self.batch, self.noise_std))
+        noisy = replace(self.batch, window_WN3=perturbed_window(self.batch, TrainingConfig.noise_std))
         loss = self.loss(noisy)
         self.optimizer.zero_grad()
         loss.backward()

@@ -28,12 +28,11 @@ from hgn.data.reader import EpisodeStore
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, shipped_weights
 from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
-from hgn.schema import ConfigError, from_mapping, from_stored, require, to_mapping
+from hgn.schema import ConfigError, from_mapping, from_stored, require
 from hgn.system.device import choose_device
 from hgn.system.files import write_json
 from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
-from hgn.system.provenance import provenance, without_folders
 from tools.error_vs_time.contenders import (
     COARSE_GRIDS,
     PARTICLES_AT_ONCE,
@@ -44,18 +43,20 @@ from tools.error_vs_time.contenders import (
     SolverContender,
     solver_row,
 )
-from tools.error_vs_time.earlier import Earlier, is_among
+from tools.error_vs_time.earlier import Earlier, same_row
 from tools.error_vs_time.paired import paired_lines, paired_rows
 from tools.error_vs_time.plot import CONVENTION
 from tools.error_vs_time.run import Run, draw
 from tools.error_vs_time.score import table
 from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.report import meta_of
 from tools.solver_launches import Setting, SolverLaunches
 from tools.solver_rollouts import other_grid
 
 if TYPE_CHECKING:
     from hgn.runtime.precompile import Precompilation
 
+REFERENCE_STEP = 0.25  # of the limit of stability, on the data's own grid
 COMPILING_FRACTION = 0.4  # of the seconds given, until when kernels that are compiled ahead are waited for
 HGN_ORDER, GNS_ORDER = ("tf32", "fp16", "fp32"), ("fp16", "tf32", "fp32")  # what tells most for its time first
 
@@ -69,14 +70,15 @@ def main(mapping: dict[str, Any]) -> int:
         return _draw_again(config, earlier)
     Path(config.out).parent.mkdir(parents=True, exist_ok=True)
     device = choose_device(config.device)
+    processor = "gpu" if device.type == "cuda" else "cpu"
     store = EpisodeStore(config.data, config.split)
     episodes = first_episodes(store, config.scenes)
     frames = min(config.frames, *(len(episode.position_TN3) for episode in episodes))
     for report in earlier:
         report.require_same([episode.key for episode in episodes], frames, _reference_name(config))
     known = [row for report in earlier for row in report.rows]
-    mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=_solver_device(device))
-    networks = [c for c in network_contenders(config, device, episodes) if not is_among(c.row, known)]
+    mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=processor)
+    networks = [c for c in network_contenders(config, device, episodes) if same_row(c.row, known) is None]
     own_cell, rate = episodes[0].obstacle_grid.cell_size, episodes[0].frame_rate_hz
     own_grid = round(1 / own_cell)
 
@@ -93,13 +95,13 @@ def main(mapping: dict[str, Any]) -> int:
         if precompilation is not None:
             stack.enter_context(precompilation)
         if config.resimulate:
-            references, left_out = resimulated(episodes, launches(own_grid), config.reference_step)
+            references, left_out = resimulated(episodes, launches(own_grid), REFERENCE_STEP)
         else:
-            references, left_out = [_with_positions(e, np.asarray(e.position_TN3[:frames])) for e in episodes], {}
+            references = [replace(e, position_TN3=np.asarray(e.position_TN3[:frames])) for e in episodes]
+            left_out = {}
         require(bool(references), "data", "scenes that the solver gets through", left_out)
-        baselines = [c for c in baseline_contenders(store, device) if not is_among(c.row, known)]
-        meta = provenance(device) | {
-            "config": without_folders(to_mapping(config)),
+        baselines = [c for c in baseline_contenders(store, device) if same_row(c.row, known) is None]
+        meta = meta_of(config, device) | {
             "data": Path(config.data).name,
             "split": config.split,
             "set": set_record(config.data, store.manifest.config["seed"], {c.file for c in networks}),
@@ -122,12 +124,7 @@ def main(mapping: dict[str, Any]) -> int:
     run.meta["seconds_before_timing"] = time.monotonic() - begun
     run.measure()
     run.write(drawn=True)
-    print(
-        table(run.rows),
-        *paired_lines(paired_rows(run.rows)),
-        f"{run.out}.png {run.file}",
-        sep="\n",
-    )
+    print(table(run.rows), *paired_lines(paired_rows(run.rows)), f"{run.out}.png {run.file}", sep="\n")
     if run.failed:
         print(f"error: {run.failed} of the measurements failed; see above, and not_run in {run.file}", file=sys.stderr)
     return EXIT_MACHINE if run.failed else 0
@@ -149,7 +146,7 @@ def _draw_again(config: ErrorVsTimeConfig, earlier: Sequence[Earlier]) -> int:
 def _reference_name(config: ErrorVsTimeConfig) -> str:
     if not config.resimulate:
         return "the data"
-    return f"the solver on the data's grid at {config.reference_step:g} of the limit of stability"
+    return f"the solver on the data's grid at {REFERENCE_STEP:g} of the limit of stability"
 
 
 def network_contenders(
@@ -158,24 +155,20 @@ def network_contenders(
     """Every weights file at every precision that its backend knows; what is left out is said."""
     files = fitting_weights(episodes) if config.weights is None else named_weights(config.weights, episodes)
     contenders: list[NetworkContender] = []
-    rate = episodes[0].frame_rate_hz
     for file in files:
-        kind = load_weights(file)[1].network.kind
-        order = HGN_ORDER if kind == "hgn" else GNS_ORDER
+        hgn = load_weights(file)[1].network.kind == "hgn"
         precisions = config.precisions
         if precisions is None:
-            precisions = ("fp32",) if device.type != "cuda" else PRECISIONS if kind == "hgn" else ("tf32", "fp16")
-        ranked = sorted(precisions, key=order.index)
+            precisions = ("fp32",) if device.type != "cuda" else PRECISIONS if hgn else ("tf32", "fp16")
+        ranked = sorted(precisions, key=(HGN_ORDER if hgn else GNS_ORDER).index)
         for precision in precisions:
-            rank = ranked.index(precision)
+            chosen = precision, config.backend, device, episodes[0].frame_rate_hz, ranked.index(precision)
             try:
-                made = NetworkContender(file, precision, config.backend, device, rate, rank, config.repeated_frames)
+                contenders.append(NetworkContender(file, *chosen))
             except ConfigError as error:
                 if precision != "fp16":
                     raise
                 print(f"left out: {file.name} at fp16: {error}", file=sys.stderr)
-            else:
-                contenders.append(made)
     return contenders
 
 
@@ -237,9 +230,8 @@ def _precompiled_frames(
     from hgn.runtime.precompile import precompile_frames
 
     particles = max(len(episode.material_N) for episode in episodes)
-    sizes = [particles, 8 * particles, PARTICLES_AT_ONCE]
-    pairs = [(contender.network.config, contender.precision) for contender in whole]
-    return precompile_frames([config for config, _ in pairs], [precision for _, precision in pairs], device, sizes)
+    configs, precisions = [c.network.config for c in whole], [c.precision for c in whole]
+    return precompile_frames(configs, precisions, device, [particles, 8 * particles, PARTICLES_AT_ONCE])
 
 
 def baseline_contenders(store: EpisodeStore, device: torch.device) -> list[Contender]:
@@ -264,7 +256,7 @@ def solver_contenders(
     """The solver at its settings, and how far the reference departs from itself: the chaos floor. What is among the
     `known` rows is neither simulated nor given.
     """
-    step = config.reference_step if config.resimulate else mpm.stability_fraction
+    step = REFERENCE_STEP if config.resimulate else mpm.stability_fraction
     if config.resimulate:
         launches(own_grid).add(Setting(step))
 
@@ -272,17 +264,14 @@ def solver_contenders(
         importance = SAME_GRID if grid == own_grid else COARSE_GRIDS
         return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, importance)
 
-    def wanted(row: Mapping[str, Any]) -> bool:
-        return not is_among(row, known)
-
     settings = [(grid, step) for grid in config.mpm_grids for step in config.mpm_steps]
-    points = {pair: solver(*pair) for pair in settings if wanted(solver_row(*pair))}
+    points = {pair: solver(*pair) for pair in settings if same_row(solver_row(*pair), known) is None}
     contenders = list(points.values())
     perturbed = {"system": "chaos", "floor": f"perturbed by {config.perturbation:g}"}
-    if config.perturbation and wanted(perturbed):
+    if config.perturbation and same_row(perturbed, known) is None:
         contenders.append(solver(own_grid, step, config.perturbation).named(**perturbed))
     coarser = {"system": "chaos", "floor": "twice the step"}
-    if config.mpm_grids and 2 * step <= 1 and wanted(coarser):
+    if config.mpm_grids and 2 * step <= 1 and same_row(coarser, known) is None:
         contenders.append((points.get((own_grid, 2 * step)) or solver(own_grid, 2 * step)).named(**coarser))
     return contenders
 
@@ -297,15 +286,7 @@ def resimulated(
         trials = launches.trials(Setting(step), episodes, lambda _: progress.update())
     pairs = list(zip(episodes, trials, strict=True))
     left_out = {episode.key: trial.cause for episode, trial in pairs if trial.cause is not None}
-    return [_with_positions(e, trial.position_TN3) for e, trial in pairs if trial.cause is None], left_out
-
-
-def _with_positions(episode: Episode, position_TN3: np.ndarray) -> Episode:
-    return replace(episode, position_TN3=position_TN3)
-
-
-def _solver_device(device: torch.device) -> str:
-    return "gpu" if device.type == "cuda" else "cpu"
+    return [replace(e, position_TN3=trial.position_TN3) for e, trial in pairs if trial.cause is None], left_out
 
 
 if __name__ == "__main__":

@@ -8,36 +8,37 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from hgn.config import NetworkConfig
 from hgn.data.batch import Batch, make_batch
-from hgn.network.features import ParticleState
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.backend import choose, set_matmul_precision
+from hgn.runtime.backend import choose
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError, network_predictor
 from tools.solver_launches import Setting, SolverLaunches
-from tools.solver_rollouts import FrameClock
+from tools.timing import FrameClock, matmul_precision
 
 if TYPE_CHECKING:
     from hgn.runtime.triton_rollout import TritonRollout
 
 PARTICLES_PER_BATCH = 32_768
 PARTICLES_AT_ONCE = 150_000  # of backend triton's one-step errors
+REST_SPEED = 1e-4  # domain units a frame; what is slower is at rest
+REPEATED_FRAMES = 51  # of rollouts of a network's further precisions on backend torch, which take minutes
 # What is measured first, a point of each kind before the others; what is last may be left out when the time is over.
 HGN_FIRST, SAME_GRID, GNS_FIRST, HGN_NEXT, COARSE_GRIDS, STATIC_PARTICLES_FIRST, HGN_LAST, GNS_LAST = range(8)
+OnFrame = Callable[[int], None] | None
 
 
 @dataclass
@@ -49,49 +50,41 @@ class OneStep:
     rest_count: int = 0
 
 
-class Contender(Protocol):
+class Contender:
     """One row of the report."""
 
     row: dict[str, Any]  # system and settings
-    all_at_once: bool  # whether all scenes are simulated side by side, or so many as the command says
-    importance: int  # 0 is scored first
+    importance = SAME_GRID  # 0 is scored first
+    all_at_once = False  # all scenes are simulated side by side, and not so many as the command says
+    stepped = True  # frames are made one by one: nothing is captured or compiled for them
 
-    def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep | None:
+    def one_step(self, episode: Episode, stride: int) -> OneStep | None:
         """Errors of the accelerations of every stride-th frame; none where the contender has no such thing."""
+        return None
 
-    def trials(
-        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
-    ) -> list[RolloutResult]:
+    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
         """Rollouts from the episodes' first frames, side by side."""
+        raise NotImplementedError
 
     def release(self) -> None:
-        """Gives back what is kept on the device for rollouts to come."""
+        """Gives back what is kept on the device for rollouts to come, if anything is."""
 
 
-class NetworkContender:
+class NetworkContender(Contender):
     """A weights file at one precision of its matrix products, on the backend that a simulation would take."""
 
     def __init__(
-        self,
-        file: Path,
-        precision: str,
-        backend: str,
-        device: torch.device,
-        frame_rate_hz: float,
-        rank: int = 0,
-        repeated_frames: int | None = None,
+        self, file: Path, precision: str, backend: str, device: torch.device, frame_rate_hz: float, rank: int = 0
     ) -> None:
-        """`rank` counts the precisions of these weights that tell more; but for the first, rollouts on backend torch
-        end at `repeated_frames`.
+        """`rank` counts the precisions of these weights that tell more.
 
         Raises: ConfigError where the backend does not take the network or the precision.
         """
-        self.file = file
+        self.file, self.device, self.precision = file, device, precision
         self.network, info = load_weights(file, device)
         require_frame_rate(info, frame_rate_hz)
         config = info.network
-        self.device, self.precision = device, precision
-        with self.matmul():
+        with matmul_precision(self.precision):
             chosen = choose(device, self.network, precision, backend)
             self.simulator = Simulator(self.network, info.frame_rate_hz, chosen)
         self.stepped, hgn = chosen.stepped, config.kind == "hgn"
@@ -101,9 +94,9 @@ class NetworkContender:
         else:
             self.importance = HGN_NEXT if not self.stepped else HGN_LAST if hgn else GNS_LAST
         self.all_at_once = hgn and self.stepped and device.type == "cuda"  # which waits for the host then
-        self.frames = None if rank == 0 or not self.stepped else repeated_frames
+        self.short = rank > 0 and self.stepped
         self._predictor: TritonPredictor | None = None
-        self.row: dict[str, Any] = {
+        self.row = {
             "system": config.kind,
             "weights": file.name,
             "levels": config.levels,
@@ -114,29 +107,18 @@ class NetworkContender:
             "updates": info.updates,
         }
 
-    @contextmanager
-    def matmul(self) -> Iterator[None]:
-        before = torch.get_float32_matmul_precision()
-        set_matmul_precision(self.precision)
-        try:
-            yield
-        finally:
-            torch.set_float32_matmul_precision(before)
+    def one_step(self, episode: Episode, stride: int) -> OneStep:
+        predict, at_once = network_predictor(self.simulator.backend), PARTICLES_PER_BATCH
+        if not self.stepped:
+            assert isinstance(self.network, HierarchicalGraphNetwork)
+            self._predictor = self._predictor or TritonPredictor(self.network, self.precision)
+            predict, at_once = self._predictor, PARTICLES_AT_ONCE
+        with matmul_precision(self.precision):
+            return one_step(predict, self.network.config, episode, stride, self.device, at_once)
 
-    def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep:
-        config = self.network.config
-        with self.matmul():
-            if not self.stepped:
-                assert isinstance(self.network, HierarchicalGraphNetwork)
-                self._predictor = self._predictor or TritonPredictor(self.network, self.precision)
-                return one_step(self._predictor, config, episode, stride, rest_speed, self.device, PARTICLES_AT_ONCE)
-            return one_step(network_predictor(self.simulator.backend), config, episode, stride, rest_speed, self.device)
-
-    def trials(
-        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
-    ) -> list[RolloutResult]:
-        frames = frames if self.frames is None or on_frame is not None else min(frames, self.frames)
-        with self.matmul():
+    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
+        frames = min(frames, REPEATED_FRAMES) if self.short and on_frame is None else frames
+        with matmul_precision(self.precision):
             return simulate_scenes(self.simulator, [InitialState.of_episode(e) for e in episodes], frames, on_frame)
 
     def release(self) -> None:
@@ -148,8 +130,10 @@ def solver_row(grid: int, step: float) -> dict[str, Any]:
     return {"system": "mpm", "grid": grid, "step": step, "precision": "fp32"}
 
 
-class SolverContender:
-    """The solver that made the data, on a grid and with a step of its own."""
+class SolverContender(Contender):
+    """The solver that made the data, on a grid and with a step of its own. It has no one-step error: a step begins from
+    stresses and volumes, which positions do not tell.
+    """
 
     all_at_once = True  # a scene takes one of a GPU's many processors
 
@@ -159,51 +143,32 @@ class SolverContender:
         self.frames, self.importance = frames, importance
         self.row = solver_row(round(1 / launches.cell_size), setting.step)
 
-    @property
-    def simulated(self) -> bool:
-        """Whether it is known already: simulated beside another of its grid."""
-        return self.launches.knows(self.setting)
-
     def named(self, **row: Any) -> SolverContender:
         """The same in another row."""
         same = copy.copy(self)
         same.row = row
         return same
 
-    def one_step(self, episode: Episode, stride: int, rest_speed: float) -> None:
-        """None: a step begins from stresses and volumes, which positions do not tell."""
-
-    def trials(
-        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
-    ) -> list[RolloutResult]:
+    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
         if on_frame is not None:
             return self.launches.timed(self.setting, episodes, frames, on_frame)
         trials, most = self.launches.trials(self.setting, episodes), min(frames, self.frames)
         return [RolloutResult(trial.position_TN3[:most], trial.cause) for trial in trials]
 
-    def release(self) -> None:
-        """Nothing is kept on the device."""
 
-
-class BaselineContender:
+class BaselineContender(Contender):
     """The same acceleration for every particle, whatever happens: nothing is learned."""
 
-    all_at_once, importance = False, SAME_GRID
-
     def __init__(self, name: str, acceleration: Callable[[Episode], np.ndarray], device: torch.device) -> None:
-        self.row: dict[str, Any] = {"system": "baseline", "predictor": name}
+        self.row = {"system": "baseline", "predictor": name}
         self.acceleration, self.device = acceleration, device
 
-    def one_step(self, episode: Episode, stride: int, rest_speed: float) -> OneStep:
+    def one_step(self, episode: Episode, stride: int) -> OneStep:
         acceleration_3 = torch.from_numpy(self.acceleration(episode)).float().to(self.device)
         network = NetworkConfig(obstacle_features=False)
-        return one_step(
-            lambda b: acceleration_3.expand_as(b.window_WN3[0]), network, episode, stride, rest_speed, self.device
-        )
+        return one_step(lambda b: acceleration_3.expand_as(b.window_WN3[0]), network, episode, stride, self.device)
 
-    def trials(
-        self, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None] | None
-    ) -> list[RolloutResult]:
+    def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
         time_T11 = np.arange(frames)[:, None, None]
 
         def trial(episode: Episode) -> RolloutResult:
@@ -216,9 +181,6 @@ class BaselineContender:
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:
             return list(threads.map(trial, episodes))
 
-    def release(self) -> None:
-        """Nothing is kept on the device."""
-
 
 class TritonPredictor:
     """Accelerations by backend triton's own launches: a frame simulated from each given state."""
@@ -228,21 +190,17 @@ class TritonPredictor:
         self._rollout: TritonRollout | None = None
 
     def __call__(self, batch: Batch) -> torch.Tensor:
-        state = batch.state()
-        rollout = self._rollout
+        from hgn.runtime.triton_rollout import TritonRollout  # loads Triton
+
+        state, rollout = batch.state(), self._rollout
         if rollout is not None and rollout.fits(state):
             rollout.begin(state, new_obstacles=True)
         else:
             room = 0 if rollout is None else rollout.particles
             self._rollout = rollout = None  # before the new one is allocated
-            rollout = self._rollout = self._made(state, room)
+            rollout = self._rollout = TritonRollout(self.network, state, self.precision, room=room)
         rollout.run(1)
         return rollout.velocity_NV[: len(state.position_N3), :3] - state.velocity_NM3[:, 0]
-
-    def _made(self, state: ParticleState, room: int) -> TritonRollout:
-        from hgn.runtime.triton_rollout import TritonRollout  # loads Triton
-
-        return TritonRollout(self.network, state, self.precision, room=room)
 
 
 def one_step(
@@ -250,7 +208,6 @@ def one_step(
     network: NetworkConfig,
     episode: Episode,
     stride: int,
-    rest_speed: float,
     device: torch.device,
     particles_per_batch: int = PARTICLES_PER_BATCH,
 ) -> OneStep:
@@ -265,7 +222,7 @@ def one_step(
             predicted_N3, true_N3 = predict(batch), batch.acceleration()
             result.error.add((predicted_N3 - true_N3).square().sum(-1), batch.material_N, network.materials)
             speed_NM = batch.state().velocity_NM3.norm(dim=-1)
-            resting_N = (speed_NM.amax(1) < rest_speed) & (true_N3.norm(dim=-1) < rest_speed)
+            resting_N = (speed_NM.amax(1) < REST_SPEED) & (true_N3.norm(dim=-1) < REST_SPEED)
             result.rest_sum += float(predicted_N3.norm(dim=-1)[resting_N].double().sum())
             result.rest_count += int(resting_N.sum())
     return result

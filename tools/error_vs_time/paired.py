@@ -31,8 +31,7 @@ def paired_difference(one_S: Sequence[float | None], other_S: Sequence[float | N
     drawn_BS = difference_S[_draws(len(pairs))]
     result: dict[str, Any] = {"scenes": len(pairs)}
     for name, statistic in (("median", np.median), ("mean", np.mean)):
-        tails = np.percentile(statistic(drawn_BS, axis=1), (50 * (1 - COVERED), 50 * (1 + COVERED)))
-        low, high = float(tails[0]), float(tails[1])
+        low, high = np.percentile(statistic(drawn_BS, axis=1), (50 * (1 - COVERED), 50 * (1 + COVERED))).tolist()
         result[name] = [float(statistic(difference_S)), low, high]
         result[f"{name}_says"] = "nearer" if high < 0 else "farther" if low > 0 else NO_DIFFERENCE
     return result
@@ -48,14 +47,16 @@ def paired_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     for i, one in enumerate(told):
         if one["system"] not in NETWORK_KINDS:
             continue
-        alike = [row for row in told[i + 1 :] if row["system"] == one["system"] == "hgn" and _other_weights(row, one)]
+        later = [row for row in told[i + 1 :] if row["system"] == one["system"] == "hgn"]
+        alike = [r for r in later if r["weights"] != one["weights"] and r["precision"] == one["precision"]]
         others = [row for row in told if row["system"] in (*NETWORK_KINDS[1:], "mpm") and row is not one]
         for other in (*alike, *others):
             for error, values in one["by_scene"].items():
                 for frame in values.keys() & other["by_scene"].get(error, {}).keys():
-                    found = paired_difference(values[frame], other["by_scene"][error][frame])
-                    if found is not None:
-                        made.append({"one": label(one), "other": label(other), "error": error, "frame": frame} | found)
+                    difference = paired_difference(values[frame], other["by_scene"][error][frame])
+                    if difference is not None:
+                        named = {"one": label(one), "other": label(other), "error": error, "frame": frame}
+                        made.append(named | difference)
     return sorted(made, key=lambda row: (row["one"], row["other"], row["error"], int(row["frame"])))
 
 
@@ -68,14 +69,9 @@ def paired_lines(rows: Sequence[Row]) -> list[str]:
         for name in ("median", "mean"):
             value, low, high = row[name]
             parts.append(f"{row[f'{name}_says']} in the {name} ({value:+.2e}, {low:+.2e} to {high:+.2e})")
-        lines.append(
-            f"  {row['one']} beside {row['other']}, {row['error']}{at}, {row['scenes']} scenes: {'; '.join(parts)}"
-        )
+        pair = f"{row['one']} beside {row['other']}"
+        lines.append(f"  {pair}, {row['error']}{at}, {row['scenes']} scenes: {'; '.join(parts)}")
     return lines
-
-
-def _other_weights(one: Row, other: Row) -> bool:
-    return one["weights"] != other["weights"] and one["precision"] == other["precision"]
 
 
 @functools.cache

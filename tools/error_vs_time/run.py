@@ -5,6 +5,7 @@ A run that is cut off anywhere leaves a whole file with all that was measured, e
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 import traceback
@@ -22,7 +23,7 @@ from tools.error_vs_time.contenders import COARSE_GRIDS, GNS_FIRST, BaselineCont
 from tools.error_vs_time.earlier import same_row
 from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
-from tools.error_vs_time.score import label, report, score
+from tools.error_vs_time.score import label, score
 from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
 from tools.error_vs_time.timing import Stopwatch, Timing
 
@@ -75,29 +76,28 @@ class Run:
         baselines, GNS at the precision that tells most, and the solver on coarse grids.
         """
         for i, contender in enumerate(self.contenders):
-            if isinstance(contender, SolverContender) and contender.simulated:
+            if isinstance(contender, SolverContender) and contender.launches.knows(contender.setting):
                 self._attempt(i, self._errors)
         self.write()
-        idle = [i for i, c in enumerate(self.contenders) if c.importance in BESIDE or isinstance(c, BaselineContender)]
-        for i in sorted(idle, key=lambda i: self.contenders[i].importance):
-            if compiling() and not self.is_past(BEGIN_FRACTION):
+        for i in self._by_importance():
+            idle = self.contenders[i].importance in BESIDE or isinstance(self.contenders[i], BaselineContender)
+            if idle and compiling() and not self.is_past(BEGIN_FRACTION):
                 self._attempt(i, self._errors)
 
     def measure(self) -> None:
         """Scores and times every contender, in order of importance, or times them where all are scored; then times all
         of them further in turns.
         """
-        order = sorted(range(len(self.contenders)), key=lambda i: self.contenders[i].importance)
-        steps = (self._errors, self._times) if self.config.times_last else (self._errors_and_times,)
-        with bar("contenders", total=len(steps) * len(order), unit="contender") as progress:
-            for step in steps:
-                for i in order:
+        turns = [[self._errors], [self._times]] if self.config.times_last else [[self._errors, self._times]]
+        with bar("contenders", total=len(turns) * len(self.contenders), unit="contender") as progress:
+            for steps in turns:
+                for i in self._by_importance():
                     # past the time too: by baselines all others are told
-                    if self.is_past(BEGIN_FRACTION) and not isinstance(self.contenders[i], BaselineContender):
-                        if i not in self._rows and i not in self._given_up:
-                            self._leave_out(i, "the time was over")
-                    else:
-                        self._attempt(i, step)
+                    if not self.is_past(BEGIN_FRACTION) or isinstance(self.contenders[i], BaselineContender):
+                        for step in steps:
+                            self._attempt(i, step)
+                    elif i not in self._rows and i not in self._given_up:
+                        self._leave_out(i, "the time was over")
                     self.write(drawn=time.monotonic() - self._drawn > DRAWN_EVERY_S)
                     progress.update()
         for _ in range(1, self.config.rounds):
@@ -107,25 +107,29 @@ class Run:
         self.write()
 
     def write(self, drawn: bool = False) -> None:
-        """Writes the JSON, and the figures if wanted."""
-        self.meta["not_timed"] = [
-            label(row) for row in self.rows if row["system"] not in UNTIMED and row.get("ms") is None
-        ]
-        self.meta["seconds"] = time.monotonic() - self.begun
-        written = report(self.meta, self.rows, paired_rows(self.rows) if drawn else ())
-        write_json(self.file, written, allow_nan=False)
+        """Writes the JSON, and the figures if wanted. Numbers that are none are null, for JSON knows no NaN."""
+        untold = [row for row in self.rows if row["system"] not in UNTIMED and row.get("ms") is None]
+        self.meta |= {"not_timed": [label(row) for row in untold], "seconds": time.monotonic() - self.begun}
+        rows = _without_nan(self.rows)
+        paired = paired_rows(self.rows) if drawn else []
+        write_json(self.file, {"meta": self.meta, "rows": rows, "paired": paired}, allow_nan=False)
         if drawn:
-            draw(self.out, written["rows"], written["meta"])
+            draw(self.out, rows, self.meta)
             self._drawn = time.monotonic()
 
-    def _errors_and_times(self, i: int) -> None:
-        self._errors(i)
-        self._times(i)
+    def _by_importance(self) -> list[int]:
+        return sorted(range(len(self.contenders)), key=lambda i: self.contenders[i].importance)
 
     def _errors(self, i: int) -> None:
-        if i not in self._rows:
-            self._score(i)
-            self.write()
+        if i in self._rows:
+            return
+        begun = time.monotonic()
+        try:
+            row = score(self.contenders[i], self.references, self.config, self.device)
+        finally:
+            self.contenders[i].release()
+        self._rows[i] = row | {"scoring_s": time.monotonic() - begun}
+        self.write()
 
     def _times(self, i: int) -> None:
         if self.contenders[i].row["system"] not in UNTIMED:
@@ -136,16 +140,8 @@ class Run:
             if i in self._scored_before:
                 self._rows[i]["timed"] = {name: self.meta[name] for name in ("device", "commit", "date")}
 
-    def _score(self, i: int) -> None:
-        begun = time.monotonic()
-        try:
-            self._rows[i] = score(self.contenders[i], self.references, self.config, self.device)
-        finally:
-            self.contenders[i].release()
-        self._rows[i]["scoring_s"] = time.monotonic() - begun
-
     def _time(self, i: int) -> None:
-        self._rows[i].update(self.timing.round(self.watches[i]))
+        self._rows[i] |= self.timing.round(self.watches[i])
 
     def _attempt(self, i: int, work: Callable[[int], None]) -> None:
         """The others need not wait for what fails; that is named, and counted where nobody foresaw it."""
@@ -178,3 +174,11 @@ def draw(out: str, rows: Sequence[dict[str, Any]], meta: dict[str, Any]) -> list
     for file, picture in files.items():
         write_atomically(Path(file), picture)
     return list(files)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

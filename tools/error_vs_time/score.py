@@ -1,13 +1,13 @@
 """The row of a contender: its errors on the test scenes against the reference, and its run times.
 
 Conventions: squared errors sum over axes and average over particles, in frame units; means over scenes, of those
-scenes that reached the frame. Shape legend: T frames, N particles of a scene.
+scenes that reached the frame. Shape legend: T frames, N particles of a scene, S scenes.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -20,26 +20,26 @@ from hgn.scene.episode import Episode
 from hgn.scene.material import MATERIALS
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.training.errors import REPORTED_FRAMES, mean_so_far, position_mse
+from tools import report
 from tools.error_vs_time.contenders import Contender, OneStep
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.sinkhorn import sinkhorn_divergences
 from tools.measures import momentum_error, outside_domain
 
+SINKHORN_POINTS, SINKHORN_BLUR = 1024, 0.01  # of each material at most; domain units
+OfMaterial = tuple[int, str, str, float]  # a scene's number, material and frame, and a value
+
 
 def score(
-    contender: Contender,
-    references: Sequence[Episode],
-    config: ErrorVsTimeConfig,
-    device: torch.device,
+    contender: Contender, references: Sequence[Episode], config: ErrorVsTimeConfig, device: torch.device
 ) -> dict[str, Any]:
     """The row without run times."""
-    steps = [contender.one_step(episode, config.frame_stride, config.rest_speed) for episode in references]
+    steps = [contender.one_step(episode, config.frame_stride) for episode in references]
     frames = len(references[0].position_TN3)
-    trials: list[RolloutResult] = []
     together = len(references) if contender.all_at_once else config.batch_scenes
+    trials: list[RolloutResult] = []
     for first in range(0, len(references), together):
-        some = references[first : first + together]
-        trials += contender.trials(some, frames, None)
+        trials += contender.trials(references[first : first + together], frames, None)
     row = contender.row | one_step_figures([step for step in steps if step is not None])
     row |= rollout_figures(trials, references, config, device)
     known = [None if step is None else _rounded(step.error.mse) for step in steps]
@@ -69,56 +69,59 @@ def rollout_figures(
     """Everything that rollouts tell; `curve` is the position MSE of each frame, none where no scene came so far."""
     frames = len(references[0].position_TN3)
     mse_ST = np.full((len(trials), frames), np.nan)
+
+    def measured(mse_T: np.ndarray, trial: RolloutResult, reference: Episode) -> dict[str, float]:
+        end = trial.frame_count
+        mse_T[:end] = position_mse(trial.position_TN3, reference.position_TN3[:end])
+        return {
+            "momentum_error": momentum_error(trial.position_TN3, reference.position_TN3),
+            "penetration": share_inside(trial.position_TN3[-1], obstacles_of_episode(reference)),
+            "reference_penetration": _reference_penetration(reference, end - 1),
+            "outside_domain": outside_domain(trial.position_TN3[-1], reference.domain_size),
+        }
+
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-        for mse_T, found_T in zip(mse_ST, threads.map(_position_mse, trials, references), strict=True):
-            mse_T[: len(found_T)] = found_T
-        momenta = list(threads.map(_momentum_error, trials, references))
-        ends = list(threads.map(_end, trials, references))
+        of_scene = list(threads.map(measured, mse_ST, trials, references))
     reached_T = np.isfinite(mse_ST).sum(0)
     curve_T = mean_so_far(mse_ST)
     reported = sorted({frame for frame in (*REPORTED_FRAMES, frames - 1) if frame < frames})
     told = [frame for frame in reported if reached_T[frame]]
     failures = [trial for trial in trials if trial.cause is not None]
-    sinkhorn_S = _sinkhorn(
-        trials[: config.sinkhorn_scenes], references[: config.sinkhorn_scenes], reported, config, device
-    )
+    few = config.sinkhorn_scenes
+    sinkhorn = _sinkhorn(trials[:few], references[:few], reported, device)
     row: dict[str, Any] = {
         "position_mse": {str(frame): float(curve_T[frame]) for frame in told},
         "position_quartiles": {str(frame): quartiles(mse_ST[:, frame]) for frame in told},
-        "position_by_material": _by_material(trials, references, told),
+        "position_by_material": _means(_position_mse(trials, references, told)),
         "curve": [float(f"{value:.4g}") for value in curve_T],
         "scenes_reached": {str(frame): int(reached_T[frame]) for frame in reported},
-        "sinkhorn": _means([found for of_scene in sinkhorn_S for found in of_scene.items()]),
+        "sinkhorn": _means(sinkhorn),
         "by_scene": {
             "position MSE": {str(frame): [_rounded(value) for value in mse_ST[:, frame]] for frame in told},
-            "Sinkhorn": {str(frame): [_of_frame(found, str(frame)) for found in sinkhorn_S] for frame in told},
+            "Sinkhorn": {str(frame): _by_scene(sinkhorn, str(frame), len(trials[:few])) for frame in told},
         },
         "failed_scenes": len(failures),
         "first_failure_frame": min((trial.frame_count for trial in failures), default=None),
         "first_failure": failures[0].cause if failures else None,
         "seeds": [reference.seed for reference in references],
     }
-    row["momentum_error"] = float(np.mean(momenta))
-    for name in ("penetration", "reference_penetration", "outside_domain"):
-        row[name] = float(np.mean([end[name] for end in ends]))
-    row["most_penetration"] = max(end["penetration"] - end["reference_penetration"] for end in ends)
+    row |= {name: float(np.mean([scene[name] for scene in of_scene])) for name in of_scene[0]}
+    row["most_penetration"] = max(scene["penetration"] - scene["reference_penetration"] for scene in of_scene)
     return row
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The figures for people."""
     frames = sorted({int(frame) for row in rows for frame in row.get("scenes_reached", {})})
-    head = "".join(f"{f'MSE at {frame}':>12}" for frame in frames)
-    lines = [f"{'system':<48} {'ms':>9} {'batched':>9} {'one-step MSE':>13}{head} {'Sinkhorn':>10} {'failed':>7}"]
+    head = ["system", "ms", "batched", "one-step MSE", *(f"MSE at {frame}" for frame in frames), "Sinkhorn", "failed"]
+    lines = []
     for row in rows:
-        errors = "".join(f"{_number(row['position_mse'].get(str(frame))):>12}" for frame in frames)
         last = [values[max(values, key=int)] for values in row["sinkhorn"].values() if values]
-        lines.append(
-            f"{label(row):<48} {_number(row.get('ms'), '.3f'):>9} {_number(row.get('ms_batched'), '.3f'):>9} "
-            f"{_number(row['one_step_mse']):>13}{errors} {_number(float(np.mean(last)) if last else None):>10} "
-            f"{row['failed_scenes']:>7}"
-        )
-    return "\n".join(lines)
+        errors = [row["one_step_mse"], *(row["position_mse"].get(str(frame)) for frame in frames)]
+        errors.append(float(np.mean(last)) if last else None)
+        times = [report.number(row.get(name), ".3f") for name in ("ms", "ms_batched")]
+        lines.append([label(row), *times, *(report.number(error, ".2e") for error in errors), row["failed_scenes"]])
+    return report.table(head, lines)
 
 
 def label(row: Mapping[str, Any]) -> str:
@@ -135,91 +138,62 @@ def label(row: Mapping[str, Any]) -> str:
     return f"{row['system'].upper().replace('_', ' ')} {size}, {row['backend']} {row['precision']} ({row['weights']})"
 
 
-def report(
-    meta: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], paired: Sequence[Mapping[str, Any]] = ()
-) -> dict[str, Any]:
-    """What the report's JSON holds; numbers that are none are null, for JSON knows no NaN."""
-    return {"meta": meta, "rows": _plain(list(rows)), "paired": list(paired)}
-
-
-def _position_mse(trial: RolloutResult, reference: Episode) -> np.ndarray:
-    return position_mse(trial.position_TN3, reference.position_TN3[: trial.frame_count])
-
-
-def _by_material(
-    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int]
-) -> dict[str, dict[str, float]]:
-    """Position MSE of a material's particles: means over the scenes that hold it and reached the frame."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for trial, reference in zip(trials, references, strict=True):
-        reached = [frame for frame in frames if frame < trial.frame_count]
-        for index in np.unique(reference.material_N):
-            chosen_N = reference.material_N == index
-            of_frames = found.setdefault(MATERIALS[index], {})
-            for frame in reached:
-                pair = trial.position_TN3[frame, chosen_N], reference.position_TN3[frame, chosen_N]
-                of_frames.setdefault(str(frame), []).append(float(position_mse(*(part[None] for part in pair))[0]))
-    return {name: {frame: float(np.mean(v)) for frame, v in values.items()} for name, values in found.items()}
-
-
-def _momentum_error(trial: RolloutResult, reference: Episode) -> float:
-    return momentum_error(trial.position_TN3, reference.position_TN3)
-
-
-def _end(trial: RolloutResult, reference: Episode) -> dict[str, float]:
-    last_N3 = trial.position_TN3[-1]
-    return {
-        "penetration": share_inside(last_N3, obstacles_of_episode(reference)),
-        "reference_penetration": _reference_penetration(reference, trial.frame_count - 1),
-        "outside_domain": outside_domain(last_N3, reference.domain_size),
-    }
-
-
 # The same for every contender.
 @functools.lru_cache(maxsize=1024)
 def _reference_penetration(reference: Episode, frame: int) -> float:
     return share_inside(np.asarray(reference.position_TN3[frame]), obstacles_of_episode(reference))
 
 
-def _sinkhorn(
-    trials: Sequence[RolloutResult],
-    references: Sequence[Episode],
-    frames: Sequence[int],
-    config: ErrorVsTimeConfig,
-    device: torch.device,
-) -> list[dict[tuple[str, str], float]]:
-    """Of each scene, by material and frame."""
-    named, pairs = [], []
+def _of_materials(
+    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int], most: int | None = None
+) -> Iterator[tuple[int, str, str, np.ndarray, np.ndarray]]:
+    """The particles of each material at those frames that a scene reached: scene, material, frame, and where they are
+    in the rollout and the reference. At most so many, drawn alike: as near to the whole clouds as so few can be.
+    """
     for scene, (trial, reference) in enumerate(zip(trials, references, strict=True)):
         for index in np.unique(reference.material_N):
-            of_material = np.flatnonzero(reference.material_N == index)
-            # The same particles of both: as near to the whole clouds as so few can be.
-            chosen = np.random.default_rng(reference.seed).permutation(of_material)[: config.sinkhorn_points]
+            chosen = np.flatnonzero(reference.material_N == index)
+            if most is not None:
+                chosen = np.random.default_rng(reference.seed).permutation(chosen)[:most]
             for frame in frames:
                 if frame < trial.frame_count:
-                    first, second = (
-                        torch.from_numpy(np.ascontiguousarray(path[frame, chosen])).to(device)
-                        for path in (trial.position_TN3, reference.position_TN3)
-                    )
-                    named.append((scene, MATERIALS[index], str(frame)))
-                    pairs.append((first, second))
-    found: list[dict[tuple[str, str], float]] = [{} for _ in trials]
-    for (scene, *kind), value in zip(named, sinkhorn_divergences(pairs, config.sinkhorn_blur), strict=True):
-        found[scene][kind[0], kind[1]] = value
-    return found
+                    pair = trial.position_TN3[frame, chosen], reference.position_TN3[frame, chosen]
+                    yield scene, MATERIALS[index], str(frame), *pair
 
 
-def _means(values: Sequence[tuple[tuple[str, str], float]]) -> dict[str, dict[str, float]]:
-    found: dict[str, dict[str, list[float]]] = {}
-    for (material, frame), value in values:
-        found.setdefault(material, {}).setdefault(frame, []).append(value)
-    return {name: {frame: float(np.mean(v)) for frame, v in frames.items()} for name, frames in found.items()}
+def _position_mse(
+    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int]
+) -> Iterator[OfMaterial]:
+    for scene, material, frame, predicted_N3, true_N3 in _of_materials(trials, references, frames):
+        yield scene, material, frame, float(position_mse(predicted_N3[None], true_N3[None])[0])
 
 
-def _of_frame(values: Mapping[tuple[str, str], float], frame: str) -> float | None:
-    """The mean over materials; none for a scene that did not come so far."""
-    found = [value for (_, other), value in values.items() if other == frame]
-    return _rounded(np.mean(found)) if found else None
+def _sinkhorn(
+    trials: Sequence[RolloutResult], references: Sequence[Episode], frames: Sequence[int], device: torch.device
+) -> list[OfMaterial]:
+    parts = list(_of_materials(trials, references, frames, SINKHORN_POINTS))
+    pairs = [
+        (torch.from_numpy(one_N3).to(device), torch.from_numpy(other_N3).to(device)) for *_, one_N3, other_N3 in parts
+    ]
+    values = sinkhorn_divergences(pairs, SINKHORN_BLUR)
+    return [(*part[:3], value) for part, value in zip(parts, values, strict=True)]
+
+
+def _means(values: Iterable[OfMaterial]) -> dict[str, dict[str, float]]:
+    """Over the scenes that hold a material and reached a frame."""
+    of_frames: dict[str, dict[str, list[float]]] = {}
+    for _, material, frame, value in values:
+        of_frames.setdefault(material, {}).setdefault(frame, []).append(value)
+    return {name: {frame: float(np.mean(v)) for frame, v in frames.items()} for name, frames in of_frames.items()}
+
+
+def _by_scene(values: Iterable[OfMaterial], frame: str, scenes: int) -> list[float | None]:
+    """The mean over materials of each scene; none for one that did not come so far."""
+    of_scenes: list[list[float]] = [[] for _ in range(scenes)]
+    for scene, _, other, value in values:
+        if other == frame:
+            of_scenes[scene].append(value)
+    return [_rounded(np.mean(some)) if some else None for some in of_scenes]
 
 
 def _rounded(value: float | np.floating[Any]) -> float | None:
@@ -231,15 +205,3 @@ def quartiles(values: Sequence[float] | np.ndarray) -> list[float] | None:
     finite = np.asarray(values, np.float64)
     finite = finite[np.isfinite(finite)]
     return [float(q) for q in np.percentile(finite, (25, 75))] if len(finite) else None
-
-
-def _number(value: float | None, form: str = ".2e") -> str:
-    return "-" if value is None or not np.isfinite(value) else format(value, form)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

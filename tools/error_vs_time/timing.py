@@ -13,6 +13,7 @@ from hgn.scene.episode import Episode
 from tools.error_vs_time.contenders import Contender, frame_milliseconds
 from tools.error_vs_time.score import quartiles
 from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.timing import GpuMemory
 
 WARM_FRAMES, TRITON_WARM_FRAMES = 6, 70  # the least that a contender is timed over, too
 SOLVER_WARM_FRAMES = 2  # the initial state and the first, in which the solver compiles
@@ -40,9 +41,8 @@ class Timing:
         some = sorted(references[: config.timed_scenes], key=lambda episode: -len(episode.material_N))
         self.singles = [[episode] for episode in some]
         # the scenes again and again where a batch holds more
-        self.batches = [
-            [references[i % len(references)] for i in range(count)] for count in sorted(config.timed_batches)
-        ]
+        counts = sorted(config.timed_batches)
+        self.batches = [[references[i % len(references)] for i in range(count)] for count in counts]
         self.config, self.device = config, device
 
     def begun(self, contender: Contender) -> Stopwatch:
@@ -50,34 +50,29 @@ class Timing:
         is done soonest; then all that will be timed, as far as something is captured or compiled for it. Tells the
         most GPU memory that the first scene took, of what torch knows. The solver is timed over whole rollouts.
         """
-        kind, graphed = contender.row["system"], not getattr(contender, "stepped", True)
         contender.release()
-        before = 0
-        if self.device.type == "cuda":
-            torch.cuda.empty_cache()
-            torch.cuda.reset_peak_memory_stats(self.device)
-            before = torch.cuda.memory_allocated(self.device)
-        most = self.config.mpm_timed_frames if kind == "mpm" else self.config.timed_frames
-        most = min(most, len(self.singles[0][0].position_TN3))
-        if kind == "mpm":
+        memory, largest = GpuMemory(self.device), self.singles[0]
+        solver, gns = contender.row["system"] == "mpm", contender.row["system"].startswith("gns")
+        most = self.config.mpm_timed_frames if solver else self.config.timed_frames
+        most = min(most, len(largest[0].position_TN3))
+        if solver:
             for scenes in self.singles:  # kernels are compiled for the materials that a scene holds
                 frame_milliseconds(contender, scenes, min(SOLVER_WARM_FRAMES, most))
         # what looks at its frames 32 at a time tells nothing of fewer
-        frames = TRITON_WARM_FRAMES if graphed else WARM_FRAMES
-        captures = graphed or kind.startswith("gns")
+        frames = min(WARM_FRAMES if contender.stepped else TRITON_WARM_FRAMES, most)
+        captures = not contender.stepped or gns
         if captures:  # which would be taken for the time of a frame
-            frame_milliseconds(contender, self.singles[0], min(frames, most))
-        taken = frame_milliseconds(contender, self.singles[0], min(frames, most))
-        peak = torch.cuda.max_memory_allocated(self.device) - before if self.device.type == "cuda" else 0
-        batch, together = self._best_batch(contender, min(frames, most), kind == "mpm" or captures)
+            frame_milliseconds(contender, largest, frames)
+        taken = frame_milliseconds(contender, largest, frames)
+        memory_gb = None if solver else memory.peak_gb()
+        batch, together = self._best_batch(contender, frames, solver or captures)
 
         def affordable(milliseconds: float | None) -> int:
-            if milliseconds is None or kind == "mpm":
+            if milliseconds is None or solver:
                 return most
             return min(most, max(frames, int(1e3 * self.config.timed_seconds / milliseconds)))
 
-        memory = peak / 1e9 if kind != "mpm" and self.device.type == "cuda" else None
-        watch = Stopwatch(contender, batch, affordable(taken), affordable(together), memory)
+        watch = Stopwatch(contender, batch, affordable(taken), affordable(together), memory_gb)
         if captures:
             for single in self.singles:
                 frame_milliseconds(contender, single, watch.single_frames)
@@ -106,14 +101,13 @@ class Timing:
         """Simulates each of the scenes once more; what the report tells of all times so far. `ms` is a frame of one
         scene, `ms_batched` a frame of each of the scenes side by side.
         """
-        for scenes in (*self.singles, watch.batch):
-            together = scenes is watch.batch
-            if together and watch.batched and watch.contender.row["system"] == "mpm":
-                continue  # a whole rollout of many scenes, once
-            frames = watch.batch_frames if together else watch.single_frames
+        rollouts = [(scenes, watch.single_frames, watch.single) for scenes in self.singles]
+        if not watch.batched or watch.contender.row["system"] != "mpm":  # a whole rollout of many scenes, once
+            rollouts.append((watch.batch, watch.batch_frames, watch.batched))
+        for scenes, frames, milliseconds in rollouts:
             taken = frame_milliseconds(watch.contender, scenes, frames)
             if taken is not None:
-                (watch.batched if together else watch.single).append(taken / len(scenes))
+                milliseconds.append(taken / len(scenes))
         return {
             "ms": float(np.median(watch.single)) if watch.single else None,
             "ms_quartiles": quartiles(watch.single),

@@ -16,16 +16,15 @@ import torch.multiprocessing
 
 from hgn.command import run_command
 from hgn.config import TrainingConfig
-from hgn.schema import ConfigError, from_mapping, to_mapping
+from hgn.schema import ConfigError, from_mapping
 from hgn.system.files import write_json
 from hgn.system.machine import available_cpus
-from hgn.system.provenance import provenance, without_folders
-from tools.bench.contenders import PASS
-from tools.bench.triton_contenders import OBSTACLE_CELL_SIZE
+from tools import report
+from tools.bench.contenders import OBSTACLE_CELL_SIZE
+from tools.report import EXIT_RED, PASS
 from tools.scaling.config import ScalingConfig
 from tools.scaling.measure import measure
 
-EXIT_RED = 1
 CELL_FRACTION = 0.3  # cells of the finest level for each particle of tools.bench.states, about
 
 
@@ -39,10 +38,7 @@ def main(mapping: dict[str, Any]) -> int:
         rows = with_efficiency(json.loads((Path(folder) / "rows.json").read_text()))
     print(table(rows))
     if config.json is not None:
-        write_json(
-            config.json,
-            {"meta": provenance(device_type) | {"config": without_folders(to_mapping(config))}, "rows": rows},
-        )
+        write_json(config.json, {"meta": report.meta_of(config, device_type), "rows": rows})
     return 0 if all(row["check"] == PASS for row in rows) else EXIT_RED
 
 
@@ -71,9 +67,8 @@ def _compile_ahead(config: ScalingConfig, device_type: str, count: int) -> None:
     particles = config.scenes * config.particles
     cells = tuple(max(1, int(CELL_FRACTION * particles) >> 2 * level) for level in range(config.network.levels))
     major, minor = torch.cuda.get_device_capability()
-    job = PrecompileJob(
-        config.network, settings, config.precision, count > 1, False, particles, cells, 10 * major + minor
-    )
+    capability = 10 * major + minor
+    job = PrecompileJob(config.network, settings, config.precision, count > 1, False, particles, cells, capability)
     with Precompilation(job, max(1, available_cpus() - 2)) as precompilation:
         print(precompilation.wait(), file=sys.stderr)
 
@@ -90,20 +85,16 @@ def with_efficiency(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The figures for people, as Markdown."""
-    lines = [
-        "| backend | precision | devices | scenes | spread | messages | update, ms | quartiles | efficiency | check |",
-        "| :-- | :-- | --: | --: | --: | :-- | --: | --: | --: | :-- |",
-    ]
+    """The figures for people."""
+    work = ("backend", "precision", "devices", "scenes", "particle_spread")
+    lines = []
     for row in rows:
         sent = f"{len(row['messages'])}, up to {max(row['messages']) / 1e6:.1f} MB" if row["averaged"] else "none"
-        low, high = row.get("ms_quartiles", (0, 0))
-        times = ("-", "-") if row["ms"] is None else (f"{row['ms']:.2f}", f"{low:.2f} … {high:.2f}")
-        efficiency = "-" if row["efficiency"] is None else f"{row['efficiency']:.3f}"
-        work = (row[key] for key in ("backend", "precision", "devices", "scenes", "particle_spread"))
-        cells = (*work, sent + (", in the graph" if row["one_graph"] else ""), *times, efficiency, row["check"])
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join(lines)
+        sent += ", in the graph" if row["one_graph"] else ""
+        times = report.number(row["ms"], ".2f"), report.spread(row.get("ms_quartiles"), ".2f")
+        lines.append((*(row[key] for key in work), sent, *times, report.number(row["efficiency"], ".3f"), row["check"]))
+    head = ("backend", "precision", "devices", "scenes", "spread", "messages", "update, ms", "quartiles", "efficiency")
+    return report.table((*head, "check"), lines)
 
 
 if __name__ == "__main__":

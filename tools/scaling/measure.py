@@ -11,7 +11,6 @@ import datetime
 import json
 import time
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +24,18 @@ from torch.nn.parallel import DistributedDataParallel
 from hgn.config import TrainingConfig
 from hgn.data.batch import Batch
 from hgn.data.sampler import balanced_parts
-from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.backend import set_matmul_precision, triton_unsupported_reason
 from hgn.runtime.parity import relative_error
-from hgn.runtime.triton_host import kernel_precision
 from hgn.system.machine import available_cpus
-from hgn.training.checkpoint import DataInfo
 from hgn.training.distributed import averaging_options
 from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
-from tools.bench.contenders import FRAME_RATE_HZ, PASS, bench_network
+from tools.bench.contenders import bench_network, training_module
 from tools.bench.states import Workload, batch_of_scenes
-from tools.bench.triton_contenders import device_samples
+from tools.bench.triton_contenders import device_samples, triton_updates
+from tools.report import PASS
 from tools.scaling.config import ScalingConfig
+from tools.timing import median_and_quartiles
 
 # Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
 # order each time, which turns the activations that lie next to their kink, and TF32 makes more of it.
@@ -57,7 +55,7 @@ class Contender:
     spread: float  # of the particles of a scene
     particles: float  # of one update, on each device, in the mean
     one_graph: bool = False  # with the gradients' average in the CUDA graph of the update
-    update: TorchUpdates | TritonUpdates | None = field(default=None, repr=False)  # none in processes that take no part
+    update: TorchUpdates | TritonUpdates | None = None  # none in processes that take no part
     check: str = PASS
     messages: list[int] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)  # of one update
@@ -68,13 +66,11 @@ class TorchUpdates:
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
         self.batches, self.device = batches, device
-        training = TrainingConfig(batch_scenes=config.scenes)
-        network = bench_network(config.network, device).train()  # the same weights on every rank
-        module = TrainingModule(network, training, DataInfo("", FRAME_RATE_HZ, 1 / 64)).to(device)
+        module = training_module(config.network, config.scenes, device)
         self.optimizer: torch.optim.Optimizer = module.configure_optimizers()["optimizer"]
-        self.guard = GradientGuard(training.maximum_skipped_updates)
+        self.guard = GradientGuard(module.training_config.maximum_skipped_updates)
         self.loss: nn.Module = _Loss(module)
-        self.parameters = list(network.parameters())
+        self.parameters = list(module.network.parameters())
 
     def average(self, group: dist.ProcessGroup, one_graph: bool = False) -> list[int]:
         """From now on gradients are averaged over the ranks of `group`; the bytes of the messages that this takes."""
@@ -116,16 +112,8 @@ class TritonUpdates:
     """The same with hgn.kernels.update, on episodes of one window each."""
 
     def __init__(self, config: ScalingConfig, batches: list[Batch], device: torch.device) -> None:
-        # Triton, which backend torch does without, is loaded here.
-        from hgn.kernels.update.op import Updates, UpdateSettings
-
-        training = TrainingConfig(batch_scenes=config.scenes)
-        network = bench_network(config.network, device)
-        assert isinstance(network, HierarchicalGraphNetwork)
-        settings = UpdateSettings(config.scenes, training.noise_std, training.grid_jitter, 1 / 64)
-        precision = kernel_precision(config.precision, device)
-        counters = torch.zeros(2, device=device), torch.zeros(5, device=device)
-        self.make = partial(Updates, network, settings, precision, *counters)
+        training, network = TrainingConfig(), bench_network(config.network, device)
+        self.make = triton_updates(network, config.scenes, config.precision, device, training)
         self.ours = self.make()
         self.chunk = [device_samples(batch) for batch in batches]
         self.rates = [training.learning_rate] * len(self.chunk)
@@ -153,7 +141,8 @@ class TritonUpdates:
         return (self.ours.first_moment - 0.9 * before) * 10
 
     def weights(self) -> torch.Tensor:
-        return self.ours.values
+        values: torch.Tensor = self.ours.values
+        return values
 
 
 class _Loss(nn.Module):
@@ -183,7 +172,9 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         backend = "nccl" if device.type == "cuda" else "gloo"
         sizes = [size for size in (1, 2, 4, 8, 16, 32, 64) if size < count] + [count]
         groups = {size: dist.new_group(range(size), PATIENCE, backend) for size in sizes if size > 1}
-        contenders = [_prepared(c, config, rank, groups, device) for c in _contenders(config, sizes, device)]
+        contenders = _contenders(config, sizes, device)
+        for contender in contenders:
+            _prepare(contender, config, rank, groups, device)
         _alternate(contenders, config, rank)
         for contender in contenders:
             _check_weights(contender, groups, rank)
@@ -234,13 +225,9 @@ def _batches(config: ScalingConfig, rank: int, ranks: int, spread: float, device
     ]
 
 
-def _prepared(
-    contender: Contender,
-    config: ScalingConfig,
-    rank: int,
-    groups: dict[int, dist.ProcessGroup],
-    device: torch.device,
-) -> Contender:
+def _prepare(
+    contender: Contender, config: ScalingConfig, rank: int, groups: dict[int, dist.ProcessGroup], device: torch.device
+) -> None:
     if rank < contender.devices:
         batches = _batches(config, rank, contender.devices, contender.spread, device)
         made = TorchUpdates if contender.backend == "torch" else TritonUpdates
@@ -248,12 +235,11 @@ def _prepared(
         if contender.averaged:
             _average(contender, groups[contender.devices])
     _agree(contender)
-    return contender
 
 
 def _averaged(loss: nn.Module, group: dist.ProcessGroup, device: torch.device) -> DistributedDataParallel:
-    here = [device] if device.type == "cuda" else None
-    return DistributedDataParallel(loss, device_ids=here, process_group=group, **averaging_options())
+    devices = [device] if device.type == "cuda" else None
+    return DistributedDataParallel(loss, device_ids=devices, process_group=group, **averaging_options())
 
 
 def _average(contender: Contender, group: dist.ProcessGroup) -> None:
@@ -317,11 +303,10 @@ def _seconds(contender: Contender, rank: int) -> float:
 
 
 def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> dict[str, Any]:
-    plain = contender.backend == "torch"
     row: dict[str, Any] = {
         "case": "weak_scaling",
         "backend": contender.backend,
-        "precision": _torch_precision(config, device) if plain else config.precision,
+        "precision": _torch_precision(config, device) if contender.backend == "torch" else config.precision,
         "devices": contender.devices,
         "scenes": config.scenes,
         "particles": config.particles,
@@ -335,6 +320,5 @@ def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> d
         "ms": None,
     }
     if contender.check == PASS:
-        low, middle, high = np.percentile(contender.milliseconds, (25, 50, 75)).tolist()
-        row |= {"ms": middle, "ms_quartiles": [low, high], "samples": len(contender.milliseconds)}
+        row |= median_and_quartiles(contender.milliseconds)
     return row

@@ -35,10 +35,11 @@ from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
 from tools.measures import energies, energy_scale, neighbours, outside_domain
-from tools.solver_rollouts import FrameClock, kept_trials, solver_trials
+from tools.solver_rollouts import kept_trials, solver_trials
 from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
 from tools.stability.network_motion import motion_rows
 from tools.stability.row import Row, table
+from tools.timing import FrameClock
 
 PART = "network"
 PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels

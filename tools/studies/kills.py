@@ -31,9 +31,9 @@ from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require
 from hgn.system.files import TEMPORARY_SUFFIX, write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
+from tools.report import EXIT_RED
 
 TARGETS = ("worker", "pool", "service", "all of them")
-EXIT_RED = 1
 _KEYS = ("kills", "interval_s", "kill_seed", "json")
 _LOOK_S = 0.02
 _PATIENCE_S = 600.0  # with a generation in which nothing gets published

@@ -24,11 +24,11 @@ from hgn.runtime.precompile import precompile_frames
 from hgn.schema import Positive, from_mapping, require, require_bounds
 from hgn.system.files import write_json
 from hgn.system.provenance import provenance
-from tools.bench.contenders import BOUNDS, PASS, bench_network, verdict
+from tools.bench.contenders import BOUNDS, bench_network, verdict
 from tools.bench.states import Workload, state_of
-from tools.bench.timing import once
+from tools.report import EXIT_RED, PASS
+from tools.timing import once
 
-EXIT_RED = 1
 GAP_CELLS = 4  # of the coarsest level between two blocks, and around all
 FRAMES = 3  # that are timed
 

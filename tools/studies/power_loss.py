@@ -42,8 +42,8 @@ from hgn.system.files import TEMPORARY_SUFFIX, write_json
 from hgn.system.provenance import provenance
 from hgn.training.checkpoint import LAST_NAMES, SECTION, read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
+from tools.report import EXIT_RED
 
-EXIT_RED = 1
 SPLITS = (0.0, 1.0, 0.5)  # of what is not synced: nothing is there; all names are; each thing is or is not
 SHARDS = 4
 CALLS = ("replace", "rename", "link", "unlink", "remove", "mkdir", "rmdir", "truncate")

@@ -34,6 +34,7 @@ from hgn.system.files import write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance, without_folders
 from tools.bench.states import Workload, scene_of
+from tools.report import EXIT_RED
 
 FRAME_RATE_HZ = 60.0
 STEP_S, SUBSTEPS = 1 / 60 / 54, 55  # Taichi Elements' step at 64 cells a side, and how many it takes a frame
@@ -49,7 +50,6 @@ TARGETS = {
 GENERATOR = (sys.executable, "-m", "datagen", "+experiment=obstacles")
 COMPARED_FRAMES = 4
 FIRST_FRAME, LATER_FRAMES, FALL = 1e-6, 1e-4, 0.01  # bounds: domain units
-EXIT_RED = 1
 
 
 @dataclass(frozen=True)
