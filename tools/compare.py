@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from hgn.command import run_command
-from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import ConfigError, Positive, from_mapping, require, require_bounds
 from hgn.system.files import write_json
-from hgn.system.provenance import provenance, without_folders
-from tools.report import EXIT_RED, PASS
+from tools.report import EXIT_RED, PASS, meta_of, spread
+from tools.report import table as aligned
 
 SOURCES = ("hgn", "tools", "conf", "datagen", "pyproject.toml")  # of a commit
 WORK = ("case", "particles", "scenes", "precision")  # what is the same work in two trees
@@ -64,8 +64,7 @@ def main(mapping: dict[str, Any]) -> int:
             for name, folder in turn if number % 2 == 0 else turn[::-1]:
                 runs[name].append(_run_bench(folder, config.bench, Path(scratch) / "bench.json"))
                 rows = compared(runs)
-                meta = provenance("cpu") | _measured(runs) | {"config": without_folders(to_mapping(config))}
-                write_json(config.out, {"meta": meta, "rows": rows})
+                write_json(config.out, {"meta": meta_of(config) | _measured(runs), "rows": rows})
     print(table(rows, config.trees))
     return 0 if all(row["check"] == PASS for row in rows) else EXIT_RED
 
@@ -89,8 +88,8 @@ def _run_bench(folder: Path, options: Sequence[str], out: Path) -> dict[str, Any
     if not out.exists():
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
         return {"failed": f"the bench ended with exit code {done.returncode}: {last[0]}", "rows": []}
-    report: dict[str, Any] = json.loads(out.read_text())
-    return report
+    written: dict[str, Any] = json.loads(out.read_text())
+    return written
 
 
 def compared(runs: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -103,7 +102,7 @@ def compared(runs: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
         works: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
         for report in reports:
             for row in report["rows"]:
-                works.setdefault(tuple(row[key] for key in WORK), []).append(row)
+                works.setdefault(_work(row), []).append(row)
         for work, samples in works.items():
             check = next((row["check"] for row in samples if row["check"] != PASS), PASS)
             row = {"tree": tree, **dict(zip(WORK, work, strict=True)), "check": check, "runs": len(samples), "ms": None}
@@ -117,21 +116,20 @@ def compared(runs: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
 
 
 def table(rows: Sequence[dict[str, Any]], trees: Sequence[str]) -> str:
-    """The figures for people, as Markdown, one line a work."""
-    lines = [f"| ms (range, ratio) | {' | '.join(trees)} |", f"| :-- |{' --: |' * len(trees)}"]
-    works = dict.fromkeys(tuple(row.get(key) for key in WORK) for row in rows if row["case"] != "bench")
-    for work in works:
+    """The figures for people, one line a work, and what is red."""
+    timed = {(row["tree"], _work(row)): row for row in rows if row["ms"] is not None}
+    lines = []
+    for work in dict.fromkeys(_work(row) for row in rows if row["case"] != "bench"):
         cells = []
-        for tree in trees:
-            row = next((r for r in rows if r["tree"] == tree and tuple(r.get(key) for key in WORK) == work), None)
-            if row is None or row["ms"] is None:
-                cells.append("-")
-            else:
-                low, high = row["ms_range"]
-                cells.append(f"{row['ms']:.3f} ({low:.3f} … {high:.3f}, {row['ratio']:.3f})")
-        lines.append(f"| {work[0]}, {work[1]} particles, {work[2]} scenes, {work[3]} | {' | '.join(cells)} |")
-    lines += [f"{row['case']} of {row['tree']}: {row['check']}" for row in rows if row["check"] != PASS]
-    return "\n".join(lines)
+        for row in (timed.get((tree, work)) for tree in trees):
+            cells.append(f"{row['ms']:.3f} ({spread(row['ms_range'], '.3f')}, {row['ratio']:.3f})" if row else "-")
+        lines.append(("{}, {} particles, {} scenes, {}".format(*work), *cells))
+    red = [f"{row['case']} of {row['tree']}: {row['check']}" for row in rows if row["check"] != PASS]
+    return "\n".join([aligned(("ms (range, ratio)", *trees), lines), *red])
+
+
+def _work(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row.get(key) for key in WORK)
 
 
 def _sources(name: str, scratch: Path, field: str) -> Path:
@@ -145,10 +143,8 @@ def _sources(name: str, scratch: Path, field: str) -> Path:
             archive = _git("-C", top, "archive", commit, *SOURCES)
         except (OSError, subprocess.CalledProcessError) as error:
             answer = (getattr(error, "stderr", b"") or str(error).encode()).decode(errors="replace").strip()
-            raise ConfigError(
-                f"{field} must be a folder, or a commit or branch of the repository here, got {name!r}; git says: "
-                f"{answer}"
-            ) from None
+            rule = "a folder, or a commit or branch of the repository here"
+            raise ConfigError(f"{field} must be {rule}, got {name!r}; git says: {answer}") from None
         with tarfile.open(fileobj=io.BytesIO(archive)) as file:
             safely: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # Python 3.11.4 on
             file.extractall(folder, **safely)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,11 @@ from hgn.system.files import write_atomically, write_json
 from hgn.system.provenance import provenance
 from tools.figure import as_png, new_figure
 
-ROW_KEYS = (
-    "update",
-    "minutes",
-    "loss",
-    "learning_rate",
-    "updates_per_second",
-    "scenes_per_second",
-    "gpu_memory_gb",
+# what of a record is kept
+BEGINNINGS = (
+    *("update", "minutes", "loss", "learning_rate", "updates_per_second", "scenes_per_second", "gpu_memory_gb"),
+    *("one_step", "baseline", "rollout", "monitor"),
 )
-ROW_PREFIXES = ("one_step", "baseline", "rollout", "monitor")
 BASELINE_STYLES = {"constant_velocity": ":", "ballistic_motion": "--", "mean_acceleration": "-."}
 LOSS = "MSE of normalised acceleration"
 ONE_STEP = "one-step MSE (sum over axes, frame units)"
@@ -72,22 +67,18 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(CurvesConfig, mapping)
     names = config.names or tuple(Path(run).name for run in config.runs)
     runs = [read_run(Path(folder), name) for folder, name in zip(config.runs, names, strict=True)]
-    out = Path(config.out)
-    report = {
-        "meta": provenance(),
-        "runs": [
-            {
-                "name": run.name,
-                "meta": dict(run.settings.get("provenance", {})) | {"config": run.settings},
-                "rows": measurements(run.records),
-            }
-            for run in runs
-        ],
-    }
-    write_json(out.with_suffix(".json"), report)
-    write_atomically(out.with_suffix(".png"), draw(runs[0]) if len(runs) == 1 else draw_several(runs))
-    print(out.with_suffix(".png"))
-    print(out.with_suffix(".json"))
+    parts = [
+        {
+            "name": run.name,
+            "meta": dict(run.settings.get("provenance", {})) | {"config": run.settings},
+            "rows": measurements(run.records),
+        }
+        for run in runs
+    ]
+    picture, report = (Path(config.out).with_suffix(ending) for ending in (".png", ".json"))
+    write_json(report, {"meta": provenance(), "runs": parts})
+    write_atomically(picture, draw(runs))
+    print(picture, report, sep="\n")
     return 0
 
 
@@ -100,9 +91,8 @@ def read_run(folder: Path, name: str) -> Run:
         lines = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
         settings = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise ConfigError(
-            f"runs must be folders of python -m hgn.train, got {folder} without {error.filename}"
-        ) from None
+        rule = "runs must be folders of python -m hgn.train"
+        raise ConfigError(f"{rule}, got {folder} without {error.filename}") from None
     records = [current_metrics(json.loads(line)) for line in lines]
     _add_minutes(records)
     # A run that was stopped and resumed may have repeated some updates: the later record holds.
@@ -123,58 +113,72 @@ def _add_minutes(records: list[dict[str, float]]) -> None:
 
 def measurements(records: list[dict[str, float]]) -> list[dict[str, float]]:
     """Records with errors in full, and at most LINES of the loss lines."""
-    losses = [record for record in records if "loss" in record]
-    step = -(-len(losses) // LINES)
-    kept = {id(record) for record in losses[:: max(1, step)]} | {id(r) for r in records if "loss" not in r}
+    losses = [i for i, record in enumerate(records) if "loss" in record]
+    kept = set(losses[:: max(1, -(-len(losses) // LINES))])
     return [
-        {k: v for k, v in record.items() if k in ROW_KEYS or k.startswith(ROW_PREFIXES)}
-        for record in records
-        if id(record) in kept
+        {name: value for name, value in record.items() if name.startswith(BEGINNINGS)}
+        for i, record in enumerate(records)
+        if i in kept or "loss" not in record
     ]
 
 
-def draw(run: Run) -> bytes:
-    """Loss and one-step errors over updates, the baselines as lines, and rollout errors; PNG bytes."""
-    figure, ((left, middle, right),) = new_figure(1, 3, (15, 4.5))
-    records = run.records
-    _plot(left, records, "loss", "training loss (noisy input)", "0.4")
-    left.set_ylabel(LOSS)
-    for split, color in (("training", "tab:blue"), ("validation", "tab:orange")):
-        _plot(middle, records, f"one_step/{split}", f"network, {split}", color, marker="o")
-    last = _last(records)
-    _baseline_lines(middle, last)
-    middle.set_ylabel(ONE_STEP)
-    for frame in (10, 50, 150, 299):
-        _plot(right, records, f"rollout/mse_frame_{frame}", f"frame {frame}", None, marker="o")
-    right.set_ylabel("rollout position MSE (domain units²)")
-    for axes in (left, middle, right):
-        _finish(axes, "updates")
-    training, dataset = run.settings["training"], run.settings["dataset"]
-    episodes = f"{int(last['episodes'])} training episodes, " if "episodes" in last else ""
-    figure.suptitle(
-        f"{dataset['folder']}, {episodes}{training['batch_scenes']} scenes an update, {_origin(run)}",
-        fontsize=10,
-    )
+def draw(runs: Sequence[Run]) -> bytes:
+    """Of one run: loss and one-step errors over updates, the baselines as lines, and rollout errors. Of several: loss
+    and validation error over updates, and the latter over minutes. PNG bytes.
+    """
+    figure, (panels,) = new_figure(1, 3, (15, 4.5))
+    last = {name: value for record in runs[0].records for name, value in record.items()}
+    title = "; ".join(sorted({_origin(run) for run in runs}))
+    if len(runs) == 1:
+        _draw_one(panels, runs[0], last)
+        training, dataset = runs[0].settings["training"], runs[0].settings["dataset"]
+        episodes = f"{int(last['episodes'])} training episodes, " if "episodes" in last else ""
+        title = f"{dataset['folder']}, {episodes}{training['batch_scenes']} scenes an update, {title}"
+    else:
+        _draw_several(panels, runs, last)
+    panels[0].set_ylabel(LOSS)
+    for panel in panels:
+        panel.grid(alpha=0.3, which="both")
+        if panel.lines:
+            panel.set_yscale("log")
+            panel.legend(fontsize=8)
+    figure.suptitle(title, fontsize=10)
     return as_png(figure)
 
 
-def draw_several(runs: list[Run]) -> bytes:
-    """Loss and validation error over updates, and the latter over minutes; PNG bytes."""
-    figure, ((left, middle, right),) = new_figure(1, 3, (15, 4.5))
+def _draw_one(panels: Any, run: Run, last: Mapping[str, float]) -> None:
+    left, middle, right = panels
+    _plot(left, run.records, "loss", "training loss (noisy input)", "0.4")
+    for split, color in (("training", "tab:blue"), ("validation", "tab:orange")):
+        _plot(middle, run.records, f"one_step/{split}", f"network, {split}", color, marker="o")
+    for frame in (10, 50, 150, 299):
+        _plot(right, run.records, f"rollout/mse_frame_{frame}", f"frame {frame}", None, marker="o")
+    _plot_baselines(middle, last)
+    middle.set_ylabel(ONE_STEP)
+    right.set_ylabel("rollout position MSE (domain units²)")
+    for panel in panels:
+        panel.set_xlabel("updates")
+
+
+def _draw_several(panels: Any, runs: Sequence[Run], last: Mapping[str, float]) -> None:
     for i, run in enumerate(runs):
         label, color = f"{run.name}, {run.settings['training']['batch_scenes']} scenes", f"C{i}"
         losses = [record for record in run.records if "loss" in record]
-        _plot(left, _means(losses, "loss"), "loss", label, color)
-        for axes, against in ((middle, "update"), (right, "minutes")):
-            _plot(axes, run.records, "one_step/validation", "", color, marker="o", against=against)
-    for axes in (middle, right):
-        _baseline_lines(axes, _last(runs[0].records))
-        axes.set_ylabel(ONE_STEP + ", validation")
-    left.set_ylabel(LOSS)
-    for axes, label in ((left, "updates"), (middle, "updates"), (right, "minutes of training")):
-        _finish(axes, label)
-    figure.suptitle("; ".join(sorted({_origin(run) for run in runs})), fontsize=10)
-    return as_png(figure)
+        _plot(panels[0], _means(losses, "loss"), "loss", label, color)
+        for panel, against in zip(panels[1:], ("update", "minutes"), strict=True):
+            _plot(panel, run.records, "one_step/validation", "", color, marker="o", against=against)
+    for panel, label in zip(panels, ("updates", "updates", "minutes of training"), strict=True):
+        panel.set_xlabel(label)
+    for panel in panels[1:]:
+        _plot_baselines(panel, last)
+        panel.set_ylabel(ONE_STEP + ", validation")
+
+
+def _plot_baselines(panel: Any, last: Mapping[str, float]) -> None:
+    for name, style in BASELINE_STYLES.items():
+        if f"baseline/validation_{name}" in last:
+            label = f"{name.replace('_', ' ')}, validation"
+            panel.axhline(last[f"baseline/validation_{name}"], color="0.3", linestyle=style, label=label)
 
 
 def _means(records: list[dict[str, float]], key: str, lines: int = 60) -> list[dict[str, float]]:
@@ -184,46 +188,18 @@ def _means(records: list[dict[str, float]], key: str, lines: int = 60) -> list[d
     return [{"update": part[-1]["update"], key: sum(r[key] for r in part) / len(part)} for part in parts]
 
 
-def _last(records: list[dict[str, float]]) -> dict[str, float]:
-    """The last value of each measurement."""
-    last: dict[str, float] = {}
-    for record in records:
-        last |= record
-    return last
-
-
 def _origin(run: Run) -> str:
     where = run.settings.get("provenance", {})
     return f"{where.get('device', '')}, commit {where.get('commit', '')}, {str(where.get('date', ''))[:10]}"
 
 
-def _baseline_lines(axes: Any, last: dict[str, float]) -> None:
-    for name, style in BASELINE_STYLES.items():
-        if f"baseline/validation_{name}" in last:
-            label = f"{name.replace('_', ' ')}, validation"
-            axes.axhline(last[f"baseline/validation_{name}"], color="0.3", linestyle=style, label=label)
-
-
-def _finish(axes: Any, label: str) -> None:
-    axes.set_xlabel(label)
-    axes.grid(alpha=0.3, which="both")
-    if axes.lines:
-        axes.set_yscale("log")
-        axes.legend(fontsize=8)
-
-
 def _plot(
-    axes: Any,
-    records: list[dict[str, float]],
-    key: str,
-    label: str,
-    color: str | None,
-    marker: str = "",
+    panel: Any, records: list[dict[str, float]], key: str, label: str, color: str | None, marker: str = "",
     against: str = "update",
-) -> None:
+) -> None:  # fmt: skip
     points = [(record[against], record[key]) for record in records if key in record]
     if points:
-        axes.plot(*zip(*points, strict=True), label=label, color=color, marker=marker, markersize=3, linewidth=1)
+        panel.plot(*zip(*points, strict=True), label=label, color=color, marker=marker, markersize=3, linewidth=1)
 
 
 if __name__ == "__main__":

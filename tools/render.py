@@ -17,16 +17,8 @@ import numpy as np
 
 from hgn.command import run_command
 from hgn.data.lookup import find_episode
+from hgn.render import pictures
 from hgn.render.exchange import PLY_ENDING, USD_ENDINGS, save_rollout
-from hgn.render.pictures import (
-    animate,
-    compare_picture,
-    error_curve,
-    position_error,
-    rollout_of_episode,
-    spread,
-    write_picture,
-)
 from hgn.scene.rollout_file import Rollout, read_rollout
 from hgn.schema import ConfigError, OneOrMore, Positive, from_mapping, require, require_bounds
 from hgn.system.progress import bar
@@ -56,21 +48,12 @@ class RenderConfig:
     def __post_init__(self) -> None:
         require_bounds(self)
         require(self.out != "", "out", "a folder or a file name", self.out)
+        given = [value is not None for value in (self.data, self.episode)]
         if self.rollout is None:
-            require(
-                self.data is not None and self.episode is not None,
-                "rollout",
-                "a file, or else data and episode given",
-                self.rollout,
-                "as in rollout=rollout.vtkhdf out=pictures",
-            )
+            rule, remedy = "a file, or else data and episode given", "as in rollout=rollout.vtkhdf out=pictures"
+            require(all(given), "rollout", rule, self.rollout, remedy)
         else:
-            require(
-                self.data is None and self.episode is None,
-                "rollout",
-                "left out where data and episode are given",
-                self.rollout,
-            )
+            require(not any(given), "rollout", "left out where data and episode are given", self.rollout)
         if self.names is not None:
             count = 1 + len(self.others)
             rule = f"{count} different ones, of rollout and of each of others"
@@ -96,8 +79,7 @@ def main(mapping: Mapping[str, Any]) -> int:
     """
     config = from_mapping(RenderConfig, mapping)
     versions = _load(config)
-    name, rollout = versions.name, versions.rollout
-    out = Path(config.out)
+    rollout, out = versions.rollout, Path(config.out)
     if out.suffix == ".png":
         _write_png(config, versions, out)
     elif out.suffix in ANIMATIONS:
@@ -109,12 +91,13 @@ def main(mapping: Mapping[str, Any]) -> int:
         endings = ", ".join((".png", *ANIMATIONS, *USD_ENDINGS, PLY_ENDING))
         raise ConfigError(f"out must be a folder or end in one of {endings}, got {config.out!r}")
     else:
-        _write_png(config, versions, out / f"{name}.png")
+        _write_png(config, versions, out / f"{versions.name}.png")
         if config.gif:
-            _write_animation(config, versions, out / f"{name}.gif")
+            _write_animation(config, versions, out / f"{versions.name}.gif")
         if versions.truth_TN3 is not None:
-            path = out / f"{name}_error.png"
-            write_picture(path, error_curve(_errors(versions), rollout.frame_rate_hz), rollout.source)
+            path = out / f"{versions.name}_error.png"
+            curve = pictures.error_curve(_errors(versions), rollout.frame_rate_hz)
+            pictures.write_picture(path, curve, rollout.source)
             print(path)
     return 0
 
@@ -126,7 +109,7 @@ def _load(config: RenderConfig) -> Versions:
     """
     if config.rollout is None:
         assert config.data is not None and config.episode is not None  # RenderConfig saw to it
-        rollout = rollout_of_episode(find_episode(config.data, config.episode))
+        rollout = pictures.rollout_of_episode(find_episode(config.data, config.episode))
         name, first, label = config.episode, f"episode {config.episode}", "ground truth" if config.others else ""
         truth_TN3 = rollout.position_TN3 if config.others else None
     else:
@@ -143,19 +126,26 @@ def _load(config: RenderConfig) -> Versions:
         other = read_rollout(file)
         if not np.array_equal(other.position_TN3[0], rollout.position_TN3[0], equal_nan=True):
             raise ConfigError(f"others[{i}] must begin with the same particles as {first}, got {file}")
+        rule = f"{rollout.frame_rate_hz:g} frames a second"
         if other.frame_rate_hz != rollout.frame_rate_hz:
-            raise ConfigError(
-                f"others[{i}] must have {rollout.frame_rate_hz:g} frames a second, got {other.frame_rate_hz:g}"
-            )
+            raise ConfigError(f"others[{i}] must have {rule}, got {other.frame_rate_hz:g}")
         others[other_name] = other.position_TN3
     return Versions(name, rollout, label, others, truth_TN3)
 
 
 def _write_png(config: RenderConfig, versions: Versions, path: Path) -> None:
-    rollout, frames = versions.rollout, config.frames
-    if frames is None:
-        frames = tuple(spread(rollout.frame_count, PICTURES))
-    write_picture(path, compare_picture(rollout, frames, config.size, versions.label, versions.others), rollout.source)
+    rollout = versions.rollout
+    frames = pictures.spread(rollout.frame_count, PICTURES) if config.frames is None else config.frames
+    picture = pictures.compare_picture(rollout, frames, config.size, versions.label, versions.others)
+    pictures.write_picture(path, picture, rollout.source)
+    print(path)
+
+
+def _write_animation(config: RenderConfig, versions: Versions, path: Path) -> None:
+    rollout = versions.rollout
+    with bar("drawing", total=len(range(0, rollout.frame_count, config.every)), unit="picture") as progress:
+        how = config.fps, config.every, config.size, lambda done, _: progress.update()
+        pictures.animate(rollout, path, *how, versions.label, versions.others)
     print(path)
 
 
@@ -163,29 +153,13 @@ def _errors(versions: Versions) -> dict[str, np.ndarray]:
     """Position error over time: of each material, or of each of several rollouts."""
     rollout, truth_TN3 = versions.rollout, versions.truth_TN3
     if not versions.others:
-        return position_error(rollout)
-    predicted = {versions.label: rollout.position_TN3, **versions.others}
-    return {
-        name: position_error(replace(rollout, position_TN3=position_TN3, reference_TN3=truth_TN3))["all"]
-        for name, position_TN3 in predicted.items()
-        if position_TN3 is not truth_TN3
-    }
-
-
-def _write_animation(config: RenderConfig, versions: Versions, path: Path) -> None:
-    pictures = len(range(0, versions.rollout.frame_count, config.every))
-    with bar("drawing", total=pictures, unit="picture") as progress:
-        animate(
-            versions.rollout,
-            path,
-            config.fps,
-            config.every,
-            config.size,
-            lambda done, _: progress.update(),
-            versions.label,
-            versions.others,
-        )
-    print(path)
+        return pictures.position_error(rollout)
+    errors = {}
+    for name, position_TN3 in {versions.label: rollout.position_TN3, **versions.others}.items():
+        if position_TN3 is not truth_TN3:
+            version = replace(rollout, position_TN3=position_TN3, reference_TN3=truth_TN3)
+            errors[name] = pictures.position_error(version)["all"]
+    return errors
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from hgn.scene.scene import Scene
 from hgn.system.machine import available_cpus
 from tools.solver_rollouts import solver_scene, solver_trials
 
+OnFrame = Callable[[int], None] | None
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -54,39 +56,25 @@ class SolverLaunches:
                 scene = solver_scene(episode, self.cell_size)
                 self._colliders[episode.key] = threads.submit(build_collider, scene, self.config.collider_band_cells)
 
-    def trials(
-        self, setting: Setting, episodes: Sequence[Episode], on_frame: Callable[[int], None] | None = None
-    ) -> list[RolloutResult]:
+    def trials(self, setting: Setting, episodes: Sequence[Episode], on_frame: OnFrame = None) -> list[RolloutResult]:
         """Trajectories of `frames` frames from the episodes' first ones."""
         missing = [episode for episode in episodes if (setting, episode.key) not in self._known]
         if missing:
             pairs = [(other, episode) for other in self._settings for episode in missing]
-            simulated = self._simulate(pairs, self.frames, on_frame)
+            simulated = self.simulate(pairs, self.frames, on_frame)
             self._known |= {(s, e.key): trial for (s, e), trial in zip(pairs, simulated, strict=True)}
         return [self._known[setting, episode.key] for episode in episodes]
 
-    def timed(
-        self, setting: Setting, episodes: Sequence[Episode], frames: int, on_frame: Callable[[int], None]
-    ) -> list[RolloutResult]:
-        """A few frames with one setting alone, for the clock."""
-        return self._simulate([(setting, episode) for episode in episodes], frames, on_frame)
-
-    def _simulate(
-        self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: Callable[[int], None] | None
-    ) -> list[RolloutResult]:
+    def simulate(self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
+        """So many frames of these settings and episodes, whatever is known."""
         with ThreadPoolExecutor(available_cpus()) as threads:
             self.collide([episode for _, episode in pairs], threads)
+        scenes = [self._scene(setting, episode) for setting, episode in pairs]
+        colliders = [self._colliders[episode.key].result() for _, episode in pairs]
+        steps = [setting.step for setting, _ in pairs]
         # a scene's steps are its own; where all are alike the config says so
-        alike = replace(self.config, stability_fraction=pairs[0][0].step)
-        return solver_trials(
-            [self._scene(setting, episode) for setting, episode in pairs],
-            alike,
-            frames,
-            self.frame_rate_hz,
-            on_frame,
-            [self._colliders[episode.key].result() for _, episode in pairs],
-            [setting.step for setting, _ in pairs],
-        )
+        alike = replace(self.config, stability_fraction=steps[0])
+        return solver_trials(scenes, alike, frames, self.frame_rate_hz, on_frame, colliders, steps)
 
     def _scene(self, setting: Setting, episode: Episode) -> Scene:
         scene = solver_scene(episode, self.cell_size)

@@ -49,24 +49,14 @@ def solver_trials(
     from datagen.mpm.solver import SceneFailure, simulate
 
     results = simulate(
-        scenes,
-        config,
-        frames,
-        frame_rate_hz,
-        on_frame,
-        colliders=colliders,
-        stability_fractions=stability_fractions,
+        scenes, config, frames, frame_rate_hz, on_frame, colliders=colliders, stability_fractions=stability_fractions
     )
-    trials = []
-    for scene, result in zip(scenes, results, strict=True):
-        if isinstance(result, SceneFailure):
-            trials.append(RolloutResult(scene.position_N3[None], result.cause))
-        else:
-            finite_T = np.isfinite(result.position_TN3).all(axis=(1, 2))
-            good = frames if finite_T.all() else int(finite_T.argmin())
-            cause = None if good == frames else f"positions are not finite at frame {good}"
-            trials.append(RolloutResult(result.position_TN3[:good], cause))
-    return trials
+    return [
+        RolloutResult(scene.position_N3[None], result.cause)
+        if isinstance(result, SceneFailure)
+        else RolloutResult(result.position_TN3)
+        for scene, result in zip(scenes, results, strict=True)
+    ]
 
 
 def kept_trials(
@@ -81,18 +71,17 @@ def kept_trials(
     files = [folder / f"{key}.npz" for key in keys]
     missing = [i for i, file in enumerate(files) if not file.exists()]
     if missing:
-        trials = solver_trials([scenes[i] for i in missing], config, frames, frame_rate_hz)
-        for i, trial in zip(missing, trials, strict=True):
+        simulated = solver_trials([scenes[i] for i in missing], config, frames, frame_rate_hz)
+        for i, trial in zip(missing, simulated, strict=True):
             with temporary_file(files[i]) as temporary:
                 with temporary.open("wb") as file:
                     np.savez(file, position_TN3=trial.position_TN3, cause=np.array(trial.cause or ""))
                 temporary.replace(files[i])
-    return [_kept_trial(file) for file in files]
-
-
-def _kept_trial(path: Path) -> RolloutResult:
-    with np.load(path) as stored:
-        return RolloutResult(stored["position_TN3"], str(stored["cause"]) or None)
+    trials = []
+    for path in files:
+        with np.load(path) as stored:
+            trials.append(RolloutResult(stored["position_TN3"], str(stored["cause"]) or None))
+    return trials
 
 
 def other_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:

@@ -43,10 +43,8 @@ FOLDERS = ("results", "hgn/weights", "jobs", "docs")  # of the repository, searc
 SPECIFICATION = "tables.yaml"
 REMEDY = "run python -m tools.tables"
 
-EXPRESSION_ERRORS = (
-    *(ArithmeticError, AttributeError, LookupError, NameError, SyntaxError, TypeError, ValueError),
-    OSError,  # a file that is not there
-)
+# OSError: a file that is not there
+EXPRESSION_ERRORS = ArithmeticError, AttributeError, LookupError, NameError, OSError, SyntaxError, TypeError, ValueError
 
 TABLE = re.compile(r"(?P<begin><!-- table: (?P<name>[\w-]+) -->\n)(?P<text>.*?)(?P<end><!-- end -->)", re.DOTALL)
 VALUE = re.compile(r"(?P<begin><!--=(?P<name>[\w-]+)-->)(?P<text>[^<]*)(?P<end><!--/-->)")
@@ -88,9 +86,8 @@ def specifications(root: Path) -> list[Path]:
     """All `tables.yaml` of the repository. Raises ConfigError where there is none."""
     paths = sorted(path for folder in FOLDERS for path in (root / folder).rglob(SPECIFICATION))
     if not paths:
-        raise ConfigError(
-            f"no {SPECIFICATION} in {root}/{{{','.join(FOLDERS)}}}; run it from a checkout of the repository"
-        )
+        places = f"{root}/{{{','.join(FOLDERS)}}}"
+        raise ConfigError(f"no {SPECIFICATION} in {places}; run it from a checkout of the repository")
     return paths
 
 
@@ -113,9 +110,8 @@ def pages(specification: Path) -> list[Page]:
         def filled(match: re.Match[str], kind: str) -> str:
             name = match["name"]
             if name not in kinds[kind]:
-                raise ConfigError(
-                    f"{path}: {specification} has no {kind} {name}; define it there or take the marker away"
-                )
+                remedy = "define it there or take the marker away"
+                raise ConfigError(f"{path}: {specification} has no {kind} {name}; {remedy}")
             used.add(name)
             read.clear()
             try:
@@ -158,8 +154,8 @@ class Source:
     def _loaded(self) -> Any:
         self._read.add(self._path.name)
         if self._node is None:
-            read = _safetensors_header if self._path.suffix == ".safetensors" else _json
-            self._node = _node(read(self._path))
+            weights = self._path.suffix == ".safetensors"
+            self._node = _node(_safetensors_header(self._path) if weights else json.loads(self._path.read_text()))
         return self._node
 
 
@@ -194,10 +190,6 @@ def _node(value: Any) -> Any:
     return Records(map(_node, value)) if isinstance(value, list) else value
 
 
-def _json(path: Path) -> Any:
-    return json.loads(path.read_text())
-
-
 def _safetensors_header(path: Path) -> dict[str, Any]:
     with path.open("rb") as file:
         (length,) = struct.unpack("<Q", file.read(8))
@@ -206,19 +198,10 @@ def _safetensors_header(path: Path) -> dict[str, Any]:
     return {"bytes": path.stat().st_size, "tensors": header, "metadata": metadata}
 
 
-def _rms(values: Any) -> float:
-    return math.sqrt(statistics.fmean(value**2 for value in values))
-
-
 FUNCTIONS: dict[str, Any] = {
     **{function.__name__: function for function in (abs, any, dict, every, len, list, max, min, sorted, str, sum, zip)},
-    **{
-        "mean": statistics.fmean,
-        "median": statistics.median,
-        "rms": _rms,
-        "prod": math.prod,
-        "stdev": statistics.stdev,
-    },
+    **{"mean": statistics.fmean, "median": statistics.median, "stdev": statistics.stdev, "prod": math.prod},
+    "rms": lambda values: math.sqrt(statistics.fmean(value**2 for value in values)),
 }
 
 

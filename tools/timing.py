@@ -20,6 +20,7 @@ TOGETHER_S = 20e-6  # frames that are reported less than this apart were compute
 class Timed:
     """What takes turns: `sample` does the work once or more and returns milliseconds."""
 
+    warm_up = WARM_UP  # samples that are thrown away
     rounds: int | None = None  # samples in all, for one that is long; none: one a round
     failure: str | None = None  # why what was timed is worth nothing
 
@@ -42,18 +43,17 @@ def once(run: Callable[[], object], device: torch.device) -> float:
     return first.elapsed_time(last)
 
 
-def alternate(contenders: Sequence[Timed], rounds: int, seconds: float) -> list[list[float]]:
-    """The milliseconds of each: every round takes one sample of each contender in turn.
+def alternate(contenders: Sequence[Timed], rounds: int, is_over: Callable[[], bool]) -> list[list[float]]:
+    """The milliseconds of each: every round takes one sample of each contender in turn, once all are warmed up.
 
-    Ends after `rounds` rounds, or after `seconds` once MINIMUM_ROUNDS are done. Warm-up samples are thrown away.
+    Ends after `rounds` rounds, or where `is_over` says so once MINIMUM_ROUNDS are done.
     """
-    started = time.monotonic()
     for timed in contenders:
-        for _ in range(WARM_UP if timed.rounds is None else 1):
+        for _ in range(timed.warm_up):
             timed.sample()
     milliseconds: list[list[float]] = [[] for _ in contenders]
     for index in range(rounds):
-        if index >= MINIMUM_ROUNDS and time.monotonic() - started > seconds:
+        if index >= MINIMUM_ROUNDS and is_over():
             break
         for timed, samples in zip(contenders, milliseconds, strict=True):
             if index % (1 if timed.rounds is None else max(1, rounds // timed.rounds)) == 0:

@@ -153,17 +153,17 @@ def test_contenders_take_turns():
 
     class Named(Timed):
         def __init__(self, name, rounds=None):
-            self.name, self.rounds = name, rounds
+            self.name, self.rounds, self.warm_up = name, rounds, 3 if rounds is None else 1
 
         def sample(self):
             order.append(self.name)
             return float(len(order))
 
-    times = alternate([Named("a"), Named("b"), Named("c", rounds=2)], 6, 60.0)
+    times = alternate([Named("a"), Named("b"), Named("c", rounds=2)], 6, lambda: False)
     assert "".join(order) == "aaabbbc" + "abc" + "ab" * 2 + "abc" + "ab" * 2
     assert [len(milliseconds) for milliseconds in times] == [6, 6, 2]
     assert median_and_quartiles([4.0, 1.0, 2.0, 3.0, 5.0]) == {"ms": 3.0, "ms_quartiles": [2.0, 4.0], "samples": 5}
-    assert len(alternate([Named("d")], 100, 0.0)[0]) == 5
+    assert len(alternate([Named("d")], 100, lambda: True)[0]) == 5
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError, from_mapping
 from tools.measures import neighbours
 from tools.solver_rollouts import solver_trials
-from tools.stability import network_motion
+from tools.stability import network, network_cases, network_motion
 from tools.stability.network import (
     case_row,
     case_trials,
@@ -51,7 +51,7 @@ SCENE = {
     "group_size": 0.04,
 }
 GRAVITY = (0.0, -9.8, 0.0)
-SMALL = {"frames": 3, "long_frames": 5, "domain_factors": [4], "scene": SCENE, "device": "cpu", "solver_device": "cpu"}
+SMALL = {"frames": 3, "long_frames": 5, "scene": SCENE, "device": "cpu", "solver_device": "cpu"}
 MATERIAL_NAMES = ("water", "sand", "snow")
 
 
@@ -67,10 +67,12 @@ def weights(tmp_path):
     return str(path)
 
 
-def test_every_case_has_a_row(weights, tmp_path, capsys):
+def test_every_case_has_a_row(weights, tmp_path, monkeypatch, capsys):
     """Each case is simulated and told with the report's keys; what rests holds everywhere."""
+    monkeypatch.setattr(network_cases, "SPEED_FACTOR", 8.0)
+    monkeypatch.setattr(network_cases, "DOMAIN_SIDES", (2,))
     path, picture = tmp_path / "reports" / "stability.json", tmp_path / "reports" / "stability.png"
-    assert main(SMALL | {"weights": weights, "json": str(path), "picture": str(picture), "speed_factor": 8.0}) == 0
+    assert main(SMALL | {"weights": weights, "json": str(path), "picture": str(picture)}) == 0
     with Image.open(picture) as drawn:
         assert drawn.height > 14 * 300
     report = json.loads(path.read_text())
@@ -240,37 +242,37 @@ def test_collisions_against_the_solver():
     assert not brakes.held and brakes.measured > 0.1
 
 
-def row_of(simulator, case, energy_bound):
+def row_of(simulator, case):
     states = initial_states(case)
-    return case_row(simulator, case, states, energy_bound, *case_trials(simulator, case, states))
+    return case_row(simulator, case, states, *case_trials(simulator, case, states))
 
 
-def test_failures_are_told(weights):
+def test_failures_are_told(weights, monkeypatch):
     """A rollout that diverges says at which frame; energy from nowhere and particles that leave are failures too."""
     config = from_mapping(StabilityNetworkConfig, SMALL | {"weights": weights, "cases": ["single"]})
-    network = network_of(torch.float32)
-    case = next(iter(cases(config, network.config)))
-    simulator = Simulator(network, 60.0)
+    simulator = Simulator(network_of(torch.float32), 60.0)
+    case = next(iter(cases(config, simulator.network.config)))
     push = torch.tensor(GRAVITY) / 60**2
     simulator.backend.predict = lambda state: push.expand(len(state.position_N3), 3)
     case = Case(case.name, case.scenes, 16, GRAVITY, 12)
-    row = row_of(simulator, case, 0.02)
+    row = row_of(simulator, case)
     assert row.held and row.more["share_of_way"] == pytest.approx(1, rel=1e-3)
     push[0] = 1e-2
-    row = row_of(simulator, Case(case.name, case.scenes, 40), 0.02)
+    row = row_of(simulator, Case(case.name, case.scenes, 40))
     assert not row.held and row.measured < 40 and "diverged at frame" in row.beyond
     assert row.more["guard"] == "raised" and row.more["failed_scenes"] == 1
-    row = row_of(simulator, case, 0.02)
+    row = row_of(simulator, case)
     assert not row.held and row.measured == 16 and row.beyond.startswith("energy grows")
-    row = row_of(simulator, case, 1e9)
+    monkeypatch.setattr(network, "ENERGY_BOUND", 1e9)
+    row = row_of(simulator, case)
     assert not row.held and row.beyond == "1e+02 % of the particles end outside of the domain"
 
 
 @pytest.mark.parametrize("inputs", ["absolute", "relative"])
 def test_the_guard_is_asked(inputs):
     """A weight that explodes is noticed at the first frame, also where free flight leaves networks no answer."""
-    network = network_of(torch.float32, inputs=inputs, width=8, material_embedding=2, levels=2)
-    row = guard_row(Simulator(network, 60.0, "torch"), StabilityNetworkConfig("", scene=SceneConfig()))
+    exploding = network_of(torch.float32, inputs=inputs, width=8, material_embedding=2, levels=2)
+    row = guard_row(Simulator(exploding, 60.0, "torch"), SceneConfig())
     assert row.held, row
 
 
@@ -340,11 +342,11 @@ def test_rest_beside_the_solver(stretch, shift, beyond):
 
     own = path(stretch, 0.0, shift) if shift > 1 else path(stretch, shift)
     case, simulator = Case("4 frames", (), 4, settled=2), Simulator(network_of(), 60.0)
-    row = case_row(simulator, case, [scene], 1.0, [own], None, [path(1.0, 0.0, 1.0)])
+    row = case_row(simulator, case, [scene], [own], None, [path(1.0, 0.0, 1.0)])
     assert row.held is (beyond is None) and (beyond is None or beyond in row.beyond), row
     assert row.more["solver_rest"]["drift"] == pytest.approx(1.0, rel=1e-3)
     early = RolloutResult(own.position_TN3[:3], "diverged")
-    assert not case_row(simulator, case, [scene], 1.0, [own], None, [early]).held
+    assert not case_row(simulator, case, [scene], [own], None, [early]).held
 
 
 def test_the_solver_is_asked_once(tmp_path, monkeypatch):
@@ -399,9 +401,7 @@ def test_the_solver_has_the_law_that_is_named():
     ("change", "message"),
     [
         ({"cases": ["wide"]}, r"cases\[0\] must be one of throw"),
-        ({"domain_factors": [5]}, r"domain_factors\[0\] must be a square"),
         ({"frames": 1}, "frames must be at least 2"),
-        ({"energy_bound": 0.0}, "energy_bound must be a finite number > 0"),
         ({"precision": "fp8"}, "precision must be one of fp32, tf32, fp16"),
         ({"scenes_at_once": 0}, "scenes_at_once must be .* > 0, got 0"),
         ({"solver_device": "moon"}, "solver_device must be one of auto, cpu, gpu"),

@@ -68,12 +68,13 @@ def test_validation_rows(monkeypatch):
     """Even four cells of water lead the experiment by less than 18 %; columns have run-out and height by each law."""
     monkeypatch.setattr(solver_validation, "DAM_CELLS", (4, 5))
     monkeypatch.setattr(solver_validation, "COLUMN_CELLS", 4)
+    monkeypatch.setattr(solver_validation, "COLUMN_ASPECTS", (1.0,))
     monkeypatch.setattr(solver_validation, "OTHER_ASPECTS", (1.0,))
     monkeypatch.setattr(solver_validation, "SAND_LAWS", (("compression", 45.0),))
     monkeypatch.setattr(solver_validation, "REST_S", 3.0)
     cpu = MpmConfig(device="cpu")
     rows = [row for part in ("rest", "dam_breaks") for row in getattr(solver_validation, part)(cpu)]
-    rows += solver_validation.columns(cpu, (1.0,)) + solver_validation.columns(cpu, (1.0,), (0.0, 50.0))
+    rows += solver_validation.columns(cpu) + solver_validation.columns(cpu, (0.0, 50.0))
     rows += solver_validation.column_laws(cpu)
     assert [row.case.split(",")[0] for row in rows] == [
         "level of water at rest", *["dam break"] * 3, *["sand column"] * 8

@@ -6,6 +6,7 @@ Prints no time of what fails its check. The JSON holds {"meta": provenance, "row
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,8 @@ def group_rows(
     with matmul_precision(precision):
         prepared = [_prepare(config, device, precision, case, work) for case in cases]
         ready = [(row, contender) for row, contender in prepared if contender is not None]
-        times = alternate([contender for _, contender in ready], config.rounds, config.seconds)
+        end = time.monotonic() + config.seconds
+        times = alternate([contender for _, contender in ready], config.rounds, lambda: time.monotonic() > end)
     for (row, contender), milliseconds in zip(ready, times, strict=True):
         if contender.failure is not None:
             row["check"] = contender.failure

@@ -26,7 +26,7 @@ from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError, network_predictor
-from tools.solver_launches import Setting, SolverLaunches
+from tools.solver_launches import OnFrame, Setting, SolverLaunches
 from tools.timing import FrameClock, matmul_precision
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ REST_SPEED = 1e-4  # domain units a frame; what is slower is at rest
 REPEATED_FRAMES = 51  # of rollouts of a network's further precisions on backend torch, which take minutes
 # What is measured first, a point of each kind before the others; what is last may be left out when the time is over.
 HGN_FIRST, SAME_GRID, GNS_FIRST, HGN_NEXT, COARSE_GRIDS, STATIC_PARTICLES_FIRST, HGN_LAST, GNS_LAST = range(8)
-OnFrame = Callable[[int], None] | None
 
 
 @dataclass
@@ -151,7 +150,7 @@ class SolverContender(Contender):
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
         if on_frame is not None:
-            return self.launches.timed(self.setting, episodes, frames, on_frame)
+            return self.launches.simulate([(self.setting, episode) for episode in episodes], frames, on_frame)
         trials, most = self.launches.trials(self.setting, episodes), min(frames, self.frames)
         return [RolloutResult(trial.position_TN3[:most], trial.cause) for trial in trials]
 

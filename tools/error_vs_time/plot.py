@@ -19,8 +19,7 @@ SHOWN_FRAME = 50  # in a panel of its own, beside the last one
 HGN_COLORS = ("#0b3c8c", "#2f7fd6", "#12a3a8", "#7b5cd6", "#5aa9e6", "#2b2f77")
 GNS_COLORS = ("#d9480f", "#a61e4d", "#f08c00", "#862e9c")
 GRID_COLORS = ("#111111", "#5c5c5c", "#9a9a9a", "#c0c0c0")  # the finest first
-PRECISION_MARKERS = {"fp32": "o", "tf32": "s", "fp16": "D"}
-PRECISION_NAMES = {"fp32": "fp32", "tf32": "TF32", "fp16": "fp16"}
+PRECISIONS = {"fp32": ("o", "fp32"), "tf32": ("s", "TF32"), "fp16": ("D", "fp16")}  # markers and names
 STEP_MARKERS = ("^", "v", "<", ">")  # the largest step first
 FLOOR_COLOR, BASELINE_COLOR = "#2b8a3e", "#868e96"
 FLOOR_LINES, BASELINE_LINES = ("-", "--"), (":", "--", "-.")
@@ -29,6 +28,7 @@ TEXT, SMALL, TINY = 10.5, 9.5, 7.5  # points
 FIGURE_WIDTH, PANEL_HEIGHT = 16.2, 4.9  # inches
 NEAR_FLOOR, FAR_ABOVE = 30, 8  # what is still shown: times below the least error, above the best that learns nothing
 LEGEND_LINE = 1.5 * SMALL  # points
+TIMED = (*NETWORK_KINDS, "mpm")
 UPPER_EDGE = 0.965  # where of a panel's height they are marked that diverged in all scenes
 
 Row = Mapping[str, Any]
@@ -45,7 +45,8 @@ def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = Fa
     shown: list[int | None] = [None, *sorted({f for f in frames if f == SHOWN_FRAME} | set(frames[-1:]))]
     looks = _looks(rows)
     columns = _legend(rows, looks)
-    below = max(len(column) for column in columns) * LEGEND_LINE / 72  # inches
+    most = max(len(column) for column in columns)
+    below = most * LEGEND_LINE / 72  # inches
     size = (FIGURE_WIDTH, PANEL_HEIGHT + below + 0.9)
     figure, grid = new_figure(1, len(shown), size)
     scenes = max((row.get("batch_scenes") or 1 for row in rows), default=1)
@@ -54,17 +55,9 @@ def draw_pareto(rows: Sequence[Row], meta: Mapping[str, Any], batched: bool = Fa
         _pareto(panel, rows, frame, "ms_batched" if batched else "ms", looks)
         panel.set_xlabel(f"milliseconds a frame{' and scene' if batched else ''}", fontsize=TEXT)
     footer = _footer(figure, meta)
-    most = max(len(column) for column in columns)
-    figure.legend(
-        handles=[handle for column in columns for handle in column + [_mark("", "", "none")] * (most - len(column))],
-        loc="lower center",
-        bbox_to_anchor=(0.5, footer / size[1]),
-        ncols=len(columns),
-        fontsize=SMALL,
-        frameon=False,
-        columnspacing=2.5,
-        borderaxespad=0,
-    )
+    filled = [handle for column in columns for handle in column + [_mark("", "", "none")] * (most - len(column))]
+    place = {"loc": "lower center", "bbox_to_anchor": (0.5, footer / size[1]), "borderaxespad": 0}
+    figure.legend(handles=filled, ncols=len(columns), fontsize=SMALL, frameon=False, columnspacing=2.5, **place)
     return _png(figure, meta, f"Error against run time, {how}", footer + below + 0.12)
 
 
@@ -75,20 +68,18 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
     best: dict[str, Row] = {}
     for row in rows:
         if row["system"] in NETWORK_KINDS:
-            known = best.get(row["weights"])
-            if known is None or _length(row) > _length(known):
-                best[row["weights"]] = row
+            best[row["weights"]] = max(best.get(row["weights"], row), row, key=_length)
     for row in rows:
-        if row["system"] in NETWORK_KINDS and row is not best[row["weights"]]:
+        network = row["system"] in NETWORK_KINDS
+        if network and row is not best[row["weights"]]:
             continue
         look, curve_T = looks[_name(row)], np.array([np.nan if v is None else v for v in row["curve"]])
         time_T = np.flatnonzero(curve_T > 0)
-        style = {"color": look["color"], "linestyle": look.get("line", "-")}
+        style = {"color": look["color"], "linestyle": look.get("line", "-"), "linewidth": 2.0 if network else 1.2}
         if row["system"] == "mpm":
             style |= {"marker": look["markers"][row["step"]], "markevery": 0.15, "markersize": 5}
-        width = 2.0 if row["system"] in NETWORK_KINDS else 1.2
-        name = f"{_name(row)}, {PRECISION_NAMES[row['precision']]}" if row["system"] in NETWORK_KINDS else label(row)
-        panel.plot(time_T, curve_T[time_T], label=name, linewidth=width, **style)
+        name = f"{_name(row)}, {PRECISIONS[row['precision']][1]}" if network else label(row)
+        panel.plot(time_T, curve_T[time_T], label=name, **style)
     panel.set_xlabel("frame", fontsize=TEXT)
     panel.set_ylabel("position MSE (domain lengths²)", fontsize=TEXT)
     panel.set_yscale("log")
@@ -106,49 +97,40 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks:
     from matplotlib.ticker import LogLocator
 
     times = [row[key] for row in rows if row.get(key) is not None] or [1.0]
-    limits = _limits(rows, frame)
+    low, high = _limits(rows, frame)
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(_name(row), []).append(row)
     for name, some in groups.items():
-        look = looks[name]
-        if some[0]["system"] in UNTIMED:
-            error = _error(some[0], frame)
-            if error is not None:
-                panel.axhline(error, color=look["color"], linestyle=look["line"], linewidth=1.3, zorder=1)
-            continue
-        points = sorted((row for row in some if row.get(key) is not None), key=lambda row: row[key])
-        there = [(row[key], _error(row, frame)) for row in points if _error(row, frame) is not None]
-        panel.plot([x for x, _ in there], [y for _, y in there], "-", color=look["color"], linewidth=1.2, alpha=0.6)
-        for row in points:
-            _point(panel, row, frame, key, look, limits[1])
-    panel.set_xscale("log")
-    panel.set_xlim(min(times) / 1.8, max(times) * 1.8)
+        look, error = looks[name], _error(some[0], frame)
+        if some[0]["system"] not in UNTIMED:
+            points = sorted((row for row in some if row.get(key) is not None), key=lambda row: row[key])
+            there = [(row[key], y) for row in points if (y := _error(row, frame)) is not None]
+            panel.plot([x for x, _ in there], [y for _, y in there], "-", color=look["color"], linewidth=1.2, alpha=0.6)
+            for row in points:
+                _point(panel, row, frame, key, look, high)
+        elif error is not None:
+            panel.axhline(error, color=look["color"], linestyle=look["line"], linewidth=1.3, zorder=1)
+    panel.set(xscale="log", yscale="log", xlim=(min(times) / 1.8, max(times) * 1.8), ylim=(low, high))
     panel.xaxis.set_major_locator(LogLocator(subs=TICKS))
     panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
     panel.xaxis.set_minor_formatter("")
-    panel.set_yscale("log")
-    panel.set_title(
-        "one step: MSE of accelerations" if frame is None else f"rollout: MSE of positions at frame {frame}",
-        fontsize=TEXT,
-    )
+    title = "one step: MSE of accelerations" if frame is None else f"rollout: MSE of positions at frame {frame}"
+    panel.set_title(title, fontsize=TEXT)
     panel.set_ylabel("MSE (domain lengths² / frame⁴)" if frame is None else "MSE (domain lengths²)", fontsize=SMALL)
     panel.tick_params(labelsize=SMALL)
     panel.grid(alpha=0.25)
     panel.grid(alpha=0.1, which="minor", axis="x")
-    panel.set_ylim(*limits)
-    floors = [error for row in rows if row["system"] == "chaos" and (error := _error(row, frame)) is not None]
+    floors = _errors(rows, frame, "chaos")
     if floors:
-        panel.axhspan(limits[0], max(floors), color=FLOOR_COLOR, alpha=0.09, linewidth=0, zorder=0)
+        panel.axhspan(low, max(floors), color=FLOOR_COLOR, alpha=0.09, linewidth=0, zorder=0)
 
 
 def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
     """Of the errors' axis: all points but those far above what learns nothing, and floors that are near."""
-    errors = [error for row in rows if (error := _error(row, frame)) is not None and row["system"] not in UNTIMED]
-    baselines = [error for row in rows if row["system"] == "baseline" and (error := _error(row, frame)) is not None]
-    floors = [error for row in rows if row["system"] == "chaos" and (error := _error(row, frame)) is not None]
-    everything = errors + baselines + floors or [1.0]
-    low, high = min(errors or everything), max([*errors, *baselines[:1]] or everything)
+    points, baselines, floors = (_errors(rows, frame, *of) for of in (TIMED, ("baseline",), ("chaos",)))
+    everything = points + baselines + floors or [1.0]
+    low, high = min(points or everything), max([*points, *baselines[:1]] or everything)
     low = min([low, *(floor for floor in floors if floor > low / NEAR_FLOOR)])
     if baselines:
         high = min(max(high, min(baselines)), FAR_ABOVE * min(baselines))
@@ -156,28 +138,25 @@ def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
 
 
 def _point(panel: Any, row: Row, frame: int | None, key: str, look: Mapping[str, Any], highest: float) -> None:
-    mpm = row["system"] == "mpm"
-    marker = look["markers"][row["step"]] if mpm else PRECISION_MARKERS[row["precision"]]
+    marker = look["markers"][row["step"]] if row["system"] == "mpm" else PRECISIONS[row["precision"]][0]
     style = {"color": look["color"], "markeredgecolor": "white", "markeredgewidth": 0.7, "markersize": 8.5, "zorder": 4}
-    error, reached = _error(row, frame), _reached(row, frame)
-    if error is None:
-        if frame is not None and not reached and row["failed_scenes"]:
-            panel.plot(row[key], UPPER_EDGE, marker, transform=panel.get_xaxis_transform(), **style)
-            panel.plot(
-                row[key], UPPER_EDGE, "x", color="black", markersize=10, zorder=5, transform=panel.get_xaxis_transform()
-            )
+    x, error, scenes = row[key], _error(row, frame), len(row["seeds"])
+    reached = scenes if frame is None else int(row["scenes_reached"].get(str(frame), 0))
+    if error is None and (reached or not row["failed_scenes"]):
         return
-    if error > highest:
-        panel.plot(row[key], UPPER_EDGE, marker, transform=panel.get_xaxis_transform(), **style)
+    edge = {"transform": panel.get_xaxis_transform()}
+    inside = error is not None and error <= highest
+    y, at = (error, {}) if inside else (UPPER_EDGE, edge)
+    panel.plot(x, y, marker, **at, **style)
+    if error is not None and not inside:
         told = {"textcoords": "offset points", "xytext": (8, -4), "fontsize": SMALL, "color": look["color"]}
-        panel.annotate(f"↑ {error:.0e}", (row[key], UPPER_EDGE), xycoords=panel.get_xaxis_transform(), **told)
+        panel.annotate(f"↑ {error:.0e}", (x, y), xycoords=edge["transform"], **told)
         return
     bars = row["one_step_quartiles"] if frame is None else row["position_quartiles"].get(str(frame))
-    if bars and min(bars) > 0:
-        panel.plot([row[key]] * 2, bars, "-", color=look["color"], linewidth=4, alpha=0.28, zorder=2)
-    panel.plot(row[key], error, marker, **style)
-    if frame is not None and reached < len(row["seeds"]):
-        panel.plot(row[key], error, "x", color="black", markersize=10, zorder=5)
+    if inside and bars and min(bars) > 0:
+        panel.plot([x] * 2, bars, "-", color=look["color"], linewidth=4, alpha=0.28, zorder=2)
+    if reached < scenes:
+        panel.plot(x, y, "x", color="black", markersize=10, zorder=5, **at)
 
 
 def _mark(marker: str, name: str, color: str = "0.35") -> Any:
@@ -191,28 +170,24 @@ def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    systems = [row["system"] for row in rows]
     networks: list[Any] = []
     grids: list[Any] = []
     lines: list[Any] = []
     steps: dict[float, str] = {}
     for name, look in looks.items():
-        if look["system"] in NETWORK_KINDS:
-            networks.append(Line2D([], [], color=look["color"], linewidth=3.5, label=name))
-        elif look["system"] == "mpm":
-            grids.append(Line2D([], [], color=look["color"], linewidth=3.5, label=name))
-            steps |= look["markers"]
-        else:
-            lines.append(Line2D([], [], color=look["color"], linestyle=look["line"], linewidth=1.5, label=name))
+        kind = networks if look["system"] in NETWORK_KINDS else grids if look["system"] == "mpm" else lines
+        style = {"linestyle": look["line"], "linewidth": 1.5} if kind is lines else {"linewidth": 3.5}
+        kind.append(Line2D([], [], color=look["color"], label=name, **style))
+        steps |= look.get("markers", {})
     present = {row["precision"] for row in rows if row["system"] in NETWORK_KINDS}
-    precisions = [_mark(m, PRECISION_NAMES[name]) for name, m in PRECISION_MARKERS.items() if name in present]
+    precisions = [_mark(*PRECISIONS[name]) for name in PRECISIONS if name in present]
     marks = [_mark(m, f"solver, {step:g} of the stable step") for step, m in sorted(steps.items(), reverse=True)]
     notes: list[Any] = []
     if networks or grids:
         notes.append(Patch(color="0.35", alpha=0.28, label="bar: the middle half of the scenes"))
     if any(row["failed_scenes"] for row in rows):
         notes.append(_mark("x", "some scenes failed (at the upper edge: all)", "black"))
-    if "chaos" in systems:
+    if any(row["system"] == "chaos" for row in rows):
         notes.append(Patch(color=FLOOR_COLOR, alpha=0.15, label="below the chaos floor: means nothing"))
     columns = [networks, [*grids, *marks], [*precisions, *notes], lines]
     return [column for column in columns if column] or [[_mark("", "nothing was measured")]]
@@ -230,16 +205,16 @@ def _looks(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
         name, system = _name(row), row["system"]
         if name in looks:
             continue
-        looks[name] = {"system": system}
         if system == "mpm":
             color = GRID_COLORS[min(grids.index(row["grid"]), len(GRID_COLORS) - 1)]
-            looks[name] |= {"color": color, "markers": markers}
+            looks[name] = {"color": color, "markers": markers}
         elif system == "chaos":
-            looks[name] |= {"color": FLOOR_COLOR, "line": next(floors)}
+            looks[name] = {"color": FLOOR_COLOR, "line": next(floors)}
         elif system == "baseline":
-            looks[name] |= {"color": BASELINE_COLOR, "line": next(baselines)}
+            looks[name] = {"color": BASELINE_COLOR, "line": next(baselines)}
         else:
-            looks[name] |= {"color": next(hgn if system == "hgn" else gns)}
+            looks[name] = {"color": next(hgn if system == "hgn" else gns)}
+        looks[name]["system"] = system
     return looks
 
 
@@ -264,8 +239,8 @@ def _error(row: Row, frame: int | None) -> float | None:
     return error if error is not None and error > 0 else None
 
 
-def _reached(row: Row, frame: int | None) -> int:
-    return len(row["seeds"]) if frame is None else int(row["scenes_reached"].get(str(frame), 0))
+def _errors(rows: Sequence[Row], frame: int | None, *systems: str) -> list[float]:
+    return [error for row in rows if row["system"] in systems and (error := _error(row, frame)) is not None]
 
 
 def _length(row: Row) -> int:
@@ -274,11 +249,9 @@ def _length(row: Row) -> int:
 
 def _footer(figure: Any, meta: Mapping[str, Any]) -> float:
     """Where the figure comes from, at its lower edge; the inches that it takes."""
-    versions = meta["versions"]
-    told = (
-        f"{CONVENTION}; scored by {meta['reference']}. torch {versions['torch']}, taichi {versions['taichi']}, commit "
-        f"{meta['commit']}, {meta['date'][:10]}: {meta['command']}"
-    )
+    versions = "torch {torch}, taichi {taichi}".format(**meta["versions"])
+    when = f"commit {meta['commit']}, {meta['date'][:10]}: {meta['command']}"
+    told = f"{CONVENTION}; scored by {meta['reference']}. {versions}, {when}"
     width = int(figure.get_figwidth() * 72 / (0.62 * TINY))  # characters
     lines = textwrap.wrap(told, width, max_lines=4, placeholder=" …")
     figure.text(0.006, 0.008, "\n".join(lines), fontsize=TINY, color="0.35", va="bottom")
@@ -289,7 +262,6 @@ def _png(figure: Any, meta: Mapping[str, Any], title: str, below: float) -> byte
     """With a title, and so many inches kept free below."""
     free = below / figure.get_figheight()
     figure.get_layout_engine().set(rect=(0, free, 1, 1 - free))
-    figure.suptitle(
-        f"{title}: {meta['scenes']} {meta['split']} scenes of {meta['data']}, {meta['device']}", fontsize=TEXT + 2
-    )
+    scenes = f"{meta['scenes']} {meta['split']} scenes of {meta['data']}, {meta['device']}"
+    figure.suptitle(f"{title}: {scenes}", fontsize=TEXT + 2)
     return as_png(figure, dpi=130)

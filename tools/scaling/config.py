@@ -22,7 +22,7 @@ class ScalingConfig:
     precision: Precision = "tf32"  # as for training; or fp32, fp16 (where backend torch takes tf32)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rounds: Positive[int] = 20  # samples of each contender
-    seconds: Positive[float] = 30.0  # at most for all contenders, once three rounds are done
+    seconds: Positive[float] = 30.0  # at most for all contenders, once five rounds are done
     device: str = "auto"  # or cpu, cuda
     json: str | None = None  # also write the rows to this file; --json FILE does the same
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import copy
 import datetime
+import itertools
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,18 +37,17 @@ from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.triton_contenders import device_samples, triton_updates
 from tools.report import PASS
 from tools.scaling.config import ScalingConfig
-from tools.timing import median_and_quartiles
+from tools.timing import Timed, alternate, median_and_quartiles
 
 # Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
 # order each time, which turns the activations that lie next to their kink, and TF32 makes more of it.
 GRADIENT_BOUND = 2e-2
 WARM_UPDATES = 3
-MINIMUM_ROUNDS = 3
 PATIENCE = datetime.timedelta(minutes=2)
 
 
 @dataclass
-class Contender:
+class Contender(Timed):
     """Some of the devices training at the same time, together or each for itself."""
 
     backend: str  # torch or triton
@@ -59,6 +60,20 @@ class Contender:
     check: str = PASS
     messages: list[int] = field(default_factory=list)
     milliseconds: list[float] = field(default_factory=list)  # of one update
+    batches: int = 1  # updates of one sample
+
+    def sample(self) -> float:
+        """Of the slowest rank; the others wait, and so do those that take no part."""
+        taken = torch.zeros(1)
+        dist.barrier()
+        if self.update is not None:
+            started = time.perf_counter()
+            self.update.run()
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            taken.fill_(time.perf_counter() - started)
+        dist.all_reduce(taken, dist.ReduceOp.MAX)
+        return 1e3 * float(taken) / self.batches
 
 
 class TorchUpdates:
@@ -175,7 +190,9 @@ def measure(rank: int, count: int, config: ScalingConfig, device_type: str, fold
         contenders = _contenders(config, sizes, device)
         for contender in contenders:
             _prepare(contender, config, rank, groups, device)
-        _alternate(contenders, config, rank)
+        ready = [contender for contender in contenders if contender.check == PASS]
+        for contender, times in zip(ready, alternate(ready, config.rounds, _until(config.seconds)), strict=True):
+            contender.milliseconds = times
         for contender in contenders:
             _check_weights(contender, groups, rank)
         if rank == 0:
@@ -195,13 +212,13 @@ def _contenders(config: ScalingConfig, sizes: list[int], device: torch.device) -
     for backend in config.backends:
         if backend == "triton" and triton_unsupported_reason(device, config.network, config.precision):
             continue
-        spreads = [0.0] if config.particle_spread == 0 else [0.0, config.particle_spread]
-        cases = [(size, averaged, spread) for size in sizes for averaged in (False, True) for spread in spreads]
-        for size, averaged, spread in cases:
+        for size, averaged, spread in itertools.product(sizes, (False, True), sorted({0.0, config.particle_spread})):
             if averaged == (size > 1) or (not averaged and spread == 0):
                 particles = float(_particles(config, size, spread).sum(-1).mean())
-                ways = (False, True) if backend == "triton" and averaged else (False,)
-                contenders += [Contender(backend, size, averaged, spread, particles, one_graph) for one_graph in ways]
+                for one_graph in (False, True) if backend == "triton" and averaged else (False,):
+                    contender = Contender(backend, size, averaged, spread, particles, one_graph)
+                    contender.batches, contender.warm_up = config.batches, -(-WARM_UPDATES // config.batches)
+                    contenders.append(contender)
     return contenders
 
 
@@ -272,34 +289,16 @@ def _agree(contender: Contender) -> None:
     contender.check = next((check for check in checks if check != PASS), PASS)
 
 
-def _alternate(contenders: list[Contender], config: ScalingConfig, rank: int) -> None:
-    ready = [contender for contender in contenders if contender.check == PASS]
-    for contender in ready:
-        for _ in range(-(-WARM_UPDATES // config.batches)):
-            _seconds(contender, rank)
-    started, go_on = time.monotonic(), torch.ones(1)
-    for index in range(config.rounds):
-        if index >= MINIMUM_ROUNDS:
-            go_on.fill_(float(time.monotonic() - started < config.seconds))
-            dist.broadcast(go_on, 0)
-            if not go_on:
-                break
-        for contender in ready:
-            contender.milliseconds.append(1e3 * _seconds(contender, rank) / config.batches)
+def _until(seconds: float) -> Callable[[], bool]:
+    """Whether so many seconds are over, as the first rank has it."""
+    begun, over = time.monotonic(), torch.zeros(1)
 
+    def is_over() -> bool:
+        over.fill_(float(time.monotonic() - begun > seconds))
+        dist.broadcast(over, 0)
+        return bool(over)
 
-def _seconds(contender: Contender, rank: int) -> float:
-    """Seconds that the slowest rank takes for all batches; the others wait, and so do those that take no part."""
-    taken = torch.zeros(1)
-    dist.barrier()
-    if contender.update is not None:
-        started = time.perf_counter()
-        contender.update.run()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        taken.fill_(time.perf_counter() - started)
-    dist.all_reduce(taken, dist.ReduceOp.MAX)
-    return float(taken)
+    return is_over
 
 
 def _row(contender: Contender, config: ScalingConfig, device: torch.device) -> dict[str, Any]:

@@ -24,7 +24,7 @@ import torch
 from PIL import Image
 
 from hgn.command import run_command
-from hgn.config import MpmConfig
+from hgn.config import MpmConfig, SceneConfig
 from hgn.render.pictures import compare_picture, spread, stacked, write_picture
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
@@ -33,23 +33,23 @@ from hgn.schema import from_mapping, to_mapping
 from hgn.system.files import write_json
 from hgn.system.machine import available_cpus
 from hgn.system.progress import bar
-from hgn.system.provenance import provenance, without_folders
 from tools.measures import energies, energy_scale, neighbours, outside_domain
+from tools.report import meta_of
 from tools.solver_rollouts import kept_trials, solver_trials
-from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, cases
+from tools.stability.network_cases import CASES, Case, StabilityNetworkConfig, body, cases
 from tools.stability.network_motion import motion_rows
 from tools.stability.row import Row, table
 from tools.timing import FrameClock
 
-PART = "network"
 PICTURES, PICTURE_SIZE = 4, 300  # of each case; the width of one in pixels
 LONGEST = 100.0  # domain that is drawn whole, in heights
 DRAWN_EVERY_S = 5.0  # the picture of all cases so far, which takes longer with each
+ENERGY_BOUND = 0.02  # how much energy may come from nowhere, of a fall through the domain
 WAY_BOUND = 0.2  # how far off a known way may be
 DENSITY_BOUND = 2.0  # times as many neighbours, or as few, may there be at rest after thousands of frames
 DRIFT_FACTOR, DRIFT_CELLS = 2.0, 1.0  # of the solver's own drift at rest, and so many of its cells, may there be
 HEIGHT_CELLS = 0.1  # that the mean height at rest may differ from the solver's
-FAR_DOMAINS = 100.0  # how far the guard's case throws particles
+FAR_DOMAINS, GUARD_FRAMES = 100.0, 4  # how far the guard's case throws particles, in so many frames
 ON_THE_FLOOR = 0.04  # times the height of a particle in the middle: 0.02 domain heights
 
 
@@ -58,62 +58,61 @@ def main(mapping: dict[str, Any]) -> int:
     begun = time.monotonic()
     config = from_mapping(StabilityNetworkConfig, mapping)
     simulator = Simulator.load(config.weights, config.device, config.backend, config.precision)
-    network, device, backend, info = simulator.network, simulator.device, simulator.backend, simulator.info
-    print(simulator.backend.note, file=sys.stderr)
+    network, device, backend, info = simulator.network.config, simulator.device, simulator.backend, simulator.info
+    print(backend.note, file=sys.stderr)
     rows: list[Row] = []
     pictures: list[Image.Image] = []
     drawn = 0.0  # when the picture was last written
-    meta = provenance(device) | {"config": without_folders(to_mapping(config)), "weights": Path(config.weights).name}
-    meta |= {"updates": info.updates, "backend": backend.name, "network": to_mapping(info.network)}
+    weights, wanted = Path(config.weights).name, config.cases or CASES
+    meta = meta_of(config, device) | {"weights": weights, "updates": info.updates, "backend": backend.name}
+    meta["network"] = to_mapping(info.network)
 
     def keep(done: bool = False) -> None:  # a run that is cut off leaves the cases that it had
         nonlocal drawn
         if config.json is not None:
-            write_json(config.json, {"meta": meta, "rows": [row.mapping(PART) for row in rows]}, allow_nan=False)
+            write_json(config.json, {"meta": meta, "rows": [row.mapping("network") for row in rows]}, allow_nan=False)
         if config.picture is not None and pictures and (done or time.monotonic() - drawn > DRAWN_EVERY_S):
             write_picture(config.picture, stacked(pictures))
             drawn = time.monotonic()
 
-    made = list(cases(config, network.config))
+    made = list(cases(config, network))
     solver = solver_of(config)
     with ThreadPoolExecutor(available_cpus()) as threads, ExitStack() as stack:
         # What the runtime makes of obstacles takes seconds where there are many: the largest cases first.
-        order = sorted(range(len(made)), key=lambda i: -sum(len(scene.obstacles) for scene in made[i].scenes))
-        starts = {i: threads.submit(initial_states, made[i]) for i in order}
+        order = sorted(made, key=lambda case: -sum(len(scene.obstacles) for scene in case.scenes))
+        starts = {case.name: threads.submit(initial_states, case) for case in order}
         ahead = None
         if made and not backend.stepped:
             # Triton, which backend torch does without, is loaded here.
             from hgn.runtime.precompile import precompile_frames
 
             particles = [sum(len(scene.position_N3) for scene in case.scenes) for case in made]
-            ahead = precompile_frames([network.config], [config.precision], device, particles)
+            ahead = precompile_frames([network], [config.precision], device, particles)
         if ahead is not None:
             stack.enter_context(ahead)
-        for row in motion_rows(
-            simulator, config.scene, network.config.materials, config.cases or CASES, config.scenes_at_once, solver
-        ):
+        for row in motion_rows(simulator, config.scene, network.materials, wanted, config.scenes_at_once, solver):
             rows.append(row)
             keep()
-        initial = [starts[i].result() for i in range(len(made))]  # nothing runs beside what is timed
+        initial = {name: start.result() for name, start in starts.items()}  # nothing runs beside what is timed
         if ahead is not None:
             print(ahead.wait(), file=sys.stderr)
     meta["seconds_before_cases"] = time.monotonic() - begun
     beside = solver_beside(made, solver, simulator.frame_rate_hz, config.solver_kept) if solver is not None else {}
     late = late_kernels(backend.name)
     with bar("cases", total=len(made), unit="case") as progress:
-        for case, states in zip(made, initial, strict=True):
-            started, growths, compiled = time.monotonic(), simulator.backend.growths, late()
-            trials = case_trials(simulator, case, states)
-            row = case_row(simulator, case, states, config.energy_bound, *trials, beside.get(case.name))
+        for case in made:
+            started, growths, compiled, states = time.monotonic(), backend.growths, late(), initial[case.name]
+            trials, milliseconds = case_trials(simulator, case, states)
+            row = case_row(simulator, case, states, trials, milliseconds, beside.get(case.name))
             if config.picture is not None:
-                pictures.append(case_picture(simulator, case, trials[0][0], Path(config.weights).name))
-            row.more["growths"], row.more["kernels_compiled"] = simulator.backend.growths - growths, late() - compiled
+                pictures.append(case_picture(simulator, case, trials[0], weights))
+            row.more["growths"], row.more["kernels_compiled"] = backend.growths - growths, late() - compiled
             row.more["seconds"] = time.monotonic() - started
             rows.append(row)
             keep()
             progress.update()
-    if "guard" in (config.cases or CASES):
-        rows.append(guard_row(simulator, config))
+    if "guard" in wanted:
+        rows.append(guard_row(simulator, config.scene))
     meta["seconds"] = time.monotonic() - begun
     print(table(rows))
     keep(done=True)
@@ -132,12 +131,12 @@ def solver_beside(
     are read and kept in a folder where one is given.
     """
     simulate = solver_trials if kept is None else partial(kept_trials, Path(kept))
-    found: dict[str, list[RolloutResult]] = {}
+    of_cases: dict[str, list[RolloutResult]] = {}
     for frames in sorted({case.frames for case in made if case.beside_solver}):
         some = [case for case in made if case.beside_solver and case.frames == frames]
         trials = iter(simulate([scene for case in some for scene in case.scenes], config, frames, frame_rate_hz))
-        found |= {case.name: [next(trials) for _ in case.scenes] for case in some}
-    return found
+        of_cases |= {case.name: [next(trials) for _ in case.scenes] for case in some}
+    return of_cases
 
 
 def late_kernels(backend: str) -> Callable[[], int]:
@@ -163,96 +162,73 @@ def case_trials(
 
 
 def case_picture(simulator: Simulator, case: Case, trial: RolloutResult, weights: str) -> Image.Image:
-    """Some frames of a case's first scene."""
-    scene = case.scenes[0]
+    """Some frames of a case's first scene. Of a domain that is long beyond all others, which would leave a line, only
+    the end is drawn, where the particles are.
+    """
+    scene, (length, height, depth) = case.scenes[0], case.scenes[0].domain_size
+    shift_3 = np.array([length - height if length > LONGEST * height else 0.0, 0.0, 0.0])
     rollout = Rollout(
-        trial.position_TN3,
+        (trial.position_TN3 - shift_3).astype(np.float32),
         scene.material_N,
-        scene.obstacles,
-        scene.domain_size,
+        tuple(replace(mesh, vertex_V3=mesh.vertex_V3 - shift_3) for mesh in scene.obstacles),
+        (length - float(shift_3[0]), height, depth),
         simulator.frame_rate_hz,
         source={"weights": weights},
     )
-    # A domain that is long beyond all others would leave a line: where its particles are is drawn of it.
-    return compare_picture(_cut(rollout), spread(trial.frame_count, PICTURES), PICTURE_SIZE, case.name)
-
-
-def _cut(rollout: Rollout) -> Rollout:
-    length, height, depth = rollout.domain_size
-    if length <= LONGEST * height:
-        return rollout
-    shift_3 = np.array([length - height, 0.0, 0.0])
-    return replace(
-        rollout,
-        position_TN3=(rollout.position_TN3 - shift_3).astype(np.float32),
-        obstacles=tuple(replace(body, vertex_V3=body.vertex_V3 - shift_3) for body in rollout.obstacles),
-        domain_size=(height, height, depth),
-    )
+    return compare_picture(rollout, spread(trial.frame_count, PICTURES), PICTURE_SIZE, case.name)
 
 
 def case_row(
     simulator: Simulator,
     case: Case,
     initial: Sequence[InitialState],
-    energy_bound: float,
     trials: Sequence[RolloutResult],
     milliseconds: float | None,
     beside: Sequence[RolloutResult] | None = None,
 ) -> Row:
     """Says whether a case held; `beside` is what the solver makes of it."""
-    reached = min(trial.frame_count for trial in trials)
+    rate, pairs = simulator.frame_rate_hz, list(zip(trials, initial, strict=True))
     finite = all(bool(np.isfinite(trial.position_TN3).all()) for trial in trials)
-    growth = max(
-        energy_growth(trial, scene, simulator.frame_rate_hz) for trial, scene in zip(trials, initial, strict=True)
-    )
-    outside = max(
-        outside_domain(trial.position_TN3[-1], scene.domain_size) for trial, scene in zip(trials, initial, strict=True)
-    )
+    growth = max(energy_growth(trial, scene, rate) for trial, scene in pairs)
+    outside = max(outside_domain(trial.position_TN3[-1], scene.domain_size) for trial, scene in pairs)
+    causes = [trial.cause for trial in trials if trial.cause is not None]
 
     def came(some: Sequence[RolloutResult]) -> float:
-        return min(share_of_way(*pair, simulator.frame_rate_hz, case) for pair in zip(some, initial, strict=True))
+        return min(share_of_way(*pair, rate, case) for pair in zip(some, initial, strict=True))
 
     way = came(trials) if case.known_3 is not None else None
-    astray = way is not None and abs(way - 1) > WAY_BOUND
     more: dict[str, Any] = {"solver_share_of_way": came(beside)} if beside and way is not None else {}
     restless = None
     if case.settled is not None and beside is not None:
         own, solvers = (at_rest(some, initial, case.settled) for some in (trials, beside))
         more |= {"rest": own, "solver_rest": solvers}
         restless = unrest(own, solvers)
-    causes = [trial.cause for trial in trials if trial.cause is not None]
     beyond = None
     if causes:
         beyond = causes[0]
     elif not finite:
         beyond = "positions are not finite, and the runtime did not say so"
-    elif growth > energy_bound:
+    elif growth > ENERGY_BOUND:
         beyond = f"energy grows by {growth:.2g} of a fall through the domain"
-    elif astray:
-        beyond = f"comes {100 * (way or 0):.2g} % of its way in the first {case.known_frames} frames"
+    elif way is not None and abs(way - 1) > WAY_BOUND:
+        beyond = f"comes {100 * way:.2g} % of its way in the first {case.known_frames} frames"
     elif restless:
         beyond = restless
     elif outside:
         beyond = f"{100 * outside:.2g} % of the particles end outside of the domain"
-    return Row(
-        case.name,
-        predicted=case.frames,
-        measured=reached,
-        held=beyond is None,
-        beyond=beyond or "nothing seen",
-        more={
-            "particles": sum(len(scene.position_N3) for scene in initial),
-            "scenes": len(initial),
-            "domain_size": list(initial[0].domain_size),
-            "energy_growth": growth if math.isfinite(growth) else None,
-            "outside_domain": outside,
-            "share_of_way": way,
-            "failed_scenes": len(causes),
-            "guard": "missed" if not finite else "raised" if causes else "not needed",
-            "ms": milliseconds,
-            **more,
-        },
-    )
+    more = {
+        "particles": sum(len(scene.position_N3) for scene in initial),
+        "scenes": len(initial),
+        "domain_size": list(initial[0].domain_size),
+        "energy_growth": growth if math.isfinite(growth) else None,
+        "outside_domain": outside,
+        "share_of_way": way,
+        "failed_scenes": len(causes),
+        "guard": "missed" if not finite else "raised" if causes else "not needed",
+        "ms": milliseconds,
+    } | more
+    reached = min(trial.frame_count for trial in trials)
+    return Row(case.name, case.frames, reached, beyond is None, beyond or "nothing seen", more)
 
 
 def energy_growth(trial: RolloutResult, scene: InitialState, frame_rate_hz: float) -> float:
@@ -313,7 +289,7 @@ def unrest(own: dict[str, float] | None, solvers: dict[str, float] | None) -> st
     return None
 
 
-def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
+def guard_row(simulator: Simulator, config: SceneConfig) -> Row:
     """A network with a weight that explodes: the runtime must stop at the first frame.
 
     Its particles lie on the floor: with relative inputs nothing comes of a weight in free flight.
@@ -321,23 +297,17 @@ def guard_row(simulator: Simulator, config: StabilityNetworkConfig) -> Row:
     broken = copy.deepcopy(simulator.network)
     with torch.no_grad():
         # Not NaN: backends that are compared with each other before they run could not agree on that.
-        thrown = FAR_DOMAINS * max(config.scene.domain_size) / broken.normaliser.acceleration_std[0]
+        thrown = FAR_DOMAINS * max(config.domain_size) / broken.normaliser.acceleration_std[0]
         dict(broken.named_parameters())["decode.second.bias"][0] = thrown
-    only = StabilityNetworkConfig(config.weights, cases=("single",), frames=4, scene=config.scene)
-    scenes: Sequence[InitialState] = [
-        InitialState.of_scene(
-            replace(scene, position_N3=scene.position_N3 * np.array((1.0, ON_THE_FLOOR, 1.0), np.float32))
-        )
-        for case in cases(only, broken.config)
-        for scene in case.scenes
-    ]
+    floor_13 = 0.5 * np.array([config.domain_size]) * (1.0, ON_THE_FLOOR, 1.0)
+    materials = [name for name in config.materials if name in broken.config.materials]
+    scenes = [InitialState.of_scene(body(config, material, floor_13, np.zeros(3))) for material in materials]
     sabotaged = Simulator(broken, simulator.frame_rate_hz, simulator.backend.name, simulator.backend.precision)
-    trials = simulate_scenes(sabotaged, scenes, only.frames)
+    trials = simulate_scenes(sabotaged, scenes, GUARD_FRAMES)
     caught = all(trial.cause is not None and trial.frame_count == 1 for trial in trials)
     beyond = next((trial.cause for trial in trials if trial.cause is not None), "the runtime did not say so")
     frames = max(trial.frame_count for trial in trials)
-    guard = {"guard": "raised" if caught else "missed"}
-    return Row("a weight that explodes", predicted=1, measured=frames, held=caught, beyond=beyond, more=guard)
+    return Row("a weight that explodes", 1, frames, caught, beyond, {"guard": "raised" if caught else "missed"})
 
 
 if __name__ == "__main__":

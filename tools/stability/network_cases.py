@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Scene
 from hgn.scene.shapes import shape_obstacle
-from hgn.schema import ConfigError, Positive, one_of, require, require_bounds
+from hgn.schema import ConfigError, FrameCount, Positive, one_of, require_bounds
+from tools.scenes import filled
 
 MOTION = ("throw", "gravity", "collision")  # tools/stability/network_motion.py
 CASES = (*MOTION, "rest", "particles", "domain", "speed", "single", "slope", "far", "guard")
@@ -27,6 +28,10 @@ SLOPE_SIDE, SLOPE_WAY = 0.6, 0.35  # of the domain's smallest side: the slope's,
 FRAME_RATE_HZ = 60.0  # for how long cases are
 FALL_FRAMES = 12  # in which what falls meets nothing
 ATTEMPTS = 20  # at scenes that turn out to be too full
+PARTICLE_FACTOR = 10.0
+DOMAIN_SIDES = (2, 3, 4)  # times as long and deep, with as many more obstacles and groups as the floor grows
+SPEED_FACTOR = 3.0  # times the speed of a fall through the domain
+FAR_CELLS = 64_000  # how long the domain is that particles lie at the far end of, in obstacle cells
 
 
 @dataclass(frozen=True)
@@ -36,8 +41,8 @@ class StabilityNetworkConfig:
     weights: str  # a file of python -m hgn.export, or the name of shipped weights
     # of throw, gravity, collision, rest, particles, domain, speed, single, slope, far, guard; null: all
     cases: tuple[Annotated[str, one_of(*CASES)], ...] | None = None
-    frames: int = 300
-    long_frames: int = 3000  # of the case rest
+    frames: FrameCount = 300
+    long_frames: FrameCount = 3000  # of the case rest
     # in each rollout of throw, gravity and collision; null: as many as a row has throws
     scenes_at_once: Positive[int] | None = None
     # also ask the solver, which needs Taichi: for slope, collision and rest; without it rest is left out
@@ -47,13 +52,6 @@ class StabilityNetworkConfig:
     mpm: MpmConfig = field(default_factory=MpmConfig)
     # a folder in which its trajectories of slope and rest stay, for other weights beside the same version of it
     solver_kept: str | None = None
-    particle_factor: Positive[float] = 10.0
-    # times the floor area, with as many more obstacles and groups; squares
-    domain_factors: tuple[int, ...] = (4, 9, 16)
-    speed_factor: Positive[float] = 3.0  # times the speed of a fall through the domain
-    far_cells: Positive[int] = 64_000  # how long the domain is that particles lie at the far end of, in obstacle cells
-    seeds: Positive[int] = 1  # scenes of each case
-    energy_bound: Positive[float] = 0.02  # how much energy may come from nowhere, of a fall through the domain
     # the scenes as they are in training; obstacles only where the network sees them
     scene: SceneConfig = field(default_factory=SceneConfig)
     backend: BackendName = "auto"  # torch, triton, cpu; auto: the fastest that runs
@@ -64,11 +62,6 @@ class StabilityNetworkConfig:
 
     def __post_init__(self) -> None:
         require_bounds(self)
-        for name in ("frames", "long_frames"):
-            require(getattr(self, name) >= 2, name, "at least 2", getattr(self, name))
-        for i, factor in enumerate(self.domain_factors):
-            rule = "a square of a whole number above 1"
-            require(factor > 1 and math.isqrt(factor) ** 2 == factor, f"domain_factors[{i}]", rule, factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,99 +85,82 @@ def cases(config: StabilityNetworkConfig, network: NetworkConfig) -> Iterator[Ca
     wanted = config.cases or CASES
     base = config.scene if network.sees_obstacles else replace(config.scene, obstacle_count=0)
     base = replace(base, materials=tuple(name for name in base.materials if name in network.materials))
-    side = base.domain_size[1]
 
-    def case(name: str, scene: SceneConfig) -> Case:
-        return Case(name, tuple(_scene(scene, REPORT_SEED + i) for i in range(config.seeds)), config.frames)
+    def case(name: str, **change: Any) -> Case:
+        return Case(name, (_scene(replace(base, **change)),), config.frames)
 
     for material in base.materials if "rest" in wanted and config.solver else ():
-        rest = case(f"{config.long_frames} frames, {material}", replace(base, obstacle_count=0, materials=(material,)))
+        rest = case(f"{config.long_frames} frames, {material}", obstacle_count=0, materials=(material,))
         settled = min(config.frames, config.long_frames) - 1
         yield replace(rest, frames=config.long_frames, settled=settled, beside_solver=True)
     if "particles" in wanted:
-        size = base.group_size * config.particle_factor ** (1 / 3)
-        yield case(f"particles x{config.particle_factor:g}", replace(base, group_size=size))
-    for factor in config.domain_factors if "domain" in wanted else ():
-        width, height, depth = base.domain_size
-        root = math.isqrt(factor)
-        larger = replace(
-            base,
-            domain_size=(width * root, height, depth * root),
+        yield case(f"particles x{PARTICLE_FACTOR:g}", group_size=base.group_size * PARTICLE_FACTOR ** (1 / 3))
+    for side in DOMAIN_SIDES if "domain" in wanted else ():
+        (width, height, depth), factor = base.domain_size, side**2
+        yield case(
+            f"domain x{factor}",
+            domain_size=(width * side, height, depth * side),
             obstacle_count=base.obstacle_count * factor,
             group_count=base.group_count * factor,
         )
-        yield case(f"domain x{factor}", larger)
     if "speed" in wanted:
-        speed = config.speed_factor * math.sqrt(2 * float(np.linalg.norm(base.gravity)) * side)
-        yield case(f"thrown at up to {speed:.1f} a second", replace(base, maximum_initial_speed=speed))
+        speed = SPEED_FACTOR * math.sqrt(2 * float(np.linalg.norm(base.gravity)) * base.domain_size[1])
+        yield case(f"thrown at up to {speed:.1f} a second", maximum_initial_speed=speed)
     for material in base.materials if "single" in wanted else ():
-        yield Case(f"single particle, {material}", (_single(base, material),), config.frames, base.gravity, FALL_FRAMES)
+        single = body(base, material, 0.5 * np.array([base.domain_size]), np.zeros(3))
+        yield Case(f"single particle, {material}", (single,), config.frames, base.gravity, FALL_FRAMES)
     for material in base.materials if "slope" in wanted and network.sees_obstacles else ():
         for degrees in SLOPES_DEG:
             yield replace(_slope(base, material, config.frames, degrees), beside_solver=config.solver)
     if "far" in wanted:
-        yield Case(
-            f"at the end of {config.far_cells} cells",
-            (_far(_scene(base, REPORT_SEED), config.far_cells),),
-            config.frames,
-        )
+        yield Case(f"at the end of {FAR_CELLS} cells", (_far(_scene(base)),), config.frames)
 
 
-def _scene(config: SceneConfig, seed: int) -> Scene:
+def body(config: SceneConfig, material: str, position_N3: np.ndarray, velocity_3: np.ndarray, **more: Any) -> Scene:
+    """Particles of one material in an empty domain; `more` are fields of Scene."""
+    own = {"domain_size": config.domain_size, "cell_size": config.cell_size, "gravity": config.gravity}
+    return filled(MATERIALS.index(material), position_N3, velocity_3, **own, **more)
+
+
+def cube_places(config: SceneConfig, seed: int = 0) -> np.ndarray:
+    """A cube of a scene's group size about 0, filled as densely as the scene's groups, float64 [N, 3]."""
+    count = int(config.particles_per_cell * (config.group_size / config.cell_size) ** 3) + 1
+    return config.group_size * (np.random.default_rng(seed).random((count, 3)) - 0.5)
+
+
+def _scene(config: SceneConfig) -> Scene:
     """The first of some scenes that has room for everything."""
-    for attempt in range(ATTEMPTS):
+    for attempt in range(1, ATTEMPTS):
         try:
-            return generate_scene(config, seed + attempt * REPORT_SEED)
+            return generate_scene(config, attempt * REPORT_SEED)
         except ConfigError:
-            if attempt + 1 == ATTEMPTS:
-                raise
-    raise AssertionError
-
-
-def _single(config: SceneConfig, material: str) -> Scene:
-    return Scene(
-        position_N3=np.array([[0.5 * length for length in config.domain_size]], np.float32),
-        velocity_N3=np.zeros((1, 3), np.float32),
-        material_N=np.array([MATERIALS.index(material)], np.uint8),
-        domain_size=config.domain_size,
-        cell_size=config.cell_size,
-        gravity=config.gravity,
-    )
+            continue
+    return generate_scene(config, ATTEMPTS * REPORT_SEED)
 
 
 def _slope(config: SceneConfig, material: str, frames: int, degrees: float) -> Case:
     """A block just above the upper end of a tilted square: without friction it slides as gravity along the slope
     pulls, whatever the material."""
     length = min(config.domain_size)
-    count = int(config.particles_per_cell * (config.group_size / config.cell_size) ** 3)
     turn = euler_rotation((degrees, 0.0, 0.0))
     up_3, down_3 = turn @ np.array([0.0, 1.0, 0.0]), turn @ np.array([0.0, 0.0, 1.0])
     middle_3 = 0.5 * np.array(config.domain_size)
     start_3 = middle_3 - 0.6 * SLOPE_WAY * length * down_3 + (0.5 * config.group_size + 0.75 * config.cell_size) * up_3
-    draw_N3 = np.random.default_rng(0).random((count + 1, 3)) - 0.5
-    scene = Scene(
-        position_N3=(start_3 + config.group_size * draw_N3 @ turn.T).astype(np.float32),
-        velocity_N3=np.zeros((count + 1, 3), np.float32),
-        material_N=np.full(count + 1, MATERIALS.index(material), np.uint8),
-        obstacles=(shape_obstacle("square", SLOPE_SIDE * length, tuple(middle_3.tolist()), turn, "slope"),),
-        domain_size=config.domain_size,
-        cell_size=config.cell_size,
-        gravity=config.gravity,
-    )
+    slope = shape_obstacle("square", SLOPE_SIDE * length, tuple(middle_3.tolist()), turn, "slope")
+    scene = body(config, material, start_3 + cube_places(config) @ turn.T, np.zeros(3), obstacles=(slope,))
     pull = float(np.array(config.gravity) @ down_3)
     last = int(FRAME_RATE_HZ * math.sqrt(2 * SLOPE_WAY * length / pull)) if pull > 0 else 0
     known_3 = tuple((pull * down_3).tolist())
     return Case(f"slides down {degrees:g} degrees, {material}", (scene,), min(frames, last + 2), known_3, last)
 
 
-def _far(scene: Scene, cells: int) -> Scene:
+def _far(scene: Scene) -> Scene:
     """The same at the far end of a long domain: where coordinates are coarse."""
-    length = cells * scene.cell_size
+    length = FAR_CELLS * scene.cell_size
     shift_3 = np.array([length - scene.domain_size[0], 0.0, 0.0])
-    obstacles = tuple(replace(body, vertex_V3=body.vertex_V3 + shift_3) for body in scene.obstacles)
     return replace(
         scene,
         position_N3=(scene.position_N3 + shift_3).astype(np.float32),
-        obstacles=obstacles,
+        obstacles=tuple(replace(mesh, vertex_V3=mesh.vertex_V3 + shift_3) for mesh in scene.obstacles),
         domain_size=(length, *scene.domain_size[1:]),
     )

@@ -17,11 +17,12 @@ import numpy as np
 from hgn.config import MpmConfig, SceneConfig
 from hgn.runtime.rollouts import RolloutResult, simulate_scenes
 from hgn.runtime.simulator import InitialState, Simulator
-from hgn.scene.material import MATERIALS
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 from hgn.training.errors import position_mse
+from tools.scenes import joined
 from tools.solver_rollouts import solver_trials
+from tools.stability.network_cases import body, cube_places
 from tools.stability.row import Row
 
 EARTH = 9.8  # domain units per second squared
@@ -61,9 +62,9 @@ class Flight:
     kept: float | None
     error: float
     across: float
+    frames: int
     kept_frame: int
     error_frame: int
-    frames: int
 
 
 def motion_rows(
@@ -94,17 +95,8 @@ def motion_rows(
 
 def cube(scene: SceneConfig, material: str, centre_3: np.ndarray, velocity_3: np.ndarray, seed: int = 0) -> Scene:
     """A cube of a scene's group size at random places, without obstacles."""
-    count = int(scene.particles_per_cell * (scene.group_size / scene.cell_size) ** 3) + 1
-    place_N3 = centre_3 + scene.group_size * (np.random.default_rng(seed).random((count, 3)) - 0.5)
-    return Scene(
-        position_N3=place_N3.astype(np.float32),
-        velocity_N3=np.tile(np.float32(velocity_3), (count, 1)),
-        material_N=np.full(count, MATERIALS.index(material), np.uint8),
-        domain_size=scene.domain_size,
-        cell_size=scene.cell_size,
-        gravity=scene.gravity,
-        particles_per_cell=scene.particles_per_cell,
-    )
+    place_N3 = centre_3 + cube_places(scene, seed)
+    return body(scene, material, place_N3, velocity_3, particles_per_cell=scene.particles_per_cell)
 
 
 def flight_row(
@@ -116,37 +108,38 @@ def flight_row(
     together: int | None,
 ) -> Row:
     """Whether all throws keep their velocity and fall as gravity says, in each frame of the flight."""
-    middle_3 = 0.5 * np.array(scene.domain_size)
+    middle_3, rate = 0.5 * np.array(scene.domain_size), simulator.frame_rate_hz
     together = together or len(throws)
     # full rollouts: the same throws again with other random places
     labels = list(islice(cycle(throws), together * -(-len(throws) // together)))
     scenes = [cube(scene, material, middle_3, throws[label], seed) for seed, label in enumerate(labels)]
-    reach = REACH * simulator.network.config.cell_size
-    frames = [flight_frames(item, simulator.frame_rate_hz, reach) for item in scenes]
+    frames = [flight_frames(item, rate, REACH * simulator.network.config.cell_size) for item in scenes]
     trials: list[RolloutResult] = []
-    for first in range(0, len(scenes), together):
-        some = _rollouts(simulator, scenes[first : first + together], max(frames[first : first + together]) + 1)
-        if isinstance(some, str):
-            return Row(name, GRAVITY_WITHIN, "refused", False, some)
-        trials += some
+    try:
+        for first in range(0, len(scenes), together):
+            some = slice(first, first + together)
+            trials += _rollouts(simulator, scenes[some], max(frames[some]) + 1)
+    except ConfigError as refusal:
+        return Row(name, GRAVITY_WITHIN, "refused", False, str(refusal))
     causes = [trial.cause for trial, last in zip(trials, frames, strict=True) if trial.frame_count <= last]
     if causes:
         return Row(name, GRAVITY_WITHIN, "diverged", False, str(causes[0]))
-    flights = [flight(*item, simulator.frame_rate_hz) for item in zip(trials, scenes, frames, strict=True)]
-    at = max(range(len(flights)), key=lambda i: flights[i].error)
-    worst, error = flights[at], flights[at].error
-    beyond, held = f"gravities off in frame {worst.error_frame} {labels[at]}", error <= GRAVITY_WITHIN
-    more: dict[str, object] = {"scenes": together, "particles": sum(item.particle_count for item in scenes[:together])}
-    kept = {i: found.kept for i, found in enumerate(flights) if found.kept is not None}
+    flights = [flight(*item, rate) for item in zip(trials, scenes, frames, strict=True)]
+    label, worst = max(zip(labels, flights, strict=True), key=lambda pair: pair[1].error)
+    beyond, held = f"gravities off in frame {worst.error_frame} {label}", worst.error <= GRAVITY_WITHIN
+    more: dict[str, Any] = {"scenes": together, "particles": sum(item.particle_count for item in scenes[:together])}
+    kept = [
+        (one.kept, label, one.kept_frame) for label, one in zip(labels, flights, strict=True) if one.kept is not None
+    ]
     if kept:
-        at = min(kept, key=lambda i: kept[i])
-        beyond += f"; keeps {kept[at]:.1%} of its velocity in frame {flights[at].kept_frame} {labels[at]}"
-        held, more["kept"] = held and kept[at] >= KEPT_AT_LEAST, kept[at]
+        least, label, frame = min(kept, key=lambda item: item[0])
+        beyond += f"; keeps {least:.1%} of its velocity in frame {frame} {label}"
+        held, more["kept"] = held and least >= KEPT_AT_LEAST, least
     more["throws"] = {
         label: {"kept": one.kept, "error": one.error, "across": one.across, "frames": one.frames}
         for label, one in zip(labels[: len(throws)], flights, strict=False)
     }
-    return Row(name, GRAVITY_WITHIN, error, held, beyond, more)
+    return Row(name, GRAVITY_WITHIN, worst.error, held, beyond, more)
 
 
 def flight_frames(scene: Scene, frame_rate_hz: float, reach: float) -> int:
@@ -178,20 +171,21 @@ def flight(trial: RolloutResult, scene: Scene, frames: int, frame_rate_hz: float
     lost_T = np.linalg.norm(lost_T3, axis=1)
     kept = 1 - float(lost_T.max()) / speed if speed else None
     across = float(lost_T[-1]) / frames * frame_rate_hz**2 / EARTH
-    return Flight(kept, float(error_T.max()), across, int(lost_T.argmax()), int(error_T.argmax()), frames)
+    return Flight(kept, float(error_T.max()), across, frames, int(lost_T.argmax()), int(error_T.argmax()))
 
 
 def turned_rows(simulator: Simulator, scene: SceneConfig, material: str, solver: MpmConfig) -> Iterator[Row]:
     """Whether a cube that falls and comes to rest is as near to the solver where the scene and gravity are turned."""
     upright = cube(scene, material, 0.5 * np.array(scene.domain_size), np.zeros(3))
     reference: RolloutResult | None = None
-    for name, order in TURNS.items():
-        name = f"to rest in gravity along {name}, {material}"
+    for way, order in TURNS.items():
+        name = f"to rest in gravity along {way}, {material}"
         x, y, z = (upright.gravity[axis] for axis in order)
         turned = replace(upright, position_N3=upright.position_N3[:, order], gravity=(x, y, z))
-        trials = _rollouts(simulator, [upright, turned], TO_REST_FRAMES)
-        if isinstance(trials, str):
-            yield Row(name, AS_GOOD, "refused", False, trials)
+        try:
+            trials = _rollouts(simulator, [upright, turned], TO_REST_FRAMES)
+        except ConfigError as refusal:
+            yield Row(name, AS_GOOD, "refused", False, str(refusal))
             continue
         if reference is None:  # seconds on a GPU, a minute on a CPU
             (reference,) = solver_trials([upright], solver, TO_REST_FRAMES, simulator.frame_rate_hz)
@@ -201,59 +195,47 @@ def turned_rows(simulator: Simulator, scene: SceneConfig, material: str, solver:
             continue
         straight, back = trials[0].position_TN3, trials[1].position_TN3[..., order]
         own, other = (float(position_mse(path, reference.position_TN3).mean()) for path in (straight, back))
-        held = other <= AS_GOOD * own
         more = {"upright_mse": own, "turned_mse": other}
-        yield Row(name, AS_GOOD, other / own, held, "times the upright rollout's position MSE to the solver", more)
+        beyond = "times the upright rollout's position MSE to the solver"
+        yield Row(name, AS_GOOD, other / own, other <= AS_GOOD * own, beyond, more)
 
 
 def meeting_row(
     simulator: Simulator, scene: SceneConfig, material: str, together: int, solver: MpmConfig | None
 ) -> Row:
     """Whether two cubes that meet off centre, without gravity, keep momentum and angular momentum."""
-    name = f"two bodies meet without gravity, {material}"
+    name, rate = f"two bodies meet without gravity, {material}", simulator.frame_rate_hz
     scenes = [meeting(scene, material, seed) for seed in range(together)]
-    trials = _rollouts(simulator, scenes, MEETING_FRAMES)
-    if isinstance(trials, str):
-        return Row(name, MOMENTUM_WITHIN, "refused", False, trials)
+    try:
+        trials = _rollouts(simulator, scenes, MEETING_FRAMES)
+    except ConfigError as refusal:
+        return Row(name, MOMENTUM_WITHIN, "refused", False, str(refusal))
     reach = REACH * simulator.network.config.cell_size
-    figures = np.array([conserved(*item, reach, simulator.frame_rate_hz) for item in zip(trials, scenes, strict=True)])
-    momentum, angular, met = figures[:, 0].max(), figures[:, 1].max(), figures[:, 2].min()
-    more: dict[str, Any] = {
-        "angular": float(angular),
-        "met": float(met),
-        "particles": sum(item.particle_count for item in scenes),
-    }
+    figures = np.array([conserved(*item, reach, rate) for item in zip(trials, scenes, strict=True)])
+    momentum, angular, met = (float(value) for value in (*figures[:, :2].max(axis=0), figures[:, 2].min()))
+    particles = sum(item.particle_count for item in scenes)
+    more: dict[str, Any] = {"angular": angular, "met": met, "particles": particles}
     least, most = MET_AT_LEAST, ANGULAR_WITHIN
     if solver is not None:
-        (trial,) = solver_trials(scenes[:1], solver, MEETING_FRAMES, simulator.frame_rate_hz)
-        named = dict(
-            zip(
-                ("momentum", "angular", "met"), conserved(trial, scenes[0], reach, simulator.frame_rate_hz), strict=True
-            )
-        )
-        more["solver"], least, most = named, 0.5 * named["met"], ANGULAR_WITHIN + named["angular"]
+        (trial,) = solver_trials(scenes[:1], solver, MEETING_FRAMES, rate)
+        beside = conserved(trial, scenes[0], reach, rate)
+        more["solver"] = dict(zip(("momentum", "angular", "met"), beside, strict=True))
+        least, most = 0.5 * beside[2], ANGULAR_WITHIN + beside[1]
     causes = [trial.cause for trial in trials if trial.cause is not None]
     held = not causes and momentum <= MOMENTUM_WITHIN and angular <= most and met >= least
     beyond = f"of momentum; {angular:.2%} of angular momentum; {met:.2f} of the relative velocity went over"
-    return Row(name, MOMENTUM_WITHIN, float(momentum), bool(held), causes[0] if causes else beyond, more)
+    return Row(name, MOMENTUM_WITHIN, momentum, held, causes[0] if causes else beyond, more)
 
 
 def meeting(scene: SceneConfig, material: str, seed: int = 0) -> Scene:
     """Two cubes a fifth of their side apart, half of it off centre, that move towards each other along x."""
     size, middle_3 = scene.group_size, 0.5 * np.array(scene.domain_size)
     scene = replace(scene, gravity=(0.0, 0.0, 0.0))
-    one, other = (
-        cube(
-            scene, material, middle_3 + side * size * np.array([0.6, 0.25, 0.0]), np.array([speed, 0, 0]), 2 * seed + i
-        )
-        for i, (side, speed) in enumerate(zip((-1, 1), MEETING, strict=True))
-    )
-    return replace(
-        one,
-        position_N3=np.concatenate([one.position_N3, other.position_N3]),
-        velocity_N3=np.concatenate([one.velocity_N3, other.velocity_N3]),
-        material_N=np.concatenate([one.material_N, other.material_N]),
-    )
+    cubes = []
+    for i, (side, speed) in enumerate(zip((-1, 1), MEETING, strict=True)):
+        centre_3 = middle_3 + side * size * np.array([0.6, 0.25, 0.0])
+        cubes.append(cube(scene, material, centre_3, np.array([speed, 0, 0]), 2 * seed + i))
+    return joined(cubes)
 
 
 def conserved(trial: RolloutResult, scene: Scene, reach: float, frame_rate_hz: float) -> tuple[float, float, float]:
@@ -282,9 +264,6 @@ def conserved(trial: RolloutResult, scene: Scene, reach: float, frame_rate_hz: f
     )
 
 
-def _rollouts(simulator: Simulator, scenes: Sequence[Scene], frames: int) -> list[RolloutResult] | str:
-    """Rollouts side by side, or why the weights refuse the scenes."""
-    try:
-        return simulate_scenes(simulator, [InitialState.of_scene(scene) for scene in scenes], frames)
-    except ConfigError as error:
-        return str(error)
+def _rollouts(simulator: Simulator, scenes: Sequence[Scene], frames: int) -> list[RolloutResult]:
+    """Side by side. Raises: ConfigError where the weights refuse the scenes."""
+    return simulate_scenes(simulator, [InitialState.of_scene(scene) for scene in scenes], frames)

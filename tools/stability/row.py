@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
+
+from tools import report
 
 
 @dataclass(frozen=True)
@@ -22,17 +25,13 @@ class Row:
         return {"part": part} | row.pop("more") | row
 
 
-def table(rows: list[Row]) -> str:
+def within(case: str, bound: float, measured: float, beyond: str, more: dict[str, Any] | None = None) -> Row:
+    """A row that holds where the size of what is measured is at most the bound."""
+    return Row(case, bound, measured, abs(measured) <= bound, beyond, more or {})
+
+
+def table(rows: Sequence[Row]) -> str:
     """The rows for people."""
-    width = max((len(row.case) for row in rows), default=4)
-    lines = [f"{'case':<{width}} {'predicted':>12} {'measured':>12}  held  beyond"]
-    for row in rows:
-        held = "yes" if row.held else "NO"
-        lines.append(
-            f"{row.case:<{width}} {_text(row.predicted):>12} {_text(row.measured):>12}  {held:<4}  {row.beyond}"
-        )
-    return "\n".join(lines)
-
-
-def _text(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"
+    figures = [[v if isinstance(v, str) else f"{v:.4g}" for v in (row.predicted, row.measured)] for row in rows]
+    lines = [(r.case, *figure, "yes" if r.held else "NO", r.beyond) for r, figure in zip(rows, figures, strict=True)]
+    return report.table(("case", "predicted", "measured", "held", "beyond"), lines)

@@ -21,7 +21,9 @@ from hgn.config import MpmConfig
 from hgn.scene.material import MATERIALS, PAPER_MATERIALS, SAND, SNOW
 from hgn.scene.rotation import euler_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
-from tools.stability.row import Row
+from tools.scenes import filled, random_places
+from tools.stability.row import Row, within
+from tools.stability.solver_scenes import positions
 
 DOMAIN_CELLS = 32
 GRAVITY = 9.8  # m/s²
@@ -90,25 +92,17 @@ def block(
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Scene:
     """A block from `low` on, in cells about the middle of the surface, eight particles a cell; vectors turn with it."""
-    count = round(8 * math.prod(size))
-    place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * size + np.array(low)
-    turned = rotate(np.array([velocity, gravity]), setting.rotation)
-    return Scene(
-        position_N3=setting.place(place).astype(np.float32),
-        velocity_N3=np.tile(turned[0].astype(np.float32), (count, 1)),
-        material_N=np.full(count, material, np.uint8),
-        obstacles=obstacles,
-        domain_size=(DOMAIN_CELLS * setting.cell_size,) * 3,
-        cell_size=setting.cell_size,
-        gravity=(float(turned[1, 0]), float(turned[1, 1]), float(turned[1, 2])),
-    )
+    turned_velocity, turned_gravity = rotate(np.array([velocity, gravity]), setting.rotation)
+    domain_size = (DOMAIN_CELLS * setting.cell_size,) * 3
+    return filled(
+        material, setting.place(random_places(size) + np.array(low)), turned_velocity, obstacles=obstacles,
+        domain_size=domain_size, cell_size=setting.cell_size, gravity=tuple(turned_gravity.tolist()),
+    )  # fmt: skip
 
 
 def centres(setting: Setting, outcome: Simulated | SceneFailure) -> np.ndarray:
     """The block's centre along the surface's own axes at each frame, m, float64 [T, 3]."""
-    if isinstance(outcome, SceneFailure):
-        raise RuntimeError(outcome.cause)
-    return np.asarray(rotate(outcome.position_TN3.astype(np.float64).mean(axis=1), setting.rotation.T))
+    return np.asarray(rotate(positions(outcome).astype(np.float64).mean(axis=1), setting.rotation.T))
 
 
 def flight_errors(
@@ -120,26 +114,22 @@ def flight_errors(
     frames = 1 + round(seconds * FRAME_RATE_HZ)
     scenes, ways = [], []
     width, height, depth = FLYING_CELLS
-    for setting, material in cases:
+    worst = [{"below": 0.0, "leaving": 0.0} for _ in cases]
+    for errors, (setting, material) in zip(worst, cases, strict=True):
         surface = (sheet(setting),)
         for gap in GAPS:
             low = (-width / 2, -gap - height, -depth / 2)
             scenes.append(block(setting, material, low, FLYING_CELLS, surface, gravity=(0.0, -GRAVITY, 0.0)))
-            ways.append(("below", frames - 1, -GRAVITY * seconds**2 / 2))
+            ways.append((errors, setting, "below", frames - 1, -GRAVITY * seconds**2 / 2))
         for speed in LEAVING_SPEEDS:
             low = (-width / 2, 0.3, -depth / 2)
             scenes.append(block(setting, material, low, FLYING_CELLS, surface, (0.0, speed, 0.0)))
             last = min(frames - 1, int(FRAME_RATE_HZ * LEAVING_CELLS * setting.cell_size / speed))
-            ways.append(("leaving", last, speed * last / FRAME_RATE_HZ))
+            ways.append((errors, setting, "leaving", last, speed * last / FRAME_RATE_HZ))
     outcomes = simulate(scenes, config, frames, FRAME_RATE_HZ)
-    worst = []
-    for index, (setting, _) in enumerate(cases):
-        errors = {"below": 0.0, "leaving": 0.0}
-        own = slice(index * len(ways) // len(cases), (index + 1) * len(ways) // len(cases))
-        for outcome, (kind, last, way) in zip(outcomes[own], ways[own], strict=True):
-            centre = centres(setting, outcome)[:, 1]
-            errors[kind] = max(errors[kind], abs(float(centre[last] - centre[0]) / way - 1))
-        worst.append(errors)
+    for outcome, (errors, setting, kind, last, way) in zip(outcomes, ways, strict=True):
+        centre = centres(setting, outcome)[:, 1]
+        errors[kind] = max(errors[kind], abs(float(centre[last] - centre[0]) / way - 1))
     return worst
 
 
@@ -148,26 +138,18 @@ def glued_below(cases: Sequence[tuple[Setting, int]], config: MpmConfig) -> list
     FALLING_S later and still there after HANGING_S: pieces that swing in below its rim fall on.
     """
     width, _, depth = FALLING_CELLS
-    half = width / 3
-    scenes = [
-        block(
-            setting, material, (-width / 2, 1.5, -depth / 2), FALLING_CELLS, (sheet(setting, half),),
-            gravity=(0.0, -GRAVITY, 0.0),
-        )
-        for setting, material in cases
-    ]  # fmt: skip
+    low, half, down = (-width / 2, 1.5, -depth / 2), width / 3, (0.0, -GRAVITY, 0.0)
+    scenes = [block(at, kind, low, FALLING_CELLS, (sheet(at, half),), gravity=down) for at, kind in cases]
     looks = [round(FALLING_S * FRAME_RATE_HZ), round((FALLING_S + HANGING_S) * FRAME_RATE_HZ)]
     fractions = []
     for (setting, _), outcome in zip(cases, simulate(scenes, config, 1 + looks[1], FRAME_RATE_HZ), strict=True):
-        if isinstance(outcome, SceneFailure):
-            raise RuntimeError(outcome.cause)
         middle = rotate(setting.place(np.zeros((1, 3))), setting.rotation.T)
-        hangs = np.ones(outcome.position_TN3.shape[1], bool)
-        for position in outcome.position_TN3[looks].astype(np.float64):
-            place = (rotate(position, setting.rotation.T) - middle) / setting.cell_size
-            hangs &= (np.abs(place[:, [0, 2]]) < half - RIM_CELLS).all(axis=1)
-            hangs &= (place[:, 1] < 0) & (place[:, 1] > -BELOW_CELLS)
-        fractions.append(float(hangs.mean()))
+        hangs = []
+        for position_N3 in positions(outcome)[looks].astype(np.float64):
+            x_N, y_N, z_N = ((rotate(position_N3, setting.rotation.T) - middle) / setting.cell_size).T
+            beside_N = np.maximum(np.abs(x_N), np.abs(z_N))
+            hangs.append((beside_N < half - RIM_CELLS) & (y_N < 0) & (y_N > -BELOW_CELLS))
+        fractions.append(float(np.all(hangs, axis=0).mean()))
     return fractions
 
 
@@ -204,26 +186,22 @@ def contacts(config: MpmConfig) -> list[Row]:
     places = [(setting, material) for setting in settings for material in range(len(PAPER_MATERIALS))]
     for (turn, kind), errors in _grouped(places, flight_errors(places, config)).items():
         for name in ("below", "leaving"):
-            worst = max(error[name] for error in errors)
-            beyond = "of the way of free flight, at most"
-            case = f"contact, {name} a sheet {turn}, {MATERIALS[kind]}"
-            rows.append(Row(case, FLIGHT_ERROR, worst, worst <= FLIGHT_ERROR, beyond))
+            worst, case = max(error[name] for error in errors), f"contact, {name} a sheet {turn}, {MATERIALS[kind]}"
+            rows.append(within(case, FLIGHT_ERROR, worst, "of the way of free flight, at most"))
     for (turn, kind), fractions in _grouped(places, glued_below(places, config)).items():
-        worst = max(fractions)
         case = f"contact, glued below a sheet {turn}, {MATERIALS[kind]}"
-        rows.append(Row(case, 0.0, worst, worst == 0, "of the particles, at most"))
+        rows.append(within(case, 0.0, max(fractions), "of the particles, at most"))
     for surface in ("sheet", "body", "floor"):
+        own = [Setting(0.0)] if surface == "floor" else settings
+        places = [(setting, material) for setting in own for material in FRICTION_ERRORS]
         for friction in FRICTIONS:
-            own = [Setting(0.0)] if surface == "floor" else settings
-            places = [(setting, material) for setting in own for material in FRICTION_ERRORS]
-            cases = [(setting, surface, kind) for setting, kind in places]
-            for (turn, kind), acting in _grouped(places, acting_frictions(cases, friction, config)).items():
+            found = acting_frictions([(setting, surface, kind) for setting, kind in places], friction, config)
+            for (turn, kind), acting in _grouped(places, found).items():
                 worst = max(acting, key=lambda value: abs(value - friction))
                 held = abs(worst / friction - 1) <= FRICTION_ERRORS[kind]
                 beyond = f"mean {np.mean(acting):.4g}; within {FRICTION_ERRORS[kind]:.0%} wanted"
-                rows.append(
-                    Row(f"contact, friction on a {surface} {turn}, {MATERIALS[kind]}", friction, worst, held, beyond)
-                )
+                case = f"contact, friction on a {surface} {turn}, {MATERIALS[kind]}"
+                rows.append(Row(case, friction, worst, held, beyond))
     return rows
 
 

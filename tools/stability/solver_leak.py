@@ -10,10 +10,10 @@ Shape legend: T frames, N particles, F triangles.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import multiprocessing
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from hgn.scene.rotation import euler_rotation
 from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.system.machine import available_cpus
-from tools.stability.row import Row
+from tools.stability.row import Row, within
 from tools.stability.solver_scenes import CELL, block
 
 SHAPES = {"sheet": "square", "cone": "cone", "bowl": "half_sphere"}
@@ -52,13 +52,7 @@ def leaks(base: MpmConfig, seconds: float, block_cells: float, offsets: int = le
     """A row for each shape, orientation, material and speed: the share of paths of all offsets that cross; of depth
     and projections the worst. From AT_REST_S on also a row for the gap of each shape, orientation and material.
     """
-    keys = [
-        (shape, turn, kind, speed)
-        for shape in SHAPES
-        for turn in ORIENTATIONS
-        for kind in range(len(PAPER_MATERIALS))
-        for speed in SPEEDS
-    ]
+    keys = list(itertools.product(SHAPES, ORIENTATIONS, range(len(PAPER_MATERIALS)), SPEEDS))
     frames = 1 + max(1, round(seconds * FRAME_RATE_HZ))
     # Taichi's process cannot be forked; a few scenes are done sooner here
     many = len(keys) * offsets * frames >= PROCESSES_FROM_FRAMES
@@ -67,81 +61,67 @@ def leaks(base: MpmConfig, seconds: float, block_cells: float, offsets: int = le
         scenes = [scene(*key, offset, block_cells) for key in keys for offset in OFFSETS[:offsets]]
         colliders = list(pool.map(build_collider, scenes, [base.collider_band_cells] * len(scenes)))
         outcomes = simulate(scenes, base, frames, FRAME_RATE_HZ, colliders=colliders)
-        paths = [outcome.cause if isinstance(outcome, SceneFailure) else _looked_at(outcome) for outcome in outcomes]
-        counters = [{} if isinstance(outcome, SceneFailure) else outcome.counters for outcome in outcomes]
-        found = list(pool.map(_measure, scenes, paths, counters))
+        measured = list(pool.map(_measure, scenes, map(_looked_at, outcomes)))
     rows: list[Row] = []
     gaps: dict[str, float] = {}
     for index, (shape, turn, kind, speed) in enumerate(keys):
-        own = found[index * offsets : (index + 1) * offsets]
-        rows.append(_row(f"leak, {shape} {turn}, {MATERIALS[kind]} at {speed:g} m/s", own))
-        gap = max((item["gap_cells"] for item in own if not isinstance(item, str)), default=0.0)
-        name = f"gap, {shape} {turn}, {MATERIALS[kind]}"
-        gaps[name] = max(gap, gaps.get(name, 0.0))
-    if seconds < AT_REST_S:
-        return rows
-    return rows + [
-        Row(name, GAP_AT_MOST, gap, gap <= GAP_AT_MOST, "cells, of the lowest twentieth of what lies on it")
-        for name, gap in gaps.items()
-        if gap
-    ]
+        own = slice(index * offsets, (index + 1) * offsets)
+        causes = [outcome.cause for outcome in outcomes[own] if isinstance(outcome, SceneFailure)]
+        case = f"{shape} {turn}, {MATERIALS[kind]}"
+        rows.append(_row(f"leak, {case} at {speed:g} m/s", measured[own], causes))
+        gap = max(item.get("gap_cells", 0.0) for item in measured[own])
+        gaps[f"gap, {case}"] = max(gap, gaps.get(f"gap, {case}", 0.0))
+    if seconds >= AT_REST_S:
+        beyond = "cells, of the lowest twentieth of what lies on it"
+        rows += [within(name, GAP_AT_MOST, gap, beyond) for name, gap in gaps.items() if gap]
+    return rows
 
 
-def _row(name: str, found: list[dict[str, float] | str]) -> Row:
-    stopped = [item for item in found if isinstance(item, str)]
-    if stopped:
-        return Row(name, CROSSED_AT_MOST, "stopped", False, stopped[0])
-    own = [item for item in found if not isinstance(item, str)]
-    worst = {key: max(item[key] for item in own) for key in own[0]}
-    worst["crossed"] = sum(item["crossed"] for item in own) / len(own)
-    held = worst["crossed"] <= CROSSED_AT_MOST and worst["depth_p99_cells"] <= DEPTH_AT_MOST
-    beyond = (
-        f"99 % of depths {worst['depth_p99_cells']:.2g} cells, {worst['projections']:.1e} projections a particle-step"
-    )
-    return Row(name, CROSSED_AT_MOST, worst["crossed"], held, beyond, {key: float(worst[key]) for key in worst})
+def _row(name: str, measured: Sequence[dict[str, float]], causes: Sequence[str]) -> Row:
+    if causes:
+        return Row(name, CROSSED_AT_MOST, "stopped", False, causes[0])
+    worst = {key: max(item[key] for item in measured) for key in measured[0]}
+    worst["crossed"] = sum(item["crossed"] for item in measured) / len(measured)
+    depth, projections = worst["depth_p99_cells"], worst["projections"]
+    held = worst["crossed"] <= CROSSED_AT_MOST and depth <= DEPTH_AT_MOST
+    beyond = f"99 % of depths {depth:.2g} cells, {projections:.1e} projections a particle-step"
+    return Row(name, CROSSED_AT_MOST, worst["crossed"], held, beyond, worst)
 
 
 def scene(shape: str, turn: str, kind: int, speed: float, offset: Sequence[float], size: float) -> Scene:
     """A block of `size` cells above an obstacle in the middle of a small domain; a sheet reaches from wall to wall."""
     centre = CENTRE + np.asarray(offset)
     side = SHEET if shape == "sheet" else SIZE
-    obstacle = shape_obstacle(
-        SHAPES[shape], side * CELL, tuple(centre * CELL), euler_rotation(ORIENTATIONS[turn])
-    )  # fmt: skip
-    low = DOMAIN_CELLS / 2 - size / 2
+    obstacle = shape_obstacle(SHAPES[shape], side * CELL, tuple(centre * CELL), euler_rotation(ORIENTATIONS[turn]))
+    low, domain_size = DOMAIN_CELLS / 2 - size / 2, (DOMAIN_CELLS * CELL,) * 3
     # what a tilted sheet rises by under the block
     top = min(float(obstacle.vertex_V3[:, 1].max()) / CELL, centre[1] + (size if shape == "sheet" else np.inf))
-    fallen = block(kind, (low, top + GAP_CELLS, low), (size, size, size), (0, -speed, 0), obstacles=(obstacle,))
-    return dataclasses.replace(fallen, domain_size=(DOMAIN_CELLS * CELL,) * 3)
+    corner, sides = (low, top + GAP_CELLS, low), (size, size, size)
+    return block(kind, corner, sides, (0, -speed, 0), obstacles=(obstacle,), domain_size=domain_size)
 
 
-def _looked_at(outcome: Simulated) -> np.ndarray:
+def _looked_at(outcome: Simulated | SceneFailure) -> Simulated | SceneFailure:
     """All frames of the impact, fewer later, and the last."""
-    return np.concatenate(
-        [outcome.position_TN3[:IMPACT_FRAMES], outcome.position_TN3[IMPACT_FRAMES::LATER], outcome.position_TN3[-1:]]
-    )
+    if isinstance(outcome, SceneFailure):
+        return outcome
+    path = outcome.position_TN3
+    path = np.concatenate([path[:IMPACT_FRAMES], path[IMPACT_FRAMES::LATER], path[-1:]])
+    return dataclasses.replace(outcome, position_TN3=path)
 
 
-def _measure(scene: Scene, path: np.ndarray | str, counters: dict[str, Any]) -> dict[str, float] | str:
-    if isinstance(path, str):
-        return path
-    (obstacle,) = scene.obstacles
-    crossed = crossing_paths(path, obstacle.vertex_V3[obstacle.triangle_F3], rim(obstacle))
-    depth, gap = 0.0, 0.0
-    end = path[-1]
+def _measure(scene: Scene, outcome: Simulated | SceneFailure) -> dict[str, float]:
+    """Of a scene that was stopped nothing."""
+    if isinstance(outcome, SceneFailure):
+        return {}
+    (obstacle,), end, counters = scene.obstacles, outcome.position_TN3[-1], outcome.counters
     distance, above = _distances(end, obstacle)
-    if obstacle.closed:
-        inside = contains(end, obstacle)
-        depth = float(np.quantile(np.where(inside, distance, 0.0), 0.99))
-    near = distance[above & (distance < NEAR_CELLS)]
-    if len(near) >= NEAR_PARTICLES:  # of what rests on it, the lowest layer
-        gap = float(np.quantile(near, 0.05))
-    steps = counters["substeps"] * scene.particle_count
+    depth = np.quantile(np.where(contains(end, obstacle), distance, 0.0), 0.99) if obstacle.closed else 0.0
+    near = distance[above & (distance < NEAR_CELLS)]  # of what rests on it, the lowest layer
     return {
-        "crossed": crossed,
-        "depth_p99_cells": depth,
-        "gap_cells": gap,
-        "projections": counters["surface_projections"] / steps,
+        "crossed": crossing_paths(outcome.position_TN3, obstacle.vertex_V3[obstacle.triangle_F3], rim(obstacle)),
+        "depth_p99_cells": float(depth),
+        "gap_cells": float(np.quantile(near, 0.05)) if len(near) >= NEAR_PARTICLES else 0.0,
+        "projections": counters["surface_projections"] / (counters["substeps"] * scene.particle_count),
     }
 
 
@@ -216,10 +196,8 @@ def _count_crossings(start_P3: np.ndarray, way_P3: np.ndarray, triangle_F33: np.
 
 def rim(obstacle: Obstacle) -> np.ndarray:
     """The edges that only one triangle has, [E, 2, 3]."""
-    triangle = np.asarray(obstacle.triangle_F3)
-    edge, uses = np.unique(
-        np.sort(np.concatenate([triangle[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1), axis=0, return_counts=True
-    )
+    edges = np.sort(np.asarray(obstacle.triangle_F3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edge, uses = np.unique(edges, axis=0, return_counts=True)
     return np.asarray(obstacle.vertex_V3, np.float64)[edge[uses == 1]]
 
 

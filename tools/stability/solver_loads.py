@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,17 @@ from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds, simulat
 from hgn.config import MpmConfig
 from hgn.scene.material import MATERIALS, SNOW
 from hgn.scene.scene import Scene
+from tools.scenes import joined
 from tools.stability.row import Row
-from tools.stability.solver_scenes import block, centre_cells, front_cells, height_cells, thickness_cells
+from tools.stability.solver_scenes import (
+    block,
+    centre_cells,
+    front_cells,
+    height_cells,
+    positions,
+    rms_speed,
+    thickness_cells,
+)
 
 FRAME_RATE_HZ = 60.0
 STIFFNESS = (1.0, 10.0, 100.0, 1000.0)
@@ -26,6 +37,7 @@ CONVERGENCE_RATE_HZ = 240.0
 RESOLVED_CELLS = 2.0
 LONG_SUBSTEPS = 100_000
 DROP_CELLS = 1.0  # between floor and block
+MEASURES = {"height": height_cells, "centre": centre_cells, "front": front_cells}
 
 
 def stiffnesses(base: MpmConfig) -> list[Row]:
@@ -33,29 +45,20 @@ def stiffnesses(base: MpmConfig) -> list[Row]:
     rows = []
     for stiffness in STIFFNESS:
         config = dataclasses.replace(base, youngs_modulus_pa=base.youngs_modulus_pa * stiffness)
-        outcomes = simulate([_falling(kind, 3.0) for kind in range(3)], config, 7, FRAME_RATE_HZ)
-        rows += [
-            _bounded(f"stiffness x{stiffness:g}, {MATERIALS[kind]} at 3 m/s", outcome, _falling(kind, 3.0), config)
-            for kind, outcome in enumerate(outcomes)
-        ]
+        names = [f"stiffness x{stiffness:g}, {MATERIALS[kind]} at 3 m/s" for kind in range(3)]
+        rows += _bounded(names, [_falling(kind, 3.0) for kind in range(3)], config, 7)
     soft = _falling(SNOW, 3.0)
     modulus = np.full(soft.particle_count, base.youngs_modulus_pa, np.float32)
     modulus[soft.position_N3[:, 0] > soft.position_N3[:, 0].mean()] *= STIFFNESS[-1]
     contrast = dataclasses.replace(soft, material_parameters={"youngs_modulus_pa": modulus})
-    (outcome,) = simulate([contrast], base, 7, FRAME_RATE_HZ)
-    return [*rows, _bounded(f"stiffness contrast 1:{STIFFNESS[-1]:g}, snow at 3 m/s", outcome, contrast, base)]
+    return rows + _bounded([f"stiffness contrast 1:{STIFFNESS[-1]:g}, snow at 3 m/s"], [contrast], base, 7)
 
 
 def impacts(base: MpmConfig) -> list[Row]:
     """Blocks and single particles that hit the floor at up to 30 m/s."""
-    cases = [
-        (f"impact at {speed:g} m/s, {what} of {MATERIALS[kind]}", _falling(kind, speed, size))
-        for speed in SPEEDS
-        for kind in range(3)
-        for what, size in (("block", 4.0), ("particle", 0.1))
-    ]
-    outcomes = simulate([scene for _, scene in cases], base, 13, FRAME_RATE_HZ)
-    return [_bounded(name, outcome, scene, base) for (name, scene), outcome in zip(cases, outcomes, strict=True)]
+    cases = list(itertools.product(SPEEDS, range(3), {"block": 4.0, "particle": 0.1}.items()))
+    names = [f"impact at {speed:g} m/s, {what} of {MATERIALS[kind]}" for speed, kind, (what, _) in cases]
+    return _bounded(names, [_falling(kind, speed, size) for speed, kind, (_, size) in cases], base, 13)
 
 
 def convergence(base: MpmConfig) -> list[Row]:
@@ -67,47 +70,39 @@ def convergence(base: MpmConfig) -> list[Row]:
     rate, which is part of the grid's resolution: what smooths velocities is their number (see results/solver).
     """
     half = dataclasses.replace(base, stability_fraction=base.stability_fraction / 2)
-    cases: list[tuple[str, Callable[[int], Scene], dict[str, Callable[[np.ndarray], float]]]] = [
-        (
-            f"a block of {MATERIALS[kind]} at {speed:g} m/s",
-            lambda seed, kind=kind, speed=speed: _falling(kind, speed, 8.0, seed),  # type: ignore[misc]
-            {"height": height_cells, "centre": centre_cells},
-        )
+    blocks = [
+        (f"a block of {MATERIALS[kind]} at {speed:g} m/s", partial(_falling, kind, speed, 8.0), 0.1, "centre")
         for speed in (4.5, 10.0)
         for kind in range(3)
     ]
-    cases += [
-        (
-            f"a column of {MATERIALS[kind]}",
-            lambda seed, kind=kind: block(kind, (2, 2, 28), (6, 12, 8), seed=seed),  # type: ignore[misc]
-            {"height": height_cells, "front": front_cells},
-        )
+    columns = [
+        (f"a column of {MATERIALS[kind]}", partial(block, kind, (2, 2, 28), (6, 12, 8)), 0.4, "front")
         for kind in range(3)
     ]
     rows = []
-    for name, make, measures in cases:
-        frames = 1 + round(CONVERGENCE_RATE_HZ * (0.4 if "column" in name else 0.1))
-        shift = np.random.default_rng(1).standard_normal((make(0).particle_count, 3)).astype(np.float32)
-        moved = dataclasses.replace(make(0), position_N3=make(0).position_N3 + np.float32(1e-6) * shift)
-        paths, counts = [], []
-        for config, scenes in ((base, [make(0), moved, make(1)]), (half, [make(0)])):
-            for outcome in simulate(scenes, config, frames, CONVERGENCE_RATE_HZ):
-                assert isinstance(outcome, Simulated), (name, outcome)
-                paths.append(outcome.position_TN3.astype(np.float64))
-                counts.append({name: outcome.counters[name] for name in ("substeps", "transfers")})
-        whole, shifted, filled, fine = paths
-        until = _sinks_until(whole)
-        for measure, value in measures.items():
-            series = [np.array([value(x) for x in path[:until]]) for path in (whole, shifted, filled, fine)]
-            change, chaos, filling = ((np.abs(other / series[0] - 1)).max() for other in (series[3], *series[1:3]))
+    for name, make, seconds, other in (*blocks, *columns):
+        frames = 1 + round(CONVERGENCE_RATE_HZ * seconds)
+        first = make(seed=0)
+        shift = np.random.default_rng(1).standard_normal(first.position_N3.shape).astype(np.float32)
+        moved = dataclasses.replace(first, position_N3=first.position_N3 + np.float32(1e-6) * shift)
+        outcomes = [
+            outcome
+            for config, scenes in ((base, [first, moved, make(seed=1)]), (half, [first]))
+            for outcome in simulate(scenes, config, frames, CONVERGENCE_RATE_HZ)
+        ]
+        paths = [positions(outcome).astype(np.float64) for outcome in outcomes]
+        steps = [{n: o.counters[n] for n in ("substeps", "transfers")} for o in outcomes if isinstance(o, Simulated)]
+        until = _sinks_until(paths[0])
+        for measure in ("height", other):
+            series = [np.array([MEASURES[measure](x) for x in path[:until]]) for path in paths]
+            chaos, filling, change = (float(np.abs(changed / series[0] - 1).max()) for changed in series[1:])
             beyond = (
                 f"floors: {chaos:.1%} by 1e-6, {filling:.1%} by another filling; {series[0][0]:.3g} cells became "
                 f"{series[0][-1]:.4g}, and {series[3][-1]:.4g} at half the step"
             )
-            more: dict[str, Any] = {"displaced": float(chaos), "filled_anew": float(filling), "frames": until}
-            more |= {"default_step": counts[0], "half_the_step": counts[3]}
-            case = f"half the step: {measure} of {name}"
-            rows.append(Row(case, CONVERGED, float(change), bool(change < CONVERGED), beyond, more))
+            more: dict[str, Any] = {"displaced": chaos, "filled_anew": filling, "frames": until}
+            more |= {"default_step": steps[0], "half_the_step": steps[-1]}
+            rows.append(Row(f"half the step: {measure} of {name}", CONVERGED, change, change < CONVERGED, beyond, more))
     return rows
 
 
@@ -121,18 +116,13 @@ def _sinks_until(path_TN3: np.ndarray) -> int:
 def long_run(base: MpmConfig) -> list[Row]:
     """A small scene of all three materials for 100,000 substeps: nothing drifts, sinks or comes alive."""
     config = dataclasses.replace(base, time_step="fixed", fixed_time_step_s=1.5e-4)
-    joined = [block(kind, (4 + 6 * kind, 3.5, 4), (3, 3, 3), seed=kind) for kind in range(3)]
-    scene = Scene(
-        np.concatenate([part.position_N3 for part in joined]), np.concatenate([part.velocity_N3 for part in joined]),
-        np.concatenate([part.material_N for part in joined]), cell_size=joined[0].cell_size,
-        domain_size=(24 / 64, 24 / 64, 24 / 64),
-    )  # fmt: skip
+    blocks = [block(kind, (4 + 6 * kind, 3.5, 4), (3, 3, 3), seed=kind) for kind in range(3)]
+    scene = dataclasses.replace(joined(blocks), domain_size=(24 / 64, 24 / 64, 24 / 64))
     frames = 1 + math.ceil(LONG_SUBSTEPS / math.ceil(1 / (FRAME_RATE_HZ * config.fixed_time_step_s)))
     (outcome,) = simulate([scene], config, frames, FRAME_RATE_HZ)
     if isinstance(outcome, SceneFailure):
         return [Row("long run", LONG_SUBSTEPS, 0.0, False, outcome.cause)]
-    last = outcome.position_TN3[-60:].astype(float)
-    speed = float(np.sqrt((np.diff(last, axis=0) ** 2).sum(axis=2).mean())) * FRAME_RATE_HZ
+    speed = rms_speed(outcome.position_TN3[-60:], FRAME_RATE_HZ)
     steps = float(outcome.counters["substeps"])
     beyond = f"root mean square speed over the last second {speed:.2g} m/s"
     return [Row("long run, three materials", LONG_SUBSTEPS, steps, steps >= LONG_SUBSTEPS and speed < 0.05, beyond)]
@@ -142,18 +132,22 @@ def _falling(kind: int, speed: float, size: float = 4.0, seed: int = 0) -> Scene
     return block(kind, (30, 3 + DROP_CELLS, 30), (size, size, size), (0, -speed, 0), seed)
 
 
-def _bounded(name: str, outcome: Simulated | SceneFailure, scene: Scene, config: MpmConfig) -> Row:
-    """That it stays finite and inside, and that no kinetic energy comes from nowhere."""
-    if isinstance(outcome, SceneFailure):
-        return Row(name, ENERGY, "stopped", False, outcome.cause)
-    low, high = particle_bounds(scene, config)
-    inside = bool(((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all())
-    path = outcome.position_TN3.astype(float)
-    square = ((np.diff(path, axis=0) * FRAME_RATE_HZ) ** 2).sum(axis=2).mean(axis=1)
-    start = float((scene.velocity_N3.astype(float) ** 2).sum(axis=1).mean())
-    fallen = path[0, :, 1].mean() - path[1:, :, 1].mean(axis=1)
-    energy = float((square / (start + 2 * abs(scene.gravity[1]) * np.maximum(fallen, 0))).max())
-    floors = {key: value for key, value in outcome.counters.items() if value and key.endswith(TOUCHED)}
-    noted = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in floors.items()) or "no floor touched"
-    more = {key: outcome.counters[key] for key in ("substeps", "smallest_time_step_s", "largest_speed")}
-    return Row(name, ENERGY, energy, inside and energy <= ENERGY, noted, more)
+def _bounded(names: Sequence[str], scenes: Sequence[Scene], config: MpmConfig, frames: int) -> list[Row]:
+    """That scenes stay finite and inside, and that no kinetic energy comes from nowhere."""
+    rows = []
+    for name, scene, outcome in zip(names, scenes, simulate(scenes, config, frames, FRAME_RATE_HZ), strict=True):
+        if isinstance(outcome, SceneFailure):
+            rows.append(Row(name, ENERGY, "stopped", False, outcome.cause))
+            continue
+        low, high = particle_bounds(scene, config)
+        inside = bool(((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all())
+        path = outcome.position_TN3.astype(float)
+        square = ((np.diff(path, axis=0) * FRAME_RATE_HZ) ** 2).sum(axis=2).mean(axis=1)
+        start = float((scene.velocity_N3.astype(float) ** 2).sum(axis=1).mean())
+        fallen = path[0, :, 1].mean() - path[1:, :, 1].mean(axis=1)
+        energy = float((square / (start + 2 * abs(scene.gravity[1]) * np.maximum(fallen, 0))).max())
+        floors = {key: value for key, value in outcome.counters.items() if value and key.endswith(TOUCHED)}
+        noted = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in floors.items()) or "no floor touched"
+        more = {key: outcome.counters[key] for key in ("substeps", "smallest_time_step_s", "largest_speed")}
+        rows.append(Row(name, ENERGY, energy, inside and energy <= ENERGY, noted, more))
+    return rows

@@ -1,19 +1,21 @@
-"""The scenes of the stability report: blocks and single particles above the floor of a domain of one unit.
+"""Blocks and single particles above the floor of a domain of one unit, and what is measured of them.
 
-Shape legend: N particles.
+Shape legend: T frames, N particles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from hgn.scene.scene import Obstacle, Scene
+from datagen.mpm.solver import SceneFailure, Simulated
+from hgn.scene.scene import Scene
+from tools.scenes import filled, random_places
 
 CELL = 1 / 64
 FLOOR_CELLS = 3  # nodes below it belong to the walls
-PARTICLES_PER_CELL = 8
 
 
 def block(
@@ -22,32 +24,22 @@ def block(
     size_cells: Sequence[float],
     velocity: Sequence[float] = (0.0, 0.0, 0.0),
     seed: int = 0,
-    obstacles: tuple[Obstacle, ...] = (),
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0),
+    **more: Any,
 ) -> Scene:
     """A box of particles at random places, eight a cell; corner and size in cells of the default grid."""
-    count = max(1, round(PARTICLES_PER_CELL * float(np.prod(size_cells))))
-    place = np.random.default_rng(seed).uniform(0, 1, (count, 3)) * np.asarray(size_cells) + np.asarray(low_cells)
-    return particles(material, place, velocity, obstacles, gravity)
+    return filled(material, (random_places(size_cells, seed) + np.asarray(low_cells)) * CELL, velocity, **more)
 
 
-def particles(
-    material: int,
-    place_N3: np.ndarray,
-    velocity: Sequence[float] = (0.0, 0.0, 0.0),
-    obstacles: tuple[Obstacle, ...] = (),
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0),
-) -> Scene:
-    """Particles of one material and velocity at the given places, in cells."""
-    count = len(place_N3)
-    return Scene(
-        position_N3=(np.asarray(place_N3) * CELL).astype(np.float32),
-        velocity_N3=np.tile(np.asarray(velocity, np.float32), (count, 1)),
-        material_N=np.full(count, material, np.uint8),
-        obstacles=obstacles,
-        cell_size=CELL,
-        gravity=gravity,
-    )
+def positions(outcome: Simulated | SceneFailure) -> np.ndarray:
+    """A scene's trajectory, float32 [T, N, 3]. Raises: RuntimeError where the solver stopped it."""
+    if isinstance(outcome, SceneFailure):
+        raise RuntimeError(f"a scene was stopped: {outcome.cause}")
+    return outcome.position_TN3
+
+
+def rms_speed(path_TN3: np.ndarray, rate_hz: float) -> float:
+    """Root mean square over the particles and frames given, domain units a second."""
+    return float(np.sqrt((np.diff(path_TN3.astype(np.float64), axis=0) ** 2).sum(axis=2).mean())) * rate_hz
 
 
 def thickness_cells(position_N3: np.ndarray) -> float:

@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 
 from datagen.mpm.layout import sand_alpha, sand_sine
-from datagen.mpm.solver import SceneFailure, Simulated, simulate
+from datagen.mpm.solver import simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import PAPER_MATERIALS, SAND, WATER
 from hgn.scene.scene import Obstacle, Scene
-from tools.stability.row import Row
-from tools.stability.solver_scenes import PARTICLES_PER_CELL
+from tools.scenes import PARTICLES_PER_CELL, filled, random_places, some
+from tools.stability.row import Row, within
+from tools.stability.solver_scenes import positions, rms_speed
 
 GRAVITY = 9.8
 WALL = 2.0  # cells: the last wall node; what lies beyond cannot move
@@ -90,17 +91,16 @@ def dam_breaks(base: MpmConfig) -> list[Row]:
         path = _path(dam(cells), base, 2 + math.ceil(DAM[-1, 0] * math.sqrt(DAM_WIDTH / (2 * GRAVITY)) * DAM_RATE_HZ))
         time = np.arange(len(path)) / DAM_RATE_HZ * math.sqrt(2 * GRAVITY / DAM_WIDTH)
         front = np.interp(DAM[:, 0], time, [dam_front(position, cells) for position in path])
-        lead = front / DAM[:, 1] - 1
         fronts.append(front)
         beyond = "fronts " + ", ".join(f"{x:.2f} at {t:.2f} ({y:.2f})" for x, (t, y) in zip(front, DAM, strict=True))
         more = {"front": front.tolist(), "experiment": DAM.tolist()}
-        worst = float(np.abs(lead).max())
+        worst = float(np.abs(front / DAM[:, 1] - 1).max())
         touched = _strays(path * (cells / DAM_WIDTH), DAM_ROOM * cells, (0,))
         held = worst <= DAM_LEADS and not touched
         rows.append(Row(f"dam break, {cells} cells wide", DAM_LEADS, worst, held, beyond + touched, more))
     change = float(np.abs(fronts[1] / fronts[0] - 1).max())
     name = f"dam break, {DAM_CELLS[0]} against {DAM_CELLS[1]} cells"
-    return [*rows, Row(name, DAM_RESOLVED, change, change <= DAM_RESOLVED, "largest change of the front")]
+    return [*rows, within(name, DAM_RESOLVED, change, "largest change of the front")]
 
 
 def dam(cells: int) -> Scene:
@@ -121,21 +121,20 @@ def rest(base: MpmConfig) -> list[Row]:
     path = _path(scene, base, 1 + round(REST_S * REST_RATE_HZ), REST_RATE_HZ)
     level = 2 * (path[:, :, 1].mean(axis=1) / scene.cell_size - WALL) / REST_CELLS
     change = level[round(SETTLED_S * REST_RATE_HZ) :] / level[0] - 1
-    worst = float(change[np.abs(change).argmax()])
     beyond = f"{change[0]:+.2%} after {SETTLED_S:g} s, {change[-1]:+.2%} after {REST_S:g} s"
-    return [Row("level of water at rest, random filling", REST_WITHIN, worst, abs(worst) <= REST_WITHIN, beyond)]
+    worst = float(change[np.abs(change).argmax()])
+    return [within("level of water at rest, random filling", REST_WITHIN, worst, beyond)]
 
 
 def grids(base: MpmConfig, cells: Sequence[int]) -> list[Row]:
     """How fronts, run-outs and heights change with the grid, with the order of it: `cells`, three or more, are those of
     the width of a dam, the radius of a column, and the side of blocks that hit the floor.
     """
-    sand = base.sand_friction_law, base.sand_friction_angle_deg
     measured: dict[str, list[float]] = {}
     for count in cells:
         path = _path(dam(count), base, 2 + math.ceil(GRID_DAM_S * DAM_RATE_HZ))
         measured.setdefault("front of the dam break, in widths", []).append(dam_front(path[-1], count))
-        for row in column_rows(GRID_ASPECT, *sand, base, count):
+        for row in column_rows(GRID_ASPECT, base.sand_friction_law, base.sand_friction_angle_deg, base, count):
             what = row.case.rsplit(", ", 1)[1]
             measured.setdefault(f"{what} of a sand column, in radii", []).append(float(row.measured))
         for kind, name in enumerate(PAPER_MATERIALS):
@@ -145,12 +144,11 @@ def grids(base: MpmConfig, cells: Sequence[int]) -> list[Row]:
     rows = []
     for name, values in measured.items():
         order, limit = convergence_order(cells, values)
-        change = abs(values[-1] / values[-2] - 1)
-        beyond = ", ".join(f"{value:.3f} at {count}" for value, count in zip(values, cells, strict=True)) + " cells; "
+        series = ", ".join(f"{value:.3f} at {count}" for value, count in zip(values, cells, strict=True)) + " cells; "
+        leads = "approaches nothing yet" if order is None else f"order {order:.2g}, towards {limit:.3f}"
         more: dict[str, Any] = {"cells": list(cells), "series": values, "order": order, "limit": limit}
-        beyond += "approaches nothing yet" if order is None else f"order {order:.2g}, towards {limit:.3f}"
-        case = f"grid of {cells[-1]} cells beside {cells[-2]}: {name}"
-        rows.append(Row(case, GRID_WITHIN, change, change <= GRID_WITHIN, beyond, more))
+        case, change = f"grid of {cells[-1]} cells beside {cells[-2]}: {name}", abs(values[-1] / values[-2] - 1)
+        rows.append(within(case, GRID_WITHIN, change, series + leads, more))
     return rows
 
 
@@ -174,32 +172,24 @@ def convergence_order(cells: Sequence[int], values: Sequence[float]) -> tuple[fl
 def impact(kind: int, cells: int) -> Scene:
     """A block so many cells a side that is about to hit the floor, in a room four times as wide."""
     scene = basin(kind, (cells,) * 3, (4 * cells, 2 * cells, 4 * cells), IMPACT_SIDE / cells)
-    shift = np.array([1.5, IMPACT_DROP, 1.5]) * IMPACT_SIDE
-    return dataclasses.replace(
-        scene, position_N3=(scene.position_N3 + shift).astype(np.float32),
-        velocity_N3=np.tile(np.array([0, -IMPACT_SPEED, 0], np.float32), (scene.particle_count, 1)),
-    )  # fmt: skip
+    position_N3 = (scene.position_N3 + np.array([1.5, IMPACT_DROP, 1.5]) * IMPACT_SIDE).astype(np.float32)
+    velocity_N3 = scene.velocity_N3 + np.array([0, -IMPACT_SPEED, 0], np.float32)
+    return dataclasses.replace(scene, position_N3=position_N3, velocity_N3=velocity_N3)
 
 
-def columns(
-    base: MpmConfig,
-    aspects: Sequence[float] = COLUMN_ASPECTS,
-    grains: Sequence[float] | None = None,
-    cells: int = 0,
-) -> list[Row]:
+def columns(base: MpmConfig, grains: Sequence[float] | None = None) -> list[Row]:
     """Run-out and height of collapsed columns by the config's own law, grains and all, or with so many grains in radius
-    (0: friction does not grow with the rate of flow), and `cells` in radius where that is more than the least.
+    (0: friction does not grow with the rate of flow).
     """
     own = base.sand_friction_law, base.sand_friction_angle_deg
-    diameters = (
-        [base.sand_grain_diameter_m] if grains is None else [COLUMN_RADIUS / many if many else 0.0 for many in grains]
-    )
-    configs = [dataclasses.replace(base, sand_grain_diameter_m=diameter) for diameter in diameters]
+    diameters = [COLUMN_RADIUS / many if many else 0.0 for many in grains or ()]
     return [
         row
-        for config in configs
-        for aspect in aspects
-        for row in column_rows(aspect, *own, config, max(cells, least_cells(aspect)))
+        for diameter in ([base.sand_grain_diameter_m] if grains is None else diameters)
+        for aspect in COLUMN_ASPECTS
+        for row in column_rows(
+            aspect, *own, dataclasses.replace(base, sand_grain_diameter_m=diameter), least_cells(aspect)
+        )
     ]
 
 
@@ -241,7 +231,7 @@ def column_rows(aspect: float, law: str, angle_deg: float, base: MpmConfig, cell
     for what, value, published in (("run-out", run_out, run_outs(aspect)), ("height", height, heights(aspect))):
         expected = min(max(value, min(published)), max(published))
         change = value / expected - 1
-        beyond = f"{change:+.1%}; speed at the end {_speed(path, 40 / duration):.2g} m/s{touched}"
+        beyond = f"{change:+.1%}; speed at the end {rms_speed(path[-2:], 40 / duration):.2g} m/s{touched}"
         more = {"cells": cells, "particles": scene.particle_count, "published": sorted(set(published))}
         rows.append(Row(f"{name}, {what}", expected, value, abs(change) <= COLUMN_WITHIN and not touched, beyond, more))
     return rows
@@ -251,12 +241,8 @@ def column(aspect: float, cells: int) -> Scene:
     """A quarter of a round column of sand `cells` in radius on a rough floor, between two smooth walls."""
     room = math.ceil(COLUMN_ROOM * lube(aspect) * cells)
     scene = basin(SAND, (cells, aspect * cells, cells), (room, aspect * cells + 2, room), COLUMN_RADIUS / cells, 2)
-    cell = _above_floor(scene.position_N3, scene.cell_size)
-    round_N = np.hypot(cell[:, 0], cell[:, 2]) < cells
-    return dataclasses.replace(
-        scene, position_N3=scene.position_N3[round_N], velocity_N3=scene.velocity_N3[round_N],
-        material_N=scene.material_N[round_N],
-    )  # fmt: skip
+    place_N3 = _above_floor(scene.position_N3, scene.cell_size)
+    return some(scene, np.hypot(place_N3[:, 0], place_N3[:, 2]) < cells)
 
 
 def lube(aspect: float) -> float:
@@ -309,7 +295,7 @@ def repose(angle_deg: float, start_deg: float, base: MpmConfig, cells: int) -> t
     path = _path(scene, _sand(base, base.sand_friction_law, angle_deg), 31, rate_hz)
     place = path / scene.cell_size - WALL - np.array([0.0, round(PIT * cells), 0.0])
     on = (place[-1, :, 1] > 0) & (place[-1, :, 0] < cells)
-    return surface_slope(place[0], cells), surface_slope(place[-1, on], cells), _speed(path[:, on], rate_hz)
+    return surface_slope(place[0], cells), surface_slope(place[-1, on], cells), rms_speed(path[-2:, on], rate_hz)
 
 
 def platform(slope_deg: float, cells: int) -> Scene:
@@ -322,10 +308,7 @@ def platform(slope_deg: float, cells: int) -> Scene:
     sheet = scene.obstacles[0]
     corner = sheet.vertex_V3.copy()
     corner[:, 0] = np.minimum(corner[:, 0], (WALL + cells) * scene.cell_size)
-    return dataclasses.replace(
-        scene, position_N3=scene.position_N3[below], velocity_N3=scene.velocity_N3[below],
-        material_N=scene.material_N[below], obstacles=(dataclasses.replace(sheet, vertex_V3=corner),),
-    )  # fmt: skip
+    return dataclasses.replace(some(scene, below), obstacles=(dataclasses.replace(sheet, vertex_V3=corner),))
 
 
 def surface_slope(place_N3: np.ndarray, cells: int) -> float:
@@ -346,8 +329,7 @@ def basin(
     """A box of particles at random places in the corner of a basin, wall to wall where the room is as large; above
     the wall's floor, or with `floor` that many cells higher on a sheet.
     """
-    count = round(PARTICLES_PER_CELL * float(np.prod(size_cells)))
-    place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * np.asarray(size_cells) + WALL
+    place = random_places(size_cells) + WALL
     nodes = [math.ceil(room + WALL + FAR_WALL) for room in room_cells]
     obstacles: tuple[Obstacle, ...] = ()
     if floor is not None:
@@ -356,10 +338,9 @@ def basin(
         low, high, y = -cell, (max(nodes) + 1) * cell, (WALL + floor) * cell
         corner = np.array([[low, y, low], [high, y, low], [high, y, high], [low, y, high]])
         obstacles = (Obstacle("floor", corner, np.array([[0, 1, 2], [0, 2, 3]], np.int32), False),)
-    return Scene(
-        (place * cell).astype(np.float32), np.zeros((count, 3), np.float32), np.full(count, material, np.uint8),
-        obstacles, domain_size=(nodes[0] * cell, nodes[1] * cell, nodes[2] * cell), cell_size=cell,
-        gravity=(0.0, -GRAVITY, 0.0), particles_per_cell=PARTICLES_PER_CELL,
+    return filled(
+        material, place * cell, (0.0, 0.0, 0.0), obstacles=obstacles, domain_size=tuple(n * cell for n in nodes),
+        cell_size=cell, gravity=(0.0, -GRAVITY, 0.0), particles_per_cell=PARTICLES_PER_CELL,
     )  # fmt: skip
 
 
@@ -405,12 +386,4 @@ def shear_strength(config: MpmConfig) -> float:
 
 
 def _path(scene: Scene, config: MpmConfig, frames: int, rate_hz: float = DAM_RATE_HZ) -> np.ndarray:
-    (outcome,) = simulate([scene], config, frames, rate_hz)
-    if isinstance(outcome, SceneFailure):
-        raise RuntimeError(f"a validation scene was stopped: {outcome.cause}")
-    assert isinstance(outcome, Simulated)
-    return outcome.position_TN3
-
-
-def _speed(path_TN3: np.ndarray, rate_hz: float) -> float:
-    return float(np.sqrt((np.diff(path_TN3[-2:].astype(np.float64), axis=0) ** 2).sum(axis=2).mean())) * rate_hz
+    return positions(simulate([scene], config, frames, rate_hz)[0])

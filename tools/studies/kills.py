@@ -80,26 +80,23 @@ def main(mapping: dict[str, Any]) -> int:
     equal = equal_shards(peaceful, killed)
     manifest = Manifest.load(killed)
     counts = {target: sum(kill.target == target for kill in kills) for target in TARGETS}
+    episodes = {split: manifest.published(split) for split in SPLITS}
     summary = {
         "kills": counts,
         "seconds": round(time.monotonic() - began, 1),
-        "episodes": {split: manifest.published(split) for split in SPLITS},
+        "episodes": episodes,
         "shards": len(manifest.shards),
         "shards_bitwise_equal": equal,
         "kills_that_met_a_temporary_file": sum(kill.temporary_files > 0 for kill in kills),
         "differences": faults,
     }
+    whole = "complete and verified, with the same scenes and first frames; no temporary file is left"
     print(f"{len(kills)} kills: " + ", ".join(f"{count} of {target}" for target, count in counts.items()))
-    print(
-        f"{manifest.published('train')} training episodes; {equal} of {len(manifest.shards)} shards are bitwise equal"
-    )
-    print(
-        "\n".join(faults) or "complete and verified, with the same scenes and first frames; no temporary file is left"
-    )
+    print(f"{episodes['train']} training episodes; {equal} of {len(manifest.shards)} shards are bitwise equal")
+    print("\n".join(faults) or whole)
     if kills_config.json is not None:
         meta = provenance() | {"config": without_folders(to_mapping(config) | {"kills": to_mapping(kills_config)})}
-        report = {"meta": meta, "summary": summary, "rows": [asdict(kill) for kill in kills]}
-        write_json(kills_config.json, report)
+        write_json(kills_config.json, {"meta": meta, "summary": summary, "rows": [asdict(kill) for kill in kills]})
     return EXIT_RED if faults else 0
 
 
@@ -117,25 +114,22 @@ def generate_with_kills(command: Sequence[str], folder: Path, config: KillsConfi
     order = [TARGETS[i] for _ in range(config.kills) for i in generator.permutation(len(TARGETS))]
     began = time.monotonic()
     with log.open("ab") as stream, bar("killing", total=config.kills, unit="kill") as progress:
-        service = _Service(command, stream, log)
+        service = _Service(command, folder, stream, log)
         try:
-            while len(kills) < config.kills:
-                service.wait_or_complete(folder, generator.exponential(config.interval_s))
-                target = order[len(kills)]
-                if not service.kill(target, folder, generator):
-                    break
+            for target in order[: config.kills]:
+                service.wait(generator.exponential(config.interval_s))
+                if not service.kill(target, generator):
+                    raise ConfigError(
+                        f"kills must fall into the generation, got {len(kills)} of {config.kills} before it was "
+                        "complete; ask for more scenes, or set interval_s lower"
+                    )
                 temporary = len(list(folder.rglob(f"*{TEMPORARY_SUFFIX}")))
                 published = verified_shards(folder, published)
                 kills.append(Kill(round(time.monotonic() - began, 3), target, len(published), temporary))
                 progress.update()
                 if service.process.poll() is not None:
-                    service = _Service(command, stream, log)
-            if len(kills) < config.kills:
-                raise ConfigError(
-                    f"kills must fall into the generation, got {len(kills)} of {config.kills} before it was complete; "
-                    "ask for more scenes, or set interval_s lower"
-                )
-            service.wait_until_complete(folder)
+                    service = _Service(command, folder, stream, log)
+            service.wait_until_complete()
         finally:
             service.stop()
     return kills
@@ -162,18 +156,16 @@ def differences(peaceful: Path, killed: Path) -> list[str]:
     if not other.complete:
         faults.append("it is not complete")
     if other.quarantined:
-        faults.append(
-            f"{len(other.quarantined)} scenes are quarantined, the first because {other.quarantined[0].cause}"
-        )
+        cause = other.quarantined[0].cause
+        faults.append(f"{len(other.quarantined)} scenes are quarantined, the first because {cause}")
     if sorted(shard.name for shard in one.shards) != sorted(shard.name for shard in other.shards):
         faults.append("its shards have other names")
     for split in SPLITS:
-        first, second = (_by_key(EpisodeStore(folder, split)) for folder in (peaceful, killed))
+        first, second = ({e.key: e for e in EpisodeStore(folder, split).episodes} for folder in (peaceful, killed))
         if first.keys() != second.keys():
             faults.append(f"{split}: other episodes")
-        faults += [
-            f"{key}: another scene" for key in first.keys() & second.keys() if not _same(first[key], second[key])
-        ]
+        both = first.keys() & second.keys()
+        faults += [f"{key}: another scene" for key in both if not _same(first[key], second[key])]
     index = {Path(name).name for name, _ in other.shards.files()}
     expected = {MANIFEST_NAME, INDEX_NAME, LOCK_NAME, *index, *(shard.name for shard in other.shards)}
     left = sorted(path.name for path in killed.rglob("*") if path.name not in expected)
@@ -184,10 +176,6 @@ def equal_shards(one: Path, other: Path) -> int:
     """How many shards are the same, bitwise; on several threads the solver rounds differently each time."""
     first, second = ({(s.name, s.sha256) for s in Manifest.load(folder).shards} for folder in (one, other))
     return len(first & second)
-
-
-def _by_key(store: EpisodeStore) -> dict[str, Episode]:
-    return {episode.key: episode for episode in store.episodes}
 
 
 def _same(one: Episode, other: Episode) -> bool:
@@ -204,42 +192,35 @@ def _same(one: Episode, other: Episode) -> bool:
 
 
 class _Service:
-    """A running service and the processes below it."""
+    """A running service that fills a folder, and the processes below it."""
 
-    def __init__(self, command: Sequence[str], stream: Any, log: Path) -> None:
-        self._log = log
+    def __init__(self, command: Sequence[str], folder: Path, stream: Any, log: Path) -> None:
+        self._folder, self._log = folder, log
         self.process = subprocess.Popen(command, stdout=stream, stderr=stream, start_new_session=True)
 
-    def wait_or_complete(self, folder: Path, seconds: float) -> None:
+    def wait(self, seconds: float) -> None:
         """Waits, less long when the data set is complete before. Raises: RuntimeError when the service has ended."""
         deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline and not _complete(folder):
-            self._require_running()
+        while time.monotonic() < deadline and not self._complete():
             time.sleep(_LOOK_S)
 
-    def wait_until_complete(self, folder: Path) -> None:
+    def wait_until_complete(self) -> None:
         """Raises: RuntimeError when the service has ended, or publishes nothing more."""
         revision, deadline = -1, time.monotonic() + _PATIENCE_S
-        while not _complete(folder):
-            self._require_running()
-            now = Manifest.load(folder).revision if (folder / MANIFEST_NAME).exists() else -1
+        while not self._complete():
+            now = Manifest.load(self._folder).revision if (self._folder / MANIFEST_NAME).exists() else -1
             if now != revision:
                 revision, deadline = now, time.monotonic() + _PATIENCE_S
-            if time.monotonic() > deadline:
-                raise RuntimeError(f"nothing was published for {_PATIENCE_S:.0f} s; see {self._log}")
-            time.sleep(_LOOK_S)
+            self._look_again(deadline, "nothing was published")
 
-    def kill(self, target: str, folder: Path, generator: np.random.Generator) -> bool:
+    def kill(self, target: str, generator: np.random.Generator) -> bool:
         """Ends a process by SIGKILL as soon as there is such a one; False when the data set is complete before."""
         deadline = time.monotonic() + _PATIENCE_S
-        while not _complete(folder):
-            self._require_running()
+        while not self._complete():
             victims = self._processes(target)
             if victims and self._kill(target, victims[generator.integers(len(victims))]):
                 return True
-            if time.monotonic() > deadline:
-                raise RuntimeError(f"the service has no {target} for {_PATIENCE_S:.0f} s; see {self._log}")
-            time.sleep(_LOOK_S)
+            self._look_again(deadline, f"the service has no {target}")
         return False
 
     def stop(self) -> None:
@@ -250,10 +231,7 @@ class _Service:
 
     def _kill(self, target: str, process: int) -> bool:
         try:
-            if target == "all of them":
-                os.killpg(process, signal.SIGKILL)
-            else:
-                os.kill(process, signal.SIGKILL)
+            (os.killpg if target == "all of them" else os.kill)(process, signal.SIGKILL)
         except ProcessLookupError:
             return False
         if process == self.process.pid:
@@ -266,14 +244,19 @@ class _Service:
         pools = _spawned(self.process.pid)
         return pools if target == "pool" else [worker for pool in pools for worker in _spawned(pool)]
 
-    def _require_running(self) -> None:
+    def _complete(self) -> bool:
+        """Raises: RuntimeError when it is not, and the service has ended."""
+        if (self._folder / MANIFEST_NAME).exists() and Manifest.load(self._folder).complete:
+            return True
         if self.process.poll() is not None:
-            tail = self._log.read_text(errors="replace").splitlines()[-5:]
-            raise RuntimeError(f"the service ended by itself, exit code {self.process.returncode}: " + "\n".join(tail))
+            tail = "\n".join(self._log.read_text(errors="replace").splitlines()[-5:])
+            raise RuntimeError(f"the service ended by itself, exit code {self.process.returncode}: {tail}")
+        return False
 
-
-def _complete(folder: Path) -> bool:
-    return (folder / MANIFEST_NAME).exists() and Manifest.load(folder).complete
+    def _look_again(self, deadline: float, lacking: str) -> None:
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"{lacking} for {_PATIENCE_S:.0f} s; see {self._log}")
+        time.sleep(_LOOK_S)
 
 
 def _spawned(process: int) -> list[int]:

@@ -21,7 +21,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -39,10 +39,9 @@ from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require_bounds
 from hgn.system.files import TEMPORARY_SUFFIX, write_json
-from hgn.system.provenance import provenance
 from hgn.training.checkpoint import LAST_NAMES, SECTION, read_checkpoint
 from hgn.training.checkpoint_writer import CheckpointWriter
-from tools.report import EXIT_RED
+from tools.report import EXIT_RED, meta_of
 
 SPLITS = (0.0, 1.0, 0.5)  # of what is not synced: nothing is there; all names are; each thing is or is not
 SHARDS = 4
@@ -75,15 +74,13 @@ class Disk:
         self._bytes: dict[int, bytes] = {}  # of files
         self._folders: set[int] = set()
         self.written = set[str]()  # names of files that were opened for writing, or truncated
-        self._kept_open: list[int] = []  # so that no inode's number is given to another file
+        self._stack = ExitStack()
         self._lock = threading.RLock()
 
     @contextmanager
     def followed(self) -> Iterator[None]:
         """While it is entered Python's calls are followed, in all threads."""
-        self._sync = os.fsync
-        with ExitStack() as stack:
-            stack.callback(self._close)
+        with self._stack as stack:
             for name in CALLS:
                 stack.enter_context(mock.patch.object(os, name, self._followed(getattr(os, name))))
             stack.enter_context(mock.patch.object(os, "fsync", self._fsync))
@@ -91,10 +88,6 @@ class Disk:
             stack.enter_context(mock.patch.object(io, "open", opened))
             stack.enter_context(mock.patch.object(builtins, "open", opened))
             yield
-
-    def _close(self) -> None:
-        for file in self._kept_open:
-            os.close(file)
 
     def step(self) -> None:
         """A call is about to be made."""
@@ -122,9 +115,8 @@ class Disk:
     def _content(self, inode: int, path: Path | None, kept: float, draw: random.Random) -> bytes:
         synced = self._bytes.get(inode, b"")
         now = synced if path is None else path.read_bytes()
-        same = next(
-            (i for i, (a, b) in enumerate(zip(synced, now, strict=False)) if a != b), min(len(synced), len(now))
-        )
+        different = (i for i, (a, b) in enumerate(zip(synced, now, strict=False)) if a != b)
+        same = next(different, min(len(synced), len(now)))
         choices = [synced, now, now[: (same + len(now)) // 2], now[:same] + bytes(len(now) - same)]
         return choices[draw.randrange(4) if 0 < kept < 1 else 0]
 
@@ -144,7 +136,7 @@ class Disk:
         self.step()  # the study itself is not brought to the disk
         with self._lock:
             inode = os.fstat(descriptor).st_ino
-            self._kept_open.append(os.dup(descriptor))
+            self._stack.callback(os.close, os.dup(descriptor))  # so that no other file gets the inode's number
             if path.is_dir():
                 self._names[inode] = _entries(path)
                 self._folders |= {inode for name, inode in self._names[inode].items() if (path / name).is_dir()}
@@ -253,11 +245,9 @@ class Checkpoints:
 
     def check(self, folder: Path, promised: dict[str, int]) -> None:
         """Raises: whatever is wrong."""
-        found = 0
-        for path in (folder / "runs" / "one" / "checkpoints" / name for name in LAST_NAMES):
-            if path.exists():
-                found = read_checkpoint(path)[SECTION]["updates"]
-                break
+        paths = [folder / "runs" / "one" / "checkpoints" / name for name in LAST_NAMES]
+        last = next((path for path in paths if path.exists()), None)
+        found = 0 if last is None else read_checkpoint(last)[SECTION]["updates"]
         assert found >= promised.get("updates", 0), f"update {promised} was saved, {found} is there"
 
 
@@ -358,8 +348,7 @@ def main(mapping: dict[str, Any]) -> int:
         rows.append({"what": name, **counts, "faults": faults + wrong})
         print(json.dumps(rows[-1]))
     if config.json is not None:
-        options = {key: value for key, value in asdict(config).items() if key not in ("out", "json")}
-        write_json(config.json, {"meta": provenance() | {"config": options}, "rows": rows})
+        write_json(config.json, {"meta": meta_of(config), "rows": rows})
     return EXIT_RED if any(row["faults"] for row in rows) else 0
 
 

@@ -29,12 +29,12 @@ from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.storage import verify_file
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.scene import Scene
-from hgn.schema import Positive, from_mapping, require, require_bounds, to_mapping
+from hgn.schema import Positive, from_mapping, require, require_bounds
 from hgn.system.files import write_json
 from hgn.system.progress import bar
-from hgn.system.provenance import provenance, without_folders
+from tools import report
 from tools.bench.states import Workload, scene_of
-from tools.report import EXIT_RED
+from tools.timing import FrameClock
 
 FRAME_RATE_HZ = 60.0
 STEP_S, SUBSTEPS = 1 / 60 / 54, 55  # Taichi Elements' step at 64 cells a side, and how many it takes a frame
@@ -47,6 +47,7 @@ TARGETS = {
     "scenes_256_random": None, "particles_1m": 110.0, "plain_one_scene_te_step": None, "plain_256_te_step": None,
     "dataset_800": 150.0,
 }  # fmt: skip
+GREEN = "green"
 GENERATOR = (sys.executable, "-m", "datagen", "+experiment=obstacles")
 COMPARED_FRAMES = 4
 FIRST_FRAME, LATER_FRAMES, FALL = 1e-6, 1e-4, 0.01  # bounds: domain units
@@ -79,7 +80,7 @@ def main(mapping: dict[str, Any]) -> int:
 
     config = from_mapping(SolverTargetsConfig, mapping)
     device = initialise(config.device)
-    meta = provenance("cuda" if device.kind == "gpu" else "cpu") | {"config": without_folders(to_mapping(config))}
+    meta = report.meta_of(config, "cuda" if device.kind == "gpu" else "cpu")
     rows: list[dict[str, Any]] = []
     with bar("cases", len(config.cases), unit="case") as progress:
         for case in config.cases:
@@ -88,37 +89,35 @@ def main(mapping: dict[str, Any]) -> int:
             if config.json is not None:  # after each: what a later case does takes nothing away
                 write_json(config.json, {"meta": meta, "rows": rows})
     print(table(rows))
-    return 0 if all(row["check"] == "green" for row in rows) else EXIT_RED
+    return 0 if all(row["check"] == GREEN for row in rows) else report.EXIT_RED
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The figures for people, as Markdown."""
-    lines = [
-        "| case | ms a frame and scene, or s | asked for | steps a frame | check |",
-        "| :-- | --: | --: | --: | :-- |",
-    ]
+    """The figures for people."""
+    lines = []
     for row in rows:
-        found = row.get("seconds", row.get("ms"))
-        figures = [f"{value:.4g}" if value is not None else "" for value in (found, row["target"], row.get("substeps"))]
-        lines.append(f"| {row['case']} | " + " | ".join(figures) + f" | {row['check']} |")
-    return "\n".join(lines)
+        figures = row.get("seconds", row.get("ms")), row["target"], row.get("substeps")
+        lines.append((row["case"], *(report.number(value, ".4g") for value in figures), row["check"]))
+    return report.table(("case", "ms a frame and scene, or s", "asked for", "steps a frame", "check"), lines)
 
 
 def _row(case: str, config: SolverTargetsConfig, kind: str) -> dict[str, Any]:
-    plain, mpm, rate, frames = MpmConfig(device=kind), _at_their_step(kind), 1 / (SUBSTEPS * STEP_S), config.frames
-    many = [_cubes()] * SIDE_BY_SIDE
     if case == "dataset_800":
         return _dataset(config)
-    if case.startswith("plain"):
-        return _plain(len(many) if "256" in case else 1, mpm, rate, frames)
-    if case == "one_scene":
-        return timed([_cubes()], plain, frames)
-    if case in ("one_random_scene", "scenes_256_random"):
-        scenes, colliders = _random_scenes(1 if case == "one_random_scene" else SIDE_BY_SIDE)
-        return timed(scenes, plain, frames, colliders=colliders)
+    own, frames, many = MpmConfig(device=kind), config.frames, SIDE_BY_SIDE if "256" in case else 1
+    if "random" in case:
+        scenes, colliders = _random_scenes(many)
+        return timed(scenes, own, frames, colliders=colliders)
     if case == "particles_1m":
-        return timed([scene_of(Workload(1_000_000, 1), 0, 0.035)], plain, max(COMPARED_FRAMES, frames // 10))
-    return timed(many if case == "scenes_256_te_step" else many[:1], mpm, frames, rate)
+        return timed([scene_of(Workload(1_000_000, 1), 0, 0.035)], own, max(COMPARED_FRAMES, frames // 10))
+    if case == "one_scene":
+        return timed([_cubes()], own, frames)
+    theirs, rate = _at_their_step(kind), 1 / (SUBSTEPS * STEP_S)
+    return (
+        _plain(many, theirs, rate, frames)
+        if case.startswith("plain")
+        else timed([_cubes()] * many, theirs, frames, rate)
+    )
 
 
 def timed(
@@ -134,8 +133,8 @@ def timed(
     colliders = colliders or [build_collider(scenes[0], mpm.collider_band_cells)] * len(scenes)
     expected = simulate(scenes[:1], mpm, COMPARED_FRAMES, rate, colliders=colliders[:1], team=Team(0))[0]
     simulate(scenes, mpm, 2, rate, colliders=colliders)
-    ends: list[float] = []
-    outcomes = simulate(scenes, mpm, frames, rate, lambda _: ends.append(time.perf_counter()), colliders=colliders)
+    clock = FrameClock()
+    outcomes = simulate(scenes, mpm, frames, rate, clock, colliders=colliders)
     row: dict[str, Any] = {"scenes": len(scenes), "particles": sum(scene.particle_count for scene in scenes)}
     for outcome in (expected, *outcomes):
         if isinstance(outcome, SceneFailure):
@@ -147,12 +146,13 @@ def timed(
     if away_T[1] > FIRST_FRAME or away_T.max() > LATER_FRAMES:
         return row | {"ms": None, "check": f"{away_T[1]:.1e} after a frame, {away_T.max():.1e} after some"}
     # frames of one launch end together: from the end of the launch that the middle frame is in
+    ends = clock.ends
     begin = max(t for t in range(frames - 1) if ends[t] <= ends[(frames - 1) // 2] + 1e-3)
     steps = [outcome.counters["substeps"] for outcome in outcomes if isinstance(outcome, Simulated)]
     return row | {
         "ms": 1e3 * (ends[-1] - ends[begin]) / (frames - 1 - begin) / len(scenes),
         "substeps": float(np.mean(steps)) / (frames - 1),
-        "check": "green",
+        "check": GREEN,
     }
 
 
@@ -168,7 +168,7 @@ def _plain(copies: int, mpm: MpmConfig, rate: float, frames: int) -> dict[str, A
     row = {"scenes": copies, "particles": copies * scene.particle_count, "substeps": SUBSTEPS}
     if not away < FALL:
         return row | {"ms": None, "check": f"its centre of mass is {away:.1e} from ours"}
-    return row | {"ms": taken / copies, "check": "green"}
+    return row | {"ms": taken / copies, "check": GREEN}
 
 
 def _dataset(config: SolverTargetsConfig) -> dict[str, Any]:
@@ -184,7 +184,9 @@ def _dataset(config: SolverTargetsConfig) -> dict[str, Any]:
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGINT)  # what is published stays
             process.wait()
-            return row | {"check": f"{_published(folder)} scenes after {config.seconds:g} s"}
+            found = (Path(folder) / MANIFEST_NAME).exists()
+            published = Manifest.load(folder).published("train") if found else 0  # training scenes
+            return row | {"check": f"{published} scenes after {config.seconds:g} s"}
         seconds = time.perf_counter() - begin
         if ended:
             return row | {"check": f"ended with {ended}"}
@@ -192,12 +194,7 @@ def _dataset(config: SolverTargetsConfig) -> dict[str, Any]:
         shards = Manifest.load(data).shards.since(0)
         for shard in shards:
             verify_file(data / shard.name, shard.sha256, shard.bytes, "generate it again")
-    return row | {"seconds": seconds, "check": "green" if shards else "no shards"}
-
-
-def _published(folder: str) -> int:
-    """Training scenes."""
-    return Manifest.load(folder).published("train") if (Path(folder) / MANIFEST_NAME).exists() else 0
+    return row | {"seconds": seconds, "check": GREEN if shards else "no shards"}
 
 
 def _at_their_step(kind: str) -> MpmConfig:

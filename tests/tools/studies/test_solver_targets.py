@@ -22,7 +22,7 @@ def test_rows_and_table(tmp_path, monkeypatch):
     rows = json.loads(file.read_text())["rows"]
     assert [row["case"] for row in rows] == given["cases"]
     assert all(row["ms"] > 0 and row["check"] == "green" and row["substeps"] == 55 for row in rows)
-    assert "| one_scene_te_step | " in table(rows)
+    assert "| one_scene_te_step " in table(rows)
     monkeypatch.setattr(solver_targets, "FALL", 0.0)
     assert main({**given, "cases": ["plain_one_scene_te_step"]}) == 1
 

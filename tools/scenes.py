@@ -1,0 +1,49 @@
+"""Scenes that reports make: bodies of one material at random places, parts of them, and several together.
+
+Shape legend: N particles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from hgn.scene.scene import Scene
+
+PARTICLES_PER_CELL = 8
+
+
+def random_places(size_cells: Sequence[float], seed: int = 0) -> np.ndarray:
+    """Uniform in a box with a corner at 0, eight a cell, in cells."""
+    count = max(1, round(PARTICLES_PER_CELL * float(np.prod(size_cells))))
+    return np.random.default_rng(seed).random((count, 3)) * np.asarray(size_cells)
+
+
+def filled(material: int, position_N3: np.ndarray, velocity_3: Sequence[float] | np.ndarray, **more: Any) -> Scene:
+    """Particles of one material and velocity; `more` are fields of Scene."""
+    count = len(position_N3)
+    velocity_N3 = np.tile(np.asarray(velocity_3, np.float32), (count, 1))
+    return Scene(np.asarray(position_N3).astype(np.float32), velocity_N3, np.full(count, material, np.uint8), **more)
+
+
+def some(scene: Scene, chosen_N: np.ndarray) -> Scene:
+    """A scene with those of its particles alone."""
+    return replace(
+        scene,
+        position_N3=scene.position_N3[chosen_N],
+        velocity_N3=scene.velocity_N3[chosen_N],
+        material_N=scene.material_N[chosen_N],
+    )
+
+
+def joined(scenes: Sequence[Scene]) -> Scene:
+    """The first scene with the particles of all."""
+    return replace(
+        scenes[0],
+        position_N3=np.concatenate([scene.position_N3 for scene in scenes]),
+        velocity_N3=np.concatenate([scene.velocity_N3 for scene in scenes]),
+        material_N=np.concatenate([scene.material_N for scene in scenes]),
+    )
