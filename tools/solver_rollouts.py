@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
 from hgn.scene.scene import Scene
 from hgn.system.files import make_folder, temporary_file
+from hgn.system.machine import available_cpus
+
+OnFrame = Callable[[int], None] | None
 
 
 def solver_scene(episode: Episode, cell_size: float | None = None) -> Scene:
@@ -41,7 +45,7 @@ def solver_trials(
     config: MpmConfig,
     frames: int,
     frame_rate_hz: float,
-    on_frame: Callable[[int], None] | None = None,
+    on_frame: OnFrame = None,
     colliders: Sequence[Any] | None = None,
     stability_fractions: Sequence[float] | None = None,
 ) -> list[RolloutResult]:
@@ -87,3 +91,68 @@ def kept_trials(
 def other_grid(config: MpmConfig, cell_size: float, own_cell_size: float) -> MpmConfig:
     """The solver's settings for cells of another size: walls as thick as they were, to the nearest node."""
     return replace(config, wall_cells=max(2, round(config.wall_cells * own_cell_size / cell_size)))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is varied on a grid: the share of the limit of stability, and how far particles start off at most."""
+
+    step: float
+    perturbation: float = 0.0  # domain units
+
+
+class SolverLaunches:
+    """Simulates scenes on one grid with every setting that was added, all side by side, as a launch lasts as long as
+    its longest scene, whatever runs beside it; each is simulated once, and scenes get their colliders once.
+    """
+
+    def __init__(self, config: MpmConfig, cell_size: float, frame_rate_hz: float, frames: int) -> None:
+        self.config, self.cell_size, self.frame_rate_hz, self.frames = config, cell_size, frame_rate_hz, frames
+        self._settings: list[Setting] = []
+        self._known: dict[tuple[Setting, str], RolloutResult] = {}
+        self._colliders: dict[str, Future[Any]] = {}
+
+    def add(self, setting: Setting) -> Setting:
+        if setting not in self._settings:
+            self._settings.append(setting)
+        return setting
+
+    def knows(self, setting: Setting) -> bool:
+        """Whether scenes were simulated with it."""
+        return any(known == setting for known, _ in self._known)
+
+    def collide(self, episodes: Sequence[Episode], threads: Executor) -> None:
+        """Builds the colliders of the scenes on those threads."""
+        from datagen.mpm.collider import build_collider
+
+        for episode in episodes:
+            if episode.key not in self._colliders:
+                scene = solver_scene(episode, self.cell_size)
+                self._colliders[episode.key] = threads.submit(build_collider, scene, self.config.collider_band_cells)
+
+    def trials(self, setting: Setting, episodes: Sequence[Episode], on_frame: OnFrame = None) -> list[RolloutResult]:
+        """Trajectories of `frames` frames from the episodes' first ones."""
+        missing = [episode for episode in episodes if (setting, episode.key) not in self._known]
+        if missing:
+            pairs = [(other, episode) for other in self._settings for episode in missing]
+            simulated = self.simulate(pairs, self.frames, on_frame)
+            self._known |= {(s, e.key): trial for (s, e), trial in zip(pairs, simulated, strict=True)}
+        return [self._known[setting, episode.key] for episode in episodes]
+
+    def simulate(self, pairs: Sequence[tuple[Setting, Episode]], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
+        """So many frames of these settings and episodes, whatever is known."""
+        with ThreadPoolExecutor(available_cpus()) as threads:
+            self.collide([episode for _, episode in pairs], threads)
+        scenes = [self._scene(setting, episode) for setting, episode in pairs]
+        colliders = [self._colliders[episode.key].result() for _, episode in pairs]
+        steps = [setting.step for setting, _ in pairs]
+        # a scene's steps are its own; where all are alike the config says so
+        alike = replace(self.config, stability_fraction=steps[0])
+        return solver_trials(scenes, alike, frames, self.frame_rate_hz, on_frame, colliders, steps)
+
+    def _scene(self, setting: Setting, episode: Episode) -> Scene:
+        scene = solver_scene(episode, self.cell_size)
+        if setting.perturbation:
+            draw = np.random.default_rng(scene.seed).uniform
+            scene.position_N3[:] += draw(-setting.perturbation, setting.perturbation, scene.position_N3.shape)
+        return scene

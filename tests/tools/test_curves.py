@@ -64,5 +64,3 @@ def test_time_of_a_stop_is_no_training(tmp_path):
 def test_a_folder_that_is_no_run_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"runs must be folders of python -m hgn.train, got .*empty"):
         read_run(tmp_path / "empty", "empty")
-    with pytest.raises(ConfigError, match="names must be one for each of the 1 runs"):
-        main({"runs": ["a"], "names": ["x", "y"], "out": "curves"})

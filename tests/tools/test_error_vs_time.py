@@ -30,7 +30,7 @@ from tools.error_vs_time.contenders import (
 from tools.error_vs_time.run import Run
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.timing import Timing
-from tools.solver_launches import Setting, SolverLaunches
+from tools.solver_rollouts import Setting, SolverLaunches
 
 CPU = torch.device("cpu")
 RESULTS = Path(__file__).resolve().parents[2] / "results"
@@ -295,22 +295,6 @@ def test_shipped_weights_that_fit(data, tmp_path, monkeypatch, capsys):
     assert set(shipped_weights()) >= {"gns", "obstacles", "obstacles_small"}
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"mpm_steps": [0.0]}, r"mpm_steps\[0\] must be above 0"),
-        ({"weights": ["a/x.safetensors", "b/x.safetensors"]}, "weights must be files of different names"),
-        ({"frames": 1}, "frames must be at least 2"),
-        ({"precisions": ["fp8"]}, r"precisions\[0\] must be one of fp32, tf32, fp16"),
-        ({"split": "all"}, "split must be one of train"),
-    ],
-)
-def test_bad_options(change, message):
-    """Each wrong option is named before anything is simulated."""
-    with pytest.raises(ConfigError, match=message):
-        from_mapping(ErrorVsTimeConfig, {"data": "d", "out": "o"} | change)
-
-
 def test_what_launches_none_of_the_kernels_is_scored_beside_their_compilation(data, tmp_path, monkeypatch):
     """Baselines, then coarse grids, as long as it lasts; neither networks nor the data's own grid."""
     order: list[str] = []
@@ -442,5 +426,3 @@ def test_weights_that_do_not_fit_are_told_at_once(data, tmp_path, monkeypatch):
     ):
         with pytest.raises(ConfigError, match=message):
             main({"data": data, "out": str(tmp_path / "report"), "weights": [name]} | SHORT)
-    with pytest.raises(ConfigError, match="data must be a data set, got None; make one with python -m datagen, or"):
-        main({"out": str(tmp_path / "report")})

@@ -114,23 +114,6 @@ def test_triton_is_timed_alike(alone):
     assert float(fast.update.weights().norm()) == pytest.approx(float(plain.update.weights().norm()), rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"devices": 0}, "devices must be at least 1"),
-        ({"device": "cuda:1"}, "device must be auto, cpu or cuda"),
-        ({"batches": 0}, "batches must be at least 1"),
-        ({"backends": ["slow"]}, r"backends\[0\] must be torch or triton"),
-        ({"particle_spread": -1}, "particle_spread must be"),
-        ({"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),
-    ],
-)
-def test_bad_options(change, message):
-    """Each wrong option is named before anything is started."""
-    with pytest.raises(ConfigError, match=message):
-        from_mapping(ScalingConfig, change)
-
-
 def test_devices_that_are_not_there(monkeypatch):
     """More GPUs than the machine has are refused."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hgn.config import MpmConfig
-from hgn.schema import ConfigError
 from tools.stability import solver_leak, solver_steps, solver_validation
 from tools.stability.row import Row
 from tools.stability.solver import main
@@ -150,13 +149,3 @@ def test_extents():
     position = np.stack([line, line, line], axis=1)
     assert thickness_cells(position) == pytest.approx(0.9 * 64)
     assert front_cells(position) == pytest.approx(0.99 * 64 - 2)
-
-
-def test_bad_options_are_refused():
-    """Unknown cases, and a picture without the case that it shows."""
-    with pytest.raises(ConfigError, match="cases"):
-        main({"cases": ["stesp"]})
-    with pytest.raises(ConfigError, match="picture"):
-        main({"cases": ["leak"], "picture": "steps.png"})
-    with pytest.raises(ConfigError, match="grid_cells"):
-        main({"cases": ["grid"], "grid_cells": [16, 8, 12]})

@@ -50,8 +50,7 @@ from tools.error_vs_time.run import Run, draw
 from tools.error_vs_time.score import table
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.report import meta_of
-from tools.solver_launches import Setting, SolverLaunches
-from tools.solver_rollouts import other_grid
+from tools.solver_rollouts import Setting, SolverLaunches, other_grid
 
 if TYPE_CHECKING:
     from hgn.runtime.precompile import Precompilation

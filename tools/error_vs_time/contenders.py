@@ -26,7 +26,7 @@ from hgn.runtime.simulator import InitialState, Simulator
 from hgn.runtime.weights import load_weights, require_frame_rate
 from hgn.scene.episode import Episode
 from hgn.training.errors import Predictor, SquaredError, network_predictor
-from tools.solver_launches import OnFrame, Setting, SolverLaunches
+from tools.solver_rollouts import OnFrame, Setting, SolverLaunches
 from tools.timing import FrameClock, matmul_precision
 
 if TYPE_CHECKING:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import torch
 
 SCALING = 0.8  # the blur's ratio between steps, from the clouds' size down
+LARGEST = 10.0  # blur: float32 would round what larger ones find
 FINAL_STEPS = 20  # at the last blur
 ENTRIES_AT_ONCE = 1 << 26  # of costs
 
@@ -39,51 +40,42 @@ def sinkhorn_divergences(pairs: Sequence[tuple[torch.Tensor, torch.Tensor]], blu
 
 def _divergences(first_BN3: torch.Tensor, second_BM3: torch.Tensor, blur: float) -> torch.Tensor:
     both = torch.cat([first_BN3, second_BM3], dim=1)
-    sizes = (both.amax(1) - both.amin(1)).norm(dim=-1).tolist()
-    blur_SB = _blurs(sizes, blur, first_BN3)
-    cost_BNM = _squared(first_BN3, second_BM3)
-    f_BN, g_BM = _potentials(cost_BNM, blur_SB)
-    own_BN = _symmetric_potential(_squared(first_BN3, first_BN3), blur_SB)
-    own_BM = _symmetric_potential(_squared(second_BM3, second_BM3), blur_SB)
-    divergence_B = (f_BN - own_BN).mean(1) + (g_BM - own_BM).mean(1)
-    return torch.where(both.isfinite().flatten(1).all(1), divergence_B, math.nan)
+    finite_B = both.isfinite().flatten(1).all(1)
+    size_B = (both.amax(1) - both.amin(1)).norm(dim=-1)
+    blurs = _blurs(float(size_B[finite_B].clamp(max=LARGEST).max()) if finite_B.any() else 0.0, blur)
+    f_BN, g_BM = _potentials(_squared(first_BN3, second_BM3), blurs)
+    own_BN = _symmetric_potential(_squared(first_BN3, first_BN3), blurs)
+    own_BM = _symmetric_potential(_squared(second_BM3, second_BM3), blurs)
+    return torch.where(finite_B, (f_BN - own_BN).mean(1) + (g_BM - own_BM).mean(1), math.nan)
 
 
-def _blurs(sizes: Sequence[float], blur: float, like: torch.Tensor) -> torch.Tensor:
-    """The blur of each pair at each step, [S, B]: from its clouds' size down; all end together, and are 0 before."""
-    columns = []
-    for size in sizes:
-        steps = max(0, math.ceil(math.log(blur / size) / math.log(SCALING))) if blur < size < math.inf else 0
-        columns.append([size * SCALING**k for k in range(steps)] + [blur] * FINAL_STEPS)
-    most = max(len(column) for column in columns)
-    padded = [[0.0] * (most - len(column)) + column for column in columns]
-    return like.new_tensor(padded).T.contiguous()
+def _blurs(size: float, blur: float) -> list[float]:
+    """From the clouds' size down, which finds the optimum sooner, and then at the last."""
+    steps = max(0, math.ceil(math.log(blur / size) / math.log(SCALING))) if blur < size else 0
+    return [size * SCALING**k for k in range(steps)] + [blur] * FINAL_STEPS
 
 
-def _potentials(cost_BNM: torch.Tensor, blur_SB: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _potentials(cost_BNM: torch.Tensor, blurs: Sequence[float]) -> tuple[torch.Tensor, torch.Tensor]:
     f_BN, g_BM = cost_BNM.new_zeros(cost_BNM.shape[:2]), cost_BNM.new_zeros(cost_BNM.shape[0], cost_BNM.shape[2])
     turned_BMN = cost_BNM.transpose(1, 2)
-    for blur_B in blur_SB:
+    for blur in blurs:
         # Both from the old ones, averaged: symmetric in the clouds, and it does not oscillate.
-        next_f_BN, next_g_BM = _soft_minimum(cost_BNM, g_BM, blur_B), _soft_minimum(turned_BMN, f_BN, blur_B)
-        begun_B1 = (blur_B > 0)[:, None]
-        f_BN = torch.where(begun_B1, 0.5 * (f_BN + next_f_BN), f_BN)
-        g_BM = torch.where(begun_B1, 0.5 * (g_BM + next_g_BM), g_BM)
-    return _soft_minimum(cost_BNM, g_BM, blur_SB[-1]), _soft_minimum(turned_BMN, f_BN, blur_SB[-1])
+        next_f_BN, next_g_BM = _soft_minimum(cost_BNM, g_BM, blur), _soft_minimum(turned_BMN, f_BN, blur)
+        f_BN, g_BM = 0.5 * (f_BN + next_f_BN), 0.5 * (g_BM + next_g_BM)
+    return _soft_minimum(cost_BNM, g_BM, blurs[-1]), _soft_minimum(turned_BMN, f_BN, blurs[-1])
 
 
-def _symmetric_potential(cost_BNN: torch.Tensor, blur_SB: torch.Tensor) -> torch.Tensor:
+def _symmetric_potential(cost_BNN: torch.Tensor, blurs: Sequence[float]) -> torch.Tensor:
     f_BN = cost_BNN.new_zeros(cost_BNN.shape[:2])
-    for blur_B in blur_SB:
-        f_BN = torch.where((blur_B > 0)[:, None], 0.5 * (f_BN + _soft_minimum(cost_BNN, f_BN, blur_B)), f_BN)
-    return _soft_minimum(cost_BNN, f_BN, blur_SB[-1])
+    for blur in blurs:
+        f_BN = 0.5 * (f_BN + _soft_minimum(cost_BNN, f_BN, blur))
+    return _soft_minimum(cost_BNN, f_BN, blurs[-1])
 
 
-def _soft_minimum(cost_BNM: torch.Tensor, g_BM: torch.Tensor, blur_B: torch.Tensor) -> torch.Tensor:
+def _soft_minimum(cost_BNM: torch.Tensor, g_BM: torch.Tensor, blur: float) -> torch.Tensor:
     """-ε log mean exp((g - c) / ε) over M, with ε = blur²."""
-    epsilon_B11 = (blur_B * blur_B).clamp(min=1e-30)[:, None, None]
-    exponent_BNM = (g_BM[:, None] - cost_BNM).div_(epsilon_B11)
-    return -epsilon_B11[..., 0] * (torch.logsumexp(exponent_BNM, dim=2) - math.log(cost_BNM.shape[2]))
+    exponent_BNM = (g_BM[:, None] - cost_BNM).div_(blur**2)
+    return -(blur**2) * (torch.logsumexp(exponent_BNM, dim=2) - math.log(cost_BNM.shape[2]))
 
 
 def _squared(first_BN3: torch.Tensor, second_BM3: torch.Tensor) -> torch.Tensor:

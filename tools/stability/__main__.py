@@ -15,15 +15,14 @@ PARTS = ("network", "solver")
 
 def run() -> None:
     """Runs the part that the first argument names."""
-    if sys.argv[1:2] in (["--help"], ["-h"]):
-        parts = "\n".join(f"  python -m tools.stability {part} --help" for part in PARTS)
-        print(f"{__doc__}\n{parts}")
+    part = next(iter(sys.argv[1:]), "nothing")
+    if part in ("--help", "-h"):
+        print(__doc__, *(f"  python -m tools.stability {part} --help" for part in PARTS), sep="\n")
         return
-    if len(sys.argv) < 2 or sys.argv[1] not in PARTS:
-        found = sys.argv[1] if len(sys.argv) > 1 else "nothing"
-        print(f"error: the first argument must be one of {', '.join(PARTS)}, got {found}", file=sys.stderr)
+    if part not in PARTS:
+        print(f"error: the first argument must be one of {', '.join(PARTS)}, got {part}", file=sys.stderr)
         sys.exit(EXIT_INPUT)
-    part = sys.argv.pop(1)
+    del sys.argv[1]
     run_command(importlib.import_module(f"tools.stability.{part}").main, f"stability_{part}")
 
 

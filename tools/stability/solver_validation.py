@@ -10,6 +10,7 @@ Shape legend: T frames, N particles.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -160,13 +161,13 @@ def convergence_order(cells: Sequence[int], values: Sequence[float]) -> tuple[fl
     slopes = steps / np.diff(np.log(cells))
     if not ((steps > 0).all() or (steps < 0).all()) or abs(slopes[-1]) >= abs(slopes[0]):
         return None, None
-    best = (math.inf, 0.0, 0.0)
+    fits = []
     for order in np.linspace(*ORDERS):
         basis = np.stack([np.ones(len(cells)), np.asarray(cells, float) ** -order], axis=1)
         solution = np.linalg.lstsq(basis, np.asarray(values), rcond=None)[0]
-        residual = float(np.square(basis @ solution - values).sum())
-        best = min(best, (residual, float(order), float(solution[0])))
-    return best[1:] if ORDERS[0] < best[1] < ORDERS[1] else (None, None)
+        fits.append((float(np.square(basis @ solution - values).sum()), float(order), float(solution[0])))
+    _, order, limit = min(fits)
+    return (order, limit) if ORDERS[0] < order < ORDERS[1] else (None, None)
 
 
 def impact(kind: int, cells: int) -> Scene:
@@ -182,14 +183,14 @@ def columns(base: MpmConfig, grains: Sequence[float] | None = None) -> list[Row]
     (0: friction does not grow with the rate of flow).
     """
     own = base.sand_friction_law, base.sand_friction_angle_deg
-    diameters = [COLUMN_RADIUS / many if many else 0.0 for many in grains or ()]
+    configs = [base]
+    if grains is not None:
+        diameters = [COLUMN_RADIUS / many if many else 0.0 for many in grains]
+        configs = [dataclasses.replace(base, sand_grain_diameter_m=diameter) for diameter in diameters]
     return [
         row
-        for diameter in ([base.sand_grain_diameter_m] if grains is None else diameters)
-        for aspect in COLUMN_ASPECTS
-        for row in column_rows(
-            aspect, *own, dataclasses.replace(base, sand_grain_diameter_m=diameter), least_cells(aspect)
-        )
+        for config, aspect in itertools.product(configs, COLUMN_ASPECTS)
+        for row in column_rows(aspect, *own, config, least_cells(aspect))
     ]
 
 
@@ -198,8 +199,7 @@ def column_laws(base: MpmConfig) -> list[Row]:
     base = dataclasses.replace(base, sand_grain_diameter_m=0.0)
     return [
         row
-        for law in SAND_LAWS
-        for aspect in OTHER_ASPECTS
+        for law, aspect in itertools.product(SAND_LAWS, OTHER_ASPECTS)
         for row in column_rows(aspect, *law, base, least_cells(aspect))
     ]
 

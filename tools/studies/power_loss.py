@@ -97,20 +97,21 @@ class Disk:
     def lay_out(self, target: Path, kept: float, draw: random.Random) -> None:
         """The folder as the disk may have it now; `kept` is the chance of what is not synced."""
         paths = {path.stat().st_ino: path for path in (self.folder, *self.folder.rglob("*"))}
-        self._lay_out(self.folder.stat().st_ino, target, kept, draw, paths)
 
-    def _lay_out(self, inode: int, target: Path, kept: float, draw: random.Random, paths: dict[int, Path]) -> None:
-        target.mkdir()
-        synced, now = self._names.get(inode, {}), _entries(paths[inode]) if inode in paths else {}
-        for name in sorted(synced.keys() | now.keys()):
-            entry = (now if draw.random() < kept else synced).get(name)
-            if entry is None:
-                continue
-            path = paths.get(entry)
-            if entry in self._folders or (path is not None and path.is_dir()):
-                self._lay_out(entry, target / name, kept, draw, paths)
-            else:
-                (target / name).write_bytes(self._content(entry, path, kept, draw))
+        def lay_out(inode: int, target: Path) -> None:
+            target.mkdir()
+            synced, now = self._names.get(inode, {}), _entries(paths[inode]) if inode in paths else {}
+            for name in sorted(synced.keys() | now.keys()):
+                entry = (now if draw.random() < kept else synced).get(name)
+                if entry is None:
+                    continue
+                path = paths.get(entry)
+                if entry in self._folders or (path is not None and path.is_dir()):
+                    lay_out(entry, target / name)
+                else:
+                    (target / name).write_bytes(self._content(entry, path, kept, draw))
+
+        lay_out(self.folder.stat().st_ino, target)
 
     def _content(self, inode: int, path: Path | None, kept: float, draw: random.Random) -> bytes:
         synced = self._bytes.get(inode, b"")
@@ -122,7 +123,7 @@ class Disk:
 
     def _followed(self, call: Callable[..., Any]) -> Callable[..., Any]:
         def followed(path: Any, *arguments: Any, **options: Any) -> Any:
-            if self._is_ours(path):
+            if _path_of(path).is_relative_to(self.folder):
                 self.written |= {_path_of(path).name} if call.__name__ == "truncate" else set()
                 self.step()
             return call(path, *arguments, **options)
@@ -143,9 +144,6 @@ class Disk:
             else:
                 self._bytes[inode] = Path(f"/proc/self/fd/{descriptor}").read_bytes()
 
-    def _is_ours(self, path: Any) -> bool:
-        return _path_of(path).is_relative_to(self.folder)
-
     def _opened(self, call: Callable[..., Any]) -> Callable[..., Any]:
         disk = self
 
@@ -165,7 +163,7 @@ class Disk:
             newline: str | None = None, closefd: bool = True, opener: Any = None,
         ) -> Any:  # fmt: skip
             writes = bool(set("wax+") & set(mode))
-            if not self._is_ours(file) or not (writes or self.piece):
+            if not _path_of(file).is_relative_to(self.folder) or not (writes or self.piece):
                 return call(file, mode, buffering, encoding, errors, newline, closefd, opener)
             if writes:
                 self.written.add(_path_of(file).name)
@@ -274,29 +272,26 @@ SCENARIOS = {"generation": Generation(), "checkpoints": Checkpoints(), "cache": 
 
 def lose_power(scenario: Any, folder: Path, every: int, rounds: int, seed: int) -> tuple[int, int, list[str]]:
     """Calls that were made, folders that were laid out, and what was wrong with them."""
-    calls, tried, faults, promised = 0, 0, list[str](), dict[str, Any]()
+    calls, faults, promised = 0, list[str](), dict[str, Any]()
+    laid_out: list[tuple[Path, dict[str, Any]]] = []
 
     def before() -> None:
-        nonlocal calls, tried
+        nonlocal calls
         calls += 1
-        if (calls + seed) % every:
-            return
-        for number in range(rounds):
+        for number in range(0 if (calls + seed) % every else rounds):
             draw = random.Random(f"{seed}/{calls}/{number}")
             place = folder / f"{calls}-{number}"
             disk.lay_out(place, SPLITS[(calls // every + number) % len(SPLITS)], draw)
             laid_out.append((place, dict(promised)))
 
-    laid_out: list[tuple[Path, dict[str, Any]]] = []
     (folder / "disk").mkdir(parents=True)
     disk = Disk(folder / "disk", before)
     with disk.followed():
         scenario.write(folder / "disk", promised)
     for place, then in laid_out:
-        tried += 1
         faults += broken(scenario, place, then, place.name)
         shutil.rmtree(place)
-    return calls, tried, faults
+    return calls, len(laid_out), faults
 
 
 def broken(scenario: Any, place: Path, promised: dict[str, Any], when: str) -> list[str]:
@@ -310,9 +305,10 @@ def broken(scenario: Any, place: Path, promised: dict[str, Any], when: str) -> l
 
 def fail(scenario: Any, folder: Path, every: int, piece: int | None) -> tuple[int, list[str]]:
     """How many of the calls failed with EIO, one a run, and what was wrong afterwards; calls move `piece` bytes."""
-    faults, last, number = list[str](), 0, 1
+    faults, failed = list[str](), 0
     while True:
-        calls, promised, place = 0, dict[str, Any](), folder / f"failing-{number}"
+        calls, number, promised = 0, 1 + failed * every, dict[str, Any]()
+        place = folder / f"failing-{number}"
 
         def before(number: int = number) -> None:
             nonlocal calls
@@ -324,17 +320,14 @@ def fail(scenario: Any, folder: Path, every: int, piece: int | None) -> tuple[in
         try:
             with Disk(place, before, piece).followed():
                 scenario.write(place, promised)
-        except OSError as error:
-            if error.errno != errno.EIO:
-                faults.append(f"call {number}: {error!r}")
         except Exception as error:  # noqa: BLE001 - a fault: it is told
-            faults.append(f"call {number}: {error!r}")
+            if not (isinstance(error, OSError) and error.errno == errno.EIO):
+                faults.append(f"call {number}: {error!r}")
         if calls < number:
-            return last, faults
-        last += 1
+            return failed, faults
+        failed += 1
         faults += broken(scenario, place, promised, f"after call {number}")
         shutil.rmtree(place)
-        number += every
 
 
 def main(mapping: dict[str, Any]) -> int:

@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from datagen.mpm.collider import Collider, build_collider
 from hgn.command import run_command
-from hgn.config import MpmConfig, Processor, SceneConfig
+from hgn.config import MpmConfig, Processor, SceneConfig, config_directory
 from hgn.data.manifest import MANIFEST_NAME, Manifest
 from hgn.data.storage import verify_file
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
@@ -198,13 +199,10 @@ def _dataset(config: SolverTargetsConfig) -> dict[str, Any]:
 
 
 def _at_their_step(kind: str) -> MpmConfig:
-    """As conf/mpm/taichi_elements.yaml, at the step that Taichi Elements takes."""
-    return MpmConfig(
-        device=kind, time_step="fixed", fixed_time_step_s=STEP_S, sand_volume_correction="taichi_elements",
-        sand_friction_law="compression", sand_friction_angle_deg=45.0, sand_grain_diameter_m=0.0,
-        time_integration="symplectic_euler", water_volume_update="taichi_elements", water_density_relaxation_s=None,
-        snow_maximum_hardening=100.0,
-    )  # fmt: skip
+    """conf/mpm/taichi_elements.yaml, at the step that Taichi Elements takes."""
+    theirs = yaml.safe_load((config_directory() / "mpm" / "taichi_elements.yaml").read_text())
+    del theirs["defaults"]
+    return from_mapping(MpmConfig, theirs | {"device": kind, "fixed_time_step_s": STEP_S})
 
 
 def _cubes() -> Scene:

@@ -58,9 +58,3 @@ def test_a_data_set_that_is_kept(folder, tmp_path, monkeypatch, name, seconds, c
     assert Manifest.load(kept).published("train") == 5
     with pytest.raises(ConfigError, match="folder must be one without a data set"):
         main(given)
-
-
-def test_bad_input():
-    """Cases that there are not are refused by name."""
-    with pytest.raises(ConfigError, match=r"cases must be some of one_scene_te_step, .*'two_scenes'"):
-        main({"cases": ["two_scenes"]})

@@ -1,0 +1,88 @@
+"""Wrong options of the reports: each is named with its rule before anything is measured."""
+
+import re
+
+import pytest
+
+from hgn.schema import ConfigError, from_mapping
+from tools.bench.config import BenchConfig
+from tools.compare import CompareConfig
+from tools.curves import CurvesConfig
+from tools.error_vs_time.settings import ErrorVsTimeConfig
+from tools.scaling.config import ScalingConfig
+from tools.stability.network_cases import StabilityNetworkConfig
+from tools.stability.solver import StabilitySolverConfig
+from tools.studies.solver_targets import SolverTargetsConfig
+
+GIVEN = {  # what each must be given
+    BenchConfig: {},
+    CompareConfig: {"trees": ["."], "out": "c.json"},
+    CurvesConfig: {"runs": ["a"], "out": "curves"},
+    ErrorVsTimeConfig: {"data": "d", "out": "o"},
+    ScalingConfig: {},
+    SolverTargetsConfig: {},
+    StabilityNetworkConfig: {"weights": "w"},
+    StabilitySolverConfig: {},
+}
+
+
+@pytest.mark.parametrize(
+    ("config", "change", "message"),
+    [
+        (BenchConfig, {"cases": ["frames"]}, "cases[0] must be one of frame, train"),
+        (BenchConfig, {"particles": [0]}, "particles[0] must be at least 1"),
+        (BenchConfig, {"precisions": ["fp8"]}, "precisions[0] must be one of fp32, tf32, fp16"),
+        (BenchConfig, {"rounds": 0}, "rounds must be a finite number > 0"),
+        (BenchConfig, {"gns": {"kind": "hgn"}}, "gns.kind must be gns"),
+        (BenchConfig, {"mpm_frames": 2}, "mpm_frames must be at least 4"),
+        (
+            BenchConfig,
+            {"cases": ["public_gns_train"]},
+            "public_gns must be a folder with the public code for public_gns_t",
+        ),
+        (CompareConfig, {"trees": []}, "trees must be a list with at least one tree"),
+        (CompareConfig, {"trees": [".", "."]}, "trees must be a list of different trees"),
+        (CompareConfig, {"rounds": 0}, "rounds must be"),
+        (CompareConfig, {"bench": ["json=x"]}, "bench[0] must be KEY=VALUE other than json"),
+        (CurvesConfig, {"names": ["x", "y"]}, "names must be one for each of the 1 runs"),
+        (ErrorVsTimeConfig, {"data": None}, "data must be a data set, got None; make one with python -m datagen, or"),
+        (ErrorVsTimeConfig, {"mpm_steps": [0.0]}, "mpm_steps[0] must be above 0"),
+        (
+            ErrorVsTimeConfig,
+            {"weights": ["a/x.safetensors", "b/x.safetensors"]},
+            "weights must be files of different names",
+        ),
+        (ErrorVsTimeConfig, {"frames": 1}, "frames must be at least 2"),
+        (ErrorVsTimeConfig, {"precisions": ["fp8"]}, "precisions[0] must be one of fp32, tf32, fp16"),
+        (ErrorVsTimeConfig, {"split": "all"}, "split must be one of train"),
+        (ScalingConfig, {"devices": 0}, "devices must be at least 1"),
+        (ScalingConfig, {"device": "cuda:1"}, "device must be auto, cpu or cuda"),
+        (ScalingConfig, {"batches": 0}, "batches must be at least 1"),
+        (ScalingConfig, {"backends": ["slow"]}, "backends[0] must be torch or triton"),
+        (ScalingConfig, {"particle_spread": -1}, "particle_spread must be"),
+        (ScalingConfig, {"network": {"kind": "gns", "levels": 1}}, "network.kind must be hgn"),
+        (SolverTargetsConfig, {"cases": ["two_scenes"]}, "cases must be some of one_scene_te_step, one_scene"),
+        (StabilityNetworkConfig, {"cases": ["wide"]}, "cases[0] must be one of throw"),
+        (StabilityNetworkConfig, {"frames": 1}, "frames must be at least 2"),
+        (StabilityNetworkConfig, {"precision": "fp8"}, "precision must be one of fp32, tf32, fp16"),
+        (StabilityNetworkConfig, {"scenes_at_once": 0}, "scenes_at_once must be a finite number > 0, got 0"),
+        (StabilityNetworkConfig, {"solver_device": "moon"}, "solver_device must be one of auto, cpu, gpu"),
+        (StabilityNetworkConfig, {"backend": "quick"}, "backend must be one of auto, torch, triton, cpu"),
+        (StabilitySolverConfig, {"cases": ["stesp"]}, "cases[0] must be one of steps"),
+        (
+            StabilitySolverConfig,
+            {"cases": ["leak"], "picture": "steps.png"},
+            "picture must be left out without the case",
+        ),
+        (
+            StabilitySolverConfig,
+            {"cases": ["grid"], "grid_cells": [16, 8, 12]},
+            "grid_cells must be three numbers or more",
+        ),
+        (StabilitySolverConfig, {"leak_offsets": 9}, "leak_offsets must be 1 to 8, got 9"),
+    ],
+)
+def test_bad_options(config, change, message):
+    """Each is answered by its name, the rule and what was seen."""
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        from_mapping(config, GIVEN[config] | change)
