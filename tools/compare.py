@@ -8,12 +8,10 @@ code is 1 where a check is red.
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import subprocess
 import sys
-import tarfile
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +26,6 @@ from hgn.system.files import write_json
 from tools.report import EXIT_RED, PASS, meta_of, spread
 from tools.report import table as aligned
 
-SOURCES = ("hgn", "tools", "conf", "datagen", "pyproject.toml")  # of a commit
 WORK = ("case", "particles", "scenes", "precision")  # what is the same work in two trees
 
 
@@ -133,28 +130,26 @@ def _work(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _sources(name: str, scratch: Path, field: str) -> Path:
-    """The tree's folder; a commit's files are taken out of the repository. Raises: ConfigError."""
+    """The tree's folder; a commit is checked out in a clone of the repository. Raises: ConfigError."""
     folder = Path(name).expanduser()
     if not folder.is_dir():
         folder = scratch
         try:
-            top = _git("rev-parse", "--show-toplevel").decode().strip()
-            commit = _git("rev-parse", "--verify", "--end-of-options", f"{name}^{{commit}}").decode().strip()
-            archive = _git("-C", top, "archive", commit, *SOURCES)
+            top = _git("rev-parse", "--show-toplevel")
+            commit = _git("rev-parse", "--verify", "--end-of-options", f"{name}^{{commit}}")
+            _git("clone", "--quiet", "--shared", "--no-checkout", top, str(folder))
+            _git("-C", str(folder), "checkout", "--quiet", commit)
         except (OSError, subprocess.CalledProcessError) as error:
-            answer = (getattr(error, "stderr", b"") or str(error).encode()).decode(errors="replace").strip()
+            answer = (getattr(error, "stderr", "") or str(error)).strip()
             rule = "a folder, or a commit or branch of the repository here"
             raise ConfigError(f"{field} must be {rule}, got {name!r}; git says: {answer}") from None
-        with tarfile.open(fileobj=io.BytesIO(archive)) as file:
-            safely: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # Python 3.11.4 on
-            file.extractall(folder, **safely)
     bench = folder / "tools" / "bench" / "__main__.py"
     require(bench.is_file(), field, "a tree with tools/bench", name, "name the folder above hgn and tools")
     return folder.resolve()
 
 
-def _git(*arguments: str) -> bytes:
-    return subprocess.run(["git", *arguments], capture_output=True, check=True).stdout
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], capture_output=True, check=True, text=True).stdout.strip()
 
 
 if __name__ == "__main__":

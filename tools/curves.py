@@ -24,7 +24,7 @@ from hgn.renamed import current_metrics
 from hgn.schema import ConfigError, from_mapping, require
 from hgn.system.files import write_atomically, write_json
 from hgn.system.provenance import provenance
-from tools.figure import as_png, new_figure
+from tools.report import as_png, new_figure
 
 # what of a record is kept
 BEGINNINGS = (

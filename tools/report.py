@@ -1,11 +1,13 @@
-"""What reports share: where they come from, their table for people, and what a check says."""
+"""What reports share: where they come from, their tables and figures for people, and what a check says."""
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 
 from hgn.schema import to_mapping
@@ -36,3 +38,17 @@ def number(value: float | None, form: str) -> str:
 def spread(quartiles: Sequence[float] | None, form: str) -> str:
     """The least and the most, or the quartiles, for people."""
     return "-" if quartiles is None else " … ".join(format(value, form) for value in quartiles)
+
+
+def new_figure(lines: int, columns: int, size: tuple[float, float], share_y: bool = False) -> tuple[Any, np.ndarray]:
+    """A figure of that size in inches, and its panels [lines, columns]."""
+    from matplotlib.figure import Figure  # takes a second to load, which a command may not need
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(lines, columns, sharey=share_y, squeeze=False)
+
+
+def as_png(figure: Any, dpi: int = 110) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()

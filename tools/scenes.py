@@ -14,6 +14,7 @@ import numpy as np
 from hgn.scene.scene import Scene
 
 PARTICLES_PER_CELL = 8
+OF_PARTICLES = ("position_N3", "velocity_N3", "material_N")
 
 
 def random_places(size_cells: Sequence[float], seed: int = 0) -> np.ndarray:
@@ -31,19 +32,11 @@ def filled(material: int, position_N3: np.ndarray, velocity_3: Sequence[float] |
 
 def some(scene: Scene, chosen_N: np.ndarray) -> Scene:
     """A scene with those of its particles alone."""
-    return replace(
-        scene,
-        position_N3=scene.position_N3[chosen_N],
-        velocity_N3=scene.velocity_N3[chosen_N],
-        material_N=scene.material_N[chosen_N],
-    )
+    return replace(scene, **{name: getattr(scene, name)[chosen_N] for name in OF_PARTICLES})
 
 
 def joined(scenes: Sequence[Scene]) -> Scene:
     """The first scene with the particles of all."""
     return replace(
-        scenes[0],
-        position_N3=np.concatenate([scene.position_N3 for scene in scenes]),
-        velocity_N3=np.concatenate([scene.velocity_N3 for scene in scenes]),
-        material_N=np.concatenate([scene.material_N for scene in scenes]),
+        scenes[0], **{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in OF_PARTICLES}
     )

@@ -112,10 +112,9 @@ class SolverLaunches:
         self._known: dict[tuple[Setting, str], RolloutResult] = {}
         self._colliders: dict[str, Future[Any]] = {}
 
-    def add(self, setting: Setting) -> Setting:
+    def add(self, setting: Setting) -> None:
         if setting not in self._settings:
             self._settings.append(setting)
-        return setting
 
     def knows(self, setting: Setting) -> bool:
         """Whether scenes were simulated with it."""
@@ -132,6 +131,7 @@ class SolverLaunches:
 
     def trials(self, setting: Setting, episodes: Sequence[Episode], on_frame: OnFrame = None) -> list[RolloutResult]:
         """Trajectories of `frames` frames from the episodes' first ones."""
+        self.add(setting)
         missing = [episode for episode in episodes if (setting, episode.key) not in self._known]
         if missing:
             pairs = [(other, episode) for other in self._settings for episode in missing]

@@ -85,10 +85,6 @@ def test_a_run_that_fails_once_takes_the_time_away():
 def test_a_commit_is_a_tree(tmp_path, monkeypatch):
     """Commits and branches of the repository here are taken out of it, and left as they are."""
     repository = tree(tmp_path / "repository")
-    for name in ("hgn", "conf", "datagen"):
-        (repository / name).mkdir()
-        (repository / name / "file").touch()
-    (repository / "pyproject.toml").touch()
     git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c"]
     for arguments in (["init", "-q", "-b", "main"], ["add", "."], ["commit", "-qm", "one"]):
         subprocess.run([*git, *arguments], cwd=repository, check=True)

@@ -32,6 +32,8 @@ from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.error_vs_time.timing import Timing
 from tools.solver_rollouts import Setting, SolverLaunches
 
+SHORT = {"split": "validation", "device": "cpu", "frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1}
+SHORT |= {"batch_scenes": 2, "timed_batches": [2], "mpm_timed_frames": 4, "perturbation": 0.0}
 CPU = torch.device("cpu")
 RESULTS = Path(__file__).resolve().parents[2] / "results"
 
@@ -60,6 +62,12 @@ def weights_file(path, kind):
 
 
 @pytest.fixture
+def both(tmp_path):
+    """Weights of an HGN and of a GNS."""
+    return [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
+
+
+@pytest.fixture
 def data(small_dataset):
     return str(small_dataset)
 
@@ -70,22 +78,12 @@ def undrawn(monkeypatch):
     monkeypatch.setattr("tools.error_vs_time.run.draw", lambda *_: [])
 
 
-def test_the_report(data, tmp_path, monkeypatch, capsys):
+def test_the_report(data, both, tmp_path, monkeypatch, capsys):
     """Every contender gets a row with the report's keys on the same scenes; a solver that fails is counted."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
-    weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
     out = tmp_path / "results" / "report"
-    options = {"data": data, "out": str(out), "weights": weights, "split": "validation", "frame_stride": 2}
-    options |= {
-        "mpm_grids": [32, 64],
-        "timed_frames": 5,
-        "rounds": 1,
-        "batch_scenes": 2,
-        "timed_batches": [2],
-        "timed_scenes": 1,
-    }
-    options |= {"device": "cpu"}
-    assert main(options) == 0
+    options = {"data": data, "out": str(out), "weights": both, "mpm_grids": [32, 64], "perturbation": 1e-6}
+    assert main(SHORT | options | {"frame_stride": 2, "timed_frames": 5, "mpm_timed_frames": 300}) == 0
     report = json.loads(Path(f"{out}.json").read_text())
     assert {"device", "versions", "commit", "date", "command", "convention", "reference"} <= report["meta"].keys()
     rows = report["rows"]
@@ -146,16 +144,7 @@ def test_when_time_is_over(data, tmp_path, monkeypatch):
     monkeypatch.setattr(datagen.mpm.solver, "simulate", counted)
     monkeypatch.setattr("tools.error_vs_time.__main__.shipped_weights", dict)
     out = tmp_path / "report"
-    options = {"data": data, "out": str(out), "split": "validation", "device": "cpu", "resimulate": False}
-    options |= {
-        "mpm_grids": [64],
-        "mpm_frames": 3,
-        "timed_frames": 5,
-        "mpm_timed_frames": 4,
-        "timed_batches": [2],
-        "rounds": 1,
-        "perturbation": 0.0,
-    }
+    options = SHORT | {"data": data, "out": str(out), "resimulate": False, "mpm_grids": [64], "mpm_frames": 3}
     assert main(options) == 0
     assert [call for call in calls if call[2] == 3] == [(1 / 64, [0.5, 1.0], 3)]  # of one grid side by side
     assert {call[2] for call in calls} == {2, 3, 4} and all(len(call[1]) == 1 for call in calls if call[2] != 3)
@@ -179,10 +168,9 @@ def test_the_data_can_be_the_reference(data, tmp_path):
     assert rows["ballistic motion"]["one_step_mse"] < 1e-13 < rows["constant velocity"]["one_step_mse"]
 
 
-def test_precisions_that_a_path_does_not_know(data, tmp_path, capsys):
+def test_precisions_that_a_path_does_not_know(data, both, tmp_path, capsys):
     """The HGN in fp16 on backend torch is left out, and that is said; triton must run where it is asked for."""
-    files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
-    options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": files}
+    options = {"data": data, "out": str(tmp_path / "report"), "split": "test", "weights": both}
     config = from_mapping(ErrorVsTimeConfig, options | {"precisions": ["fp32", "fp16"]})
     (episode,) = EpisodeStore(data, "test").episodes
     found = [(c.row["system"], c.row["precision"]) for c in network_contenders(config, CPU, [episode])]
@@ -193,14 +181,13 @@ def test_precisions_that_a_path_does_not_know(data, tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_what_counts_most_comes_first(data, tmp_path, monkeypatch, capsys):
+def test_what_counts_most_comes_first(data, both, tmp_path, monkeypatch, capsys):
     """What is simulated with the reference, networks at the precision that tells most, baselines, coarse grids, then
     other precisions, whose rollouts off backend triton are short; the report keeps its order. What fails is named with
     the cause, the others go on, and only a fault that nobody foresaw makes the exit code 1."""
     monkeypatch.setattr(datagen.mpm.solver, "simulate", fake_simulate)
     monkeypatch.setattr("tools.error_vs_time.__main__.GNS_ORDER", ("fp32", "fp16", "tf32"))
     monkeypatch.setattr("tools.error_vs_time.contenders.REPEATED_FRAMES", 3)
-    files = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("gns", "hgn")]
     order: list[str] = []
 
     def noted(contender, *more):
@@ -210,17 +197,9 @@ def test_what_counts_most_comes_first(data, tmp_path, monkeypatch, capsys):
         return score.score(contender, *more)
 
     monkeypatch.setattr("tools.error_vs_time.run.score", noted)
-    options = {"data": data, "out": str(tmp_path / "report"), "split": "validation", "weights": files, "device": "cpu"}
-    options |= {
-        "frame_stride": 5,
-        "timed_frames": 4,
-        "rounds": 1,
-        "timed_scenes": 1,
-        "timed_batches": [2],
-        "sinkhorn_scenes": 0,
-    }
-    options |= {"mpm_grids": [48, 64], "mpm_steps": [0.5], "precisions": ["tf32", "fp32"]}
-    assert main(options) == 0
+    options = {"data": data, "out": str(tmp_path / "report"), "weights": both[::-1], "perturbation": 1e-6}
+    options |= {"mpm_grids": [48, 64], "mpm_steps": [0.5], "precisions": ["tf32", "fp32"], "sinkhorn_scenes": 0}
+    assert main(SHORT | options) == 0
     assert [name.split(" (")[0] for name in order] == [
         *["MPM 64³, step 0.5", "chaos floor: perturbed by 1e-06", "chaos floor: twice the step"],
         "HGN L = 3, M = 2, cpu tf32",
@@ -314,11 +293,7 @@ def test_what_launches_none_of_the_kernels_is_scored_beside_their_compilation(da
     assert order == ["nothing moves", "MPM 32³, step 1", "MPM 48³, step 1"] and run.failed == 0
 
 
-SHORT = {"split": "validation", "device": "cpu", "frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1}
-SHORT |= {"batch_scenes": 2, "timed_batches": [2], "mpm_timed_frames": 4, "perturbation": 0.0}
-
-
-def test_a_report_goes_on_where_it_was_cut_off(data, tmp_path, monkeypatch):
+def test_a_report_goes_on_where_it_was_cut_off(data, both, tmp_path, monkeypatch):
     """Rows of an earlier report are neither simulated nor scored again; those without a run time get one, and where and
     when. Without data they are drawn again and nothing else."""
     simulated: list[set[float]] = []
@@ -329,9 +304,8 @@ def test_a_report_goes_on_where_it_was_cut_off(data, tmp_path, monkeypatch):
 
     monkeypatch.setattr(datagen.mpm.solver, "simulate", noted)
     monkeypatch.setattr("tools.error_vs_time.run.draw", lambda *_: [])
-    weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
     first, second = tmp_path / "first", tmp_path / "second"
-    options = {"data": data, "weights": weights, "mpm_grids": [64], "mpm_steps": [0.5], **SHORT}
+    options = {"data": data, "weights": both, "mpm_grids": [64], "mpm_steps": [0.5], **SHORT}
     assert main(options | {"out": str(first)}) == 0
     report = json.loads(Path(f"{first}.json").read_text())
     rows = {row["system"]: row for row in report["rows"]}
@@ -366,9 +340,8 @@ def test_a_report_goes_on_where_it_was_cut_off(data, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_what_nobody_foresaw_stops_one_contender(data, tmp_path, monkeypatch, capsys):
+def test_what_nobody_foresaw_stops_one_contender(data, both, tmp_path, monkeypatch, capsys):
     """The others are scored and timed, the fault is printed whole and named in the report, the exit code is 1."""
-    weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
 
     def failing(contender, *more):
         if contender.row["system"] == "hgn":
@@ -376,7 +349,7 @@ def test_what_nobody_foresaw_stops_one_contender(data, tmp_path, monkeypatch, ca
         return score.score(contender, *more)
 
     monkeypatch.setattr("tools.error_vs_time.run.score", failing)
-    options = {"data": data, "weights": weights, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
+    options = {"data": data, "weights": both, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
     assert main(options | SHORT) == 1
     report = json.loads((tmp_path / "report.json").read_text())
     assert [row["system"] for row in report["rows"]] == ["gns", *["baseline"] * 3]
@@ -387,9 +360,8 @@ def test_what_nobody_foresaw_stops_one_contender(data, tmp_path, monkeypatch, ca
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("times_last", [False, True])
-def test_a_run_that_is_killed_leaves_whole_points(data, tmp_path, monkeypatch, times_last):
+def test_a_run_that_is_killed_leaves_whole_points(data, both, tmp_path, monkeypatch, times_last):
     """After each contender the file holds its errors and its run times; where all run times come last, none yet."""
-    weights = [str(weights_file(tmp_path / f"{kind}.safetensors", kind)) for kind in ("hgn", "gns")]
 
     def killed(contender, *more):
         if contender.row["system"] == "gns":
@@ -397,7 +369,7 @@ def test_a_run_that_is_killed_leaves_whole_points(data, tmp_path, monkeypatch, t
         return score.score(contender, *more)
 
     monkeypatch.setattr("tools.error_vs_time.run.score", killed)
-    options = {"data": data, "weights": weights, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
+    options = {"data": data, "weights": both, "out": str(tmp_path / "report"), "resimulate": False, "mpm_grids": []}
     with pytest.raises(KeyboardInterrupt):
         main(options | SHORT | {"times_last": times_last})
     rows = {row["system"]: row for row in json.loads((tmp_path / "report.json").read_text())["rows"]}

@@ -9,7 +9,7 @@ from tools.bench.config import BenchConfig
 from tools.compare import CompareConfig
 from tools.curves import CurvesConfig
 from tools.error_vs_time.settings import ErrorVsTimeConfig
-from tools.scaling.config import ScalingConfig
+from tools.scaling.measure import ScalingConfig
 from tools.stability.network_cases import StabilityNetworkConfig
 from tools.stability.solver import StabilitySolverConfig
 from tools.studies.solver_targets import SolverTargetsConfig

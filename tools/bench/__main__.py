@@ -42,16 +42,17 @@ def main(mapping: dict[str, Any]) -> int:
     device = choose_device(config.device)
     rows: list[Row] = []
     groups = [
-        (precision, cases, work)
+        (precision, wanted, work)
         for precision in config.precisions or (("tf32", "fp16") if device.type == "cuda" else ("fp32",))
         for work in workloads(config, device)
-        for cases in (FRAME_CASES, TRAIN_CASES)
-        if _wanted(config, device, precision, cases) and _meant(cases, work)
+        # the paper's scenes are trained on; others are simulated only
+        for cases in ((FRAME_CASES, TRAIN_CASES) if work.particles <= TILE_PARTICLES else (FRAME_CASES,))
+        if (wanted := _wanted(config, device, precision, cases))
     ]
     meta = report.meta_of(config, device)
     with bar("timing", total=len(groups), unit="group") as progress:
-        for precision, cases, work in groups:
-            rows += group_rows(config, device, precision, _wanted(config, device, precision, cases), work)
+        for group in groups:
+            rows += group_rows(config, device, *group)
             progress.update()
             if config.json is not None:  # after each: what a later group does takes nothing away
                 write_json(config.json, {"meta": meta, "rows": rows})
@@ -159,10 +160,6 @@ def _wanted(config: BenchConfig, device: torch.device, precision: str, cases: tu
         known = (("frame", "train") if triton else ()) + ("gns_frame", "gns_train")
         wanted = tuple(case for case in known if case in wanted)
     return [case for case in cases if case in wanted]
-
-
-def _meant(cases: tuple[str, ...], work: Workload) -> bool:
-    return cases is not TRAIN_CASES or work.particles <= TILE_PARTICLES  # the paper's scenes; others are simulated only
 
 
 if __name__ == "__main__":

@@ -11,10 +11,6 @@ PUBLIC_GNS_CASES = ("public_gns_frame", "public_gns_train")
 CASES = ("frame", "train", "torch_frame", "torch_train", "gns_frame", "gns_train", *PUBLIC_GNS_CASES, "mpm_frame")
 
 
-def _bench_gns() -> NetworkConfig:
-    return NetworkConfig(kind="gns", levels=1, message_passing_steps=10)
-
-
 @dataclass(frozen=True)
 class BenchConfig:
     """`python -m tools.bench`: what is timed."""
@@ -28,7 +24,7 @@ class BenchConfig:
     # fp32, tf32, fp16 (backend triton and our GNS); null: tf32 and fp16 on a GPU, fp32 on a CPU
     precisions: tuple[str, ...] | None = None
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    gns: NetworkConfig = field(default_factory=_bench_gns)
+    gns: NetworkConfig = field(default_factory=lambda: NetworkConfig(kind="gns", levels=1, message_passing_steps=10))
     public_gns: str | None = None  # a folder with a copy of github.com/geoelements/gns, which needs PyTorch Geometric
     rounds: Positive[int] = 50  # samples of each contender
     seconds: Positive[float] = 20.0  # at most for contenders that take turns, once five rounds are done

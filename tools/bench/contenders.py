@@ -137,16 +137,13 @@ class MpmFrame(Timed):
         self.config = MpmConfig(device="gpu" if device.type == "cuda" else "cpu", scenes_per_launch=work.scenes)
         self.frames = config.mpm_frames
         self.particles = sum(scene.particle_count for scene in self.scenes) // work.scenes
-        self.rounds, self.warm_up, self.compiled = MPM_ROUNDS, 1, False
+        self.rounds, self.warm_up = MPM_ROUNDS, 1
         self.substeps = 0.0  # of a frame, mean over particles
 
     def sample(self) -> float:
         """Milliseconds a frame of a short simulation: frames may come several at once."""
         from datagen.mpm.solver import SceneFailure, simulate
 
-        if not self.compiled:  # which is no part of it
-            simulate(self.scenes, self.config, 2, FRAME_RATE_HZ, lambda _: None)
-            self.compiled = True
         clock = FrameClock()
         results = simulate(self.scenes, self.config, self.frames, FRAME_RATE_HZ, clock)
         steps = 0

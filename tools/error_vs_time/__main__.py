@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -41,12 +41,10 @@ from tools.error_vs_time.contenders import (
     Contender,
     NetworkContender,
     SolverContender,
-    solver_row,
 )
-from tools.error_vs_time.earlier import Earlier, same_row
 from tools.error_vs_time.paired import paired_lines, paired_rows
 from tools.error_vs_time.plot import CONVENTION
-from tools.error_vs_time.run import Run, draw
+from tools.error_vs_time.run import Earlier, Run, draw, same_row
 from tools.error_vs_time.score import table
 from tools.error_vs_time.settings import ErrorVsTimeConfig
 from tools.report import meta_of
@@ -77,7 +75,6 @@ def main(mapping: dict[str, Any]) -> int:
         report.require_same([episode.key for episode in episodes], frames, _reference_name(config))
     known = [row for report in earlier for row in report.rows]
     mpm = replace(from_stored(MpmConfig, store.manifest.config["mpm"], "mpm"), device=processor)
-    networks = [c for c in network_contenders(config, device, episodes) if same_row(c.row, known) is None]
     own_cell, rate = episodes[0].obstacle_grid.cell_size, episodes[0].frame_rate_hz
     own_grid = round(1 / own_cell)
 
@@ -88,7 +85,13 @@ def main(mapping: dict[str, Any]) -> int:
         cell_size = own_cell if grid == own_grid else 1 / grid
         return SolverLaunches(other_grid(mpm, cell_size, own_cell), cell_size, rate, most)
 
-    solvers = solver_contenders(config, mpm, launches, own_grid, known)
+    every: list[Contender] = [*network_contenders(config, device, episodes), *baseline_contenders(store, device)]
+    every += solver_contenders(config, mpm, launches, own_grid)
+    contenders = [contender for contender in every if same_row(contender.row, known) is None]
+    networks = [contender for contender in contenders if isinstance(contender, NetworkContender)]
+    solvers = [contender for contender in contenders if isinstance(contender, SolverContender)]
+    for solver in solvers:
+        solver.launches.add(solver.setting)
     with ExitStack() as stack:
         precompilation = _precompiled_frames(networks, episodes, device)
         if precompilation is not None:
@@ -99,7 +102,6 @@ def main(mapping: dict[str, Any]) -> int:
             references = [replace(e, position_TN3=np.asarray(e.position_TN3[:frames])) for e in episodes]
             left_out = {}
         require(bool(references), "data", "scenes that the solver gets through", left_out)
-        baselines = [c for c in baseline_contenders(store, device) if same_row(c.row, known) is None]
         meta = meta_of(config, device) | {
             "data": Path(config.data).name,
             "split": config.split,
@@ -113,7 +115,7 @@ def main(mapping: dict[str, Any]) -> int:
             "seconds_before_scoring": time.monotonic() - begun,
         }
         untimed = [row for report in earlier for row in report.untimed]
-        run = Run(config, [*networks, *baselines, *solvers], references, device, meta, begun, known, untimed)
+        run = Run(config, contenders, references, device, meta, begun, known, untimed)
         with ThreadPoolExecutor(available_cpus()) as threads:
             for solver in solvers:
                 solver.launches.collide(references, threads)
@@ -246,32 +248,21 @@ def baseline_contenders(store: EpisodeStore, device: torch.device) -> list[Conte
 
 
 def solver_contenders(
-    config: ErrorVsTimeConfig,
-    mpm: MpmConfig,
-    launches: Callable[[int], SolverLaunches],
-    own_grid: int,
-    known: Sequence[Mapping[str, Any]] = (),
-) -> list[SolverContender]:
-    """The solver at its settings, and how far the reference departs from itself: the chaos floor. What is among the
-    `known` rows is neither simulated nor given.
-    """
+    config: ErrorVsTimeConfig, mpm: MpmConfig, launches: Callable[[int], SolverLaunches], own_grid: int
+) -> list[Contender]:
+    """The solver at its settings, and how far the reference departs from itself: the chaos floor."""
     step = REFERENCE_STEP if config.resimulate else mpm.stability_fraction
-    if config.resimulate:
-        launches(own_grid).add(Setting(step))
 
-    def solver(grid: int, step: float, perturbation: float = 0.0) -> SolverContender:
+    def solver(grid: int, step: float, perturbation: float = 0.0, **named: Any) -> SolverContender:
         importance = SAME_GRID if grid == own_grid else COARSE_GRIDS
-        return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, importance)
+        return SolverContender(launches(grid), Setting(step, perturbation), config.mpm_frames, importance, named)
 
-    settings = [(grid, step) for grid in config.mpm_grids for step in config.mpm_steps]
-    points = {pair: solver(*pair) for pair in settings if same_row(solver_row(*pair), known) is None}
-    contenders = list(points.values())
-    perturbed = {"system": "chaos", "floor": f"perturbed by {config.perturbation:g}"}
-    if config.perturbation and same_row(perturbed, known) is None:
-        contenders.append(solver(own_grid, step, config.perturbation).named(**perturbed))
-    coarser = {"system": "chaos", "floor": "twice the step"}
-    if config.mpm_grids and 2 * step <= 1 and same_row(coarser, known) is None:
-        contenders.append((points.get((own_grid, 2 * step)) or solver(own_grid, 2 * step)).named(**coarser))
+    contenders: list[Contender] = [solver(grid, step) for grid in config.mpm_grids for step in config.mpm_steps]
+    if config.perturbation:
+        floor = f"perturbed by {config.perturbation:g}"
+        contenders.append(solver(own_grid, step, config.perturbation, system="chaos", floor=floor))
+    if config.mpm_grids and 2 * step <= 1:
+        contenders.append(solver(own_grid, 2 * step, system="chaos", floor="twice the step"))
     return contenders
 
 

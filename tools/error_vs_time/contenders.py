@@ -6,7 +6,6 @@ Shape legend: T frames, N particles of a scene.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,6 +31,7 @@ from tools.timing import FrameClock, matmul_precision
 if TYPE_CHECKING:
     from hgn.runtime.triton_rollout import TritonRollout
 
+Row = dict[str, Any]
 PARTICLES_PER_BATCH = 32_768
 PARTICLES_AT_ONCE = 150_000  # of backend triton's one-step errors
 REST_SPEED = 1e-4  # domain units a frame; what is slower is at rest
@@ -52,7 +52,7 @@ class OneStep:
 class Contender:
     """One row of the report."""
 
-    row: dict[str, Any]  # system and settings
+    row: Row  # system and settings
     importance = SAME_GRID  # 0 is scored first
     all_at_once = False  # all scenes are simulated side by side, and not so many as the command says
     stepped = True  # frames are made one by one: nothing is captured or compiled for them
@@ -125,10 +125,6 @@ class NetworkContender(Contender):
         self.simulator.backend.release()
 
 
-def solver_row(grid: int, step: float) -> dict[str, Any]:
-    return {"system": "mpm", "grid": grid, "step": step, "precision": "fp32"}
-
-
 class SolverContender(Contender):
     """The solver that made the data, on a grid and with a step of its own. It has no one-step error: a step begins from
     stresses and volumes, which positions do not tell.
@@ -136,17 +132,13 @@ class SolverContender(Contender):
 
     all_at_once = True  # a scene takes one of a GPU's many processors
 
-    def __init__(self, launches: SolverLaunches, setting: Setting, frames: int, importance: int) -> None:
-        """Rollouts end at `frames`, where nobody takes the time."""
-        self.launches, self.setting = launches, launches.add(setting)
-        self.frames, self.importance = frames, importance
-        self.row = solver_row(round(1 / launches.cell_size), setting.step)
-
-    def named(self, **row: Any) -> SolverContender:
-        """The same in another row."""
-        same = copy.copy(self)
-        same.row = row
-        return same
+    def __init__(
+        self, launches: SolverLaunches, setting: Setting, frames: int, importance: int, named: Row | None = None
+    ) -> None:
+        """Rollouts end at `frames`, where nobody takes the time. `named`: its row, where that is not the settings'."""
+        self.launches, self.setting, self.frames, self.importance = launches, setting, frames, importance
+        grid = round(1 / launches.cell_size)
+        self.row = named or {"system": "mpm", "grid": grid, "step": setting.step, "precision": "fp32"}
 
     def trials(self, episodes: Sequence[Episode], frames: int, on_frame: OnFrame) -> list[RolloutResult]:
         if on_frame is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from hgn.config import NETWORK_KINDS
 from tools.error_vs_time.score import label
 from tools.error_vs_time.settings import UNTIMED
-from tools.figure import as_png, new_figure
+from tools.report import as_png, new_figure
 
 CONVENTION = "squared errors: sum over axes, mean over particles and scenes, frame units"
 SHOWN_FRAME = 50  # in a panel of its own, beside the last one
@@ -68,7 +68,9 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
     best: dict[str, Row] = {}
     for row in rows:
         if row["system"] in NETWORK_KINDS:
-            best[row["weights"]] = max(best.get(row["weights"], row), row, key=_length)
+            best[row["weights"]] = max(
+                best.get(row["weights"], row), row, key=lambda r: sum(v is not None for v in r["curve"])
+            )
     for row in rows:
         network = row["system"] in NETWORK_KINDS
         if network and row is not best[row["weights"]]:
@@ -241,10 +243,6 @@ def _error(row: Row, frame: int | None) -> float | None:
 
 def _errors(rows: Sequence[Row], frame: int | None, *systems: str) -> list[float]:
     return [error for row in rows if row["system"] in systems and (error := _error(row, frame)) is not None]
-
-
-def _length(row: Row) -> int:
-    return sum(value is not None for value in row["curve"])
 
 
 def _footer(figure: Any, meta: Mapping[str, Any]) -> float:

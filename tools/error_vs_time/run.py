@@ -5,22 +5,24 @@ A run that is cut off anywhere leaves a whole file with all that was measured, e
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from hgn.renamed import current_names
 from hgn.scene.episode import Episode
-from hgn.schema import ConfigError
+from hgn.schema import ConfigError, require
 from hgn.system.files import write_atomically, write_json
 from hgn.system.progress import bar
 from tools.error_vs_time.contenders import COARSE_GRIDS, GNS_FIRST, BaselineContender, Contender, SolverContender
-from tools.error_vs_time.earlier import same_row
 from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, score
@@ -31,6 +33,46 @@ from tools.error_vs_time.timing import Stopwatch, Timing
 BEGIN_FRACTION, ROUND_FRACTION = 0.85, 0.95
 BESIDE = (GNS_FIRST, COARSE_GRIDS)  # what is scored while kernels are compiled, with baselines
 DRAWN_EVERY_S = 60.0  # which takes some seconds each time
+# of a contender: rows of earlier reports that have the same need not be measured again
+IDENTITY = ("system", "weights", "backend", "precision", "updates", "grid", "step", "predictor", "floor")
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """A report's meta, those rows that are whole (with run times, where there are any to take), and those without."""
+
+    field: str
+    meta: dict[str, Any]
+    rows: list[dict[str, Any]]
+    untimed: list[dict[str, Any]]
+
+    @staticmethod
+    def read(file: str, field: str) -> Earlier:
+        """Raises: ConfigError where there is no such file, or it is none of this report."""
+        remedy = "leave it out to begin anew"
+        try:
+            report = json.loads(Path(file).read_text(encoding="utf-8"))
+            meta, rows = report["meta"], [current_names(row) for row in report["rows"]]
+            whole = [row for row in rows if row["system"] in UNTIMED or row.get("ms") is not None]
+            ours = all("curve" in row for row in rows) and {"episodes", "frames", "reference"} <= meta.keys()
+        except FileNotFoundError:
+            raise ConfigError(f"{field} must be an existing file, got {file}; {remedy}") from None
+        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
+            ours = False
+        require(ours, field, "JSON that python -m tools.error_vs_time wrote", file, remedy)
+        return Earlier(field, meta, whole, [row for row in rows if row not in whole])
+
+    def require_same(self, episodes: Sequence[str], frames: int, reference: str) -> None:
+        """Raises: ConfigError where the report is on other scenes, fewer frames, or was scored by something else."""
+        remedy = "take the data and options of that report, or leave it out"
+        for name, value in {"episodes": list(episodes), "frames": frames, "reference": reference}.items():
+            rule = f"{value} as in this report"
+            require(self.meta[name] == value, f"{self.field} {name}", rule, self.meta[name], remedy)
+
+
+def same_row(row: Mapping[str, Any], known: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """The first row of a contender of those settings, if any."""
+    return next((other for other in known if all(row.get(name) == other.get(name) for name in IDENTITY)), None)
 
 
 class Run:

@@ -22,8 +22,7 @@ from hgn.system.machine import available_cpus
 from tools import report
 from tools.bench.contenders import OBSTACLE_CELL_SIZE
 from tools.report import EXIT_RED, PASS
-from tools.scaling.config import ScalingConfig
-from tools.scaling.measure import measure
+from tools.scaling.measure import ScalingConfig, measure
 
 CELL_FRACTION = 0.3  # cells of the finest level for each particle of tools.bench.states, about
 

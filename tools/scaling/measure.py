@@ -23,11 +23,12 @@ from torch import nn
 from torch.distributed.algorithms.ddp_comm_hooks.default_hooks import allreduce_hook
 from torch.nn.parallel import DistributedDataParallel
 
-from hgn.config import TrainingConfig
+from hgn.config import NetworkConfig, Precision, TrainingConfig
 from hgn.data.batch import Batch
 from hgn.data.sampler import balanced_parts
 from hgn.runtime.backend import set_matmul_precision, triton_unsupported_reason
 from hgn.runtime.parity import relative_error
+from hgn.schema import NonNegative, OneOrMore, Positive, require, require_bounds
 from hgn.system.machine import available_cpus
 from hgn.training.distributed import averaging_options
 from hgn.training.gradients import GradientGuard
@@ -36,7 +37,6 @@ from tools.bench.contenders import bench_network, training_module
 from tools.bench.states import Workload, batch_of_scenes
 from tools.bench.triton_contenders import device_samples, triton_updates
 from tools.report import PASS
-from tools.scaling.config import ScalingConfig
 from tools.timing import Timed, alternate, median_and_quartiles
 
 # Relative error of the averaged gradients, of their norm. Looser than rounding: on a GPU sums are taken in another
@@ -44,6 +44,32 @@ from tools.timing import Timed, alternate, median_and_quartiles
 GRADIENT_BOUND = 2e-2
 WARM_UPDATES = 3
 PATIENCE = datetime.timedelta(minutes=2)
+
+
+@dataclass(frozen=True)
+class ScalingConfig:
+    """`python -m tools.scaling`: how training is timed on several devices of this machine."""
+
+    devices: OneOrMore | None = None  # at most; none: all GPUs, or two processes on a CPU
+    scenes: OneOrMore = 8  # on each device
+    particles: OneOrMore = 4_296  # of a scene
+    # of a scene's particles, standard deviation as a fraction of the mean; the paper's random scenes: 0.17
+    particle_spread: NonNegative[float] = 0.17
+    batches: OneOrMore = 8  # of each device; one sample is an update on each of them
+    backends: tuple[str, ...] = ("torch", "triton")  # of training; triton where there are GPUs
+    precision: Precision = "tf32"  # as for training; or fp32, fp16 (where backend torch takes tf32)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    rounds: Positive[int] = 20  # samples of each contender
+    seconds: Positive[float] = 30.0  # at most for all contenders, once five rounds are done
+    device: str = "auto"  # or cpu, cuda
+    json: str | None = None  # also write the rows to this file; --json FILE does the same
+
+    def __post_init__(self) -> None:
+        require_bounds(self)
+        for i, backend in enumerate(self.backends):
+            require(backend in ("torch", "triton"), f"backends[{i}]", "torch or triton", backend)
+        require(self.device in ("auto", "cpu", "cuda"), "device", "auto, cpu or cuda", self.device)
+        require(self.network.kind == "hgn", "network.kind", "hgn", self.network.kind)
 
 
 @dataclass

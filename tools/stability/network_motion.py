@@ -8,7 +8,7 @@ Shape legend: T frames, N particles.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import cycle, islice
 from typing import Any
 
@@ -51,20 +51,6 @@ MEETING_FRAMES = 40
 # and positions do not show. 0.04 for cubes of snow of 0.08, 0.06 for water, 0.07 for sand.
 MOMENTUM_WITHIN, ANGULAR_WITHIN = 0.01, 0.05
 MET_AT_LEAST = 0.1  # of the relative velocity, that must go over; beside the solver half of what goes over there
-
-
-@dataclass(frozen=True)
-class Flight:
-    """What one flight shows at its worst: the share of its velocity kept across gravity (none for a drop), the error of
-    its acceleration along gravity in gravities (the earth's where there is none), the frames of these, and the
-    acceleration across gravity on average, in the earth's: what takes velocity away."""
-
-    kept: float | None
-    error: float
-    across: float
-    frames: int
-    kept_frame: int
-    error_frame: int
 
 
 def motion_rows(
@@ -125,21 +111,19 @@ def flight_row(
     if causes:
         return Row(name, GRAVITY_WITHIN, "diverged", False, str(causes[0]))
     flights = [flight(*item, rate) for item in zip(trials, scenes, frames, strict=True)]
-    label, worst = max(zip(labels, flights, strict=True), key=lambda pair: pair[1].error)
-    beyond, held = f"gravities off in frame {worst.error_frame} {label}", worst.error <= GRAVITY_WITHIN
+    label, worst = max(zip(labels, flights, strict=True), key=lambda pair: pair[1]["error"])
+    beyond, held = f"gravities off in frame {worst['error_frame']} {label}", worst["error"] <= GRAVITY_WITHIN
     more: dict[str, Any] = {"scenes": together, "particles": sum(item.particle_count for item in scenes[:together])}
-    kept = [
-        (one.kept, label, one.kept_frame) for label, one in zip(labels, flights, strict=True) if one.kept is not None
-    ]
-    if kept:
-        least, label, frame = min(kept, key=lambda item: item[0])
-        beyond += f"; keeps {least:.1%} of its velocity in frame {frame} {label}"
-        held, more["kept"] = held and least >= KEPT_AT_LEAST, least
+    thrown = [pair for pair in zip(labels, flights, strict=True) if pair[1]["kept"] is not None]
+    if thrown:
+        label, slowed = min(thrown, key=lambda pair: pair[1]["kept"])
+        beyond += f"; keeps {slowed['kept']:.1%} of its velocity in frame {slowed['kept_frame']} {label}"
+        held, more["kept"] = held and slowed["kept"] >= KEPT_AT_LEAST, slowed["kept"]
     more["throws"] = {
-        label: {"kept": one.kept, "error": one.error, "across": one.across, "frames": one.frames}
+        label: {key: one[key] for key in ("kept", "error", "across", "frames")}
         for label, one in zip(labels[: len(throws)], flights, strict=False)
     }
-    return Row(name, GRAVITY_WITHIN, worst.error, held, beyond, more)
+    return Row(name, GRAVITY_WITHIN, worst["error"], held, beyond, more)
 
 
 def flight_frames(scene: Scene, frame_rate_hz: float, reach: float) -> int:
@@ -154,8 +138,11 @@ def flight_frames(scene: Scene, frame_rate_hz: float, reach: float) -> int:
     return FLIGHT_FRAMES
 
 
-def flight(trial: RolloutResult, scene: Scene, frames: int, frame_rate_hz: float) -> Flight:
-    """The worst frames of a flight beside its closed form."""
+def flight(trial: RolloutResult, scene: Scene, frames: int, frame_rate_hz: float) -> dict[str, Any]:
+    """What a flight shows at its worst beside its closed form: the share of its velocity `kept` across gravity (none
+    for a drop), the `error` of its acceleration along gravity in gravities (the earth's where there is none), the
+    frames of these, and the acceleration `across` gravity on average, in the earth's: what takes velocity away.
+    """
     gravity_3 = np.array(scene.gravity) / frame_rate_hz**2
     thrown_3 = scene.velocity_N3[0].astype(np.float64) / frame_rate_hz
     size, speed = float(np.linalg.norm(gravity_3)), float(np.linalg.norm(thrown_3))
@@ -169,9 +156,14 @@ def flight(trial: RolloutResult, scene: Scene, frames: int, frame_rate_hz: float
     if size:  # across gravity alone
         lost_T3 = lost_T3 - np.outer(lost_T3 @ gravity_3, gravity_3) / size**2
     lost_T = np.linalg.norm(lost_T3, axis=1)
-    kept = 1 - float(lost_T.max()) / speed if speed else None
-    across = float(lost_T[-1]) / frames * frame_rate_hz**2 / EARTH
-    return Flight(kept, float(error_T.max()), across, frames, int(lost_T.argmax()), int(error_T.argmax()))
+    return {
+        "kept": 1 - float(lost_T.max()) / speed if speed else None,
+        "kept_frame": int(lost_T.argmax()),
+        "error": float(error_T.max()),
+        "error_frame": int(error_T.argmax()),
+        "across": float(lost_T[-1]) / frames * frame_rate_hz**2 / EARTH,
+        "frames": frames,
+    }
 
 
 def turned_rows(simulator: Simulator, scene: SceneConfig, material: str, solver: MpmConfig) -> Iterator[Row]:

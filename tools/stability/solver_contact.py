@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from datagen.mpm.solver import SceneFailure, Simulated, simulate
 from hgn.config import MpmConfig
@@ -76,10 +77,8 @@ def sheet(setting: Setting, half: float = 40.0) -> Obstacle:
 
 def body(setting: Setting) -> Obstacle:
     """A closed box whose upper face is the surface."""
-    corner = np.array([[x, y, z] for x in (-40, 40) for y in (-40, 0) for z in (-40, 40)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangle = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.int32)
-    return Obstacle("body", setting.place(corner), triangle, True)
+    box = trimesh.creation.box(bounds=[(-40, -40, -40), (40, 0, 40)])
+    return Obstacle("body", setting.place(box.vertices), np.asarray(box.faces, np.int32), True)
 
 
 def block(

@@ -21,7 +21,7 @@ from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
 from hgn.scene.scene import Scene
 from hgn.system.files import write_atomically
-from tools.figure import as_png, new_figure
+from tools.report import as_png, new_figure
 from tools.scenes import filled
 from tools.stability.row import Row
 from tools.stability.solver_scenes import CELL, block
