@@ -20,10 +20,7 @@ def test_old_names_are_answered(monkeypatch):
     monkeypatch.setitem(KEYS, "training.rate", "training.learning_rate")
     monkeypatch.setitem(VALUES, "symmetry", {"upright": "gravity"})
     for training, remedy in (
-        (
-            {"rate": 0.1},
-            "training.rate is not a known key; it is called training.learning_rate now; write ",
-        ),
+        ({"rate": 0.1}, "training.rate is not a known key; it is called training.learning_rate now; write "),
         ({"symmetry": "upright"}, "training.symmetry must be one of .*, got 'upright'; upright is called gravity now"),
         ({"raet": 0.1}, "training.raet is not a known key; known keys: "),
     ):

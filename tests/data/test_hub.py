@@ -60,10 +60,7 @@ def test_weights_come_from_a_repository(url, hub):
         ("hf://datasets/one/data", r"weights must be of a repository of weights, hf://USER/NAME"),
         ("hf://one/two", r"weights must name one of a.safetensors, b.safetensors, got 'hf://one/two'"),
         ("hf://one/none", r"weights must name a repository with a .safetensors file"),
-        (
-            "hf://one/absent",
-            r"weights must be open to this program, got hf://one/absent refused or .*HF_TOKEN",
-        ),
+        ("hf://one/absent", r"weights must be open to this program, got hf://one/absent refused or .*HF_TOKEN"),
         ("hf://one/net/other.safetensors", r"weights must be a file of the repository, got .*has no such file"),
         ("hf://one/private/x.safetensors", r"weights must be open to this program"),
     ],

@@ -61,14 +61,7 @@ def test_plain_tar_and_webdataset_read_shards(folder):
     names = subprocess.run(["tar", "-tf", shard], capture_output=True, text=True, check=True).stdout.split()
     assert names[:6] == [
         f"train-000002.{name}"
-        for name in (
-            "position.npy",
-            "velocity.npy",
-            "material.npy",
-            "obstacle_cell.npy",
-            "obstacle_normal.npy",
-            "json",
-        )
+        for name in ("position.npy", "velocity.npy", "material.npy", "obstacle_cell.npy", "obstacle_normal.npy", "json")
     ]
     samples = list(webdataset.WebDataset(str(shard), shardshuffle=False).decode())
     stored = EpisodeStore(folder, "train").episodes[2:4]
@@ -177,10 +170,7 @@ def test_full_disk_leaves_nothing_half_written(make_config, make_dataset, stage,
         stage(writer, "train", 0)
         writer.publish_next()
         before = hashes(writer.folder)
-    with (
-        pytest.raises(OSError, match=r"No space left on device: .*data"),
-        DatasetWriter(make_config()) as writer,
-    ):
+    with pytest.raises(OSError, match=r"No space left on device: .*data"), DatasetWriter(make_config()) as writer:
         full_disk(after)
         for index in (1, 2, 3):
             stage(writer, "train", index)
@@ -256,10 +246,7 @@ def test_shards_that_wait_are_packed_together(make_config, stage, tmp_path, monk
 @pytest.mark.parametrize("after", range(0, 12, 2))
 def test_full_disk_while_several_are_packed(make_config, make_dataset, stage, full_disk, after):
     """A full disk in any of several packers ends the run with its message and no partial file; then it goes on."""
-    with (
-        pytest.raises(OSError, match=r"No space left on device: .*data"),
-        DatasetWriter(make_config()) as writer,
-    ):
+    with pytest.raises(OSError, match=r"No space left on device: .*data"), DatasetWriter(make_config()) as writer:
         while writer.claim_next():
             pass
         for split, index in writer.remaining():

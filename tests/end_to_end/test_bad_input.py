@@ -261,10 +261,7 @@ def test_damaged_checkpoint(place, command, capsys, monkeypatch):
     ("change", "message"),
     [
         (lambda ours: ours.clear(), "checkpoint must be one of python -m hgn.train, got foreign.ckpt"),
-        (
-            lambda ours: ours["network"].update(wings=2),
-            "got foreign.ckpt: network.wings is not a known key; ",
-        ),
+        (lambda ours: ours["network"].update(wings=2), "got foreign.ckpt: network.wings is not a known key; "),
         (lambda ours: ours["network"].update(width=16), "got foreign.ckpt: size mismatch for "),
     ],
 )

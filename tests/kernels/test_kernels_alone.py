@@ -190,10 +190,7 @@ def test_empty_levels(precision, table):
     assert not engine.totals.any() and not engine.output.any()
 
 
-@pytest.mark.parametrize(
-    ("precision", "half_cells", "half_sums"),
-    [("tf32", False, False), ("fp16", True, True)],
-)
+@pytest.mark.parametrize(("precision", "half_cells", "half_sums"), [("tf32", False, False), ("fp16", True, True)])
 @pytest.mark.usefixtures("many_rows")
 def test_inference(precision, half_cells, half_sums, table):
     """The kernels where nothing is kept for gradients and buffers are shared, in fp16 with cells rounded

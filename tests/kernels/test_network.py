@@ -158,12 +158,7 @@ def test_rounded_reference():
 @gpu
 @pytest.mark.gpu
 @pytest.mark.parametrize(
-    ("precision", "counts", "draws"),
-    [
-        ("tf32", (300, 131, 77), 5),
-        ("fp16", (300, 131, 77), 5),
-        ("tf32", (1,), 9),
-    ],
+    ("precision", "counts", "draws"), [("tf32", (300, 131, 77), 5), ("fp16", (300, 131, 77), 5), ("tf32", (1,), 9)]
 )
 def test_whole_networks_on_a_gpu(precision, counts, draws):
     """With all levels and steps, in TF32 and float16, the median error of several states is at most 1.5 times that of

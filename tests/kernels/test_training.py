@@ -189,12 +189,7 @@ GOLD, HALF = "it needs gold", "it has no fp16"
             ("torch", "training backend: torch (not triton: it needs gold), precision tf32"),
         ),
         ("triton", "tf32", (GOLD, None), "training.backend must be torch or auto here, got triton: it needs gold"),
-        (
-            "auto",
-            "fp16",
-            (GOLD, HALF),
-            "precision must be tf32 or fp32 on backend torch, got fp16; triton: it",
-        ),
+        ("auto", "fp16", (GOLD, HALF), "precision must be tf32 or fp32 on backend torch, got fp16; triton: it"),
         ("torch", "fp16", (None, HALF), "got fp16; training.backend=torch was asked for"),
     ],
 )

@@ -102,8 +102,7 @@ def parameters_of(updates):
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "directions"),
-    [("adam", torch.float32), ("muon", torch.float32), ("muon", torch.bfloat16)],
+    ("optimizer", "directions"), [("adam", torch.float32), ("muon", torch.float32), ("muon", torch.bfloat16)]
 )
 def test_updates_are_those_of_torch(optimizer, directions, monkeypatch):
     """Two updates of two scenes, with and without obstacles, at different rates, weighted:
@@ -115,10 +114,7 @@ def test_updates_are_those_of_torch(optimizer, directions, monkeypatch):
     small, grid = episode(1, 5, True)
     open_space, none = episode(2, 3, False)
     wide, other = episode(3, 5, True, spread=0.6)
-    chunk = [
-        [(small, 0, 1, 0.3), (open_space, 1, 2)],
-        [(wide, 2, 3), (open_space, 0, 4, 1.7)],
-    ]
+    chunk = [[(small, 0, 1, 0.3), (open_space, 1, 2)], [(wide, 2, 3), (open_space, 0, 4, 1.7)]]
     rates = [1e-3, 3e-4]
     updates = updates_of(network, 2, capacities=(32, 16), optimizer=optimizer)
     updates.run(chunk, rates)

@@ -110,10 +110,7 @@ def test_hierarchy_is_what_the_definition_says(particles, scenes):
         assert set(zip(level.sender_E.tolist(), level.receiver_E.tolist(), strict=True)) == neighbours
 
 
-@given(
-    st.integers(0, SCENE_LIMIT - 1),
-    st.tuples(*[st.integers(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1)] * 3),
-)
+@given(st.integers(0, SCENE_LIMIT - 1), st.tuples(*[st.integers(-COORDINATE_LIMIT, COORDINATE_LIMIT - 1)] * 3))
 def test_keys_round_trip(scene, cell):
     """Packing loses nothing over the whole range, and no key is negative."""
     key = pack(torch.tensor([scene]), torch.tensor([cell]))

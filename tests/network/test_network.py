@@ -21,8 +21,7 @@ from hgn.network.obstacles import ObstacleCells
 
 
 @pytest.mark.parametrize(
-    ("changes", "millions"),
-    [({}, 3.50), ({"message_passing_steps": 2}, 1.88), ({"obstacle_features": False}, 3.50)],
+    ("changes", "millions"), [({}, 3.50), ({"message_passing_steps": 2}, 1.88), ({"obstacle_features": False}, 3.50)]
 )
 def test_parameter_counts_are_the_papers(changes, millions):
     """3.50 million at M = 4 and 1.88 million at M = 2, width 128."""

@@ -27,10 +27,7 @@ def scene():
         position_N3=(np.array([0.4, 0.42, 0.4]) + 0.15 * rng.random((PARTICLES, 3))).astype(np.float32),
         velocity_N3=rng.normal(0, 0.2, (PARTICLES, 3)).astype(np.float32),
         material_N=rng.integers(0, 3, PARTICLES).astype(np.uint8),
-        obstacles=(
-            shape_obstacle("cone", 0.2, (0.5, 0.38, 0.5)),
-            shape_obstacle("square", 0.2, (0.5, 0.36, 0.5)),
-        ),
+        obstacles=(shape_obstacle("cone", 0.2, (0.5, 0.38, 0.5)), shape_obstacle("square", 0.2, (0.5, 0.36, 0.5))),
     )
 
 

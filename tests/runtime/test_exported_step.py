@@ -30,12 +30,7 @@ FRAMES = 4
 NETWORKS = {
     "absolute": {},
     "relative": {"inputs": "relative"},
-    "contacts": {
-        "inputs": "relative",
-        "contact_gate": "cell",
-        "contact_forces": "normal",
-        "rest_threshold": 0.3,
-    },
+    "contacts": {"inputs": "relative", "contact_gate": "cell", "contact_forces": "normal", "rest_threshold": 0.3},
 }
 SIZES = [(particles, obstacles) for particles in (1, 216, 4_096, 30_000) for obstacles in (True, False)]
 SCENE = str(config_directory() / "example/own_mesh.yaml")

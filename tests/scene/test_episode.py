@@ -74,9 +74,7 @@ def test_bytes_are_a_function_of_the_content():
     """Memory layout and key order of the input leave no trace in the stored bytes."""
     episode = make_episode()
     other = dataclasses.replace(
-        episode,
-        position_TN3=np.asfortranarray(episode.position_TN3),
-        solver=dict(reversed(episode.solver.items())),
+        episode, position_TN3=np.asfortranarray(episode.position_TN3), solver=dict(reversed(episode.solver.items()))
     )
     assert encode_episode(episode) == encode_episode(other)
 
@@ -186,14 +184,8 @@ BROKEN_MEMBERS: list[tuple[dict[str, bytes | None], str]] = [
     ({"json": description(gravity=[0.0, 1.0])}, "gravity must be a list of 3 values"),
     ({"position.npy": b""}, "position.npy must be a plain .npy file"),
     ({"position.npy": b"PK\x03\x04 zip"}, "position.npy must be a plain .npy file"),
-    (
-        {"position.npy": npy(np.zeros((4, 5, 3), np.float32))[:-1]},
-        "position.npy must hold 240 bytes .*, got 239",
-    ),
-    (
-        {"position.npy": npy(np.zeros((4, 5, 3), np.float32)) + b"x"},
-        "position.npy must hold 240 bytes .*, got 241",
-    ),
+    ({"position.npy": npy(np.zeros((4, 5, 3), np.float32))[:-1]}, "position.npy must hold 240 bytes .*, got 239"),
+    ({"position.npy": npy(np.zeros((4, 5, 3), np.float32)) + b"x"}, "position.npy must hold 240 bytes .*, got 241"),
     ({"position.npy": npy(np.zeros((4, 5, 3)))}, "position.npy must be of type <f4 in C order, got <f8"),
     ({"position.npy": npy(np.zeros((4, 5, 3), np.float32, order="F"))}, "got <f4, Fortran order"),
     ({"position.npy": npy(np.zeros((4, 15), np.float32))}, "position.npy must have 3 dimensions"),

@@ -33,10 +33,7 @@ def make_rollout(reference_frames=3):
     generator = np.random.default_rng(0)
     triangle = Obstacle("sheet", generator.random((3, 3)), np.array([[0, 1, 2]], np.int32), closed=False)
     tetrahedron = Obstacle(
-        "tetrahedron",
-        np.eye(4, 3),
-        np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32),
-        closed=True,
+        "tetrahedron", np.eye(4, 3), np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32), closed=True
     )
     reference = None
     if reference_frames is not None:

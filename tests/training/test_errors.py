@@ -7,8 +7,7 @@ from hgn.training.errors import format_ratio, mean_so_far
 
 
 @pytest.mark.parametrize(
-    ("gain", "text"),
-    [(18.5, "18.50 times below"), (1.0, "1.00 times below"), (0.1, "10.00 times above")],
+    ("gain", "text"), [(18.5, "18.50 times below"), (1.0, "1.00 times below"), (0.1, "10.00 times above")]
 )
 def test_gain_in_words(gain, text):
     """An error that is larger than the other is not said to be below it."""
