@@ -3,20 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from mpm_scenes import block, sheet
 
 from hgn.config import MpmConfig
-from hgn.scene.scene import Obstacle, Scene
-
-SHEET = Obstacle(
-    "sheet", np.array([[0.0, 0.3, 0], [1, 0.3, 0], [1, 0.3, 1], [0, 0.3, 1]]),
-    np.array([[0, 1, 2], [0, 2, 3]], np.int32), False,
-)  # fmt: skip
 
 
 def _scene():
-    position = np.random.default_rng(0).uniform((0.3, 0.35, 0.3), (0.5, 0.55, 0.5), (3000, 3)).astype(np.float32)
-    kinds = (np.arange(3000) % 3).astype(np.uint8)
-    return Scene(position, np.tile(np.float32((0, -2, 0)), (3000, 1)), kinds, (SHEET,), cell_size=1 / 32)
+    low, high, room = (0.3, 0.35, 0.3), (0.5, 0.55, 0.5), {"obstacles": (sheet(0.3),), "cell_size": 1 / 32}
+    return block(np.arange(3000) % 3, low, high, (0, -2, 0), count=3000, **room)
 
 
 @pytest.mark.gpu

@@ -4,19 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from mpm_scenes import BOX, CELL, QUAD, beside, box_corners, particles, sheet, simulated
 
 from datagen.mpm.collider import HIDDEN, SEEN, build_collider
-from datagen.mpm.solver import Simulated, simulate
 from hgn.config import MpmConfig
 from hgn.scene.distance import closest_points, contains
 from hgn.scene.material import MATERIALS
-from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.scene import Obstacle
 from hgn.scene.shapes import shape_obstacle
 from hgn.schema import ConfigError
-
-CELL = 1 / 16
-QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-CONFIG = MpmConfig(device="cpu")
 
 NO_NODES = {
     "node_K3": np.zeros((0, 3), np.int32),
@@ -27,34 +23,25 @@ NO_NODES = {
 }
 
 
-def sheet(y, low=-0.2, high=1.2):
-    return Obstacle("sheet", np.array([[low, y, low], [high, y, low], [high, y, high], [low, y, high]]), QUAD, False)
+def wide_sheet(height):
+    """Beyond the domain on all sides."""
+    return sheet(height, -0.2, 1.2)
 
 
 def box(low, high, flip=False):
-    """A closed box of twelve triangles; corner number is 4 x + 2 y + z."""
-    vertex = np.array([[(low, high)[x][0], (low, high)[y][1], (low, high)[z][2]] for x in (0, 1) for y in (0, 1) for z in (0, 1)])  # fmt: skip # noqa: E501
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangle = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.int32)
-    return Obstacle("box", vertex.astype(float), triangle[:, ::-1] if flip else triangle, True)
+    return Obstacle("box", box_corners(low, high), BOX[:, ::-1] if flip else BOX, True)
 
 
-def scene_of(*obstacles, cell_size=CELL, **particles):
-    empty = {"position_N3": np.zeros((0, 3), np.float32), "velocity_N3": np.zeros((0, 3), np.float32), "material_N": np.zeros(0, np.uint8)}  # fmt: skip # noqa: E501
-    return Scene(**{**empty, **particles}, obstacles=obstacles, cell_size=cell_size)
+def scene_of(*obstacles, **scene):
+    return particles([], obstacles=obstacles, **scene)
 
 
 def dropped(material, y, speed, *obstacles):
-    position = np.random.default_rng(0).uniform((0.4, y, 0.4), (0.6, y + 0.15, 0.6), (250, 3)).astype(np.float32)
-    velocity = np.tile(np.float32([0, -speed, 0]), (250, 1))
-    return scene_of(*obstacles, position_N3=position, velocity_N3=velocity, material_N=np.full(250, material, np.uint8))
+    place_N3 = np.random.default_rng(0).uniform((0.4, y, 0.4), (0.6, y + 0.15, 0.6), (250, 3))
+    return particles(place_N3, material, (0, -speed, 0), obstacles=obstacles)
 
 
-# a particle of each material: with it beside, every test shares one compiled kernel
-BESIDE = scene_of(
-    sheet(0.2), position_N3=np.float32([[x, 0.5, 0.5] for x in (0.3, 0.45, 0.6, 0.75)]),
-    velocity_N3=np.zeros((4, 3), np.float32), material_N=np.arange(4).astype(np.uint8),
-)  # fmt: skip
+BESIDE = beside(wide_sheet(0.2))
 
 
 def test_sheet_nodes():
@@ -64,7 +51,7 @@ def test_sheet_nodes():
     """
     for offset in (0.0, 0.1, 0.3, 0.39, 0.41, 0.5, 0.9):
         y = 5 + offset
-        collider = build_collider(scene_of(sheet(y * CELL)), 0.5)
+        collider = build_collider(scene_of(wide_sheet(y * CELL)), 0.5)
         height = collider.node_K3[:, 1] - y
         assert len(collider.node_K3) == 16 * 16 * len(set(height))
         assert set(collider.node_K3[:, 1]) == {n for n in range(16) if abs(n - y) <= 1.5}
@@ -138,7 +125,7 @@ def test_sheet_nodes_of_a_crumpled_mesh():
 
 def test_closest_obstacle_wins():
     """Between two sheets each node takes the nearer one."""
-    both = build_collider(scene_of(sheet(5.1 * CELL), sheet(7.1 * CELL)), 0.5)
+    both = build_collider(scene_of(wide_sheet(5.1 * CELL), wide_sheet(7.1 * CELL)), 0.5)
     at = {int(y): both.node_K3[:, 1] == y for y in (4, 6, 7, 8)}
     normal = {y: round(float(both.normal_K23[rows, HIDDEN][0, 1])) for y, rows in at.items()}
     # node 6 is 0.9 above the lower sheet and 1.1 below the upper one
@@ -181,9 +168,8 @@ def test_one_huge_triangle_and_many_small_ones():
 def test_sheets_do_not_leak(speed, offset):
     """Nothing passes an axis-aligned sheet at 3 and 10 m/s, wherever it lies between the nodes."""
     y = (5 + offset) * CELL
-    scenes = [dropped(material, y + 2.5 * CELL, speed, sheet(y)) for material in range(len(MATERIALS))]
-    for name, outcome in zip(MATERIALS, simulate(scenes, CONFIG, 11, 60.0), strict=True):
-        assert isinstance(outcome, Simulated), (name, outcome)
+    scenes = [dropped(material, y + 2.5 * CELL, speed, wide_sheet(y)) for material in range(len(MATERIALS))]
+    for name, outcome in zip(MATERIALS, simulated(scenes, frames=11), strict=True):
         assert outcome.position_TN3[:, :, 1].min() > y, name
 
 
@@ -192,8 +178,7 @@ def test_bodies_keep_particles_out():
     thick = box((0.3, 0.25, 0.3), (0.7, 0.5, 0.7))
     thin = box((0.1, 0.48, 0.1), (0.9, 0.5, 0.9))
     scenes = [dropped(material, 0.63, 4, body) for material in range(3) for body in (thick, thin)]
-    for outcome in simulate([*scenes, BESIDE], CONFIG, 11, 60.0):
-        assert isinstance(outcome, Simulated), outcome
+    for outcome in simulated([*scenes, BESIDE], frames=11):
         assert outcome.counters["particles_inside_obstacles_at_start"] == 0
         assert outcome.counters["particles_inside_obstacles_at_end"] == 0
 
@@ -201,8 +186,7 @@ def test_bodies_keep_particles_out():
 def test_particles_inside_at_the_start_are_counted():
     """Particles that begin inside a body are counted, and the simulation stays finite."""
     scene = dropped(0, 0.4, 0, box((0.3, 0.3, 0.3), (0.7, 0.7, 0.7)))
-    outcome, _ = simulate([scene, BESIDE], CONFIG, 3, 60.0)
-    assert isinstance(outcome, Simulated)
+    outcome, _ = simulated([scene, BESIDE], frames=3)
     assert outcome.counters["particles_inside_obstacles_at_start"] == 250
     assert np.isfinite(outcome.position_TN3).all()
 
@@ -210,7 +194,7 @@ def test_particles_inside_at_the_start_are_counted():
 def test_swept_test_alone_holds():
     """Without contact at the nodes particles pass a sheet and a cone; the swept test lets none pass, and counts."""
     cone = shape_obstacle("cone", 0.5, (0.5, 0.4, 0.5))
-    obstacles = (sheet(5.3 * CELL), cone)
+    obstacles = (wide_sheet(5.3 * CELL), cone)
     scenes = [dropped(material, 0.68, 6, body) for material in range(len(MATERIALS)) for body in obstacles]
     for projection in (False, True):
         config = MpmConfig(device="cpu", collider_band_cells=0.0, collider_projection=projection)
@@ -220,8 +204,7 @@ def test_swept_test_alone_holds():
             sweep = dataclasses.replace(collider.sweep, sheets_K=0 * collider.sweep.sheets_K)
             colliders.append(dataclasses.replace(collider, sweep=sweep, **NO_NODES))
         passed, counted = [], []
-        for scene, outcome in zip(scenes, simulate(scenes, config, 13, 60.0, colliders=colliders), strict=True):
-            assert isinstance(outcome, Simulated), outcome
+        for scene, outcome in zip(scenes, simulated(scenes, config, 13, colliders=colliders), strict=True):
             counted.append(outcome.counters["surface_projections"])
             path = outcome.position_TN3.reshape(-1, 3)
             passed.append(contains(path, cone).sum() if scene.obstacles[0].closed else (path[:, 1] < 5.3 * CELL).sum())

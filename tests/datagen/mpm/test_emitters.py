@@ -4,16 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from mpm_scenes import CELL, CONFIG, particles, sheet, simulated
 
-from datagen.mpm.solver import Simulated, simulate
-from hgn.config import MpmConfig
+from datagen.mpm.solver import simulate
 from hgn.scene.emission import Face, entry_frames
 from hgn.scene.material import MATERIALS, SNOW, WATER
-from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
-CELL = 1 / 16
-CONFIG = MpmConfig(device="cpu")
 RATE_HZ = 60.0
 STOP = 0.15
 
@@ -24,11 +21,9 @@ def jet(material, face, **scene):
     body = rng.uniform(0.2, 0.28, (40, 3))
     place, time = face.draw(0.0, STOP, face.count(STOP, 8.0, CELL), rng)
     velocity = np.repeat([(0.0, 0.0, 0.0), face.velocity], [40, len(place)], axis=0)
-    return Scene(
-        np.concatenate([body, place]).astype(np.float32), velocity.astype(np.float32),
-        np.append(np.arange(40) % len(MATERIALS), np.full(len(place), material)).astype(np.uint8), cell_size=CELL,
-        entry_s_N=np.concatenate([np.zeros(40), time]), particles_per_cell=8.0, **scene,
-    )  # fmt: skip
+    kinds = np.append(np.arange(40) % len(MATERIALS), np.full(len(place), material))
+    entry = {"entry_s_N": np.concatenate([np.zeros(40), time]), "particles_per_cell": 8.0}
+    return particles(np.concatenate([body, place]), kinds, velocity, **entry, **scene)
 
 
 UP = Face((0.5, 0.35, 0.5), (0.3, 2.0, 0.0), radius=0.06)
@@ -40,8 +35,7 @@ def test_what_enters_flies_freely_and_none_is_lost():
     material, the centre of what entered is where free flight from the face has it, within 2e-4 of its way.
     """
     scenes = [jet(WATER, UP), jet(SNOW, ASIDE)]
-    for scene, face, outcome in zip(scenes, (UP, ASIDE), simulate(scenes, CONFIG, 12, RATE_HZ), strict=True):
-        assert isinstance(outcome, Simulated), outcome
+    for scene, face, outcome in zip(scenes, (UP, ASIDE), simulated(scenes, frames=12), strict=True):
         late = scene.entry_s_N > 0
         rate = face.area * np.linalg.norm(face.velocity) * 8 / CELL**3
         assert late.sum() == round(rate * STOP)
@@ -62,26 +56,20 @@ def test_emitters_leave_their_batch_alone():
     """A scene that particles enter is the same, bitwise, alone and beside others, and these are what they are alone."""
     emitting = jet(WATER, UP)
     still = dataclasses.replace(emitting, entry_s_N=None)
-    together = simulate([still, emitting, still], CONFIG, 6, RATE_HZ)
+    together = simulated([still, emitting, still], frames=6)
     for scene, outcome in zip((still, emitting, still), together, strict=True):
-        (alone,) = simulate([scene], CONFIG, 6, RATE_HZ)
-        assert isinstance(alone, Simulated) and isinstance(outcome, Simulated)
+        (alone,) = simulated([scene], frames=6)
         assert np.array_equal(alone.position_TN3, outcome.position_TN3, equal_nan=True)
         assert alone.counters == outcome.counters
 
 
 def test_an_obstacle_in_the_way_is_refused():
     """A sheet between the face and where particles are first seen would let them through."""
-    corner = np.array([[0.0, 0.36, 0], [1, 0.36, 0], [1, 0.36, 1], [0, 0.36, 1]])
-    sheet = Obstacle("sheet", corner, np.array([[0, 1, 2], [0, 2, 3]], np.int32), False)
     with pytest.raises(ConfigError, match=r"emitters must be clear of obstacles for the first frame .* through sheet"):
-        simulate([jet(WATER, UP, obstacles=(sheet,))], CONFIG, 3, RATE_HZ)
+        simulate([jet(WATER, UP, obstacles=(sheet(0.36),))], CONFIG, 3, RATE_HZ)
 
 
 def test_entry_frames():
     """A particle is seen first in the frame at its time of entry or after it; those of the start in frame 0."""
-    scene = Scene(
-        np.full((4, 3), 0.5, np.float32), np.zeros((4, 3), np.float32), np.zeros(4, np.uint8),
-        entry_s_N=np.array([0.0, 0.001, 1 / 60, 0.02]),
-    )  # fmt: skip
+    scene = particles(np.full((4, 3), 0.5), entry_s_N=np.array([0.0, 0.001, 1 / 60, 0.02]))
     assert entry_frames(scene, 60.0).tolist() == [0, 1, 1, 2]

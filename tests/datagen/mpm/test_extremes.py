@@ -2,26 +2,13 @@
 
 import numpy as np
 import pytest
+from mpm_scenes import CELL, CONFIG, assert_inside, beside, particles, simulated
 
-from datagen.mpm.solver import SceneFailure, Simulated, particle_bounds, simulate
+from datagen.mpm.solver import SceneFailure, simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import SAND, SNOW, WATER
 from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
-
-CELL = 1 / 16
-CONFIG = MpmConfig(device="cpu")
-
-
-def scene_of(place_N3, velocity, material_N, **scene):
-    place = np.asarray(place_N3, np.float32)
-    return Scene(
-        place, np.tile(np.float32(velocity), (len(place), 1)), material_N.astype(np.uint8), cell_size=CELL, **scene
-    )
-
-
-# a particle of each material: with it beside, several tests share one compiled kernel
-BESIDE = scene_of(np.array([[x, 0.5, 0.5] for x in (0.3, 0.45, 0.6, 0.75)]), (0, 0, 0), np.arange(4))
 
 
 @pytest.mark.parametrize("distance", [1000.0, -1000.0])
@@ -30,7 +17,7 @@ def test_a_scene_a_thousand_away(distance):
     place = np.full((4, 3), 0.5)
     place[:, 0] += distance
     with pytest.raises(ConfigError, match=r"position_N3 of scene 0 .* within the walls.*move the particles"):
-        simulate([scene_of(place, (0, 0, 0), np.zeros(4))], CONFIG, 2, 60.0)
+        simulate([particles(place)], CONFIG, 2, 60.0)
 
 
 def test_the_far_end_of_a_long_domain():
@@ -39,10 +26,9 @@ def test_the_far_end_of_a_long_domain():
     paths = []
     for shift in (0, 1000):
         away = np.array([shift, 0, 0])
-        moved = ((place + away) * CELL).astype(np.float32)
-        scene = scene_of(moved, (0, -2, 0), np.full(64, WATER), domain_size=(1020 * CELL, 10 * CELL, 10 * CELL))
-        (outcome,) = simulate([scene], CONFIG, 4, 60.0)
-        assert isinstance(outcome, Simulated), outcome
+        domain = (1020 * CELL, 10 * CELL, 10 * CELL)
+        scene = particles((place + away) * CELL, WATER, (0, -2, 0), domain_size=domain)
+        (outcome,) = simulated([scene], frames=4)
         paths.append(outcome.position_TN3.astype(float) - away * CELL)
     assert np.abs(paths[1] - paths[0]).max() < 0.01 * CELL
 
@@ -53,19 +39,17 @@ def test_several_cells_a_substep(material):
     particles inside, never out of range.
     """
     place = np.random.default_rng(1).uniform(0, 2, (64, 3)) * CELL + 0.45
-    scene = scene_of(place, (300, -950, 0), np.full(64, material))
-    low, high = particle_bounds(scene, CONFIG)
-    outcome, _ = simulate([scene, BESIDE], CONFIG, 2, 960.0)
-    assert isinstance(outcome, Simulated), outcome
-    assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+    scene = particles(place, material, (300, -950, 0))
+    outcome, _ = simulated([scene, beside()], rate_hz=960.0)
+    assert_inside(outcome.position_TN3, scene)
     assert outcome.counters["smallest_time_step_s"] <= 0.3 * CELL / 990
     fixed = MpmConfig(device="cpu", time_step="fixed")
-    scenes = [scene, scene_of(place, (0, 1000, 0), np.full(64, material))]
-    for outcome in simulate([*scenes, BESIDE], fixed, 3, 60.0)[:2]:
+    scenes = [scene, particles(place, material, (0, 1000, 0))]
+    for outcome in simulate([*scenes, beside()], fixed, 3, 60.0)[:2]:
         if isinstance(outcome, SceneFailure):
             assert outcome.cause.startswith("frame ")
         else:
-            assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+            assert_inside(outcome.position_TN3, scene)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -78,4 +62,4 @@ def test_numbers_that_are_not_finite(bad):
         with pytest.raises(ConfigError, match=f"{field} must be finite.*particle 1"):
             Scene(**values, material_N=np.zeros(3, np.uint8), cell_size=CELL)
     with pytest.raises(ConfigError, match="gravity of scene 0 must be finite"):
-        simulate([scene_of(place, (0, 0, 0), np.zeros(3), gravity=(0.0, bad, 0.0))], CONFIG, 2, 60.0)
+        simulate([particles(place, gravity=(0.0, bad, 0.0))], CONFIG, 2, 60.0)

@@ -4,38 +4,34 @@ import dataclasses
 
 import numpy as np
 import pytest
+from mpm_scenes import BOX, CELL, QUAD, box_corners, particles, sheet, simulated
 
 from datagen.mpm.grid_launch import motion_parts
-from datagen.mpm.solver import Simulated, simulate
+from datagen.mpm.solver import simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, MATERIALS, SAND, SNOW
 from hgn.scene.motion import Motion, turned, turning
 from hgn.scene.rotation import euler_rotation, rotate
-from hgn.scene.scene import Obstacle, Scene
+from hgn.scene.scene import Obstacle
 from hgn.schema import ConfigError
 
-CELL, CELLS = 1 / 16, 18
+CELLS = 18
 MIDDLE = np.full(3, CELL * CELLS / 2)
-CONFIG = MpmConfig(device="cpu")
 RATE_HZ = 60.0
-QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 TILT = euler_rotation((20.0, 0.0, 10.0))
 
 
 def plate(height, rotation, closed):
     """A wide level sheet so many cells above the middle, or a box that ends there, turned about the middle."""
-    corner = np.array([[x, y, z] for x in (-30, 30) for y in (height - 20, height) for z in (-30, 30)], float)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangle = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.int32)
+    corner, triangle = box_corners((-30, height - 20, -30), (30, height, 30)), BOX
     if not closed:
         corner, triangle = corner[[2, 6, 7, 3]], QUAD
     return Obstacle("plate", rotate(corner, rotation) * CELL + MIDDLE, triangle, closed)
 
 
-def sheet(floor):
+def wide_sheet(floor):
     """A level one so many cells high, from wall to wall."""
-    corner = np.array([[-9, floor, -9], [30, floor, -9], [30, floor, 30], [-9, floor, 30]], float) * CELL
-    return Obstacle("sheet", corner, QUAD, False)
+    return sheet(floor * CELL, -9 * CELL, 30 * CELL)
 
 
 def moving(obstacle, time, translation, degrees=None):
@@ -46,21 +42,17 @@ def moving(obstacle, time, translation, degrees=None):
 
 def block(material, low, size, rotation, obstacle, gravity):
     count = round(8 * np.prod(size))
-    place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * size + low
-    return Scene(
-        (rotate(place, rotation) * CELL + MIDDLE).astype(np.float32), np.zeros((count, 3), np.float32),
-        np.full(count, material, np.uint8), (obstacle,), (CELLS * CELL,) * 3, CELL, (0.0, -gravity, 0.0),
-    )  # fmt: skip
+    place = rotate(np.random.default_rng(0).uniform(0, 1, (count, 3)) * size + low, rotation) * CELL + MIDDLE
+    domain = (CELLS * CELL,) * 3
+    return particles(place, material, obstacles=(obstacle,), domain_size=domain, gravity=(0.0, -gravity, 0.0))
 
 
 def paths(scenes, seconds):
     """In cells from the middle; with a moving sheet and all materials beside, tests share one compiled kernel."""
-    still = moving(sheet(2.5), [0.0, 1.0], [np.zeros(3)] * 2)
-    place = np.float32([[4.5, height, 4.5] for height in (5, 6, 7, 8)]) * np.float32(CELL)
-    kinds, domain = np.arange(4).astype(np.uint8), scenes[0].domain_size
-    beside = Scene(place, np.zeros((4, 3), np.float32), kinds, (still,), domain, CELL)
-    outcomes = simulate([*scenes, beside], CONFIG, 1 + round(seconds * RATE_HZ), RATE_HZ)[: len(scenes)]
-    assert all(isinstance(outcome, Simulated) for outcome in outcomes), outcomes
+    still = moving(wide_sheet(2.5), [0.0, 1.0], [np.zeros(3)] * 2)
+    place = CELL * np.array([[4.5, height, 4.5] for height in (5, 6, 7, 8)])
+    beside = particles(place, range(4), obstacles=(still,), domain_size=scenes[0].domain_size)
+    outcomes = simulated([*scenes, beside], frames=1 + round(seconds * RATE_HZ))[: len(scenes)]
     return [(outcome.position_TN3.astype(np.float64) - MIDDLE) / CELL for outcome in outcomes]
 
 
@@ -71,14 +63,9 @@ def test_piston():
     count = round(8 * np.prod(size))
     place = np.random.default_rng(0).uniform(0, 1, (count, 3)) * size + [2, floor + 0.02, 2]  # from wall to wall
     way = [0.0, speed * (seconds - start), 0.0]
-    piston = moving(sheet(floor), [start, seconds], [np.zeros(3), way])
-    scenes = [
-        Scene(
-            (place * CELL).astype(np.float32), np.zeros((count, 3), np.float32), np.full(count, material, np.uint8),
-            (piston,), ((wide + 5) * CELL, 16 * CELL, (wide + 5) * CELL), CELL, particles_per_cell=8.0,
-        )
-        for material in range(len(MATERIALS))
-    ]  # fmt: skip
+    piston = moving(wide_sheet(floor), [start, seconds], [np.zeros(3), way])
+    tube = {"domain_size": ((wide + 5) * CELL, 16 * CELL, (wide + 5) * CELL), "particles_per_cell": 8.0}
+    scenes = [particles(place * CELL, kind, obstacles=(piston,), **tube) for kind in range(len(MATERIALS))]
     last = round(0.15 * RATE_HZ)
     for name, path in zip(MATERIALS, paths(scenes, seconds), strict=True):
         height = path[:, :, 1].mean(axis=1) * CELL
@@ -114,13 +101,8 @@ def test_paddle():
     turns = np.stack([euler_rotation((0, np.degrees(faster * t * t / 2), 0)) for t in time])
     blade = Obstacle("blade", corner, QUAD, False, motion=Motion(time, np.zeros((21, 3)), turns, tuple(middle)))
     place = np.random.default_rng(0).uniform(0, 1, (192, 3)) * [2, 4, 3] + [1.5, -2, -3.1]
-    scenes = [
-        Scene(
-            (place * CELL + middle).astype(np.float32), np.zeros((192, 3), np.float32), np.full(192, kind, np.uint8),
-            (blade,), (24 * CELL,) * 3, CELL, (0.0, 0.0, 0.0),
-        )
-        for kind in range(len(MATERIALS))
-    ]  # fmt: skip
+    room = {"obstacles": (blade,), "domain_size": (24 * CELL,) * 3, "gravity": (0.0, 0.0, 0.0)}
+    scenes = [particles(place * CELL + middle, kind, **room) for kind in range(len(MATERIALS))]
     across, gyration = -place[:, 2].mean(), place[:, [0, 2]].var(axis=0).sum()
     step, along, sliding, closed = 1e-4, place[:, 0].mean(), 0.0, []
     for turned_s in np.arange(step, seconds, step):

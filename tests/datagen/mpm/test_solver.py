@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mpm_scenes import CELL, CONFIG, assert_inside, beside, block, joined, particles, sheet, simulated
 
 from datagen.mpm.device import initialise
 from datagen.mpm.solver import SceneFailure, Simulated, fixed_substeps, particle_bounds, simulate
@@ -16,46 +17,15 @@ from datagen.pool.worker import Backend, make_episode, make_scene, simulate_batc
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.scene.episode import decode_episode, encode_episode
 from hgn.scene.material import MATERIALS, SAND, SNOW, WATER
-from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
 
-CELL = 1 / 16
-ADAPTIVE = MpmConfig(device="cpu")
+ADAPTIVE = CONFIG
 FIXED = MpmConfig(device="cpu", time_step="fixed")
-
-
-def block(material, low, high, velocity=(0, 0, 0), seed=0, count=0, **scene):
-    """A box of particles at random places, eight a cell unless `count` is given."""
-    low, high = np.array(low), np.array(high)
-    count = count or int(8 * np.prod((high - low) / CELL))
-    position = np.random.default_rng(seed).uniform(low, high, (count, 3)).astype(np.float32)
-    return Scene(
-        position, np.tile(np.float32(velocity), (count, 1)), np.full(count, material, np.uint8),
-        cell_size=CELL, **scene,
-    )  # fmt: skip
-
-
-def joined(*scenes):
-    return Scene(
-        np.concatenate([s.position_N3 for s in scenes]), np.concatenate([s.velocity_N3 for s in scenes]),
-        np.concatenate([s.material_N for s in scenes]), scenes[0].obstacles, cell_size=CELL,
-        gravity=scenes[0].gravity,
-    )  # fmt: skip
-
-
-# a particle of each material: with it beside, every test shares one compiled kernel
-BESIDE = Scene(
-    np.float32([[x, 0.5, 0.5] for x in (0.3, 0.45, 0.6, 0.75)]), np.zeros((4, 3), np.float32),
-    np.arange(4).astype(np.uint8), cell_size=CELL,
-)  # fmt: skip
-
-
-def beside(scene):
-    return Scene(BESIDE.position_N3, BESIDE.velocity_N3, BESIDE.material_N, (), scene.domain_size, CELL)
+BESIDE = beside()
 
 
 def run(scene, config, frames):
-    outcome = simulate([scene, beside(scene)], config, frames, 60.0)[0]
+    outcome = simulate([scene, beside(domain_size=scene.domain_size)], config, frames, 60.0)[0]
     assert isinstance(outcome, Simulated), outcome
     return outcome
 
@@ -142,10 +112,7 @@ def test_impact_at_ten_metres_per_second(material, count):
     """The adaptive step bears an impact on the floor at 10 m/s, of a block and of a single particle."""
     scene = block(material, (0.4, 0.3, 0.4), (0.6, 0.45, 0.6), (0, -10, 0), count=count)
     outcome = run(scene, ADAPTIVE, 13)
-    low, high = particle_bounds(scene, ADAPTIVE)
-    assert np.isfinite(outcome.position_TN3).all()
-    assert (outcome.position_TN3 >= low).all()
-    assert (outcome.position_TN3 <= high).all()
+    assert_inside(outcome.position_TN3, scene)
     assert outcome.counters["position_clamps"] == 0
     assert outcome.counters["largest_speed"] < 15
 
@@ -156,20 +123,16 @@ def test_stiffening_water_bears_thirty_metres_per_second():
     floors = []
     for equation in ("linear", "stiffening"):
         config = MpmConfig(device="cpu", water_equation=equation)
-        outcome = simulate([scene], config, 7, 60.0)[0]
-        assert isinstance(outcome, Simulated), outcome
-        low, high = particle_bounds(scene, config)
-        assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+        (outcome,) = simulated([scene], config, 7)
+        assert_inside(outcome.position_TN3, scene, config)
         floors.append(outcome.counters["water_volume_floors"])
     assert floors[0] > 0 and floors[1] == 0
 
 
 def test_a_million_particles_in_one_cell():
     """A cell as full as memory allows: a frame passes, finite, and nothing is lost."""
-    position = np.random.default_rng(0).uniform(8 * CELL, 9 * CELL, (1_000_000, 3)).astype(np.float32)
-    scene = Scene(position, np.zeros_like(position), np.full(len(position), WATER, np.uint8), cell_size=CELL)
-    outcome = simulate([scene], MpmConfig(device="cpu", stability_fraction=1.0), 2, 60.0)[0]
-    assert isinstance(outcome, Simulated), outcome
+    scene = block(WATER, [8 * CELL] * 3, [9 * CELL] * 3, count=1_000_000)
+    (outcome,) = simulated([scene], MpmConfig(device="cpu", stability_fraction=1.0))
     assert np.isfinite(outcome.position_TN3[-1]).all()
     fall = (outcome.position_TN3[-1] - outcome.position_TN3[0])[:, 1].mean()
     # eight steps of a symplectic scheme fall further by an eighth
@@ -211,21 +174,16 @@ def test_walls():
         config = MpmConfig(device="cpu", wall_contact=contact)
         position = run(scene, config, 10).position_TN3
         moved.append((position[-1] - position[0])[:, 0].mean())
-        low, high = particle_bounds(scene, config)
-        assert ((position >= low) & (position <= high)).all()
+        assert_inside(position, scene, config)
     assert moved[0] == pytest.approx(2 * 9 / 60, rel=0.02)
     assert moved[1] < 0.7 * moved[0]
 
 
 def test_scenes_of_a_batch_equal_scenes_alone():
     """A scene's trajectory is bitwise the same alone and beside scenes of other size, material, obstacles and steps."""
-    sheet = Obstacle(
-        "sheet", np.array([[0.0, 0.3, 0], [1, 0.3, 0], [1, 0.3, 1], [0, 0.3, 1]]),
-        np.array([[0, 1, 2], [0, 2, 3]], np.int32), False,
-    )  # fmt: skip
     scenes = [
         block(WATER, (0.4, 0.2, 0.4), (0.5, 0.3, 0.5), (1, -3, 0)),
-        joined(block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet,)), BESIDE),
+        joined(block(SNOW, (0.4, 0.45, 0.4), (0.55, 0.6, 0.5), (0, -4, 0), seed=1, obstacles=(sheet(0.3),)), BESIDE),
         joined(block(SAND, (0.3, 0.2, 0.3), (0.4, 0.3, 0.4)), block(WATER, (0.5, 0.2, 0.3), (0.6, 0.3, 0.4)), BESIDE),
     ]
     steps = (0.5, 1.0, 0.25)
@@ -267,15 +225,8 @@ def test_few_particles(material):
         [[4 * CELL, 5 * CELL, 6 * CELL], [4.5 * CELL, 5 * CELL, 6.5 * CELL], [4.5 * CELL, 4.5 * CELL, 4.5 * CELL]],
         [np.full(3, 3 * CELL), np.full(3, 13 * CELL)],
     ]
-    scenes = [
-        Scene(
-            np.array(spot, np.float32), np.zeros((len(spot), 3), np.float32), np.full(len(spot), material, np.uint8),
-            cell_size=CELL,
-        )
-        for spot in spots
-    ]  # fmt: skip
-    for scene, outcome in zip(scenes, simulate([*scenes, BESIDE], ADAPTIVE, 20, 60.0), strict=False):
-        assert isinstance(outcome, Simulated), outcome
+    scenes = [particles(spot, material) for spot in spots]
+    for scene, outcome in zip(scenes, simulated([*scenes, BESIDE], ADAPTIVE, 20), strict=False):
         assert outcome.position_TN3.dtype == np.float32
         assert np.array_equal(outcome.position_TN3[0], scene.position_N3)
         assert np.isfinite(outcome.position_TN3).all()
@@ -286,25 +237,22 @@ def test_bounds_themselves_are_inside():
     for wall_cells in (2, 3, 5):
         config = MpmConfig(device="cpu", wall_cells=wall_cells)
         low, high = particle_bounds(block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=1), config)
-        position = np.array([low, high, [low[0], high[1], low[2]]], np.float32)
-        scene = Scene(position, np.full((3, 3), 2, np.float32), np.zeros(3, np.uint8), cell_size=CELL)
-        outcome = simulate([scene], config, 5, 60.0)[0]
-        assert isinstance(outcome, Simulated), outcome
-        assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+        scene = particles([low, high, [low[0], high[1], low[2]]], WATER, (2, 2, 2))
+        assert_inside(simulated([scene], config, 5)[0].position_TN3, scene, config)
 
 
 def test_a_domain_that_is_no_cube():
     """Sides of 1, 0.75 and 1.375 with nodes that are no multiple of the block size: material spreads to each wall."""
     scene = block(WATER, (0.3, 0.2, 0.3), (0.6, 0.5, 0.6), (3, 0, 4), domain_size=(1.0, 0.75, 1.375))
     position = run(scene, ADAPTIVE, 25).position_TN3
-    low, high = particle_bounds(scene, ADAPTIVE)
-    assert ((position >= low) & (position <= high)).all()
+    assert_inside(position, scene)
+    _, high = particle_bounds(scene, ADAPTIVE)
     assert (position.max(axis=(0, 1))[[0, 2]] > high[[0, 2]] - 2 * CELL).all()
 
 
 def test_empty():
     """No scenes give no results; scenes without particles give empty trajectories, also beside others."""
-    nothing = Scene(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.uint8), cell_size=CELL)
+    nothing = particles([])
     frames: list[int] = []
     assert simulate([], ADAPTIVE, 4, 60.0) == []
     (alone,) = simulate([nothing], ADAPTIVE, 4, 60.0, frames.append)
@@ -326,20 +274,19 @@ def test_one_frame_is_the_initial_state():
 
 def test_bad_input_is_refused():
     """Scenes outside the walls, of other grids, not finite, or no frames: an error that names the field."""
-    good = block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=4)
-    other = Scene(good.position_N3, good.velocity_N3, good.material_N)
-    outside = Scene(good.position_N3 + 0.8, good.velocity_N3, good.material_N, cell_size=CELL)
-    drifting = Scene(good.position_N3, good.velocity_N3, good.material_N, cell_size=CELL, gravity=(0, np.nan, 0))
-    uneven = Scene(good.position_N3, good.velocity_N3, good.material_N, cell_size=0.06)
-    small = Scene(good.position_N3, good.velocity_N3, good.material_N, cell_size=0.25)
-    late = Scene(good.position_N3, good.velocity_N3.copy(), good.material_N, cell_size=CELL)
+    good, late = (block(WATER, (0.4, 0.4, 0.4), (0.5, 0.5, 0.5), count=4) for _ in range(2))
     late.velocity_N3[0] = np.nan
-    for scenes, field in (
-        ([good, other], "cell_size"), ([good, outside], "position_N3 of scene 1"), ([drifting], "gravity"),
-        ([uneven], "domain_size"), ([small], "domain_size"), ([late], "velocity_N3"),
-    ):  # fmt: skip
+    for changes, field in (
+        ({"cell_size": 1 / 64}, "cell_size"),
+        ({"position_N3": good.position_N3 + 0.8}, "position_N3 of scene 1"),
+    ):
         with pytest.raises(ConfigError, match=field):
-            simulate(scenes, ADAPTIVE, 2, 60.0)
+            simulate([good, dataclasses.replace(good, **changes)], ADAPTIVE, 2, 60.0)
+    drifting = dataclasses.replace(good, gravity=(0, np.nan, 0))
+    uneven, small = (dataclasses.replace(good, cell_size=size) for size in (0.06, 0.25))
+    for scene, field in ((drifting, "gravity"), (uneven, "domain_size"), (small, "domain_size"), (late, "velocity_N3")):
+        with pytest.raises(ConfigError, match=field):
+            simulate([scene], ADAPTIVE, 2, 60.0)
     with pytest.raises(ConfigError, match="frames"):
         simulate([good], ADAPTIVE, 0, 60.0)
     with pytest.raises(ConfigError, match="frame_rate_hz"):
@@ -354,7 +301,7 @@ def test_memory_is_given_back():
     def resident():
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
-    scenes = [beside(BESIDE)] * 16
+    scenes = [BESIDE] * 16
     for _ in range(5):
         simulate(scenes, ADAPTIVE, 1, 60.0)
     before = resident()

@@ -5,28 +5,18 @@ A GPU runs it with hundreds of threads a block; here a block has one, and two bl
 
 import numpy as np
 import pytest
+from mpm_scenes import CELL, CONFIG, assert_inside, block, particles, sheet, simulated
 
 from datagen.mpm import solver, team_launch
 from datagen.mpm.device import Device
-from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, _teams_at_once, particle_bounds, simulate
+from datagen.mpm.solver import SceneFailure, Simulated, Team, _team, _teams_at_once, simulate
 from hgn.config import MpmConfig
-from hgn.scene.scene import Obstacle, Scene
 from hgn.schema import ConfigError
-
-CELL = 1 / 16
-CONFIG = MpmConfig(device="cpu")
-SHEET = Obstacle(
-    "sheet", np.array([[0.0, 0.3, 0], [1, 0.3, 0], [1, 0.3, 1], [0, 0.3, 1]]),
-    np.array([[0, 1, 2], [0, 2, 3]], np.int32), False,
-)  # fmt: skip
 
 
 def mixed(count, seed, velocity, **scene):
-    position = np.random.default_rng(seed).uniform((0.3, 0.4, 0.3), (0.5, 0.6, 0.5), (count, 3)).astype(np.float32)
-    return Scene(
-        position, np.tile(np.float32(velocity), (count, 1)), (np.arange(count) % 4).astype(np.uint8),
-        (SHEET,), cell_size=CELL, **scene,
-    )  # fmt: skip
+    kinds, low, high = np.arange(count) % 4, (0.3, 0.4, 0.3), (0.5, 0.6, 0.5)
+    return block(kinds, low, high, velocity, seed, count, obstacles=(sheet(0.3),), **scene)
 
 
 # particles of many densities beside: with them all tests of this file share a kernel of each launch
@@ -39,20 +29,19 @@ def test_teams_agree_with_the_other_launch():
     """
     scenes = [mixed(120, 0, (0, -3, 0)), HEAVY, mixed(1, 2, (0, 0, 0))]
     frames: list[int] = []
-    expected = simulate(scenes, CONFIG, 11, 60.0)
+    expected = simulated(scenes, frames=11)
     found = simulate([*scenes, mixed(40, 3, (0, 1e6, 0))], CONFIG, 11, 60.0, frames.append, team=Team(1))
     assert frames == list(range(11))
     failed = found.pop()
     assert isinstance(failed, SceneFailure) and failed.cause.startswith("frame 1: ")
     for scene, one, other in zip(scenes, expected, found, strict=True):
-        assert isinstance(one, Simulated) and isinstance(other, Simulated)
+        assert isinstance(other, Simulated)
         assert np.array_equal(other.position_TN3[0], scene.position_N3)
         assert np.abs(one.position_TN3[1] - other.position_TN3[1]).max() < 1e-6
         assert np.abs(one.position_TN3 - other.position_TN3).max() < 1e-3
         assert one.counters["substeps"] == other.counters["substeps"]
     # with all that the batch's kernel computes
-    alone = simulate(scenes[1:2], CONFIG, 11, 60.0, team=Team(1))[0]
-    assert isinstance(alone, Simulated)
+    (alone,) = simulated(scenes[1:2], frames=11, team=Team(1))
     assert np.abs(alone.position_TN3 - found[1].position_TN3).max() < 1e-3
 
 
@@ -72,16 +61,12 @@ def test_a_hundred_thousand_substeps():
     """A particle of each material in the smallest domain: after 100,000 substeps all lie still, inside, unfloored."""
     place = np.array([[3.2, 3.5, 2.7], [4.1, 2.8, 3.3], [2.6, 2.9, 4.4], [4.6, 2.9, 4.6]]) * CELL
     density = {"density_kg_m3": np.float32([1000, 1200, 1000, 1000])}
-    scene = Scene(
-        place.astype(np.float32), np.zeros((4, 3), np.float32), np.arange(4).astype(np.uint8), (SHEET,),
-        (8 * CELL,) * 3, CELL, material_parameters=density,
-    )  # fmt: skip
+    room = {"obstacles": (sheet(0.3),), "domain_size": (8 * CELL,) * 3}
+    scene = particles(place, range(4), material_parameters=density, **room)
     config = MpmConfig(device="cpu", time_step="fixed", fixed_time_step_s=5e-4)
-    (outcome,) = simulate([scene], config, 12, 1 / 4.55, team=Team(1))
-    assert isinstance(outcome, Simulated), outcome
+    (outcome,) = simulated([scene], config, 12, 1 / 4.55, team=Team(1))
     assert outcome.counters["substeps"] == 11 * 9100 > 100_000
-    low, high = particle_bounds(scene, config)
-    assert ((outcome.position_TN3 >= low) & (outcome.position_TN3 <= high)).all()
+    assert_inside(outcome.position_TN3, scene, config)
     # what is left is a creep of single particles into the floor's last cell, 0.04 cells in five seconds
     assert np.abs(outcome.position_TN3[-1] - outcome.position_TN3[-2]).max() < 0.1 * CELL
     floors = {
@@ -117,10 +102,9 @@ def test_blocks_that_are_not_at_work_at_once(monkeypatch):
     monkeypatch.setattr(solver, "_teams_at_once", lambda device, team: 1)
     monkeypatch.setattr(team_launch, "PATIENCE", (10_000, 10_000))
     scenes = [mixed(120, 0, (0, -3, 0)), HEAVY]
-    expected, _ = simulate(scenes, CONFIG, 4, 60.0)
+    expected, _ = simulated(scenes, frames=4)
     with pytest.warns(RuntimeWarning, match="does not run 3 blocks of 1 threads at once"):
-        found, _ = simulate(scenes, CONFIG, 4, 60.0, team=Team(1, 3, 1))
-    assert isinstance(expected, Simulated) and isinstance(found, Simulated)
+        found, _ = simulated(scenes, frames=4, team=Team(1, 3, 1))
     assert np.array_equal(found.position_TN3, expected.position_TN3)
 
 

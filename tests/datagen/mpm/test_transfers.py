@@ -4,35 +4,26 @@ import dataclasses
 
 import numpy as np
 import pytest
+from mpm_scenes import CELL, CONFIG, joined, particles, simulated
 
 from datagen.mpm import grid_kernel
-from datagen.mpm.solver import Simulated, simulate
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, SAND, SNOW, WATER
-from hgn.scene.scene import Scene
 from hgn.schema import ConfigError
 from tools.stability.solver_scenes import block, height_cells
 
-CELL = 1 / 16
-CONFIG = MpmConfig(device="cpu")
 EVERY_STEP = dataclasses.replace(CONFIG, transfer_speed_m_s=None)
 
 
 def cube(velocity, stiffness=1.0, cell=CELL):
     """200 particles of all materials at random places above the floor; all tests share the kernel compiled for them."""
-    place = np.random.default_rng(0).uniform((0.4, 0.25, 0.4), (0.55, 0.4, 0.55), (200, 3)).astype(np.float32)
-    kinds = np.arange(200) % 4
-    modulus = np.full(200, 1e6 * stiffness, np.float32)
-    return Scene(
-        place, np.tile(np.float32(velocity), (200, 1)), kinds.astype(np.uint8), cell_size=cell,
-        material_parameters={"youngs_modulus_pa": modulus},
-    )  # fmt: skip
+    place = np.random.default_rng(0).uniform((0.4, 0.25, 0.4), (0.55, 0.4, 0.55), (200, 3))
+    parameters = {"youngs_modulus_pa": np.full(200, 1e6 * stiffness, np.float32)}
+    return particles(place, np.arange(200) % 4, velocity, cell_size=cell, material_parameters=parameters)
 
 
 def run(scene, config, frames, rate_hz=60.0):
-    (outcome,) = simulate([scene], config, frames, rate_hz)
-    assert isinstance(outcome, Simulated), outcome
-    return outcome
+    return simulated([scene], config, frames, rate_hz)[0]
 
 
 def test_stiffness_changes_steps_and_not_transfers():
@@ -76,18 +67,8 @@ def test_what_is_stiff_leaves_water_as_it_is():
     """
     water = block(WATER, (30, 4, 30), (5, 5, 5), (0, -4.5, 0))
     far = [block(kind, (6, 30, 6 + 4 * kind), (1, 1, 1)) for kind in (SAND, SNOW, ELASTIC)]
-    both = [
-        Scene(
-            np.concatenate([s.position_N3 for s in (water, *far)]),
-            np.concatenate([s.velocity_N3 for s in (water, *far)]),
-            np.concatenate([s.material_N for s in (water, *far)]),
-            cell_size=water.cell_size,
-            material_parameters={
-                "youngs_modulus_pa": np.repeat(np.float32([1e6, modulus]), [water.particle_count, 24])
-            },
-        )
-        for modulus in (1e6, 1e8)
-    ]
+    moduli = [np.repeat(np.float32([1e6, modulus]), [water.particle_count, 24]) for modulus in (1e6, 1e8)]
+    both = [joined(water, *far, material_parameters={"youngs_modulus_pa": modulus_N}) for modulus_N in moduli]
     changes = []
     for config in (CONFIG, EVERY_STEP):
         alone, beside = (run(scene, config, 9, 240.0) for scene in both)
@@ -100,12 +81,7 @@ def test_what_is_stiff_leaves_water_as_it_is():
 def with_stiff(soft, stiff, times):
     """Two scenes in one, the second elastic and so many times as stiff."""
     modulus = np.repeat(np.float32([1e6, 1e6 * times]), [soft.particle_count, stiff.particle_count])
-    return dataclasses.replace(
-        soft,
-        **{name: np.concatenate([getattr(soft, name), getattr(stiff, name)])
-           for name in ("position_N3", "velocity_N3", "material_N")},
-        material_parameters={"youngs_modulus_pa": modulus},
-    )  # fmt: skip
+    return joined(soft, stiff, material_parameters={"youngs_modulus_pa": modulus})
 
 
 def test_particles_take_steps_of_their_own(monkeypatch):
@@ -160,7 +136,6 @@ def test_half_the_step():
     half = dataclasses.replace(CONFIG, stability_fraction=CONFIG.stability_fraction / 2)
     blocks = [(SAND, 4.5), (SAND, 10.0), (WATER, 4.5)]
     scenes = [block(material, (30, 4, 30), (6, 6, 6), (0, -speed, 0)) for material, speed in blocks]
-    outcomes = [simulate([*scenes, cube((0, 0, 0), cell=1 / 64)], config, 6, 240.0) for config in (CONFIG, half)]
+    outcomes = [simulated([*scenes, cube((0, 0, 0), cell=1 / 64)], config, 6, 240.0) for config in (CONFIG, half)]
     for whole, fine in zip(*(outcome[:3] for outcome in outcomes), strict=True):
-        assert isinstance(whole, Simulated) and isinstance(fine, Simulated)
         assert abs(height_cells(fine.position_TN3[-1]) / height_cells(whole.position_TN3[-1]) - 1) < 0.03

@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from mpm_scenes import CELL, CONFIG, particles
 
 from datagen.mpm.collider import build_collider
 from datagen.mpm.device import initialise
@@ -14,14 +15,11 @@ from datagen.mpm.grid_launch import GridLaunch
 from datagen.mpm.layout import lame_parameters
 from hgn.config import MpmConfig
 from hgn.scene.material import ELASTIC, WATER
-from hgn.scene.scene import Scene
 from tools.stability import solver_validation
 from tools.stability.solver_validation import column_rows, edge, heights, repose, rest, run_outs
 
-CELL = 1 / 16
 WALL = 2  # cells: the last node that stops motion, and three from the other end
 FRAME_RATE_HZ = 60.0
-CONFIG = MpmConfig(device="cpu")
 
 
 def states(scene, config, frames, *fields, rate_hz=FRAME_RATE_HZ):
@@ -30,7 +28,7 @@ def states(scene, config, frames, *fields, rate_hz=FRAME_RATE_HZ):
     scenes = [scene]
     if scene.material_N[0] == ELASTIC:  # a particle of each material beside: a kernel that other tests compile
         place = np.tile(np.float32(scene.domain_size) / 2, (4, 1))
-        scenes.append(Scene(place, 0 * place, np.arange(4).astype(np.uint8), (), scene.domain_size, CELL))
+        scenes.append(particles(place, range(4), domain_size=scene.domain_size))
     colliders = [build_collider(each, 1.5) for each in scenes]
     launch = GridLaunch(initialise("cpu"), scenes, colliders, config, nodes, rate_hz)
     seen: list[list[np.ndarray]] = [[] for _ in fields]
@@ -52,10 +50,7 @@ def test_spinning_cube():
     place = np.random.default_rng(0).uniform(-0.125, 0.125, (512, 3))
     place -= place.mean(axis=0)
     spin, flight = np.array([3.0, 4, 2]), np.array([0.03, 0.02, -0.01])
-    scene = Scene(
-        (place + 0.5).astype(np.float32), (np.cross(spin, place) + flight).astype(np.float32),
-        np.full(512, ELASTIC, np.uint8), cell_size=CELL, gravity=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    scene = particles(place + 0.5, ELASTIC, np.cross(spin, place) + flight, gravity=(0.0, 0.0, 0.0))
     x, v, C = states(scene, CONFIG, 61, "position", "velocity", "affine")
     inertia = CELL**2 / 4  # of a quadratic B-spline, per mass
     linear = v.mean(axis=1)
@@ -76,11 +71,8 @@ def lattice(cells):
 
 def free_body(place_N3, velocity_N3, material, nodes):
     """Particles at places in cells, without gravity."""
-    return Scene(
-        (place_N3 * CELL).astype(np.float32), velocity_N3.astype(np.float32),
-        np.full(len(place_N3), material, np.uint8), domain_size=tuple(n * CELL for n in nodes), cell_size=CELL,
-        gravity=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    domain = tuple(n * CELL for n in nodes)
+    return particles(place_N3 * CELL, material, velocity_N3, domain_size=domain, gravity=(0.0, 0.0, 0.0))
 
 
 def frequency_of(mode_T, rate_hz=FRAME_RATE_HZ):
@@ -180,12 +172,8 @@ def test_hydrostatic_rest():
     """
     config = MpmConfig(device="cpu")
     _, bulk = lame_parameters(config)
-    lattice = np.stack(np.meshgrid(np.arange(10), np.arange(12), np.arange(10), indexing="ij"), axis=-1).reshape(-1, 3)
-    place = (lattice / 2 + 0.25 + WALL) * CELL
-    scene = Scene(
-        place.astype(np.float32), np.zeros((len(place), 3), np.float32), np.full(len(place), WATER, np.uint8),
-        domain_size=(10 * CELL, 14 * CELL, 10 * CELL), cell_size=CELL,
-    )  # fmt: skip
+    place = (lattice((5, 6, 5)) + WALL) * CELL
+    scene = particles(place, WATER, domain_size=(10 * CELL, 14 * CELL, 10 * CELL))
     x, J = states(scene, config, 301, "position", "volume")
     depth = 6 * CELL
     level = x[:, :, 1].mean(axis=1)
@@ -214,8 +202,7 @@ def test_water_at_rest_keeps_its_level(monkeypatch):
 @pytest.fixture(scope="module")
 def low_column():
     """Run-out and height of a column half as high as wide, eight cells in radius."""
-    run_out, height = column_rows(0.5, CONFIG.sand_friction_law, CONFIG.sand_friction_angle_deg, CONFIG, 8)
-    return run_out, height
+    return column_rows(0.5, CONFIG.sand_friction_law, CONFIG.sand_friction_angle_deg, CONFIG, 8)
 
 
 def test_sand_column_and_its_laws(low_column):
