@@ -1,5 +1,7 @@
 """Random network inputs for the tests."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -39,18 +41,21 @@ def random_state(counts, seed=0, dtype=torch.float64, obstacles=True, spread=0.3
     )
 
 
-def scene_of(state, scene, grid):
+def chosen(state, rows):
+    """These particles of a state, in its scenes."""
+    names = ("position_N3", "velocity_NM3", "material_N", "scene_N")
+    return replace(state, **{name: getattr(state, name)[rows] for name in names})
+
+
+def scene_of(state, scene, obstacles=None):
     """One scene taken out of a batch."""
-    mine = state.scene_N == scene
-    return ParticleState(
-        state.position_N3[mine],
-        state.velocity_NM3[mine],
-        state.material_N[mine],
-        torch.zeros(int(mine.sum()), dtype=torch.long),
-        state.domain_S3[scene : scene + 1],
-        state.gravity_S3[scene : scene + 1],
-        grid,
-    )
+    alone, here = chosen(state, state.scene_N == scene), slice(scene, scene + 1)
+    scenes = {"scene_N": 0 * alone.scene_N, "domain_S3": state.domain_S3[here], "gravity_S3": state.gravity_S3[here]}
+    return replace(alone, **scenes, obstacles=obstacles, surface=None)
+
+
+def on_device(state, device):
+    return replace(state, **{name: value.to(device) for name, value in vars(state).items() if value is not None})
 
 
 def network_of(dtype=torch.float64, **changes):

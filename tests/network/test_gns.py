@@ -6,12 +6,12 @@ import pytest
 import torch
 from network.comparison import assert_same_function
 from network.naive_gns import naive_gns_acceleration
-from network.states import gns_of, random_state, scene_of
+from network.states import chosen, gns_of, random_state, scene_of
 
 from hgn.config import NetworkConfig
 from hgn.network.build import build_network
+from hgn.network.gns_edges import PlainEdges
 from hgn.network.obstacles import SurfaceParticles
-from hgn.schema import ConfigError
 
 
 def with_surface(state, count, spread=0.3):
@@ -35,17 +35,21 @@ def test_parameter_count():
     assert network.parameter_count == 10 * per_step + ends
 
 
+@pytest.mark.parametrize("edges", [None, PlainEdges()], ids=["autograd", "own gradients"])
 @pytest.mark.parametrize("kind", ["gns", "gns_particles"])
 @pytest.mark.parametrize("counts", [(17, 6), (1,)])
-def test_gns_equals_the_literal_definition(kind, counts):
-    """Outputs and all parameter gradients equal the naive network's, in float64; without gradients too."""
+def test_gns_equals_the_literal_definition(kind, counts, edges, monkeypatch):
+    """Outputs and all parameter gradients equal the naive network's, in float64, by autograd and by gradients of the
+    edges' own in many blocks; without gradients too."""
+    monkeypatch.setattr("hgn.network.gns_edges.CPU_ROWS", 30)
     network = gns_of(kind=kind)
     state = state_for(network, counts)
     expected = naive_gns_acceleration(network, state)
-    found = network.normalised_acceleration(state)
+    found = network.normalised_acceleration(state, edges=edges)
     assert_same_function(network, found, expected)
     with torch.no_grad():
-        torch.testing.assert_close(network.normalised_acceleration(state), expected, rtol=1e-10, atol=1e-10)
+        found = network.normalised_acceleration(state, edges=edges)
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("kind", ["gns", "gns_particles"])
@@ -84,10 +88,9 @@ def test_order_of_particles_is_irrelevant():
     network = gns_of()
     state = state_for(network, (50,))
     order = torch.randperm(50, generator=torch.Generator().manual_seed(2))
-    names = ("position_N3", "velocity_NM3", "material_N", "scene_N")
-    shuffled = replace(state, **{name: getattr(state, name)[order] for name in names})
     expected = network.normalised_acceleration(state)[order]
-    torch.testing.assert_close(network.normalised_acceleration(shuffled), expected, rtol=1e-10, atol=1e-10)
+    found = network.normalised_acceleration(chosen(state, order))
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
 def test_static_particles_are_felt_and_only_in_reach():
@@ -117,19 +120,3 @@ def test_reach_misses_nothing():
     rows = {tuple(row): i for i, row in enumerate(surface.position_P3.tolist())}
     found[[rows[tuple(row)] for row in kept.position_P3.tolist()]] = True
     assert not (wanted & ~found).any() and not (found & ~allowed).any()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"kind": "gnn"}, "kind must be one of hgn, gns, gns_particles"),
-        ({"kind": "gns"}, "levels must be 1 for gns"),
-        ({"maximum_neighbours": 9}, "maximum_neighbours must be null for an hgn"),
-        ({"kind": "gns", "levels": 1, "maximum_neighbours": 0}, "maximum_neighbours must be at least 1"),
-        ({"kind": "gns_particles", "levels": 1}, "obstacle_features must be false for gns_particles"),
-    ],
-)
-def test_bad_configuration(changes, message):
-    """What does not fit the kind of network is named."""
-    with pytest.raises(ConfigError, match=message):
-        NetworkConfig(**changes)

@@ -4,11 +4,13 @@ import pytest
 import torch
 from network.naive_gns import naive_edges
 
-from hgn.network.grid import GridRangeError
+from hgn.network.grid import GridRangeError, build_hierarchy
 from hgn.network.neighbours import neighbour_list
 from hgn.network.segments import Segments
 
 RADIUS = 0.1
+LENGTHS = torch.tensor([0, 3, 1, 0, 4, 0])
+SEGMENTS = Segments(torch.cat([torch.zeros(1, dtype=torch.long), LENGTHS.cumsum(0)]), torch.repeat_interleave(LENGTHS))
 
 
 def pairs_of(found):
@@ -71,33 +73,29 @@ def test_maximum_keeps_the_nearest(maximum):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e6])
 def test_positions_out_of_range(value):
-    """A particle that is not finite, or too far away for integer cells, is named."""
-    position = points(5, 1.0)
+    """Where a particle is not finite, or too far away for integer cells, lists and grids name the rule."""
+    position, scene = points(5, 1.0), torch.zeros(5, dtype=torch.long)
     position[3, 1] = value
     with pytest.raises(GridRangeError, match="must be finite and within"):
-        neighbour_list(position, torch.zeros(5, dtype=torch.long), RADIUS)
+        neighbour_list(position, scene, RADIUS)
+    with pytest.raises(GridRangeError, match="must be finite and within"):
+        build_hierarchy(position, scene, torch.zeros(1, 3, dtype=torch.float64), 0.25, 2)
 
 
 def test_segment_sums():
     """Sums and spreads equal loops, with empty segments, and each is the other's gradient."""
-    lengths = torch.tensor([0, 3, 1, 0, 4, 0])
-    offset = torch.cat([torch.zeros(1, dtype=torch.long), lengths.cumsum(0)])
-    segments = Segments(offset, torch.repeat_interleave(lengths))
     rows = torch.randn(8, 3, dtype=torch.float64, requires_grad=True)
     value = torch.randn(6, 3, dtype=torch.float64, requires_grad=True)
-    expected = torch.stack([part.sum(0) for part in rows.split(lengths.tolist())])
-    torch.testing.assert_close(segments.sum(rows), expected)
-    assert torch.autograd.gradcheck(segments.sum, (rows,)) and torch.autograd.gradcheck(segments.spread, (value,))
+    expected = torch.stack([part.sum(0) for part in rows.split(LENGTHS.tolist())])
+    torch.testing.assert_close(SEGMENTS.sum(rows), expected)
+    assert torch.autograd.gradcheck(SEGMENTS.sum, (rows,)) and torch.autograd.gradcheck(SEGMENTS.spread, (value,))
 
 
 @pytest.mark.parametrize("rows", [1, 3, 4, 100])
 def test_blocks_hold_every_row_once(rows):
     """Blocks cover all segments and rows in order, whatever their size, and sum as the whole does."""
-    lengths = torch.tensor([0, 3, 1, 0, 4, 0])
-    offset = torch.cat([torch.zeros(1, dtype=torch.long), lengths.cumsum(0)])
-    segments = Segments(offset, torch.repeat_interleave(lengths))
     value = torch.randn(8, 2)
-    blocks = segments.blocks(rows)
+    blocks = SEGMENTS.blocks(rows)
     found = torch.cat([block.part.sum(value[block.rows]) for block in blocks])
-    assert torch.equal(found, segments.sum(value))
+    assert torch.equal(found, SEGMENTS.sum(value))
     assert [row for block in blocks for row in range(block.rows.start, block.rows.stop)] == list(range(8))

@@ -74,16 +74,3 @@ def test_other_normalisers_are_refused(tmp_path):
     files = [moved(tmp_path / "a.safetensors", 0.1), moved(tmp_path / "b.safetensors", 0.1, normaliser=0.5)]
     with pytest.raises(ConfigError, match=r"weights\[1\] must have the normaliser of weights\[0\] .*init_weights"):
         average(AverageConfig(tuple(map(str, files)), str(tmp_path / "mean.safetensors")))
-
-
-@pytest.mark.parametrize(
-    ("count", "coefficients", "rule"),
-    [
-        (1, None, "weights must be at least two files, got 1"),
-        (2, (0.5, 0.3, 0.2), "coefficients must be one for each of the 2 files, got 3"),
-        (2, (0.7, 0.4), "coefficients must be 1 together, got 1.1"),
-    ],
-)
-def test_bad_options(count, coefficients, rule):
-    with pytest.raises(ConfigError, match=rule):
-        AverageConfig(("a.safetensors",) * count, "out.safetensors", coefficients)

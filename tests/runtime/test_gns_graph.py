@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from network.states import gns_of, random_state
+from network.states import gns_of, on_device, random_state
 from network.test_gns import with_surface
 
 from hgn.runtime.gns_graph import GnsGraphs, padded, rounded_up
@@ -43,8 +43,5 @@ def test_graphs_equal_the_network(kind):
             state = random_state((300, 100), seed, torch.float32, kind == "gns", spread=0.15 + 0.02 * (seed % 3))
             if kind == "gns_particles":
                 state = with_surface(state, 200, 0.15)
-            moved = {name: getattr(state, name).cuda() for name in ("position_N3", "velocity_NM3", "material_N")}
-            moved |= {name: getattr(state, name).cuda() for name in ("scene_N", "domain_S3")}
-            obstacles, surface = state.obstacles and state.obstacles.to("cuda"), state.surface
-            state = type(state)(**moved, obstacles=obstacles, surface=surface and surface.to("cuda"))
+            state = on_device(state, torch.device("cuda"))
             torch.testing.assert_close(graphs(state), network(state), rtol=1e-4, atol=1e-6)

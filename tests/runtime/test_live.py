@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from network.states import network_of, random_grid, silent
+from network.states import network_of, silent
+from runtime.scenes import EMPTY_GRID
+from runtime.scenes import random_scene as scene
 
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.live import LiveSimulation, run_scene
@@ -17,20 +19,14 @@ from hgn.schema import ConfigError
 BACKENDS = ("torch", "cpu")
 
 
-def scene(particles, seed=0, low=0.05, domain=1.0):
-    rng = np.random.default_rng(seed)
-    return InitialState(
-        position_N3=(low + 0.1 * rng.random((particles, 3))).astype(np.float32),
-        velocity_N3=rng.normal(0, 0.1, (particles, 3)).astype(np.float32),
-        material_N=rng.integers(0, 3, particles).astype(np.uint8),
-        obstacle_grid=random_grid(seed, 4_000),
-        domain_size=(domain, domain, domain),
-        gravity=(0.0, -9.8, 0.0),
-    )
-
-
 def entering(live, other):
     return live.add_particles(other.position_N3, other.velocity_N3, other.material_N)
+
+
+def joined(*scenes):
+    """The arrays of all their particles, by name."""
+    names = ("position_N3", "velocity_N3", "material_N")
+    return {name: np.concatenate([getattr(one, name) for one in scenes]) for name in names}
 
 
 def frames(live, count):
@@ -59,22 +55,18 @@ def test_changes_that_change_nothing(backend):
 def test_particles_that_enter_are_those_of_a_scene(backend):
     """Particles added before the first frame move, to the bit, as if the scene had begun with them: histories too."""
     simulator, first, second = Simulator(small(), 60.0, backend), scene(30), scene(20, 1)
-    joined = {name: np.concatenate([getattr(one, name) for one in (first, second)]) for name in ARRAYS}
-    (expected_TN3,) = simulator.rollout([replace(first, **joined)], 5)
+    (expected_TN3,) = simulator.rollout([replace(first, **joined(first, second))], 5)
     live = LiveSimulation(simulator, first)
     history_AM3 = entering(live, second)
     np.testing.assert_array_equal(history_AM3, simulator.start([second]).velocity_NM3)
     np.testing.assert_array_equal(frames(live, 4), expected_TN3[1:])
 
 
-ARRAYS = ("position_N3", "velocity_N3", "material_N")
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_particles_far_away_do_not_matter(backend):
     """What enters beyond the grid's reach leaves the others' frames as they are, to rounding; what enters among them
     does not."""
-    simulator, first = Simulator(small(), 60.0, backend), scene(40, domain=20.0)
+    simulator, first = Simulator(small(), 60.0, backend), scene(40, domain_size=(20.0, 20.0, 20.0))
     (alone_TN3,) = simulator.rollout([first], 8)
     reach = {}
     for low in (0.05, 18.0):
@@ -98,9 +90,7 @@ def test_empty_until_particles_enter():
 def test_obstacles_are_replaced():
     """From the next frame on particles feel other obstacles, and without any they move as if there were none."""
     simulator, first = Simulator(small(), 60.0), scene(40)
-    bare = replace(first, obstacle_grid=replace(first.obstacle_grid, **{
-        name: getattr(first.obstacle_grid, name)[:0] for name in ("cell_K3", "normal_K3")
-    }))  # fmt: skip
+    bare = replace(first, obstacle_grid=EMPTY_GRID)
     live = LiveSimulation(simulator, first)
     live.replace_obstacles(bare)
     np.testing.assert_array_equal(frames(live, 3), simulator.rollout([bare], 4)[0][1:])
@@ -187,12 +177,8 @@ def test_a_scene_that_particles_enter(backend):
     the others are bitwise those of a rollout, and then of a simulation that they were added to.
     """
     first, new = scene(20), scene(6, seed=1, low=0.4)
-    joined = {
-        name: np.concatenate([getattr(first, name), getattr(new, name)])
-        for name in ("position_N3", "velocity_N3", "material_N")
-    }
     time = np.repeat([0.0, 0.04, 0.05], [20, 2, 4])
-    emitting = Scene(**joined, entry_s_N=time, gravity=first.gravity)
+    emitting = Scene(**joined(first, new), entry_s_N=time, gravity=first.gravity)
     simulator = Simulator(small(), 60.0, backend)
     path_TN3 = run_scene(simulator, emitting, 6)
     entry_N = np.repeat([0, 3, 3], [20, 2, 4])

@@ -13,7 +13,7 @@ from training.test_resume import stop_at as stop_at
 from training.test_symmetry import scene_with_obstacles
 
 from hgn import train
-from hgn.config import DatasetConfig, NetworkConfig, TrainConfig, TrainingConfig
+from hgn.config import TrainingConfig
 from hgn.data.batch import BatchSample, UpdateSamples, make_batch
 from hgn.data.sampler import SamplerState
 from hgn.runtime.simulator import Simulator
@@ -172,24 +172,6 @@ def test_lost_scenes_are_dropped():
     assert own._samples == [] and own.figures["pushforward/windows"] == 0 and "pushforward/mse" not in own.figures
     samples = samples_of([small] * 4, 2, seeds=(5, 6, 7, 8))
     assert own.replaced(samples, 0).samples == samples.samples
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"pushforward_fraction": 1.0}, "pushforward_fraction must be 0 or more and below 1, got 1.0"),
-        ({"pushforward_pull": 1.5}, "pushforward_pull must be from 0 to 1, got 1.5"),
-        ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
-        (
-            {"pushforward_fraction": 0.5, "pushforward_frames": 5},
-            "pushforward_frames must be at most dataset.frames - 2 = 4 .*got 5",
-        ),
-    ],
-)
-def test_wrong_values_are_refused(changes, message):
-    """Each key names its rule, the value and what follows from the data set."""
-    with pytest.raises(ConfigError, match=message):
-        TrainConfig(dataset=DatasetConfig(frames=6), network=NetworkConfig(), training=TrainingConfig(**changes))
 
 
 def test_a_resume_where_the_pool_is_made_anew_changes_nothing(data, tmp_path, stop_at):

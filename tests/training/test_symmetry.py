@@ -15,7 +15,6 @@ from hgn.network.obstacles import ObstacleCells, SurfaceParticles
 from hgn.scene.obstacle_grid import ObstacleGrid, build_obstacle_grid
 from hgn.scene.scene import Obstacle
 from hgn.scene.symmetry import Symmetry, drawn_symmetry, scene_symmetries
-from hgn.schema import ConfigError
 from hgn.training.checkpoint import DataInfo
 from hgn.training.module import TrainingModule
 from hgn.training.symmetry import drawn_symmetries, obstacles_under, under_symmetries
@@ -181,9 +180,3 @@ def test_symmetries_belong_to_samples_and_data_stay():
     assert same.obstacles is not None and together.obstacles is not None
     assert torch.equal(same.obstacles.key_K, together.obstacles.key_K)
     assert torch.equal(same.obstacles.normal_K3, together.obstacles.normal_K3)
-
-
-def test_unknown_symmetry_is_refused():
-    """Another word is refused with the choices."""
-    with pytest.raises(ConfigError, match="symmetry must be one of none, gravity, got 'square'"):
-        TrainingConfig(symmetry="square")

@@ -1,0 +1,79 @@
+"""The rules of settings: what breaks one is refused in a line that says field, rule and value."""
+
+import pytest
+
+from hgn.average import AverageConfig
+from hgn.config import DatasetConfig, NetworkConfig, SceneConfig, TrainConfig, TrainingConfig
+from hgn.schema import ConfigError
+
+GNS = {"kind": "gns", "levels": 1}
+RELATIVE = {"inputs": "relative"}
+
+
+def train_on_six_frames(**training):
+    return TrainConfig(dataset=DatasetConfig(frames=6), network=NetworkConfig(), training=TrainingConfig(**training))
+
+
+def average_of(count, coefficients=None):
+    return AverageConfig(("a.safetensors",) * count, "out.safetensors", coefficients)
+
+
+RULES = {
+    NetworkConfig: [
+        ({"kind": "gnn"}, "kind must be one of hgn, gns, gns_particles"),
+        ({"kind": "gns"}, "levels must be 1 for gns"),
+        ({"maximum_neighbours": 9}, "maximum_neighbours must be null for an hgn"),
+        (GNS | {"maximum_neighbours": 0}, "maximum_neighbours must be at least 1"),
+        (GNS | {"kind": "gns_particles"}, "obstacle_features must be false for gns_particles"),
+        ({"inputs": "Relative"}, "inputs must be one of absolute, relative, got 'Relative'"),
+        (RELATIVE | {"velocity_history": 1}, "velocity_history must be at least 2 with inputs=relative"),
+        ({"contact_reach_cells": 0.0}, "contact_reach_cells must be"),
+        (GNS | RELATIVE, "inputs must be absolute for gns, got 'relative'"),
+        (RELATIVE | {"contact_gate": "near"}, "contact_gate must be one of particle, cell, got 'near'"),
+        ({"contact_gate": "cell"}, "contact_gate must be particle with inputs=absolute, got 'cell'"),
+        ({"contact_forces": "normal"}, "contact_forces must be any with inputs=absolute, got 'normal'"),
+        ({"rest_threshold": 0.3}, "rest_threshold must be 0 with inputs=absolute, got 0.3"),
+        (RELATIVE | {"rest_threshold": 0.3, "dimensions": 2}, "rest_threshold must be 0 with dimensions=2"),
+        (RELATIVE | {"rest_threshold": float("nan")}, "rest_threshold must be a finite number >= 0"),
+        (RELATIVE | {"rest_threshold": -0.1}, "rest_threshold must be a finite number >= 0, got -0.1"),
+    ],
+    SceneConfig: [
+        ({"obstacle_shapes": ("torus",)}, r"obstacle_shapes\[0\] must be one of half_box, .*, or a mesh file"),
+        ({"pure_direction_fraction": 1.5}, "pure_direction_fraction must be .*, got 1.5"),
+        ({"colliding_scene_fraction": -0.1}, "colliding_scene_fraction must be .*, got -0.1"),
+        ({"zero_gravity_fraction": float("nan")}, "zero_gravity_fraction must be .*, got nan"),
+        ({"maximum_tilted_gravity": float("inf")}, "maximum_tilted_gravity must be .*, got inf"),
+        (
+            {"zero_gravity_fraction": 0.6, "tilted_gravity_fraction": 0.5},
+            r"tilted_gravity_fraction must be at most 1 - zero_gravity_fraction \(0.6\), got 0.5",
+        ),
+        (
+            {"colliding_scene_fraction": 0.1},
+            "maximum_initial_speed must be above 0 where colliding_scene_fraction is, got 0.0",
+        ),
+    ],
+    train_on_six_frames: [
+        ({"symmetry": "square"}, "symmetry must be one of none, gravity, got 'square'"),
+        ({"pushforward_fraction": 1.0}, "pushforward_fraction must be 0 or more and below 1, got 1.0"),
+        ({"pushforward_pull": 1.5}, "pushforward_pull must be from 0 to 1, got 1.5"),
+        ({"pushforward_every": 0}, "pushforward_every must be .*got 0"),
+        (
+            {"pushforward_fraction": 0.5, "pushforward_frames": 5},
+            "pushforward_frames must be at most dataset.frames - 2 = 4 .*got 5",
+        ),
+    ],
+    average_of: [
+        ({"count": 1}, "weights must be at least two files, got 1"),
+        ({"count": 2, "coefficients": (0.5, 0.3, 0.2)}, "coefficients must be one for each of the 2 files, got 3"),
+        ({"count": 2, "coefficients": (0.7, 0.4)}, "coefficients must be 1 together, got 1.1"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("settings", "options", "message"), [(settings, *rule) for settings, rules in RULES.items() for rule in rules]
+)
+def test_what_breaks_a_rule_is_named(settings, options, message):
+    """Of networks, random scenes, trainings and averages: values alone, and values that contradict each other."""
+    with pytest.raises(ConfigError, match=message):
+        settings(**options)
