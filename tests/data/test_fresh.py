@@ -45,9 +45,8 @@ def test_what_reports_say_of_a_set(weights, tmp_path):
     with pytest.raises(ConfigError, match=r"fresh\.json: seed must be the data set's own"):
         set_record(folder, fresh.seed + 1, [weights])
     (folder / "fresh.json").write_text(json.dumps({"seed": "x"}))
-    with pytest.raises(
-        ConfigError, match=r"fresh\.json must be what python -m datagen frozen=… wrote, got .*seed must be"
-    ):
+    message = r"fresh\.json must be what python -m datagen frozen=… wrote, got .*seed must be"
+    with pytest.raises(ConfigError, match=message):
         read_fresh(folder)
 
 

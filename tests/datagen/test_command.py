@@ -7,35 +7,26 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
 from docs.pages import run_module
-from processes import PATIENCE_S, processes_of_session, wait_until
+from processes import PATIENCE_S, exit_code, processes_of_session, start_module, wait_until
+from written_files import simulated_once
 
 from datagen.__main__ import main
 from datagen.pool.progress import BarProgress, JsonProgress
 from hgn.command import run_command
-from hgn.config import DatagenConfig, DatasetConfig, SceneConfig, config_directory
+from hgn.config import DatagenConfig, SceneConfig, config_directory
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError, to_mapping
 
-ROOT = Path(__file__).resolve().parents[2]
 SMALL = ["scenes=3", "dataset.validation_scenes=1", "dataset.test_scenes=0", "dataset.frames=5", "dataset.workers=1"]
 
 
 def start(*arguments, **options):
-    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
-    return subprocess.Popen(
-        [sys.executable, "-m", "ballistic_command", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": path},
-        start_new_session=True,
-        **options,
-    )
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return start_module("ballistic_command", *arguments, **streams, **options)
 
 
 def run(*arguments, **options):
@@ -61,11 +52,9 @@ BAD_INPUT = [
 def test_bad_input_is_one_line(arguments, message, tmp_path, monkeypatch, capsys):
     """Whatever is wrong with the input, one line says field, rule and value; the exit code is 2; nothing is made."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["datagen", *arguments])
-    with pytest.raises(SystemExit) as exit_:
-        run_command(main, "datagen")
+    code = exit_code(main, "datagen", arguments, monkeypatch)
     output, errors = capsys.readouterr()
-    assert exit_.value.code == 2 and output == ""
+    assert code == 2 and output == ""
     assert errors.startswith(message) and errors.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
     assert sys.argv == ["datagen", *arguments] and "HYDRA_FULL_ERROR" not in os.environ
@@ -85,11 +74,7 @@ def test_no_key_is_taken_for_a_config_group():
     ("error", "code", "message"),
     [
         (ConfigError("frames must be 2"), 2, "error: frames must be 2\n"),
-        (
-            OSError(errno.ENOSPC, "No space left on device", "made/a.tar"),
-            1,
-            "error: No space left on device: made/a.tar;",
-        ),
+        (OSError(errno.ENOSPC, "No space left on device", "b/a.tar"), 1, "error: No space left on device: b/a.tar;"),
         (PermissionError(errno.EACCES, "Permission denied", "made"), 1, "error: Permission denied: made; check the"),
         (KeyboardInterrupt(), 130, "error: interrupted\n"),
     ],
@@ -100,10 +85,7 @@ def test_faults_end_in_one_line(error, code, message, monkeypatch, capsys):
     def fail(mapping):
         raise error
 
-    monkeypatch.setattr(sys, "argv", ["datagen"])
-    with pytest.raises(SystemExit) as exit_:
-        run_command(fail, "datagen")
-    assert exit_.value.code == code
+    assert exit_code(fail, "datagen", [], monkeypatch) == code
     assert capsys.readouterr().err.startswith(message)
 
 
@@ -150,11 +132,9 @@ def test_makes_completes_and_leaves_alone(backend, tmp_path):
     assert code == 2 and errors.startswith("error: made holds another data set: scene.group_shapes is")
 
 
-def test_resolved_config_file(backend, tmp_path):
+def test_resolved_config_file(backend, make_config, tmp_path):
     """A resolved config in any folder, as the trainer writes one, serves instead of conf/."""
-    dataset = DatasetConfig(
-        folder=str(tmp_path / "made"), training_scenes=1, validation_scenes=0, test_scenes=0, frames=4, workers=1
-    )
+    dataset = make_config(training_scenes=1, validation_scenes=0, test_scenes=0, frames=4).dataset
     config = DatagenConfig(scene=SceneConfig(obstacle_count=1), dataset=dataset)
     (tmp_path / "dataset.yaml").write_text(yaml.safe_dump(to_mapping(config)))
     code, _, errors = run("--config-path", str(tmp_path), "--config-name", "dataset", cwd=tmp_path)
@@ -210,8 +190,7 @@ def test_two_generators_at_once(backend, control, tmp_path, make_config, make_da
     for process in processes:
         _, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0 and "shared is complete: 4 train, 2 validation, 0 test episodes" in errors
-    seeds = (control / "simulated.log").read_text().split()
-    assert len(seeds) == len(set(seeds)) == 6
+    assert simulated_once(control) == 6
     made = {shard.name: shard.sha256 for shard in Manifest.load(tmp_path / "shared").shards}
     assert made == {shard.name: shard.sha256 for shard in Manifest.load(whole).shards}
 

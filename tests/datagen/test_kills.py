@@ -1,22 +1,19 @@
 """SIGKILL of anything, at any moment, costs time and nothing else; `python -m tools.studies.kills` is longer."""
 
-import os
 import sys
-from pathlib import Path
 
 import pytest
+from processes import BALLISTIC_PATH
 
 from hgn.data.manifest import Manifest
 from hgn.schema import ConfigError
 from tools.studies.kills import TARGETS, KillsConfig, differences, equal_shards, generate_with_kills
 
-ROOT = Path(__file__).resolve().parents[2]
-
 
 @pytest.fixture
 def command(control, tmp_path, monkeypatch):
     """The command line of the ballistic service for a configuration; its data set goes to `killed`."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(Path(__file__).parent)]))
+    monkeypatch.setenv("PYTHONPATH", BALLISTIC_PATH)
 
     def make(config):
         keys = ("training_scenes", "validation_scenes", "test_scenes", "frames", "workers", "maximum_attempts")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from datagen.pool.local_workers import LocalWorker, LocalWorkerFactory
 from datagen.pool.worker_plan import WorkerPlan, plan_workers, visible_gpus
+from written_files import Recorder, hashes, simulated
 
 from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import Pool, Stopped
-from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend, MadeScene, Worker
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
@@ -21,27 +21,6 @@ from hgn.data.reader import EpisodeStore
 from hgn.schema import ConfigError
 
 ONE = WorkerPlan(solvers=1, threads=1, makers=1, scenes_per_launch=1, first_launch=1)
-
-
-class Recorder(Progress):
-    def __init__(self):
-        self.messages: list[str] = []
-        self.shards: list[str] = []
-        self.episodes: list[str] = []
-        self.launches: list[int] = []
-
-    def frame(self, worker, frame, scenes):
-        if scenes:
-            self.launches.append(scenes)
-
-    def episode(self, key):
-        self.episodes.append(key)
-
-    def shard(self, name, episodes, revision):
-        self.shards.append(name)
-
-    def message(self, text):
-        self.messages.append(text)
 
 
 def generate(config, backend, plan=ONE, **options):
@@ -54,11 +33,7 @@ def generate(config, backend, plan=ONE, **options):
     return recorder
 
 
-def simulated(control):
-    return [int(line) for line in (control / "simulated.log").read_text().split()]
-
-
-def test_whole_dataset(make_config, make_dataset, backend, tmp_path):
+def test_whole_dataset(make_config, small_dataset, backend, tmp_path):
     """Two solvers in processes of their own make the same shards, bitwise, as one loop in this process; they end in
     order, for only then Taichi writes what it compiled to its cache."""
     config = make_config()
@@ -68,9 +43,7 @@ def test_whole_dataset(make_config, make_dataset, backend, tmp_path):
     ended = len(list(ending.iterdir()))
     shutil.rmtree(ending)
     assert 1 <= ended <= 2  # one may have had no scene
-    here = make_dataset(make_config(folder=str(tmp_path / "here")))
-    for path in here.glob("*.tar"):
-        assert (Path(config.dataset.folder) / path.name).read_bytes() == path.read_bytes()
+    assert hashes(Path(config.dataset.folder)) == hashes(small_dataset)
     assert len(recorder.episodes) == 8 and len(recorder.shards) == 7
     assert {path.suffix for path in Path(config.dataset.folder).iterdir()} == {".tar", ".json", ""}
 
@@ -208,14 +181,11 @@ def test_workers_that_die_while_stopping(make_config, backend, control):
 
 
 def test_fault_in_the_solver_ends_the_run(make_config, backend, control):
-    """An exception that no scene is to blame for is not retried: it ends the run with the worker's traceback."""
+    """An exception that no scene is to blame for is not retried: it ends the run with the worker's traceback; so does a
+    solver that cannot be imported."""
     (control / "raise").touch()
     with pytest.raises(RuntimeError, match=r"(?s)a worker failed:\nTraceback .*a fault in the solver"):
         generate(make_config(), backend)
-
-
-def test_missing_solver_ends_the_run(make_config, backend):
-    """A solver that cannot be imported ends the run."""
     with pytest.raises(RuntimeError, match="ModuleNotFoundError"):
         generate(make_config(), Backend(backend.generate_scene, backend.build_obstacle_grid, "no_such_module:simulate"))
 

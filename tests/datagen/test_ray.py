@@ -8,14 +8,12 @@ from pathlib import Path
 
 import pytest
 from datagen.pool.worker_plan import WorkerPlan, plan_cluster
-from processes import PATIENCE_S
+from processes import BALLISTIC_PATH, PATIENCE_S
 
 from datagen.pool.ray_workers import RayWorkerFactory
 from datagen.pool.worker import Backend
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
 from hgn.schema import ConfigError
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_lost_node(control, tmp_path):
@@ -23,11 +21,11 @@ def test_lost_node(control, tmp_path):
     scene is blamed."""
     pytest.importorskip("ray")
     (control / "slow").touch()
-    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
+    environment = {"PYTHONPATH": BALLISTIC_PATH, "RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0"}
     program = subprocess.run(
         [sys.executable, str(Path(__file__).with_name("ray_program.py")), "data"],
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": path, "RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0"},
+        env=os.environ | environment,
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,

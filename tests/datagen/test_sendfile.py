@@ -7,22 +7,21 @@ import itertools
 import logging
 import socket
 import sys
-import threading
 from asyncio.selector_events import _SelectorSocketTransport
 from collections import Counter
 from contextlib import ExitStack, closing
 from types import SimpleNamespace
 
 import pytest
-import uvicorn
 from processes import wait_until
+from serving import serving
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.responses import Response
 from starlette.routing import Route
 
 from datagen.service.sendfile import EXTENSION, FileRange
-from datagen.service.server import Guard, make_server
+from datagen.service.server import Guard
 
 SIZE = 5_000_001
 
@@ -40,26 +39,26 @@ def serve(file):
         assert EXTENSION in request.scope["extensions"]
         return FileRange(file, SIZE, {"etag": '"tag"'}, "application/octet-stream")
 
-    begun: list[tuple[uvicorn.Server, threading.Thread]] = []
+    with ExitStack() as running:
 
-    def serve(**limits):
-        listener = socket.create_server(("127.0.0.1", 0))
-        routes = [Route("/file", answer), Route("/page", lambda request: Response(bytes(2**24)))]
-        app = Starlette(routes=routes, middleware=[Middleware(Guard, token=None, counters=Counter())])
-        server = make_server(app, **limits)
-        begun.append((server, threading.Thread(target=server.run, kwargs={"sockets": [listener]})))
-        begun[-1][1].start()
-        return listener.getsockname()[1], server
+        def serve(**limits):
+            routes = [Route("/file", answer), Route("/page", lambda request: Response(bytes(2**24)))]
+            app = Starlette(routes=routes, middleware=[Middleware(Guard, token=None, counters=Counter())])
+            return running.enter_context(serving(app, **limits))
 
-    yield serve
-    for server, thread in begun:
-        server.should_exit = True
-        thread.join()
+        yield serve
 
 
 @pytest.fixture
 def port(serve):
-    return serve(connections=8)[0]
+    return serve(connections=8)[1]
+
+
+def get(port, **headers):
+    """What comes at a request of the file by a connection of its own."""
+    with closing(http.client.HTTPConnection("127.0.0.1", port)) as connection:
+        connection.request("GET", "/file", headers=headers)
+        return connection.getresponse().read()
 
 
 class LoopOfUvloop(asyncio.SelectorEventLoop):
@@ -78,11 +77,7 @@ def uvloop(monkeypatch):
 @pytest.mark.usefixtures("uvloop")
 def test_uvloop_is_left_alone(port, file):
     """Where it is installed files come all the same."""
-    connection = http.client.HTTPConnection("127.0.0.1", port)
-    connection.request("GET", "/file")
-    with connection.getresponse() as response:
-        assert response.read() == file.read_bytes()
-    connection.close()
+    assert get(port) == file.read_bytes()
 
 
 def test_ranges_on_one_connection(port, file):
@@ -120,21 +115,14 @@ def test_reader_that_leaves(port, file, caplog):
         with socket.create_connection(("127.0.0.1", port)) as leaving:
             leaving.sendall(b"GET /file HTTP/1.1\r\nHost: x\r\n\r\n")
             assert leaving.recv(1000).startswith(b"HTTP/1.1 200 OK")
-    connection = http.client.HTTPConnection("127.0.0.1", port)
-    connection.request("GET", "/file")
-    assert connection.getresponse().read() == file.read_bytes()
-    connection.close()
-    assert not caplog.records
+    assert get(port) == file.read_bytes() and not caplog.records
 
 
 def test_file_that_became_shorter(port, file):
     """A file that was cut after it was checked ends the connection: what came is not taken for the whole."""
     file.write_bytes(file.read_bytes()[: SIZE // 2])
-    connection = http.client.HTTPConnection("127.0.0.1", port)
-    connection.request("GET", "/file")
     with pytest.raises((http.client.IncompleteRead, ConnectionError)):
-        connection.getresponse().read()
-    connection.close()
+        get(port)
 
 
 HALF = b"GET /file HTTP/1.1\r\n"
@@ -151,13 +139,11 @@ def waiting(port, sent):
 @pytest.mark.parametrize("sent", [b"", HALF])
 def test_who_only_waits_keeps_nobody_out(serve, sent, file):
     """More connections than the limit that send nothing, or half a request, make room for one that asks."""
-    port, server = serve(**EIGHT)
+    server, port = serve(**EIGHT)
     with ExitStack() as stack:
         for _ in range(40):
             stack.enter_context(waiting(port, sent))
-        with closing(http.client.HTTPConnection("127.0.0.1", port)) as connection:
-            connection.request("GET", "/file", headers={"Range": "bytes=0-9"})
-            assert connection.getresponse().read() == file.read_bytes()[:10]
+        assert get(port, Range="bytes=0-9") == file.read_bytes()[:10]
         assert len(server.server_state.connections) <= 8
 
 
@@ -169,7 +155,7 @@ def test_waiting_comes_to_an_end(serve, monkeypatch, taken):
     monkeypatch.setattr(
         _SelectorSocketTransport, "get_write_buffer_size", lambda transport: min(real(transport), next(left))
     )
-    port, server = serve(**EIGHT, patience_s=0.2)
+    server, port = serve(**EIGHT, patience_s=0.2)
     asked = (b"", HALF, HALF + b"Host: x\r\n\r\n", b"GET /page HTTP/1.1\r\nHost: x\r\n\r\n")
     with ExitStack() as stack:
         for sent in asked:

@@ -8,7 +8,6 @@ import re
 import select
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -20,7 +19,8 @@ from typing import Any
 from urllib.parse import unquote
 
 import pytest
-from processes import processes_of_session, wait_until
+from processes import exit_code, processes_of_session, start_module, wait_until
+from written_files import Recorder
 
 import datagen.service.server
 import datagen.service.supervisor
@@ -29,12 +29,10 @@ from datagen.pool.progress import Progress
 from datagen.service.__main__ import main
 from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState, Supervisor
-from hgn.command import run_command
 from hgn.data.manifest import Manifest, ShardEntry
 from hgn.data.storage import TOKEN_VARIABLE, file_sha256
 from hgn.schema import to_mapping
 
-ROOT = Path(__file__).resolve().parents[2]
 TOKEN = "correct-horse-battery"
 SHARD = "/train-000002-000004.tar"
 
@@ -160,27 +158,15 @@ def test_shards_with_ranges(ask, folder):
     assert ask(SHARD, if_none_match=f'W/"x", "{entry.sha256}"')[::2] == (304, b"")
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/.lock",
-        "/.staging/train-000000.tar",
-        "/train-000090-000091.tar",
-        "/.train-000002-000004.tar.1.partial",
-        "/../outside.txt",
-        "/%2e%2e/outside.txt",
-        "/%2e%2e%2foutside.txt",
-        "//etc/passwd",
-        "/train-000002-000004.tar/",
-        "/",
-    ],
-)
-def test_nothing_else_is_served(ask, folder, path):
+def test_nothing_else_is_served(ask, folder):
     """Whatever is not in the manifest does not exist: locks, staged and half-written files, paths that lead out."""
+    unlisted, partial = "train-000090-000091.tar", ".train-000002-000004.tar.1.partial"
     (folder.parent / "outside.txt").write_text("secret")
-    (folder / "train-000090-000091.tar").write_bytes(b"not listed")
-    (folder / ".train-000002-000004.tar.1.partial").write_bytes(b"half")
-    assert ask(path)[0] == 404
+    (folder / unlisted).write_bytes(b"not listed")
+    (folder / partial).write_bytes(b"half")
+    outside = ("/../outside.txt", "/%2e%2e/outside.txt", "/%2e%2e%2foutside.txt", "//etc/passwd")
+    for path in ("/.lock", "/.staging/train-000000.tar", f"/{unlisted}", f"/{partial}", *outside, f"{SHARD}/", "/"):
+        assert ask(path)[0] == 404, path
 
 
 def test_read_only(ask):
@@ -191,12 +177,8 @@ def test_read_only(ask):
 
 def test_token(ask):
     """With a token every path but /healthz asks for it; a wrong one, or a part of it, is refused."""
-    for headers in (
-        {},
-        {"authorization": TOKEN},
-        {"authorization": f"Bearer {TOKEN[:-1]}"},
-        {"authorization": "Bearer "},
-    ):
+    wrong = [{"authorization": value} for value in (TOKEN, f"Bearer {TOKEN[:-1]}", "Bearer ")]
+    for headers in ({}, *wrong):
         for path in ("/manifest.json", SHARD, "/progress", "/metrics", "/nothing"):
             status, answer, body = ask(path, token=TOKEN, **headers)
             assert status == 401 and answer["www-authenticate"] == "Bearer" and TOKEN.encode() not in body
@@ -228,9 +210,8 @@ def test_progress_and_metrics(ask):
     """Both tell what is published and what the pool is at; the metrics parse as Prometheus text."""
     progress = json.loads(ask("/progress")[2])
     assert progress["episodes"]["train"] == {"requested": 5, "published": 5} and progress["complete"]
-    assert progress["generator"]["status"] == "running" and progress["generator"]["running"] == [
-        {"frame": 4, "scenes": 2}
-    ]
+    generator = progress["generator"]
+    assert generator["status"] == "running" and generator["running"] == [{"frame": 4, "scenes": 2}]
     text = ask("/metrics")[2].decode()
     sample = re.compile(r'([a-z_]+)(\{[a-z]+="[a-z0-9]+"\})? [0-9.]+')
     named = {line.split()[2] for line in text.splitlines() if line.startswith("# TYPE")}
@@ -241,18 +222,6 @@ def test_progress_and_metrics(ask):
             assert match and match[1] in named, line
             values[match[1] + (match[2] or "")] = float(line.split()[-1])
     assert values['hgn_episodes_published{split="train"}'] == 5 and values["hgn_generator_starts_total"] == 2
-
-
-class Recorder(Progress):
-    def __init__(self):
-        self.messages: list[str] = []
-        self.episodes: list[str] = []
-
-    def episode(self, key):
-        self.episodes.append(key)
-
-    def message(self, text):
-        self.messages.append(text)
 
 
 def test_pool_that_says_nothing_is_started_again(make_config, monkeypatch):
@@ -335,27 +304,22 @@ def test_log_that_nobody_reads(make_config, monkeypatch, error):
 
 
 def run_service(arguments, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["service", *arguments])
-    with pytest.raises(SystemExit) as exit_:
-        run_command(main, "service")
-    return int(exit_.value.code or 0)
+    return exit_code(main, "service", arguments, monkeypatch)
 
 
 @pytest.fixture
-def taken_port():
+def taken():
+    """A port that is in use."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         yield listener.getsockname()[1]
 
 
-def test_bad_input_is_one_line(taken_port, monkeypatch, capsys, tmp_path):
+def test_bad_input_is_one_line(taken, monkeypatch, capsys, tmp_path):
     """A port in use, an open door and a folder that is none end the service before it makes anything."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
     for arguments, message in (
-        (
-            [f"port={taken_port}"],
-            f"host and port must be free to serve on, got 127.0.0.1:{taken_port} (Address already",
-        ),
+        ([f"port={taken}"], f"host and port must be free to serve on, got 127.0.0.1:{taken} (Address already"),
         (["port=70000"], "port must be 0 to 65535, got 70000"),
         (["host=0.0.0.0", "port=0"], "host must be a loopback address without a token, got '0.0.0.0'; set HGN_DATASET"),
         (["host=no.such.host.invalid"], "host and port must be free to serve on, got no.such.host.invalid:8000 ("),
@@ -399,7 +363,6 @@ def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
     `kill -9` is what test_kills.py is about.
     """
     (control / "slow").touch()
-    path = os.pathsep.join([str(ROOT), str(Path(__file__).parent)])
     arguments = ["out=made", "scenes=3", "dataset.validation_scenes=0", "dataset.test_scenes=0", "dataset.frames=5"]
     unread, log = os.pipe()
     os.set_blocking(log, False)
@@ -407,13 +370,8 @@ def test_stopping_leaves_a_resumable_folder(backend, control, tmp_path):
         os.write(log, bytes(4096))
     os.set_blocking(log, True)
     folder = tmp_path / "made"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "ballistic_service", *arguments, "port=0", "dataset.workers=1"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": path},
-        stderr=log,
-        start_new_session=True,
-    )
+    options = (*arguments, "port=0", "dataset.workers=1")
+    process = start_module("ballistic_service", *options, cwd=tmp_path, stderr=log)
     wait_until(lambda: (folder / "manifest.json").exists() and Manifest.load(folder).revision >= 1)
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 143

@@ -1,13 +1,13 @@
 """Locks, staged episodes and quarantine: whatever interrupts a writer, the next goes on to the same shards."""
 
 import dataclasses
-import json
 import os
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from written_files import claim_all, hashes, snapshot
+from written_files import claim_all, hashes, simulated_once, snapshot
 
 import datagen.pool.shard
 import datagen.pool.writer
@@ -26,12 +26,10 @@ class InterruptionError(Exception):
 
 @pytest.mark.parametrize("call", [1, 2, 3, 4, 5, 8, 13, 18, 23])
 def test_resume_after_a_crash_makes_the_same_shards(
-    make_config, make_dataset, stage, monkeypatch, tmp_path, control, call
+    make_config, make_dataset, small_dataset, stage, monkeypatch, control, call
 ):
     """Wherever a run stops, running again gives bitwise the same shards and simulates no staged episode twice."""
-    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
-    (control / "simulated.log").unlink()
-    config = make_config(folder=str(tmp_path / "cut"))
+    config = make_config()
     calls = 0
 
     def crash(path):
@@ -56,10 +54,8 @@ def test_resume_after_a_crash_makes_the_same_shards(
         except InterruptionError:
             assert Path(config.dataset.folder).exists()
     make_dataset(config)
-    assert hashes(Path(config.dataset.folder)) == hashes(whole)
-    assert Manifest.load(config.dataset.folder).complete
-    seeds = (control / "simulated.log").read_text().split()
-    assert len(seeds) == len(set(seeds)) == 8
+    assert hashes(Path(config.dataset.folder)) == hashes(small_dataset)
+    assert Manifest.load(config.dataset.folder).complete and simulated_once(control) == 8
 
 
 def test_growth_keeps_what_is_there(make_config, make_dataset, tmp_path, control):
@@ -71,17 +67,9 @@ def test_growth_keeps_what_is_there(make_config, make_dataset, tmp_path, control
     after = Manifest.load(folder)
     assert after.shards[: len(published)] == published
     assert before.items() <= hashes(folder).items()
-    assert [(shard.first, shard.stop) for shard in after.shards_of("train")] == [
-        (0, 1),
-        (1, 2),
-        (2, 3),
-        (3, 4),
-        (4, 8),
-        (8, 9),
-    ]
-    assert after.requested["train"] == 9 and after.complete
-    seeds = (control / "simulated.log").read_text().split()
-    assert len(seeds) == len(set(seeds)) == 9 + 2 + 1
+    ends = [0, 1, 2, 3, 4, 8, 9]
+    assert [(shard.first, shard.stop) for shard in after.shards_of("train")] == list(pairwise(ends))
+    assert after.requested["train"] == 9 and after.complete and simulated_once(control) == 9 + 2 + 1
     direct = make_dataset(make_config(training_scenes=9, folder=str(tmp_path / "direct")))
     for grown, made in zip(EpisodeStore(folder, "train").episodes, EpisodeStore(direct, "train").episodes, strict=True):
         assert np.array_equal(grown.position_TN3, made.position_TN3) and grown.seed == made.seed
@@ -118,40 +106,25 @@ def test_asking_for_less_ends_an_unfinished_dataset(make_config, stage):
 )
 def test_other_settings_are_refused(make_config, folder, changes, message):
     """A folder takes no episodes of another distribution, and the message names the keys and the remedy."""
-    dataset = {} if changes.keys() & {"scene", "mpm"} else changes
+    parts = {name: changes[name] for name in ("scene", "mpm") if name in changes}
+    config = dataclasses.replace(make_config(**({} if parts else changes)), **parts)
     before = snapshot(folder)
-    with (
-        pytest.raises(ConfigError, match=f"holds another data set: {message}; choose another folder"),
-        DatasetWriter(dataclasses.replace(make_config(**dataset), **(changes if not dataset else {}))),
-    ):
-        pass
+    with pytest.raises(ConfigError, match=f"holds another data set: {message}; choose another folder"):
+        DatasetWriter(config).__enter__()
     assert snapshot(folder) == before
 
 
-def test_where_and_how_fast_is_no_identity(make_config, make_dataset):
+def test_where_and_how_fast_is_no_identity(data):
     """Device, launch size, workers, attempts and shard size may change between runs of one data set."""
-    config = make_config()
-    make_dataset(config)
-    dataset = dataclasses.replace(config.dataset, workers=3, maximum_attempts=1, episodes_per_shard=2)
+    dataset = dataclasses.replace(data.dataset, workers=3, maximum_attempts=1, episodes_per_shard=2)
     mpm = MpmConfig(device="gpu", scenes_per_launch=64)
     with DatasetWriter(DatagenConfig(dataset=dataset, mpm=mpm)) as writer:
         assert writer.complete
 
 
-def test_data_of_another_schema_is_refused(make_config, make_dataset):
-    """A manifest of another version is refused with the remedy, and stays as it is."""
-    folder = make_dataset(make_config())
-    mapping = json.loads((folder / "manifest.json").read_text()) | {"schema_version": 99}
-    (folder / "manifest.json").write_text(json.dumps(mapping))
-    with pytest.raises(ConfigError, match=r"schema_version must be 1, got 99; .* or use the version that made it"):
-        make_dataset(make_config())
-
-
-def test_generators_share_a_folder(make_config, make_dataset, stage, tmp_path, control):
+def test_generators_share_a_folder(make_config, small_dataset, stage, control):
     """Each of two generators makes the shards that it claims; what one leaves behind the other makes; each sees what
     the other published."""
-    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
-    (control / "simulated.log").unlink()
     with DatasetWriter(make_config()) as other:
         with DatasetWriter(make_config()) as writer:
             first, second = writer.claim_next(), other.claim_next()
@@ -170,9 +143,8 @@ def test_generators_share_a_folder(make_config, make_dataset, stage, tmp_path, c
             pass
         assert other.complete
     assert not partial.exists() and not (other.folder / ".staging").exists()
-    assert hashes(other.folder) == hashes(whole) and Manifest.load(other.folder).complete
-    seeds = (control / "simulated.log").read_text().split()
-    assert len(seeds) == len(set(seeds)) == 8
+    assert hashes(other.folder) == hashes(small_dataset) and Manifest.load(other.folder).complete
+    assert simulated_once(control) == 8
 
 
 def test_first_writer_wins(make_config, stage, monkeypatch):
@@ -191,23 +163,18 @@ def test_first_writer_wins(make_config, stage, monkeypatch):
     assert len(Manifest.load(writer.folder).shards) == 1
 
 
-def test_array_tasks_make_one_dataset(make_config, make_dataset, tmp_path, control):
+def test_array_tasks_make_one_dataset(make_config, make_dataset, small_dataset, control):
     """Three tasks of an array make all shards once between them, each knowing nothing of the others."""
-    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
-    (control / "simulated.log").unlink()
     for task in range(3):
         folder = make_dataset(make_config(array_task=task, array_tasks=3))
         assert Manifest.load(folder).complete == (task == 2)
-    assert hashes(folder) == hashes(whole)
-    seeds = (control / "simulated.log").read_text().split()
-    assert len(seeds) == len(set(seeds)) == 8
+    assert hashes(folder) == hashes(small_dataset) and simulated_once(control) == 8
 
 
 @pytest.mark.parametrize("seconds", [0, 2**33])
-def test_no_clock_is_asked(make_config, make_dataset, stage, tmp_path, seconds):
+def test_no_clock_is_asked(make_config, make_dataset, small_dataset, stage, seconds):
     """Machines whose clocks stand in 1970 or far in the future, beside others', make the same data set: no time of a
     file says whether it is whole, left behind or new."""
-    whole = make_dataset(make_config(folder=str(tmp_path / "whole")))
 
     def turn_back(folder):
         for path in (*folder.rglob("*"), folder):
@@ -228,12 +195,12 @@ def test_no_clock_is_asked(make_config, make_dataset, stage, tmp_path, seconds):
             assert len(store) == len(store.episodes[:]) == writer.done == index + 1
     make_dataset(make_config())
     turn_back(writer.folder)
-    assert hashes(make_dataset(make_config())) == hashes(whole)
+    assert hashes(make_dataset(make_config())) == hashes(small_dataset)
     assert not list(writer.folder.rglob("*.partial"))
 
 
 @pytest.mark.parametrize("damage", ["cut", "zeroed", "a bit", "no seal"])
-def test_broken_staged_file_is_made_again(make_config, make_dataset, stage, damage, tmp_path):
+def test_broken_staged_file_is_made_again(make_config, make_dataset, small_dataset, stage, damage):
     """A staged file that is not what was written (positions that are zeros read like any others) is dropped and its
     episode made again; so the shards are those of a run in peace."""
     with DatasetWriter(make_config()) as writer:
@@ -249,7 +216,7 @@ def test_broken_staged_file_is_made_again(make_config, make_dataset, stage, dama
     with DatasetWriter(make_config(), messages.append) as writer:
         assert ("train", 1) in claim_all(writer)
     assert "must end with the sha256 of what it holds" in messages[0] and "is made again" in messages[0]
-    assert hashes(make_dataset(make_config())) == hashes(make_dataset(make_config(folder=str(tmp_path / "peace"))))
+    assert hashes(make_dataset(make_config())) == hashes(small_dataset)
 
 
 def test_staged_file_that_changes_later_is_not_published(make_config, stage):
@@ -304,11 +271,8 @@ def test_quarantined_seed_is_replaced(make_config, stage):
         writer.publish_next()
     manifest = Manifest.load(writer.folder)
     (failure,) = manifest.quarantined
-    assert (failure.key, failure.seed, failure.cause) == (
-        "train-000000",
-        scene_seed(0, "train", 0, attempt=0),
-        "diverged",
-    )
+    first_seed = scene_seed(0, "train", 0, attempt=0)
+    assert (failure.key, failure.seed, failure.cause) == ("train-000000", first_seed, "diverged")
     (entry,) = manifest.shards[0].episodes
     assert (entry.attempt, entry.seed) == (1, replacement.seed)
 

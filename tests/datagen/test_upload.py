@@ -3,16 +3,15 @@
 import dataclasses
 import os
 import signal
-import sys
 import threading
 from pathlib import Path
 
 import fsspec
 import pytest
+from processes import exit_code
 
 import hgn.data.storage
 from datagen.upload import main
-from hgn.command import run_command
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import CACHE_VARIABLE
@@ -46,10 +45,8 @@ def test_copy_is_the_data_set(make_config, make_dataset, capsys):
     assert main({"data": str(folder), "to": "memory://bucket/set/"}) == 0
     assert keys("memory://bucket/set") == keys(folder) and len(keys(folder)) == 5
     changed = {name for name, file in files.store.items() if before.get(name) != file.modified}
-    assert changed == {
-        f"/bucket/set/{name}"
-        for name in ("manifest.json", "index/1-000000.jsonl", "train-000002-000004.tar", "train-000004-000005.tar")
-    }
+    new = ("manifest.json", "index/1-000000.jsonl", "train-000002-000004.tar", "train-000004-000005.tar")
+    assert changed == {f"/bucket/set/{name}" for name in new}
 
 
 def test_copying_that_is_cut_off(folder, monkeypatch, store):
@@ -90,9 +87,8 @@ def test_following_a_data_set_that_grows(make_config, make_dataset, monkeypatch)
     growing.join()
 
 
-def test_what_is_refused(make_config, make_dataset, tmp_path, monkeypatch):
+def test_what_is_refused(folder, make_config, make_dataset, tmp_path, monkeypatch):
     """Another data set at the URL, one made anew, an altered or missing shard, and places that cannot be written to."""
-    folder = make_dataset(make_config())
     main({"data": str(folder), "to": "memory://there"})
     other = make_dataset(make_config(folder=str(tmp_path / "other"), seed=7))
     with pytest.raises(ConfigError, match="to must be empty or hold the same data set, got another one in memory://"):
@@ -114,6 +110,4 @@ def test_what_is_refused(make_config, make_dataset, tmp_path, monkeypatch):
     ):
         with pytest.raises(ConfigError, match=message):
             main(mapping)
-    monkeypatch.setattr(sys, "argv", ["upload", f"data={folder}"])
-    with pytest.raises(SystemExit, match="2"):
-        run_command(main, "upload")
+    assert exit_code(main, "upload", [f"data={folder}"], monkeypatch) == 2

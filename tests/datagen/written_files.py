@@ -1,8 +1,10 @@
-"""What the tests of the writer share: the bytes of shards, every file of a data set, and all claims."""
+"""What the tests of generation share: the bytes of shards, every file of a data set, all claims, what was simulated,
+and a progress that remembers."""
 
 import hashlib
 import json
 
+from datagen.pool.progress import Progress
 from hgn.data.manifest import Manifest
 from hgn.schema import to_mapping
 
@@ -26,6 +28,39 @@ def first_release(folder):
     mapping |= {"shards": to_mapping(list(manifest.shards)), "quarantined": to_mapping(manifest.quarantined)}
     (folder / "manifest.json").write_text(json.dumps(mapping))
     return mapping
+
+
+def simulated(control):
+    """The seeds that the stand-in for the solver was given, in order."""
+    return [int(line) for line in (control / "simulated.log").read_text().split()]
+
+
+def simulated_once(control):
+    """How many scenes were simulated; none was twice."""
+    seeds = simulated(control)
+    assert len(seeds) == len(set(seeds))
+    return len(seeds)
+
+
+class Recorder(Progress):
+    def __init__(self):
+        self.messages: list[str] = []
+        self.shards: list[str] = []
+        self.episodes: list[str] = []
+        self.launches: list[int] = []
+
+    def frame(self, worker, frame, scenes):
+        if scenes:
+            self.launches.append(scenes)
+
+    def episode(self, key):
+        self.episodes.append(key)
+
+    def shard(self, name, episodes, revision):
+        self.shards.append(name)
+
+    def message(self, text):
+        self.messages.append(text)
 
 
 def claim_all(writer):

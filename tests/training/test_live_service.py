@@ -2,15 +2,12 @@
 
 import os
 import signal
-import socket
 import subprocess
-import sys
 import threading
-from pathlib import Path
 
 import fsspec
 import pytest
-from processes import wait_until
+from processes import free_port, start_module, wait_until
 from training.runs import metrics, train_mapping
 
 import hgn.data.storage
@@ -22,7 +19,6 @@ from hgn.data.reader import EpisodeStore
 from hgn.data.storage import CACHE_VARIABLE, TOKEN_VARIABLE
 from hgn.training.checkpoint import read_checkpoint
 
-ROOT = Path(__file__).resolve().parents[2]
 SCENES = 5
 
 
@@ -30,23 +26,16 @@ class Service:
     """The ballistic service in processes of its own, always on the same port."""
 
     def __init__(self, folder, log):
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            self.port = listener.getsockname()[1]
+        self.port = free_port()
         self.folder, self.url, self._log = folder, f"http://127.0.0.1:{self.port}", log
         self.process: subprocess.Popen[bytes] | None = None
 
     def start(self):
-        path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "datagen")])
         dataset = {"training_scenes": SCENES, "validation_scenes": 1, "test_scenes": 0, "frames": 6, "workers": 1}
         overrides = [f"dataset.{key}={value}" for key, value in dataset.items()]
+        overrides += [f"out={self.folder}", f"port={self.port}"]
         with self._log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "ballistic_service", *overrides, f"out={self.folder}", f"port={self.port}"],
-                env=os.environ | {"PYTHONPATH": path},
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
+            self.process = start_module("ballistic_service", *overrides, stdout=log, stderr=log)
 
     def kill(self):
         """Ends the service and all processes below it at once."""
@@ -95,11 +84,8 @@ def test_service_restarted_midway(make_config, service, control, tmp_path):
     steering = threading.Thread(target=steer)
     steering.start()
     try:
-        code = train.main(
-            train_mapping(
-                config, run, maximum_updates=10**6, minimum_episodes=1, log_every=4, monitor_every=8, monitor_scenes=1
-            )
-        )
+        options = {"maximum_updates": 10**6, "minimum_episodes": 1, "monitor_every": 8, "monitor_scenes": 1}
+        code = train.main(train_mapping(config, run, **options))
     finally:
         ended.set()
         steering.join()
