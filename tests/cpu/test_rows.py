@@ -156,9 +156,8 @@ def test_what_is_not_compiled(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(compiled, "_library", compiled._library.__wrapped__)
     assert rows_class(128, torch.float64) is Rows
-    assert (
-        unsupported_reason(24, torch.float32) == "network.width must be a multiple of 16, at most 512, for it, not 24"
-    )
+    reason = "network.width must be a multiple of 16, at most 512, for it, not 24"
+    assert unsupported_reason(24, torch.float32) == reason
     monkeypatch.setenv("CC", str(tmp_path / "none"))
     assert describe(128) == f"rows in PyTorch ([Errno 2] No such file or directory: '{tmp_path / 'none'}')"
     monkeypatch.setenv("CC", "false")

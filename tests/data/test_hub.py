@@ -20,16 +20,12 @@ from hgn.system.hub import HubPlace, hub_weights
 def hub(tmp_path, monkeypatch):
     network = network_of(torch.float32)
     info = WeightsInfo(network.config, 60.0, 1 / 64)
-    for place in (
-        "one/net/net.safetensors",
-        "one/two/a.safetensors",
-        "one/two/b.safetensors",
-        "one/private/x.safetensors",
-    ):
-        (tmp_path / "hub" / "models" / place).parent.mkdir(parents=True, exist_ok=True)
-        save_weights(tmp_path / "hub" / "models" / place, network, info)
-    (tmp_path / "hub" / "models" / "one" / "none").mkdir()
-    (tmp_path / "hub" / "models" / "one" / "none" / "README.md").write_text("nothing")
+    models = tmp_path / "hub" / "models" / "one"
+    for place in ("net/net", "two/a", "two/b", "private/x"):
+        (models / place).parent.mkdir(parents=True, exist_ok=True)
+        save_weights(models / f"{place}.safetensors", network, info)
+    (models / "none").mkdir()
+    (models / "none" / "README.md").write_text("nothing")
     monkeypatch.setenv("HGN_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub_cache"))
     monkeypatch.delenv("HF_TOKEN", raising=False)
@@ -85,10 +81,8 @@ def test_a_server_that_fails_is_asked_again(hub, monkeypatch):
         hub_weights("hf://one/two/a.safetensors", patience_s=0.05)
 
 
-def test_a_data_set_is_read_from_a_repository(hub, make_config, make_dataset, monkeypatch):
+def test_a_data_set_is_read_from_a_repository(hub, folder, monkeypatch):
     """dataset.folder=hf://datasets/…: the episodes are the folder's, with errors on the way, in a folder of it too."""
-    config = make_config()
-    folder = make_dataset(config)
     monkeypatch.setattr("hgn.data.storage._FIRST_PAUSE_S", 0.01)
     for place in ("one/data", "one/several/part", "one/private"):
         shutil.copytree(folder, hub.folder / "datasets" / place)
@@ -104,12 +98,11 @@ def test_a_data_set_is_read_from_a_repository(hub, make_config, make_dataset, mo
         EpisodeStore("hf://data", "train")
 
 
-def test_cards_are_the_hubs(hub, make_config, make_dataset, tmp_path):
+def test_cards_are_the_hubs(hub, folder):
     """Metadata that huggingface_hub itself reads and finds valid, figures of the file and the manifest, no second
     card; and what lies in such a folder is read back by its hf:// address."""
     from huggingface_hub import DatasetCard, ModelCard
 
-    folder = make_dataset(make_config())
     assert card.main({"data": str(folder), "license": "cc-by-4.0"}) == 0
     found = DatasetCard.load(folder / "README.md")
     assert found.data.license == "cc-by-4.0" and found.data.size_categories == ["n<1K"]

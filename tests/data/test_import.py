@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from typing import Any
 
 import h5py
@@ -56,13 +57,6 @@ def own_simulations(data, boundary_P3=NOTHING):
     }
 
 
-@pytest.fixture
-def data(make_config, make_dataset):
-    config = make_config()
-    make_dataset(config)
-    return config
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_own_episodes_come_back(name, data, tmp_path):
     """In each format the windows of every frame are the same bit by bit, and so are materials and statistics."""
@@ -104,23 +98,19 @@ def test_training_losses_are_the_same(name, data, tmp_path):
     assert losses[0] == losses[1] and len(losses[0]) == 3
 
 
-def edit(path, change):
-    data = bytearray(path.read_bytes())
-    change(data)
-    path.write_bytes(data)
-
-
 def flip(place):
     """Changes a byte of train.tfrecord."""
 
     def change(folder):
-        edit(folder / "train.tfrecord", lambda data: data.__setitem__(place, data[place] ^ 1))
+        data = bytearray((folder / "train.tfrecord").read_bytes())
+        data[place] ^= 1
+        (folder / "train.tfrecord").write_bytes(data)
 
     return change
 
 
 def cut(name, size):
-    return lambda folder: edit(folder / name, lambda data: data.__delitem__(slice(size, None)))
+    return lambda folder: os.truncate(folder / name, size)
 
 
 def meta(**changes):
@@ -145,14 +135,17 @@ def hdf5(name, key, value=None):
     return change
 
 
-def npz(key, value):
-    def change(folder):
-        with np.load(folder / "train.npz") as archive:
-            members = dict(archive)
-        members[key] = value(members[key])
-        np.savez(folder / "train.npz", **members)
+def rewrite(folder, **changes):
+    """Puts other arrays into train.npz: functions of those that are there, or new ones."""
+    with np.load(folder / "train.npz") as archive:
+        members = dict(archive)
+    for key, value in changes.items():
+        members[key] = value(members[key]) if callable(value) else value
+    np.savez(folder / "train.npz", **members)
 
-    return change
+
+def npz(key, value):
+    return lambda folder: rewrite(folder, **{key: value})
 
 
 def with_nan(array):
@@ -178,10 +171,7 @@ def cells(cell, length=1.0):
     def change(folder):
         meta(obstacle_cell_size=1 / 64)(folder)
         normal = np.tile(np.array([[0, length, 0]], np.float32), (len(cell), 1))
-        path = folder / "train.npz"
-        with np.load(path) as archive:
-            members = dict(archive)
-        np.savez(path, **members, **{"00001/obstacle_cell": np.array(cell), "00001/obstacle_normal": normal})
+        rewrite(folder, **{"00001/obstacle_cell": np.array(cell), "00001/obstacle_normal": normal})
 
     return change
 
@@ -329,21 +319,19 @@ def test_each_simulation_may_have_its_own_gravity(name, tmp_path):
     """The file's, not an estimate over all; where its unit is nowhere written down, flights have to agree."""
     own = [(0.0, -0.5, 0.0), (0.2, 0.3, 0.0)]
     source = write(tmp_path / "foreign", name, flights(*own), metadata())
-    key = "grav" if name == "neuralmpm" else "gravity"
+    one_each = name == "neuralmpm"  # a file
 
     def tell(factor):
         for number, gravity in enumerate(own):
-            path, place = (
-                (f"train/sim_{number}.h5", key) if name == "neuralmpm" else ("train.h5", f"0000{number}/{key}")
-            )
+            path, group = (f"train/sim_{number}.h5", "grav") if one_each else ("train.h5", f"0000{number}/gravity")
             with h5py.File(source / path, "a") as file:
-                file.pop(place, None)
-                file[place] = factor * np.array(gravity)
+                file.pop(group, None)
+                file[group] = factor * np.array(gravity)
 
     tell(1.0)
     import_trajectories.main(options(tmp_path / "mine", source, gravity=None))
     assert [e.gravity for e in EpisodeStore(tmp_path / "mine", "train").episodes] == own
-    if name == "neuralmpm":
+    if one_each:
         tell(2.0)
         with pytest.raises(ConfigError, match=r"sim_0.h5: gravity must be what flies there shows, .* got \[0.0, -1.0,"):
             import_trajectories.main(options(tmp_path / "other", source, gravity=None))

@@ -71,10 +71,8 @@ def test_costs_do_not_grow(make_config, stage, tmp_path, monkeypatch):
     monkeypatch.setattr(DatasetWriter, "_is_present", lambda self, shard: True)
     costs = []
     for published in (1, MANY):
-        config = make_config(
-            folder=str(tmp_path / str(published)), training_scenes=MANY + 3, validation_scenes=0, test_scenes=0,
-            episodes_per_shard=1,
-        )  # fmt: skip
+        sizes = {"training_scenes": MANY + 3, "validation_scenes": 0, "test_scenes": 0, "episodes_per_shard": 1}
+        config = make_config(folder=str(tmp_path / str(published)), **sizes)
         folder = listed(config, published)
         with DatasetWriter(config) as writer:
             store = EpisodeStore(folder, "train")
@@ -178,9 +176,8 @@ def edits():
 
 
 @pytest.mark.parametrize(("edit", "message"), list(edits()))
-def test_manifest_that_contradicts_itself(make_config, make_dataset, edit, message):
+def test_manifest_that_contradicts_itself(folder, edit, message):
     """A shard listed twice, an episode left out, numbers that are none, a hash that is another configuration's."""
-    folder = make_dataset(make_config())
     content = first_release(folder)
     edit(content)
     (folder / "manifest.json").write_text(json.dumps(content))
@@ -197,9 +194,8 @@ def test_manifest_that_contradicts_itself(make_config, make_dataset, edit, messa
         (r"}\n", " \n", "must be JSON"),
     ],
 )
-def test_index_that_was_altered(make_config, make_dataset, pattern, text, message):
+def test_index_that_was_altered(folder, pattern, text, message):
     """Lines that do not add up to what the manifest says are refused; what is behind them is not read."""
-    folder = make_dataset(make_config())
     path = folder / "index" / "1-000000.jsonl"
     path.write_text(re.sub(pattern, text, path.read_text(), count=1))
     store = EpisodeStore(folder, "train")
@@ -210,10 +206,9 @@ def test_index_that_was_altered(make_config, make_dataset, pattern, text, messag
         store.episodes[0]
 
 
-def test_maps_are_bounded(make_config, make_dataset, monkeypatch):
+def test_maps_are_bounded(folder, monkeypatch):
     """Many shards need few open files; one that is cut while it is mapped is an error, not the end of the process."""
     monkeypatch.setattr(hgn.data.reader, "MAPPED_SHARDS", 2)
-    folder = make_dataset(make_config())
     store = EpisodeStore(folder, "train")
     assert [episode.key for _ in range(2) for episode in store.episodes] == [f"train-{i:06d}" for i in range(5)] * 2
     assert len(store._open_shards) == 2

@@ -10,8 +10,6 @@ import http.server
 import json
 import multiprocessing
 import os
-import socket
-import sys
 import threading
 import urllib.request
 from pathlib import Path
@@ -19,14 +17,13 @@ from pathlib import Path
 import fsspec
 import numpy as np
 import pytest
-import uvicorn
-from processes import PATIENCE_S
+from processes import PATIENCE_S, exit_code, free_port
+from serving import serving
 from written_files import first_release
 
 import hgn.data.storage
-from datagen.service.server import make_app, make_server
+from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState
-from hgn.command import run_command
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
 from hgn.data.storage import (
@@ -62,29 +59,23 @@ def in_memory(folder, name):
     return f"memory://{name}"
 
 
+def brought(url, entry=None, **options):
+    """The path of a shard, the first one, in the cache."""
+    entry = entry or Manifest.load(url).shards[0]
+    return open_storage(url).shard(entry.name, entry.sha256, entry.bytes, **options)
+
+
 @pytest.fixture
 def serve(folder):
     """Starts the service's server, without a pool, on a port of its own: its URL."""
-    running: list[tuple[uvicorn.Server, threading.Thread]] = []
+    with contextlib.ExitStack() as running:
 
-    def start(token=None, port=0):
-        listener = socket.create_server(("127.0.0.1", port))
-        app = make_app(folder, token, PoolState)
-        server = make_server(app, connections=16)
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        running.append((server, thread))
-        return f"http://127.0.0.1:{listener.getsockname()[1]}"
+        def start(token=None, port=0):
+            _, port = running.enter_context(serving(make_app(folder, token, PoolState), port, connections=16))
+            return f"http://127.0.0.1:{port}"
 
-    def stop():
-        while running:
-            server, thread = running.pop()
-            server.should_exit = True
-            thread.join()
-
-    start.stop = stop
-    yield start
-    stop()
+        start.stop = running.close
+        yield start
 
 
 class Quiet:
@@ -95,7 +86,7 @@ class Quiet:
 
 
 @contextlib.contextmanager
-def serving(handler):
+def answering(handler):
     """The URL of a server of its own."""
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever).start()
@@ -189,6 +180,12 @@ def test_ranks_share_the_cache(folder, serve, cache):
     assert not list(cache.glob("*.partial"))
 
 
+def partial_of(entry, cache):
+    """Where a shard is fetched to."""
+    cache.mkdir(parents=True, exist_ok=True)
+    return cache / f".{entry.sha256}.tar.partial"
+
+
 @pytest.mark.parametrize("left", [b"", b"prefix", b"garbage", b"too long"])
 def test_fetching_goes_on_where_it_ended(folder, cache, left, monkeypatch):
     """What a killed process had fetched is kept, unless it is not what it should be."""
@@ -196,16 +193,13 @@ def test_fetching_goes_on_where_it_ended(folder, cache, left, monkeypatch):
     url = in_memory(folder, f"resume-{left.decode().replace(' ', '-')}")
     entry = Manifest.load(url).shards[0]
     content = (folder / entry.name).read_bytes()
-    cache.mkdir(parents=True)
-    partial = cache / f".{entry.sha256}.tar.partial"
-    partial.write_bytes(
-        {b"prefix": content[:5000], b"garbage": b"?" * 5000, b"too long": content + b"?"}.get(left, b"")
-    )
+    fetched = {b"prefix": content[:5000], b"garbage": b"?" * 5000, b"too long": content + b"?"}.get(left, b"")
+    partial_of(entry, cache).write_bytes(fetched)
     reads: list[int] = []
     files = open_storage(url)._files
     real = files.cat_file
     monkeypatch.setattr(files, "cat_file", lambda *a, **k: reads.append(k["start"]) or real(*a, **k))
-    path = open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
+    path = brought(url, entry)
     assert path.read_bytes() == content and [p.name for p in cache.iterdir()] == [path.name]
     assert reads[0] == (5000 if left in (b"prefix", b"garbage") else 0)
     assert (0 in reads) == (left != b"prefix")
@@ -214,11 +208,10 @@ def test_fetching_goes_on_where_it_ended(folder, cache, left, monkeypatch):
 def test_damaged_cache_is_mended(folder, cache, capsys):
     """A shard that changed on this machine's disk is fetched again."""
     url = in_memory(folder, "mended")
-    entry = Manifest.load(url).shards[0]
-    path = open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
-    path.write_bytes(b"?" * entry.bytes)
+    path = brought(url)
+    path.write_bytes(b"?" * path.stat().st_size)
     os.utime(path, ns=(1, 1))
-    assert open_storage(url).shard(entry.name, entry.sha256, entry.bytes).read_bytes()[:5] == b"train"
+    assert brought(url).read_bytes()[:5] == b"train"
     assert "it was altered; it is fetched again" in capsys.readouterr().err
 
 
@@ -271,7 +264,7 @@ def test_answers_are_bounded(monkeypatch, attack):
                 for _ in range(0 if attack == "gzip bomb" else 1000):
                     self.wfile.write(bytes(10_000))
 
-    with serving(Attack) as url:
+    with answering(Attack) as url:
         storage = open_storage(url)
         if attack == "gzip bomb":
             assert len(storage.manifest("manifest.json")) < 20_000
@@ -281,10 +274,9 @@ def test_answers_are_bounded(monkeypatch, attack):
                 storage.read("s", 0, 50) if attack == "long range" else storage.manifest("manifest.json")
 
 
-def test_proxy_that_remembers(monkeypatch):
+def test_proxy_that_remembers():
     """A proxy that has an older, shorter file of the index is asked again until it has the one that the manifest is
     about."""
-    monkeypatch.setattr("hgn.data.storage._FIRST_PAUSE_S", 0.01)
     answers = iter([(416, b""), (206, b"56"), (206, b"5678")])
 
     class Proxy(Quiet, http.server.BaseHTTPRequestHandler):
@@ -295,7 +287,7 @@ def test_proxy_that_remembers(monkeypatch):
             self.end_headers()
             self.wfile.write(content)
 
-    with serving(Proxy) as url:
+    with answering(Proxy) as url:
         assert open_storage(url).read("index", 5, 9) == b"5678"
 
 
@@ -341,14 +333,10 @@ def test_clock_that_was_set_back(folder, cache, monkeypatch):
     """What was brought first makes room, also when this machine's clock stood in the future then."""
     url = in_memory(folder, "clock")
     first, second, third, *_ = sorted(Manifest.load(url).shards, key=lambda shard: -shard.bytes)
-
-    def bring(entry):
-        return open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
-
-    os.utime(bring(first), (2**33, 2**33))
-    brought = bring(second)
+    os.utime(brought(url, first), (2**33, 2**33))
+    kept = brought(url, second)
     monkeypatch.setenv(LIMIT_VARIABLE, str((second.bytes + third.bytes) / 1e9))
-    expected = sorted([brought, bring(third)])
+    expected = sorted([kept, brought(url, third)])
     assert sorted(cache.glob("*.tar")) == expected
 
 
@@ -358,24 +346,21 @@ def test_who_fetches_was_stopped(folder, cache, patience_s):
     that ends."""
     url = in_memory(folder, "stopped")
     entry = Manifest.load(url).shards[0]
-    cache.mkdir(parents=True)
-    with (cache / f".{entry.sha256}.tar.partial").open("wb") as partial, contextlib.ExitStack() as stack:
+    with partial_of(entry, cache).open("wb") as partial, contextlib.ExitStack() as stack:
         fcntl.flock(partial, fcntl.LOCK_EX)
         if patience_s == 1e6:
             stack.enter_context(without_patience())
         with pytest.raises(UnreachableError, match="another process is fetching it"):
-            open_storage(url).shard(entry.name, entry.sha256, entry.bytes, patience_s)
+            brought(url, patience_s=patience_s)
 
 
 def test_link_in_the_cache(folder, cache, tmp_path):
     """A partial file that is a link to another file is refused; that file stays as it is."""
     url = in_memory(folder, "linked")
-    entry = Manifest.load(url).shards[0]
-    cache.mkdir(parents=True)
     (tmp_path / "precious").write_text("mine")
-    (cache / f".{entry.sha256}.tar.partial").symlink_to(tmp_path / "precious")
+    partial_of(Manifest.load(url).shards[0], cache).symlink_to(tmp_path / "precious")
     with pytest.raises(ConfigError, match="must be a file, got a symbolic link"):
-        open_storage(url).shard(entry.name, entry.sha256, entry.bytes)
+        brought(url)
     assert (tmp_path / "precious").read_text() == "mine"
 
 
@@ -405,7 +390,7 @@ def test_server_without_ranges(folder, monkeypatch):
     class Plain(Quiet, http.server.SimpleHTTPRequestHandler):
         pass
 
-    with serving(functools.partial(Plain, directory=str(folder))) as url:
+    with answering(functools.partial(Plain, directory=str(folder))) as url:
         assert same_episodes(EpisodeStore(url, "train"), EpisodeStore(folder, "train"))
 
 
@@ -445,11 +430,8 @@ def test_server_that_comes_back(folder, serve):
 
 def test_command_without_its_server(monkeypatch, capsys):
     """A command whose server stays away ends with one line that says what to do, and exit code 1."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    monkeypatch.setattr(sys, "argv", ["kills"])
-    with pytest.raises(SystemExit, match="1"):
-        run_command(lambda mapping: Manifest.load(url, patience_s=0.01) and None, "kills")
+    url = f"http://127.0.0.1:{free_port()}"
+    assert exit_code(lambda _: Manifest.load(url, patience_s=0.01), "kills", [], monkeypatch) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: no answer for 0 s (at last: ") and error.count("\n") == 1
     assert error.endswith(f"{url}/manifest.json; see that its server runs and run the same command again\n")
@@ -474,7 +456,7 @@ def test_what_is_within_reach(folder, serve, cache):
     store = EpisodeStore(url, "train")
     assert store.within_reach([0, 1], patience_s=0)
     third = list(store.manifest.shards_of("train"))[2]
-    with (cache / f".{third.sha256}.tar.partial").open("wb") as partial:
+    with partial_of(third, cache).open("wb") as partial:
         fcntl.flock(partial, fcntl.LOCK_EX)
         assert not store.within_reach([2], patience_s=0)
     serve.stop()
@@ -482,19 +464,33 @@ def test_what_is_within_reach(folder, serve, cache):
     assert EpisodeStore(folder, "train").within_reach(range(5), patience_s=0)
 
 
-def test_full_disk(folder, cache, monkeypatch):
-    """Where the cache is full the error names it, and what was fetched does not stay in the way."""
-    url = in_memory(folder, "full")
-    store = EpisodeStore(url, "train")
+@pytest.mark.parametrize(
+    ("module", "function", "number", "error", "message"),
+    [
+        (os, "fsync", errno.ENOSPC, OSError, "No space left on device: .*cache/shards"),
+        (
+            fcntl,
+            "flock",
+            errno.ENOSYS,
+            ConfigError,
+            rf"{CACHE_VARIABLE} must name a folder on a file system with file locks, got .*shards \(Function not",
+        ),
+    ],
+    ids=["full", "no locks"],
+)
+def test_a_cache_that_fails(folder, cache, monkeypatch, module, function, number, error, message):
+    """Where it is full the error names it, and what was fetched does not stay in the way. Where it has no locks, as on
+    Lustre without -o flock, another folder is asked for, and what stands in the way is named."""
 
-    def full(descriptor):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    def failing(*arguments):
+        raise OSError(number, os.strerror(number))
 
+    store = EpisodeStore(in_memory(folder, function), "train")
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(OSError, match=r"No space left on device: .*cache/shards"):
+        patch.setattr(module, function, failing)
+        with pytest.raises(error, match=message):
             store.episodes[0]
-    assert list(cache.iterdir()) == []
+    assert function == "flock" or list(cache.iterdir()) == []
     assert store.episodes[0].key == "train-000000"
 
 
@@ -508,11 +504,20 @@ def test_damage_at_the_service(folder, serve):
 
 
 def test_cache_folder(monkeypatch, tmp_path):
-    """HGN_CACHE names the cache; otherwise it is where programs of this machine keep theirs."""
+    """HGN_CACHE names the cache; otherwise it is where programs of this machine keep theirs. A user without a home, as
+    in some containers, is told what to name."""
     assert cache_folder() == tmp_path / "cache" / "shards"
     monkeypatch.delenv(CACHE_VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder() == tmp_path / "hgn" / "shards"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    with pytest.raises(ConfigError, match=f"{CACHE_VARIABLE} must name a folder"):
+        cache_folder()
 
 
 def test_a_cache_that_cannot_be(folder, tmp_path, monkeypatch):
@@ -521,31 +526,3 @@ def test_a_cache_that_cannot_be(folder, tmp_path, monkeypatch):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
     with pytest.raises(ConfigError, match=rf"{CACHE_VARIABLE} must name a folder .* got .*shards \(Not a directory\)"):
         EpisodeStore(in_memory(folder, "uncached"), "train").episodes[0]
-
-
-def test_a_cache_without_locks(folder, cache, monkeypatch):
-    """As on Lustre without -o flock: another folder is asked for, and what stands in the way is named."""
-
-    def lustre(*arguments):
-        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
-
-    store = EpisodeStore(in_memory(folder, "unlocked"), "train")
-    with monkeypatch.context() as patch:
-        patch.setattr(fcntl, "flock", lustre)
-        message = rf"{CACHE_VARIABLE} must name a folder on a file system with file locks, got .*shards \(Function not"
-        with pytest.raises(ConfigError, match=message):
-            store.episodes[0]
-    assert store.episodes[0].key == "train-000000"
-
-
-def test_no_folder_for_shards(monkeypatch):
-    """A user without a home, as in some containers, is told what to name."""
-    for name in (CACHE_VARIABLE, "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
-
-    def homeless():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(Path, "home", homeless)
-    with pytest.raises(ConfigError, match=f"{CACHE_VARIABLE} must name a folder"):
-        cache_folder()

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from equality import assert_same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -37,20 +38,6 @@ def make_episode(frames=4, particles=5, cells=3, seed=0, **changes):
         "solver": {"substeps": 1234, "projections": 0},
     }
     return Episode(**(values | changes))
-
-
-def assert_same(left, right):
-    for field in dataclasses.fields(Episode):
-        one, other = getattr(left, field.name), getattr(right, field.name)
-        if isinstance(one, np.ndarray):
-            assert one.dtype == other.dtype and np.array_equal(one, other), field.name
-        elif field.name == "obstacle_grid":
-            assert one.cell_size == other.cell_size
-            assert np.array_equal(one.cell_K3, other.cell_K3) and np.array_equal(one.normal_K3, other.normal_K3)
-        elif field.name == "material_parameters":
-            assert one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
-        else:
-            assert one == other, field.name
 
 
 @settings(max_examples=25, deadline=None)

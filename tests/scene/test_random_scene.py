@@ -186,9 +186,8 @@ def test_gravity_of_a_share_of_the_scenes():
     scene, upright = generate_scene(MOVING, 5), generate_scene(replace(MOVING, tilted_gravity_fraction=0.0), 5)
     assert digest(scene) == digest(generate_scene(MOVING, 5)) and scene.gravity != upright.gravity
     assert (scene.position_N3 == upright.position_N3).all()
-    assert {generate_scene(replace(MOVING, tilted_gravity_fraction=0.8), seed).gravity for seed in range(3)} != {
-        (0.0, -9.8, 0.0)
-    }
+    tilted = [generate_scene(replace(MOVING, tilted_gravity_fraction=0.8), seed) for seed in range(3)]
+    assert any(scene.gravity != (0.0, -9.8, 0.0) for scene in tilted)
 
 
 def test_pure_directions():
@@ -339,27 +338,20 @@ def test_own_meshes_among_the_obstacles(tmp_path):
         mesh.apply_transform(np.diag([1, scale, 1, 1]))
         (tmp_path / name).mkdir()
         mesh.export(tmp_path / name / "brick.stl")
-    config = SceneConfig(
-        obstacle_shapes=(str(tmp_path / "here/brick.stl"),), obstacle_count=2, obstacle_size=(0.3, 0.3)
-    )
+    brick = str(tmp_path / "here/brick.stl")
+    config = SceneConfig(obstacle_shapes=(brick,), obstacle_count=2, obstacle_size=(0.3, 0.3))
     scene, again = generate_scene(config, 5), generate_scene(config, 5)
-    assert digest(scene) == digest(again) and [item.name for item in scene.obstacles] == [
-        "obstacle_0_brick",
-        "obstacle_1_brick",
-    ]
+    names = ["obstacle_0_brick", "obstacle_1_brick"]
+    assert digest(scene) == digest(again) and [item.name for item in scene.obstacles] == names
     for item in scene.obstacles:
         edges = np.linalg.norm(item.vertex_V3[:, None] - item.vertex_V3[None], axis=-1)
         assert item.closed and edges.max() == pytest.approx(0.3 * np.linalg.norm((1, 0.5, 0.25)), rel=1e-5)
     records = scene.specification["obstacles"]
     for changed in (False, True):
         known = [record | {"sha256": "0" * 64} if changed else record for record in records]
-        rebuilt = obstacles_of_episode(
-            SimpleNamespace(
-                specification=scene.specification | {"obstacles": known},
-                obstacle_grid=build_obstacle_grid(scene.obstacles, CELL, 0),
-            )
-        )
-        assert [item.name for item in rebuilt] == (["cells"] if changed else ["obstacle_0_brick", "obstacle_1_brick"])
+        specification, grid = scene.specification | {"obstacles": known}, build_obstacle_grid(scene.obstacles, CELL, 0)
+        rebuilt = obstacles_of_episode(SimpleNamespace(specification=specification, obstacle_grid=grid))
+        assert [item.name for item in rebuilt] == (["cells"] if changed else names)
         if not changed:
             np.testing.assert_array_equal(rebuilt[0].vertex_V3, scene.obstacles[0].vertex_V3)
     hashes = [

@@ -122,9 +122,8 @@ def test_groups_may_touch_the_walls_but_not_enter_them(tmp_path):
 def test_particles_inside_a_closed_obstacle_are_refused_with_their_count(tmp_path):
     """The message names group, obstacle and count; inside a bowl or above a sheet is no offence."""
     path = write(tmp_path, {"groups": [CUBE, {**CUBE, "position": [0.5, 0.25, 0.5]}], "obstacles": [CONE]})
-    with pytest.raises(
-        ConfigError, match=r"groups\[1\] \(cube of water\) must be clear of closed .*obstacle_0_cone"
-    ) as seen:
+    message = r"groups\[1\] \(cube of water\) must be clear of closed .*obstacle_0_cone"
+    with pytest.raises(ConfigError, match=message) as seen:
         load_scene(path)
     assert "1074 of 1074" not in str(seen.value)
     assert " of 1074 particles inside" in str(seen.value)
@@ -140,14 +139,8 @@ def group_with(**changes):
     return {"groups": [{**CUBE, **changes}]}
 
 
-DISC = {
-    "shape": "disc",
-    "size": 0.1,
-    "position": [0.5, 0.8, 0.5],
-    "velocity": [0, -1, 0],
-    "material": "water",
-    "stop": 1,
-}
+DISC = {"shape": "disc", "size": 0.1, "position": [0.5, 0.8, 0.5], "material": "water"}
+DISC |= {"velocity": [0, -1, 0], "stop": 1}
 
 
 def emitter_with(**changes):
@@ -244,9 +237,8 @@ def test_emitters(tmp_path):
     offset = scene.position_N3[water] - np.float32(disc["position"])
     assert np.abs(offset @ np.array([0, -2, 1])).max() < 1e-6
     assert 0.049 < np.linalg.norm(offset, axis=1).max() <= 0.05 + 1e-6
-    assert np.abs(scene.position_N3[sand] - np.float32(slot["position"])).max(axis=0) == pytest.approx(
-        [0.1, 0.025, 0], abs=1e-3
-    )
+    aside = np.abs(scene.position_N3[sand] - np.float32(slot["position"])).max(axis=0)
+    assert aside == pytest.approx([0.1, 0.025, 0], abs=1e-3)
     tension = scene.material_parameters["water_tension"]
     assert (tension[water] == 0.5).all() and np.isnan(tension[~water]).all()
 

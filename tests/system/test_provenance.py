@@ -17,16 +17,8 @@ def test_folders_are_left_out():
     }
     for text, expected in cases.items():
         assert without_folders(text) == expected
-    for text in (
-        "results/solver/a.json",
-        "http://host:80/a/b",
-        "s3://bucket/a",
-        "1/2",
-        "conf/a",
-        "../a/b",
-        "/",
-        "a = b",
-    ):
+    stay = ("results/solver/a.json", "http://host:80/a/b", "s3://bucket/a", "1/2", "conf/a", "../a/b", "/", "a = b")
+    for text in stay:
         assert without_folders(text) == text
     nested = {"a": ["/x/y", 3, None], "b": {"c": ("/x/z",)}}
     assert without_folders(nested) == {"a": ["y", 3, None], "b": {"c": ["z"]}}

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scene.test_episode import make_episode
 
 from hgn.config import NetworkConfig
 from hgn.data.batch import make_batch
-from hgn.scene.episode import Episode
-from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.training.noise import jittered_origin, perturbed_window, random_walk
 
 STD = 0.000848528
@@ -19,18 +18,12 @@ STD = 0.000848528
 def episode(particles, frames=12, seed=0):
     rng = np.random.default_rng(seed)
     steps = rng.normal(0, 1e-3, (frames, particles, 3))
-    return Episode(
-        key="train-000000",
+    return make_episode(
+        cells=0,
         position_TN3=(0.5 + steps.cumsum(0)).astype(np.float32),
         initial_velocity_N3=rng.normal(0, 0.1, (particles, 3)).astype(np.float32),
         material_N=rng.integers(0, 3, particles).astype(np.uint8),
-        obstacle_grid=ObstacleGrid(1 / 64, np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32)),
         domain_size=(1.0, 1.0, 1.0),
-        gravity=(0.0, -9.8, 0.0),
-        frame_rate_hz=60.0,
-        seed=0,
-        specification={},
-        solver={},
     )
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from equality import assert_same
 from network.states import gns_of, network_of
 from training.runs import metrics, train_mapping
 from training.test_noise import episode
-from training.test_resume import assert_same
 from training.test_resume import stop_at as stop_at
 from training.test_symmetry import scene_with_obstacles
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from equality import assert_same
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from training.runs import NETWORK, TRAINING, train_mapping
@@ -23,7 +24,7 @@ from hgn.training.stop import StopRequest
 
 UPDATES = 16  # of 2 samples, where an epoch has 25
 MORE = {"optimizer": "muon", "symmetry": "gravity", "warmup_updates": 6, "ema_decay": 0.8}
-FRAMES = st.lists(st.integers(2, 9), min_size=1, max_size=6)
+STARTS = ((1, 8), (1, 2), (0, 3), (1, 4))  # from, to: ranks, scenes each, batches read ahead, batches
 
 
 class Samples:
@@ -129,13 +130,7 @@ def test_feeds_of_all_ranks_resume_anywhere(data):
     expected = [whole.next_batch()[0].seed for _ in range(8 * 2 * 3 * 4)]
 
     @settings(max_examples=25, deadline=None, derandomize=True)
-    @given(
-        st.lists(
-            st.tuples(st.integers(1, 8), st.integers(1, 2), st.integers(0, 3), st.integers(1, 4)),
-            min_size=1,
-            max_size=3,
-        )
-    )
+    @given(st.lists(st.tuples(*(st.integers(*ends) for ends in STARTS)), min_size=1, max_size=3))
     def interrupted(starts):
         seen: list[int] = []
         sampler_state = SamplerState()
@@ -175,22 +170,6 @@ def stop_at(monkeypatch):
     return lambda update: place.update(update=update, module=None)
 
 
-def assert_same(found, expected, where=""):
-    """Equal bit by bit, tensors inside containers included."""
-    if isinstance(expected, torch.Tensor):
-        assert torch.equal(found, expected), where
-    elif isinstance(expected, dict):
-        assert found.keys() == expected.keys(), where
-        for key, value in expected.items():
-            assert_same(found[key], value, f"{where}.{key}")
-    elif isinstance(expected, (list, tuple)):
-        assert len(found) == len(expected), where
-        for index, value in enumerate(expected):
-            assert_same(found[index], value, f"{where}[{index}]")
-    else:
-        assert found == expected, where
-
-
 def test_resume_equals_no_interruption(data, stop_at):
     """Interrupted at any updates, once or several times, a training ends where an uninterrupted one does, bit by bit:
     weights, their average, both moments, learning rate and order; noise, jitter and symmetries come from the samples'
@@ -208,10 +187,8 @@ def test_resume_equals_no_interruption(data, stop_at):
     with tempfile.TemporaryDirectory() as folder:
         whole = trained(Path(folder) / "whole", [])
     digest = EpisodeStore(data.dataset.folder, "train").digest(5)
-    assert (
-        dataclasses.asdict(SamplerState(1, 7, 5, digest, seed=TrainingConfig(**TRAINING).seed))
-        == whole["hgn"]["sampler_state"]
-    )
+    expected = SamplerState(1, 7, 5, digest, seed=TrainingConfig(**TRAINING).seed)
+    assert dataclasses.asdict(expected) == whole["hgn"]["sampler_state"]
 
     @settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
     @given(st.lists(st.integers(1, UPDATES - 1), min_size=1, max_size=2, unique=True).map(sorted))
