@@ -92,9 +92,8 @@ class Reference:
         stored = read_checkpoint(folder / "run" / "checkpoints" / "last.ckpt")
         assert stored["hgn"]["updates"] == 20
         sampler_state = stored["hgn"]["sampler_state"]
-        assert (
-            25 * sampler_state["epoch"] + sampler_state["position"] == 2 * 20
-        )  # two samples an update, of 5 episodes with 5 steps
+        samples = 25 * sampler_state["epoch"] + sampler_state["position"]  # of 5 episodes with 5 steps
+        assert samples == 2 * 20  # two an update
         for name, tensor in stored["state_dict"].items():
             assert torch.equal(ends[0]["weights"][name], tensor), name
             assert torch.equal(ends[1]["weights"][name], tensor), name
@@ -214,6 +213,13 @@ def no_launcher(monkeypatch):
     return monkeypatch
 
 
+@pytest.fixture
+def launched(no_launcher, variables):
+    """By what sets these variables alone."""
+    for name, value in variables.items():
+        no_launcher.setenv(name, value)
+
+
 @pytest.mark.parametrize(
     ("variables", "first"),
     [
@@ -227,10 +233,9 @@ def no_launcher(monkeypatch):
         ({"LOCAL_RANK": "0", "NODE_RANK": "1"}, False),
     ],
 )
-def test_one_process_leads(no_launcher, variables, first):
+@pytest.mark.usefixtures("launched")
+def test_one_process_leads(first):
     """Whatever launched the processes, exactly the one of global rank 0 leads."""
-    for name, value in variables.items():
-        no_launcher.setenv(name, value)
     assert first_rank() is first
 
 
@@ -246,18 +251,15 @@ def test_one_process_leads(no_launcher, variables, first):
         ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4"}, True),
     ],
 )
-def test_launcher_and_configuration_agree(no_launcher, variables, accepted):
+@pytest.mark.usefixtures("launched")
+def test_launcher_and_configuration_agree(accepted):
     """A launcher that started another number of processes than devices x nodes is refused: each would train alone."""
-    for name, value in variables.items():
-        no_launcher.setenv(name, value)
     training = TrainingConfig(accelerator="cpu", devices=2, nodes=2)
     if accepted:
         assert layout(training) == (2, 2)
-    else:
-        with pytest.raises(
-            ConfigError, match=r"training\.devices x training\.nodes must be the \d processes .* 2 x 2;"
-        ):
-            layout(training)
+        return
+    with pytest.raises(ConfigError, match=r"training\.devices x training\.nodes must be the \d processes .* 2 x 2;"):
+        layout(training)
 
 
 @pytest.mark.parametrize(
@@ -271,10 +273,9 @@ def test_launcher_and_configuration_agree(no_launcher, variables, accepted):
         ({"SLURM_PROCID": "1", "SLURM_NTASKS": "2", "RANK": "3", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}, (2, 2)),
     ],
 )
-def test_layout_follows_the_launcher(no_launcher, variables, expected):
+@pytest.mark.usefixtures("launched")
+def test_layout_follows_the_launcher(expected):
     """Where the configuration leaves them open, devices and nodes are those that the launcher started."""
-    for name, value in variables.items():
-        no_launcher.setenv(name, value)
     assert layout(TrainingConfig(accelerator="cpu")) == expected
 
 
@@ -284,9 +285,8 @@ def test_restarts_that_would_hang_are_refused(no_launcher):
     no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "0")
     assert layout(TrainingConfig(accelerator="cpu")) == (1, 1)
     no_launcher.setenv("TORCHELASTIC_MAX_RESTARTS", "3")
-    with pytest.raises(
-        ConfigError, match=r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"
-    ):
+    message = r"STORE must be 1 in torchrun's environment .*--max-restarts 3\), got nothing"
+    with pytest.raises(ConfigError, match=message):
         layout(TrainingConfig(accelerator="cpu"))
     no_launcher.setenv("TORCHELASTIC_USE_AGENT_STORE", "False")
     assert layout(TrainingConfig(accelerator="cpu")) == (1, 1)
@@ -306,11 +306,10 @@ def test_restarts_that_would_hang_are_refused(no_launcher):
         ({"HGN_RUN": "/shared/mine"}, "/shared/mine"),
     ],
 )
-def test_one_folder_a_run(no_launcher, variables, folder):
+@pytest.mark.usefixtures("launched")
+def test_one_folder_a_run(folder):
     """All processes of a job, and its restarts, agree on the folder; two jobs get two. Our own variable comes first,
     then torchrun's id (unless it is random, as --standalone makes it), then Slurm's."""
-    for name, value in variables.items():
-        no_launcher.setenv(name, value)
     assert str(default_run("small")) == folder
 
 
@@ -373,19 +372,17 @@ def test_no_rank_waits_for_one_that_fails(data, no_launcher, warm_python, tmp_pa
 
 
 @pytest.mark.parametrize(("local_rank", "expected"), [("0", []), ("1", [signal.SIGKILL])])
-def test_ranks_end_with_the_one_that_started_them(monkeypatch, make_config, tmp_path, local_rank, expected):
+def test_ranks_end_with_the_one_that_started_them(no_launcher, make_config, tmp_path, local_rank, expected):
     """Lightning's launcher leaves the other ranks waiting when the first one fails: the kernel ends them. The first
     one of a machine outlives its shell, as any command."""
-    for name in LAUNCHER_VARIABLES:
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("LOCAL_RANK", local_rank)
+    no_launcher.setenv("LOCAL_RANK", local_rank)
     asked: list[int] = []
-    monkeypatch.setattr(train, "die_with_parent", asked.append)
+    no_launcher.setattr(train, "die_with_parent", asked.append)
 
     def far_enough(training):
         raise ConfigError("far enough")
 
-    monkeypatch.setattr(train, "layout", far_enough)
+    no_launcher.setattr(train, "layout", far_enough)
     with pytest.raises(ConfigError, match="far enough"):
         train.main(train_mapping(make_config(), tmp_path / "run"))
     assert asked == expected

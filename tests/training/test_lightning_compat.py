@@ -48,10 +48,8 @@ def test_canary(tmp_path):
     assert trainer.optimizers[0].param_groups[0]["lr"] == 0.1**7
     assert not lightning_compat.received_sigterm(trainer)
     strategies = [lightning_compat.gradient_averaging(path, "fp32") for path in ("torch", "triton")]
-    assert [type(strategy).configure_ddp is type(strategies[0]).configure_ddp for strategy in strategies] == [
-        True,
-        False,
-    ]
+    plain, rounding = (type(strategy).configure_ddp for strategy in strategies)
+    assert plain is not rounding
     trainer.save_checkpoint(tmp_path / "last.ckpt")
     stored = torch.load(tmp_path / "last.ckpt", weights_only=True)
     lightning_compat.set_stored_updates(stored, 9)

@@ -54,34 +54,28 @@ def update_water(
 
 
 @ti.kernel
-def update_volumes(
-    C: Matrices, volume: Scalars, step: ti.f32, setting: Scalars, constant: Scalars,
-    counter: ti.types.ndarray(dtype=ti.i64, ndim=2), variant: ti.template(),
-):  # fmt: skip
-    for n in range(volume.shape[0]):
-        _, _, _, v, _ = respond(
-            C[n], ti.Matrix.zero(ti.f32, 3, 3), ti.Matrix.identity(ti.f32, 3), volume[n], WATER, 0, step, 1.0, 0,
-            counter, setting, constant, variant,
-        )  # fmt: skip
-        volume[n] = v
-
-
-@ti.kernel
-def update_momenta(
+def move_water(
     C: Matrices, gain: Matrices, stiffness: Scalars, volume: Scalars, step: ti.f32, setting: Scalars,
     constant: Scalars, counter: ti.types.ndarray(dtype=ti.i64, ndim=2), variant: ti.template(),
 ):  # fmt: skip
     for n in range(volume.shape[0]):
-        A, _, _, _, k = respond(
+        A, _, _, v, k = respond(
             C[n], ti.Matrix.zero(ti.f32, 3, 3), ti.Matrix.identity(ti.f32, 3), volume[n], WATER, 0, step, 0.0, 0,
             counter, setting, constant, variant,
         )  # fmt: skip
         gain[n] = A
+        volume[n] = v
         stiffness[n] = k
 
 
 def scalars(values):
     out = ti.ndarray(ti.f32, len(values))
+    out.from_numpy(np.asarray(values, np.float32))
+    return out
+
+
+def matrices(values):
+    out = ti.Matrix.ndarray(3, 3, ti.f32, len(values))
     out.from_numpy(np.asarray(values, np.float32))
     return out
 
@@ -93,16 +87,26 @@ def counters():
 
 
 def run(material, F_N33, volume_N, config):
-    count = len(F_N33)
-    F, stress = (ti.Matrix.ndarray(3, 3, ti.f32, count) for _ in range(2))
-    F.from_numpy(F_N33.astype(np.float32))
-    volume, stiffness, counter = scalars(volume_N), scalars(np.zeros(count)), counters()
+    F, stress = matrices(F_N33), matrices(0 * F_N33)
+    volume, stiffness, counter = scalars(volume_N), scalars(0 * volume_N), counters()
     variant = SOLID_VARIANTS
     if config.sand_volume_correction == "taichi_elements":
         variant += VARIANT.taichi_elements_sand
     variant += VARIANT.rate_of_sand * (config.sand_grain_diameter_m > 0)
     update_solids(F, volume, stress, stiffness, material, scalars(constants(config)), counter, variant)
     return F.to_numpy(), volume.to_numpy(), stress.to_numpy(), stiffness.to_numpy(), counter.to_numpy()[0]
+
+
+def moved_water(C_N33, volume_N, step, variant=0, config=None, dx=1.0):
+    """What particles of water add to the momentum around them in a step, their volumes behind it, and stiffness."""
+    setting = np.ones(SETTING.length)
+    setting[SETTING.inverse_cell_size] = 1 / dx
+    gain, stiffness, volume = matrices(0 * C_N33), scalars(0 * volume_N), scalars(volume_N)
+    law = scalars(constants(config or MpmConfig()))
+    move_water(
+        matrices(C_N33), gain, stiffness, volume, step, scalars(setting), law, counters(), VARIANT.water + variant
+    )
+    return gain.to_numpy(), volume.to_numpy(), stiffness.to_numpy()
 
 
 def deformations(rng, count, spread):
@@ -247,16 +251,10 @@ def test_volume_updates_of_water():
     rate, step = 50.0, 1e-3
     turning = np.array([[0.0, -rate, 0], [rate, 0, 0], [0, 0, 0]])
     C_N33 = np.stack([turning, np.diag([rate, -rate, 0]), np.diag([rate, rate, -rate])])
-    C = ti.Matrix.ndarray(3, 3, ti.f32, len(C_N33))
-    C.from_numpy(C_N33.astype(np.float32))
-    setting = np.ones(SETTING.length)
     for bit, factor in ((0, 1 + step * np.trace(C_N33, axis1=1, axis2=2)),
                         (VARIANT.taichi_elements_water, np.linalg.det(np.eye(3) + step * C_N33))):  # fmt: skip
-        volume = scalars([0.9] * 3)
-        update_volumes(
-            C, volume, step, scalars(setting), scalars(constants(MpmConfig())), counters(), VARIANT.water + bit
-        )
-        close(volume.to_numpy(), 0.9 * factor, 1e-6)
+        _, volume_N, _ = moved_water(C_N33, np.full(3, 0.9), step, bit)
+        close(volume_N, 0.9 * factor, 1e-6)
 
 
 @pytest.mark.parametrize("stiffening", [False, True])
@@ -281,24 +279,16 @@ def test_water_without_tension(stiffening):
 def test_viscous_stress():
     """Sheared at a rate, viscous water bears the rate times its viscosity across the shear, and no other stress."""
     rate, step, viscosity, dx = 50.0, 1e-4, 3.0, 0.1
-    C = ti.Matrix.ndarray(3, 3, ti.f32, 1)
-    C.from_numpy(np.array([[[0.0, rate, 0], [0, 0, 0], [0, 0, 0]]], np.float32))
-    gain = ti.Matrix.ndarray(3, 3, ti.f32, 1)
-    setting = np.ones(SETTING.length)
-    setting[SETTING.inverse_cell_size] = 1 / dx
+    C_N33 = np.array([[[0.0, rate, 0], [0, 0, 0], [0, 0, 0]]])
     config = MpmConfig(water_viscosity_pa_s=viscosity)
-    stiffness = scalars([0.0])
-    update_momenta(
-        C, gain, stiffness, scalars([1.0]), step, scalars(setting), scalars(constants(config)), counters(),
-        VARIANT.water,
-    )  # fmt: skip
-    stress = gain.to_numpy()[0] / (-step * 4 / dx**2 / config.density_kg_m3)
+    gain_N33, _, stiffness_N = moved_water(C_N33, np.ones(1), step, config=config, dx=dx)
+    stress = gain_N33[0] / (-step * 4 / dx**2 / config.density_kg_m3)
     expected = np.zeros((3, 3))
     expected[0, 1] = expected[1, 0] = viscosity * rate
     assert stress == pytest.approx(expected, rel=1e-5, abs=0.05)
     bulk = lame_parameters(config)[1]
     rough = np.sqrt(3 * bulk / 1000) + 4 * viscosity / (1000 * dx)
-    assert stiffness.to_numpy()[0] == pytest.approx(rough**2, rel=1e-4)
+    assert stiffness_N[0] == pytest.approx(rough**2, rel=1e-4)
 
 
 def test_stiffening_water():
