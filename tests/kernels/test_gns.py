@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from kernels.engines import device
-from network.states import gns_of, random_state
+from network.states import gns_of, on_device, random_state
 from network.test_gns_edges import output_and_gradients
 
 from hgn.kernels.gns.op import FusedEdges, Tuning, fits
@@ -19,12 +19,6 @@ from hgn.schema import ConfigError
 
 SMALL = Tuning(block=16, backward_block=16, product_rows=16)
 NATIVE = torch.cuda.is_available()
-
-
-def on_device(state):
-    names = ("position_N3", "velocity_NM3", "material_N", "scene_N", "domain_S3")
-    moved = {name: getattr(state, name).to(device()) for name in names}
-    return replace(state, **moved, obstacles=state.obstacles and state.obstacles.to(device()))
 
 
 @pytest.mark.parametrize(
@@ -45,11 +39,10 @@ def on_device(state):
 def test_fused_edges_equal_the_plain_network(counts, width, precision, output_bound, gradient_bound):
     """Outputs, with gradients wanted and without, and the gradients of all parameters agree with float64."""
     steps = 2 if width < 128 else 10
-    expected = output_and_gradients(
-        gns_of(width=width, message_passing_steps=steps), None, random_state(counts, spread=0.1), 1e-5
-    )
+    plain, state = gns_of(width=width, message_passing_steps=steps), random_state(counts, spread=0.1)
+    expected = output_and_gradients(plain, None, state, 1e-5)
     network = gns_of(torch.float32, width=width, message_passing_steps=steps).to(device())
-    state = on_device(random_state(counts, spread=0.1, dtype=torch.float32))
+    state = on_device(random_state(counts, spread=0.1, dtype=torch.float32), device())
     tuning = FusedEdges.in_tf32().tuning if precision == "tf32" else Tuning()
     edges = FusedEdges(precision, tuning if NATIVE else SMALL)
     found = output_and_gradients(network, edges, state, 1e-5)
@@ -64,7 +57,7 @@ def test_room_to_spare_changes_nothing():
     """Rows of edges beyond the last offset, as CUDA graphs have them, leave the output as it is."""
     network = gns_of(torch.float32, message_passing_steps=1).to(device())
     edges = FusedEdges(tuning=SMALL)
-    state = on_device(random_state((19, 4), spread=0.1, dtype=torch.float32))
+    state = on_device(random_state((19, 4), spread=0.1, dtype=torch.float32), device())
     neighbours = network.neighbours(state)
     with torch.no_grad():
         expected = network.propagate(state, neighbours, edges)
@@ -75,7 +68,7 @@ def test_room_to_spare_changes_nothing():
 def test_wrong_kernels_are_refused(monkeypatch):
     """What differs from plain autograd in outputs or gradients is refused, saying what to set; what is right passes."""
     network = gns_of(torch.float32, message_passing_steps=1).to(device())
-    state = on_device(random_state((9, 4), spread=0.05, dtype=torch.float32))
+    state = on_device(random_state((9, 4), spread=0.05, dtype=torch.float32), device())
     backend = TritonGnsBackend(network, "fp16")
     backend.edges = FusedEdges(tuning=SMALL)
     backend.require_parity(state, gradients=True)

@@ -16,9 +16,8 @@ import pytest
 import torch
 from kernels.engines import device, engine_of, inference_of, run_forward
 from kernels.launches import watched_edges, watched_engine
-from kernels.test_gns import on_device
 from kernels.test_network import drawn, float32_state
-from network.states import gns_of, network_of, random_state
+from network.states import gns_of, network_of, on_device, random_state
 from network.test_gns_edges import output_and_gradients
 from triton.runtime.jit import KernelInterface
 
@@ -220,7 +219,7 @@ def test_gns(precision, table):
     """The kernels of GNS's edges, forward and backward."""
     network = gns_of(torch.float32, width=width_for(precision), message_passing_steps=2).to(device())
     counts = (301, 1, 81) if NATIVE else (13, 1, 6)
-    state = on_device(random_state(counts, dtype=torch.float32, spread=0.1))
+    state = on_device(random_state(counts, dtype=torch.float32, spread=0.1), device())
     edges = FusedEdges.in_tf32() if precision == "tf32" else FusedEdges(precision)
     judge = Judge(table, precision)
     with watched_edges(judge):

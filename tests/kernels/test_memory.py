@@ -74,9 +74,8 @@ def test_pushforward_stays_within_memory():
     same buffers launches what was captured, on the same memory."""
     network = network_of(torch.float32, width=16, levels=1, message_passing_steps=1, cell_size=0.1)
     scenes = [scene_with_obstacles(0, 4), falling_episode(3, seed=1), scene_with_obstacles(3, 14)]
-    own = GraphPushforwardPool(
-        network, training_of(precision="fp32", pushforward_frames=2, pushforward_fraction=0.9), CELL_SIZE, 0
-    )
+    training = training_of(precision="fp32", pushforward_frames=2, pushforward_fraction=0.9)
+    own = GraphPushforwardPool(network, training, CELL_SIZE, 0)
     episodes = [placed(scene, network) for scene in scenes]
     updates = updates_of(network, 4)
     frames: dict[object, set[tuple]] = {}

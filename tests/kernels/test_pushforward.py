@@ -35,9 +35,8 @@ def placed(made, network):
     whole, where = whole_episode(made, network.config), device()
     cells, normals = whole.obstacle_cell_K3, whole.obstacle_normal_K3
     obstacles = ObstacleHash.of(cells, normals).to(where) if len(cells) else None
-    return DeviceEpisode(
-        whole.position_TN3.to(where), whole.material_N.to(where), obstacles, whole.domain_size, whole.gravity
-    )
+    position_TN3, material_N = whole.position_TN3.to(where), whole.material_N.to(where)
+    return DeviceEpisode(position_TN3, material_N, obstacles, whole.domain_size, whole.gravity, whole.symmetries)
 
 
 def values_of(network):

@@ -9,7 +9,8 @@ import pytest
 import torch
 from kernels.engines import device
 from kernels.memory import living_tensors
-from network.states import network_of, random_grid, random_state
+from network.states import network_of, on_device, random_state
+from runtime.scenes import random_scene
 
 from hgn.config import NetworkConfig
 from hgn.kernels.grid.op import DeviceGrid, Window
@@ -19,37 +20,34 @@ from hgn.runtime import triton_rollout
 from hgn.runtime.divergence import DivergedError
 from hgn.runtime.live import LiveSimulation
 from hgn.runtime.parity import relative_error
-from hgn.runtime.simulator import InitialState, Simulator
+from hgn.runtime.simulator import Simulator
 from hgn.runtime.triton_rollout import TritonRollout, first_capacities
 from hgn.runtime.weights import find_weights, load_weights
 from hgn.schema import ConfigError
 
 pytestmark = pytest.mark.usefixtures("large_tiles")
 
-GRAVITY = (0.0, -9.8, 0.0)
 
-
-def scene(particles, seed=0, gravity=GRAVITY):
-    rng = np.random.default_rng(seed)
-    return InitialState(
-        position_N3=(0.05 + 0.1 * rng.random((particles, 3))).astype(np.float32),
-        velocity_N3=rng.normal(0, 0.1, (particles, 3)).astype(np.float32),
-        material_N=rng.integers(0, 3, particles).astype(np.uint8),
-        obstacle_grid=random_grid(seed, 4_000),
-        domain_size=(0.4, 0.4, 0.4),
-        gravity=gravity,
-    )
+def scene(particles, seed=0, **changes):
+    return random_scene(particles, seed, **({"domain_size": (0.4, 0.4, 0.4)} | changes))
 
 
 def network(levels=1, **changes):
     return network_of(torch.float32, width=16, levels=levels, message_passing_steps=1, **changes).to(device())
 
 
+def spreading():
+    """A network whose particles need more cells from frame to frame, and five of them."""
+    fast = network()
+    fast.normaliser.acceleration_std.fill_(0.03)
+    return fast, Simulator(fast, 60.0, "torch").start([scene(5)])
+
+
 @pytest.mark.parametrize("changes", [{}, {"inputs": "relative"}, {"inputs": "relative", "rest_threshold": 2.0}])
 def test_frames_are_those_of_the_plain_loop(changes):
     """Two scenes at once, of different gravity, move as in the plain simulator, frame by frame, and each frame is
     announced once."""
-    scenes, seen = [scene(5), scene(3, 1, (3.0, -1.0, 2.0))], []
+    scenes, seen = [scene(5), scene(3, 1, gravity=(3.0, -1.0, 2.0))], []
     expected = Simulator(network(2, **changes), 60.0, "torch").rollout(scenes, 3)
     found = Simulator(network(2, **changes), 60.0, "triton", "fp32").rollout(scenes, 3, seen.append)
     assert seen == [1, 2]
@@ -62,8 +60,8 @@ def test_frames_are_those_of_the_plain_loop(changes):
 def test_free_flight_is_not_refused(precision):
     """What relative inputs put out in free flight is rounding alone, which differs as a whole; both loops fall with
     gravity to 1e-3 of it. A network whose weights differ is still refused where something happens."""
-    thrown = replace(scene(40, gravity=(0.0, -5.0, 0.0)), domain_size=(1.0, 1.0, 1.0))
-    thrown = replace(thrown, position_N3=thrown.position_N3 + 0.4, velocity_N3=np.full((40, 3), 1.7, np.float32))
+    thrown = scene(40, low=0.45, gravity=(0.0, -5.0, 0.0), domain_size=(1.0, 1.0, 1.0))
+    thrown = replace(thrown, velocity_N3=np.full((40, 3), 1.7, np.float32))
     paths = [
         Simulator(network(2, inputs="relative"), 60.0, name, precision).rollout([thrown], 4)[0].astype(np.float64)
         for name in ("torch", "triton")
@@ -83,12 +81,7 @@ def test_free_flight_is_not_refused(precision):
 
 def test_overflow_loses_nothing():
     """A rollout whose cells outgrow its buffers grows them, and its frames equal those of one that had room."""
-    spreading = network()
-    with torch.no_grad():
-        spreading.normaliser.acceleration_std.fill_(0.03)
-    state = Simulator(spreading, 60.0, "torch").start([scene(5)])
-    roomy = TritonRollout(spreading, state, "fp32", (64,))
-    tight = TritonRollout(spreading, state, "fp32", (16,))
+    roomy, tight = (TritonRollout(*spreading(), "fp32", (room,)) for room in (64, 16))
     expected = roomy.run(3)
     found = np.concatenate([tight.run(1), tight.run(2)])
     assert tight.growths > 0 and roomy.growths == 0
@@ -98,14 +91,14 @@ def test_overflow_loses_nothing():
 def test_later_simulations_begin_anew():
     """What a simulator has captured it uses again, for a scene of fewer particles, other obstacles and other gravity
     too; the frames are bitwise those of a new simulator, after one that diverged as well."""
-    first, second = scene(3), scene(2, 1, (0.0, 2.0, 0.0))
-    again = Simulator(network(inputs="relative", contact_gate="cell"), 60.0, "triton", "fp32")
+    first, second = scene(3), scene(2, 1, gravity=(0.0, 2.0, 0.0))
+    again, *others = (
+        Simulator(network(inputs="relative", contact_gate="cell"), 60.0, "triton", "fp32") for _ in range(3)
+    )
     again.rollout([first], 2)
     kept = again.backend.idle[1]
-    for one in (second, first):
-        (expected,) = Simulator(network(inputs="relative", contact_gate="cell"), 60.0, "triton", "fp32").rollout(
-            [one], 2
-        )
+    for one, other in zip((second, first), others, strict=True):
+        (expected,) = other.rollout([one], 2)
         (found,) = again.rollout([one], 2)
         assert again.backend.idle[1] is kept
         np.testing.assert_array_equal(found, expected)
@@ -204,12 +197,8 @@ def on_meta():
 def test_growing_gives_back_first(monkeypatch):
     """While buffers grow the old ones are gone; where there is no memory for larger ones, the simulation has its old
     ones again and stands where it stood: with memory it goes on as if nothing had been."""
-    spreading = network()
-    with torch.no_grad():
-        spreading.normaliser.acceleration_std.fill_(0.03)
-    state = Simulator(spreading, 60.0, "torch").start([scene(5)])
-    expected = TritonRollout(spreading, state, "fp32", (64,)).run(3)
-    tight = TritonRollout(spreading, state, "fp32", (16,))
+    expected = TritonRollout(*spreading(), "fp32", (64,)).run(3)
+    tight = TritonRollout(*spreading(), "fp32", (16,))
     old = [weakref.ref(tight.grid), weakref.ref(tight.fused)]
     build, asked = DeviceGrid.__init__, []
 
@@ -232,13 +221,10 @@ def test_frames_taken_away_beside_the_next(monkeypatch):
     """Frames that are started before those before them are looked at are the same bitwise, where buffers grow too: what
     was started in vain moves nothing; and the frame of a divergence is the same."""
     monkeypatch.setattr(triton_rollout, "LOOK_FRAMES", 1)
-    spreading = network()
-    with torch.no_grad():
-        spreading.normaliser.acceleration_std.fill_(0.03)
-    state = Simulator(spreading, 60.0, "torch").start([scene(5)])
     paths, growths, lost = [], [], []
     for overlap in (False, True):
-        tight = TritonRollout(spreading, state, "fp32", (16,))
+        fast, state = spreading()
+        tight = TritonRollout(fast, state, "fp32", (16,))
         tight.overlap = overlap
         seen: list[int] = []
         paths.append(tight.run(3, seen.append))
@@ -256,9 +242,8 @@ def test_frames_taken_away_beside_the_next(monkeypatch):
 def test_divergence_names_the_frame():
     """Particles that leave the domain by more than its size end the simulation with backend torch's message."""
     wild = network()
-    with torch.no_grad():
-        wild.normaliser.acceleration_mean.fill_(0.15)
-        wild.normaliser.acceleration_std.fill_(0.0)
+    wild.normaliser.acceleration_mean.fill_(0.15)
+    wild.normaliser.acceleration_std.fill_(0.0)
     messages = []
     for backend in ("torch", "triton"):
         with pytest.raises(DivergedError) as caught:
@@ -322,8 +307,7 @@ def test_density(density):
     network, _ = load_weights(find_weights("obstacles"))
     network = network.to(device())
     assert isinstance(network, HierarchicalGraphNetwork)
-    state = block(density, network.config.cell_size, 4)
-    state = replace(state, **{name: value.to(device()) for name, value in vars(state).items() if value is not None})
+    state = on_device(block(density, network.config.cell_size, 4), device())
     output = []
     for precision in ("fp16", "tf32"):
         rollout = TritonRollout(network, state, precision)

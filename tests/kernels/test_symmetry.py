@@ -8,6 +8,7 @@ import pytest
 import torch
 from kernels.engines import device
 from kernels.test_network import flat
+from kernels.test_pushforward import placed
 from kernels.test_update import HISTORY, parameters_of, updates_of
 from network.states import gns_of, network_of
 from training.test_symmetry import CELL_SIZE, CYCLIC, EIGHT, doubled, scene_with_obstacles, seeds_of
@@ -17,8 +18,6 @@ from hgn.data.batch import make_batch
 from hgn.data.episode_tensors import UpdateChunk, whole_episode
 from hgn.data.sampler import Sample, SamplerState
 from hgn.kernels.gns.update import GnsUpdates
-from hgn.kernels.grid.op import ObstacleHash
-from hgn.kernels.update.op import DeviceEpisode
 from hgn.network.gns import GraphNetworkSimulator
 from hgn.network.hgn import HierarchicalGraphNetwork
 from hgn.runtime.parity import relative_error
@@ -34,14 +33,6 @@ FRAME = 6
 
 def small_network():
     return network_of(width=16, levels=1, message_passing_steps=1, cell_size=0.1)
-
-
-def on_device(network, made):
-    whole = whole_episode(made, network.config)
-    hashed = ObstacleHash.of(whole.obstacle_cell_K3, whole.obstacle_normal_K3).to(device())
-    obstacles = hashed if len(whole.obstacle_cell_K3) else None
-    position, material = whole.position_TN3.to(device()), whole.material_N.to(device())
-    return DeviceEpisode(position, material, obstacles, whole.domain_size, whole.gravity, whole.symmetries)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +100,7 @@ def test_without_symmetry_nothing_changes():
     network = small_network()
     seen, ends = [], []
     for symmetry, known in ((False, EIGHT), (True, EIGHT[:1])):
-        made = replace(on_device(network, scene_with_obstacles(1, 5)), symmetries=known)
+        made = replace(placed(scene_with_obstacles(1, 5), network), symmetries=known)
         updates = updates_of(network, 1, (256,), noise_std=1e-3, grid_jitter=True, symmetry=symmetry)
         updates.run([[(made, FRAME, 3)]], [1e-3])
         count = made.position_TN3.shape[1]
@@ -126,7 +117,7 @@ def test_without_symmetry_nothing_changes():
 def test_noise_and_jitter_are_those_without():
     """A sample's noise and grid origin are drawn in the image: they do not depend on the symmetry."""
     network = small_network()
-    made = replace(on_device(network, scene_with_obstacles(1, 5)), obstacles=None)
+    made = replace(placed(scene_with_obstacles(1, 5), network), obstacles=None)
     drawn = []
     for known in (EIGHT[:1], EIGHT[6:7]):
         noise = []

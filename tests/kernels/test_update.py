@@ -83,12 +83,12 @@ def plain_updates(network, chunk, grids, rates, optimizer=None):
     return losses
 
 
-def updates_of(network, scenes, capacities=(), **changes):
+def updates_of(network, scenes, capacities=(), kind=Updates, precision="fp32", **changes):
     settings = {"noise_std": 0.0, "grid_jitter": False} | changes
-    return Updates(
+    return kind(
         copy.deepcopy(network).float().to(device()),
         UpdateSettings(scenes=scenes, obstacle_cell_size=CELL_SIZE, **settings),
-        "fp32",
+        precision,
         torch.zeros(2, device=device()),
         torch.zeros(5, device=device()),
         capacities=capacities,
