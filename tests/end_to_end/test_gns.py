@@ -59,18 +59,3 @@ def test_training_and_rollout_see_the_same_surface(spacing_cells, data):
     assert distance.min() > 0.999 * spacing_cells * grid.cell_size
     assert make_batch([(plain, 1)], network).surface is None
     assert make_batch([(episode, 1)], NetworkConfig()).surface is None
-
-
-@pytest.mark.parametrize("experiment", ["gns", "gns_particles"])
-def test_experiments_name_the_papers_baselines(experiment):
-    """The experiments compose to ten steps, R = 0.035, on the main data set."""
-    from hgn.config import TrainConfig, config_directory
-    from hgn.hydra_compat import compose
-    from hgn.schema import from_mapping
-
-    (mapping,) = compose(config_directory(), "train", ["train", f"+experiment={experiment}", "run=runs/x"])
-    mapping.pop("name")
-    config = from_mapping(TrainConfig, mapping)
-    network = config.network
-    assert (network.kind, network.message_passing_steps, network.cell_size) == (experiment, 10, 0.035)
-    assert config.dataset.folder == "data/obstacles" and network.sees_obstacles

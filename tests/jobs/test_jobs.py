@@ -3,16 +3,14 @@
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import sysconfig
-import time
 from pathlib import Path
 
 import pytest
 import yaml
-from processes import PATIENCE_S
+from processes import BALLISTIC_PATH, completed, free_port, wait_until, write_program
 from training.runs import metrics, train_arguments
 
 from hgn.data.manifest import Manifest
@@ -22,12 +20,8 @@ ROOT = Path(__file__).resolve().parents[2]
 JOBS = ROOT / "jobs"
 SCRIPTS = sorted([*JOBS.rglob("*.sh"), *JOBS.rglob("*.sbatch")])
 # the second of two array tasks
-ARRAY = {
-    "SLURM_ARRAY_TASK_ID": "1",
-    "SLURM_ARRAY_TASK_COUNT": "2",
-    "SLURM_ARRAY_TASK_MIN": "0",
-    "SLURM_ARRAY_TASK_MAX": "1",
-}
+_TASKS = {"ID": "1", "COUNT": "2", "MIN": "0", "MAX": "1"}
+ARRAY = {f"SLURM_ARRAY_TASK_{name}": value for name, value in _TASKS.items()}
 SHORT = {"maximum_updates": 4, "batch_scenes": 1, "log_every": 2, "monitor_every": 4, "monitor_rollout_frames": 0}
 
 # starts one process for each task of one node, as srun does, and returns the highest exit code
@@ -72,15 +66,7 @@ def start(script, *arguments, cwd, **variables):
 
 
 def run(script, *arguments, cwd, **variables):
-    process = start(script, *arguments, cwd=cwd, **variables)
-    output, errors = process.communicate(timeout=PATIENCE_S)
-    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
-
-
-def write_program(folder, name, text):
-    folder.mkdir(exist_ok=True)
-    (folder / name).write_text(text)
-    (folder / name).chmod(0o755)
+    return completed(start(script, *arguments, cwd=cwd, **variables))
 
 
 @pytest.fixture
@@ -88,10 +74,7 @@ def slurm(tmp_path):
     """The environment of a Slurm job on one node with two tasks, with stand-ins for srun, scontrol and scancel."""
     programs = tmp_path / "programs"
     for name, text in (("srun", SRUN), ("scontrol", SCONTROL), ("scancel", SCANCEL)):
-        write_program(programs, name, text)
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        port = listener.getsockname()[1]
+        write_program(programs / name, text)
     return {
         "PATH": f"{programs}:{os.environ['PATH']}",
         "SLURM_JOB_ID": "4711",
@@ -106,7 +89,7 @@ def slurm(tmp_path):
         "SLURM_JOB_NODELIST": "localhost",
         "SLURM_GPUS_ON_NODE": "2",
         "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
+        "MASTER_PORT": str(free_port()),
     }
 
 
@@ -177,7 +160,7 @@ def test_torchrun_refuses(tmp_path, variables, message):
 
 def test_torchrun_on_several_machines(tmp_path):
     """With NODES and RENDEZVOUS torchrun is told where to meet and what the run is called; the training follows it."""
-    write_program(tmp_path, "shown", '#!/usr/bin/env bash\nenv | grep ^TORCH | sort\nprintf "%s\\n" "$@"\n')
+    write_program(tmp_path / "shown", '#!/usr/bin/env bash\nenv | grep ^TORCH | sort\nprintf "%s\\n" "$@"\n')
     variables = {"PYTHON": str(tmp_path / "shown"), "NODES": "3", "GPUS": "4", "RENDEZVOUS": "node0:29500"}
     done = run("torchrun.sh", "run=here and there", cwd=tmp_path, EXPERIMENT="small", **variables)
     assert done.stdout.splitlines() == [
@@ -208,17 +191,13 @@ def test_slurm_trains_with_torchrun(slurm, warm, data, tmp_path):
     (tmp_path / "jobs").symlink_to(JOBS)
     arguments = [a for a in train_arguments(data, tmp_path, **SHORT) if not a.startswith("run=")]
     slurm |= {"SLURM_NTASKS": "1", "EXPERIMENT": "small"} | warm
-    started = start(
-        "slurm/train_torchrun.sbatch", *arguments, "training.maximum_updates=1000000", cwd=tmp_path, **slurm
-    )
+    endless = (*arguments, "training.maximum_updates=1000000")
+    started = start("slurm/train_torchrun.sbatch", *endless, cwd=tmp_path, **slurm)
     folder = tmp_path / "runs" / "small-4711"
-    deadline = time.monotonic() + PATIENCE_S
-    while not (folder / "metrics.jsonl").exists():
-        assert started.poll() is None and time.monotonic() < deadline, started.communicate()[1][-4000:]
-        time.sleep(0.1)
+    wait_until(lambda: (folder / "metrics.jsonl").exists() or started.poll() is not None)
     started.send_signal(signal.SIGUSR1)
-    errors = started.communicate(timeout=PATIENCE_S)[1]
-    assert started.returncode == 0, errors[-4000:]
+    ended = completed(started)
+    assert ended.returncode == 0, ended.stderr[-4000:]
     assert (tmp_path / "scontrol.log").read_text().splitlines() == ["show hostnames localhost", "requeue 4711"]
     updates = read_checkpoint(folder / "checkpoints" / "last.ckpt")["hgn"]["updates"]
     assert updates > 0 and updates % 10 == 0  # ranks agree at every tenth update
@@ -253,7 +232,7 @@ def test_slurm_trains_with_torchrun(slurm, warm, data, tmp_path):
 def test_time_limit(slurm, tmp_path, script, code, returned, requeued, preempted):
     """Stopped by the signal before the time limit, or told to make room, a job is queued again; cancelled or failed, it
     is not."""
-    write_program(tmp_path / "programs", "srun", f"#!/usr/bin/env bash\nexit {code}\n")
+    write_program(tmp_path / "programs" / "srun", f"#!/usr/bin/env bash\nexit {code}\n")
     assert run(script, cwd=tmp_path, **slurm, **ARRAY, PREEMPTED=preempted).returncode == returned
     log = tmp_path / "scontrol.log"
     assert ("requeue 4711\n" in (log.read_text() if log.exists() else "")) == requeued
@@ -263,12 +242,11 @@ def test_time_limit(slurm, tmp_path, script, code, returned, requeued, preempted
 def generating(backend, slurm, tmp_path):
     """The environment of one generating task, with an interpreter that has the solver's stand-in for the solver."""
     write_program(
-        tmp_path / "programs",
-        "interpreter",
+        tmp_path / "programs" / "interpreter",
         f'#!/usr/bin/env bash\n[[ "$1 $2" == "-m datagen" ]] && {sys.executable} -m ballistic_command "${{@:3}}"\n',
     )
-    variables = {"SLURM_NTASKS": "1", "EXPERIMENT": "small", "PYTHON": "interpreter"}
-    return slurm | variables | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests' / 'datagen'}"}
+    variables = {"SLURM_NTASKS": "1", "EXPERIMENT": "small", "PYTHON": "interpreter", "PYTHONPATH": BALLISTIC_PATH}
+    return slurm | variables
 
 
 def generate(script, tmp_path, variables):

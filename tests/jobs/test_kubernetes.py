@@ -27,56 +27,20 @@ K8S = Path(__file__).resolve().parents[2] / "jobs" / "k8s"
 OLDEST, NEWEST = "1.31", "1.37"
 SERVICE_KEYS = ("host", "port", "health_port", "connections")
 RAY_JOB = {
-    "activeDeadlineSeconds",
-    "backoffLimit",
-    "clusterSelector",
-    "deletionStrategy",
-    "entrypoint",
-    "entrypointNumCpus",
-    "entrypointNumGpus",
-    "entrypointResources",
-    "jobId",
-    "managedBy",
-    "metadata",
-    "preRunningDeadlineSeconds",
-    "rayClusterSpec",
-    "runtimeEnvYAML",
-    "shutdownAfterJobFinishes",
-    "submissionMode",
-    "submitterConfig",
-    "submitterPodTemplate",
-    "suspend",
-    "ttlSecondsAfterFinished",
+    *("activeDeadlineSeconds", "backoffLimit", "clusterSelector", "deletionStrategy", "entrypoint", "jobId"),
+    *("entrypointNumCpus", "entrypointNumGpus", "entrypointResources", "managedBy", "metadata", "rayClusterSpec"),
+    *("preRunningDeadlineSeconds", "runtimeEnvYAML", "shutdownAfterJobFinishes", "submissionMode", "submitterConfig"),
+    *("submitterPodTemplate", "suspend", "ttlSecondsAfterFinished"),
 }
 RAY_CLUSTER = {
-    "authOptions",
-    "autoscalerOptions",
-    "enableInTreeAutoscaling",
-    "gcsFaultToleranceOptions",
-    "headGroupSpec",
-    "headServiceAnnotations",
-    "managedBy",
-    "networkPolicy",
-    "rayVersion",
-    "suspend",
-    "tlsOptions",
-    "upgradeStrategy",
-    "workerGroupSpecs",
+    *("authOptions", "autoscalerOptions", "enableInTreeAutoscaling", "gcsFaultToleranceOptions", "headGroupSpec"),
+    *("headServiceAnnotations", "managedBy", "networkPolicy", "rayVersion", "suspend", "tlsOptions"),
+    *("upgradeStrategy", "workerGroupSpecs"),
 }
 RAY_HEAD = {"enableIngress", "headService", "labels", "rayStartParams", "resources", "serviceType", "template"}
 RAY_WORKER = {
-    "groupName",
-    "idleTimeoutSeconds",
-    "labels",
-    "maxReplicas",
-    "minReplicas",
-    "numOfHosts",
-    "rayStartParams",
-    "replicas",
-    "resources",
-    "scaleStrategy",
-    "suspend",
-    "template",
+    *("groupName", "idleTimeoutSeconds", "labels", "maxReplicas", "minReplicas", "numOfHosts", "rayStartParams"),
+    *("replicas", "resources", "scaleStrategy", "suspend", "template"),
 }
 
 
@@ -131,11 +95,8 @@ def test_train_job():
 def test_ray_job():
     """The RayJob has only keys of its definition, those that must be there, and valid pods."""
     (job,) = documents("generate.yaml")
-    assert (job["apiVersion"], job["kind"], set(job)) == (
-        "ray.io/v1",
-        "RayJob",
-        {"apiVersion", "kind", "metadata", "spec"},
-    )
+    assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob")
+    assert set(job) == {"apiVersion", "kind", "metadata", "spec"}
     assert set(job["spec"]) <= RAY_JOB
     cluster = job["spec"]["rayClusterSpec"]
     assert set(cluster) <= RAY_CLUSTER
@@ -173,11 +134,8 @@ def test_commands_take_what_the_files_give_them(monkeypatch):
     assert datagen_config(mapping, KEYS | dict.fromkeys(SERVICE_KEYS)).dataset.folder == "/shared/data/obstacles"
     service = from_mapping(ServiceConfig, {key: mapping[key] for key in SERVICE_KEYS})
     assert [port["containerPort"] for port in container["ports"]] == [service.port, service.health_port]
-    assert (
-        container["env"][0]["name"]
-        == TOKEN_VARIABLE
-        == documents("train.yaml")[0]["spec"]["trainer"]["env"][-1]["name"]
-    )
+    trainer = documents("train.yaml")[0]["spec"]["trainer"]
+    assert container["env"][0]["name"] == TOKEN_VARIABLE == trainer["env"][-1]["name"]
 
 
 def test_files_fit_each_other():

@@ -2,17 +2,16 @@
 
 import os
 import shutil
-import socket
 import string
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
-from processes import PATIENCE_S, wait_until
+from processes import PATIENCE_S, free_port, wait_until
+from serving import serving
 
-from datagen.service.server import make_app, make_server
+from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState
 from hgn.data.storage import TOKEN_HOST_VARIABLE, TOKEN_VARIABLE
 
@@ -31,43 +30,28 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def listening():
-    return socket.create_server(("127.0.0.1", 0))
-
-
 @pytest.fixture
 def address(make_config, tmp_path):
     """Of nginx in front of a service of `data`, which asks for the token."""
-    folder = Path(make_config().dataset.folder)
-    listener = listening()
-    server = make_server(make_app(folder, TOKEN, PoolState), 64)
-    thread = threading.Thread(target=server.run, args=([listener],))
-    with listening() as free:
-        port = free.getsockname()[1]
+    folder, port = Path(make_config().dataset.folder), free_port()
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=localhost", "-addext",
          "subjectAltName=DNS:localhost", "-keyout", tmp_path / "privkey.pem", "-out", tmp_path / "fullchain.pem"],
         check=True, capture_output=True,
     )  # fmt: skip
-    values = {
-        "SERVER_NAME": "localhost",
-        "CERTIFICATES": str(tmp_path),
-        "SERVICE": f"127.0.0.1:{listener.getsockname()[1]}",
-        "LISTEN": f"127.0.0.1:{port}",
-    }
-    (tmp_path / "hgn.conf").write_text(string.Template((ROOT / "jobs/nginx.conf").read_text()).safe_substitute(values))
+    template = string.Template((ROOT / "jobs/nginx.conf").read_text())
+    values = {"SERVER_NAME": "localhost", "CERTIFICATES": str(tmp_path), "LISTEN": f"127.0.0.1:{port}"}
     command = ["nginx", "-p", str(tmp_path), "-e", str(tmp_path / "log"), "-c", str(tmp_path / "hgn.conf")]
-    nginx = subprocess.Popen([*command, "-g", "daemon off;"])
-    thread.start()
-    try:
-        wait_until(lambda: server.started and ((tmp_path / "nginx.pid").exists() or nginx.poll() is not None))
-        assert nginx.poll() is None, (tmp_path / "log").read_text()
-        yield f"https://localhost:{port}"
-    finally:
-        nginx.terminate()
-        server.should_exit = True
-        thread.join()
-        nginx.wait()
+    with serving(make_app(folder, TOKEN, PoolState), connections=64) as (server, service):
+        (tmp_path / "hgn.conf").write_text(template.safe_substitute(values | {"SERVICE": f"127.0.0.1:{service}"}))
+        nginx = subprocess.Popen([*command, "-g", "daemon off;"])
+        try:
+            wait_until(lambda: server.started and ((tmp_path / "nginx.pid").exists() or nginx.poll() is not None))
+            assert nginx.poll() is None, (tmp_path / "log").read_text()
+            yield f"https://localhost:{port}"
+        finally:
+            nginx.terminate()
+            nginx.wait()
 
 
 def reader(address, tmp_path, **variables):

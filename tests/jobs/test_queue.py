@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import PATIENCE_S, processes_of_session, wait_until
+from processes import PATIENCE_S, completed, processes_of_session, wait_until, write_program
 
 from datagen.generate import datagen_config
 from hgn.average import AverageConfig
@@ -35,9 +35,8 @@ def start(folder, text, *arguments, **variables):
     if isinstance(text, str):
         (folder / "list.txt").write_text(text)
         text = Path("list.txt")
-    kept = {
-        name: value for name, value in os.environ.items() if name not in ("CUDA_VISIBLE_DEVICES", "SCENES", "SHARE")
-    }
+    other = ("CUDA_VISIBLE_DEVICES", "SCENES", "SHARE")
+    kept = {name: value for name, value in os.environ.items() if name not in other}
     return subprocess.Popen(
         [str(JOBS / "queue.sh"), str(text), *arguments],
         cwd=folder,
@@ -50,22 +49,13 @@ def start(folder, text, *arguments, **variables):
 
 
 def run(folder, text, *arguments, **variables):
-    process = start(folder, text, *arguments, **variables)
-    output, errors = process.communicate(timeout=PATIENCE_S)
-    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
-
-
-def write_program(folder, name, text):
-    programs = folder / "programs"
-    programs.mkdir(exist_ok=True)
-    (programs / name).write_text(text)
-    (programs / name).chmod(0o755)
+    return completed(start(folder, text, *arguments, **variables))
 
 
 @pytest.fixture
 def machine(tmp_path):
     """A folder on a machine with two GPUs."""
-    write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\nprintf '0\\n1\\n'\n")
+    write_program(tmp_path / "programs" / "nvidia-smi", "#!/usr/bin/env bash\nprintf '0\\n1\\n'\n")
     return tmp_path
 
 
@@ -107,7 +97,7 @@ def test_gpus_share_a_list(machine):
 )
 def test_visible_gpus(tmp_path, visible, gpus):
     """CUDA_VISIBLE_DEVICES says which GPUs there are; nvidia-smi is not asked."""
-    write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\ntouch asked; exit 1\n")
+    write_program(tmp_path / "programs" / "nvidia-smi", "#!/usr/bin/env bash\ntouch asked; exit 1\n")
     count = len(gpus)
     text = "".join(
         f"{i}: touch {i}; until [[ $(ls ? | wc -l) == {count} ]]; do sleep 0.02; done; echo $CUDA_VISIBLE_DEVICES\n"
@@ -128,7 +118,7 @@ def test_without_gpus(machine):
 
 def test_nvidia_smi_that_fails_is_told(tmp_path):
     """A driver at fault is no machine without GPUs."""
-    write_program(tmp_path, "nvidia-smi", "#!/usr/bin/env bash\necho 'no driver'\nexit 9\n")
+    write_program(tmp_path / "programs" / "nvidia-smi", "#!/usr/bin/env bash\necho 'no driver'\nexit 9\n")
     done = run(tmp_path, "a: touch a\n")
     assert done.returncode == 2 and not (tmp_path / "a").exists()
     assert done.stderr == (
@@ -149,9 +139,8 @@ def test_failing_and_going_on(machine):
     ]
     text = "\n".join(lines)
     done = run(machine, text)
-    assert done.returncode == 1 and ("end, exit code 1") in [
-        what for _, name, what in events(done.stdout) if name == "bad"
-    ]
+    told = [what for _, name, what in events(done.stdout) if name == "bad"]
+    assert done.returncode == 1 and "end, exit code 1" in told
     assert done.stdout.splitlines()[-1] == (
         "failed: bad; see runs/queue/NAME.log. Not begun, behind the barrier: behind; the same call goes on"
     )
@@ -195,28 +184,24 @@ while true; do sleep 0.02; done
 def test_signals_reach_the_commands(machine, number):
     """Commands get SIGTERM, and what they still have to write is waited for, in pipes and in the background too; their
     lines do not go on, no other line begins, and the same call goes on with all of them."""
-    write_program(machine, "training", TRAINING)
-    text = "\n".join(
-        [
-            "a: [[ -e quick ]] || training a; [[ -e quick ]] || touch went_on",
-            "b: [[ -e quick ]] || { (training b; true) | cat & wait; }",
-            "c: touch c",
-            "wait",
-            "d: touch d",
-        ]
-    )
+    write_program(machine / "programs" / "training", TRAINING)
+    lines = [
+        "a: [[ -e quick ]] || training a; [[ -e quick ]] || touch went_on",
+        "b: [[ -e quick ]] || { (training b; true) | cat & wait; }",
+        *("c: touch c", "wait", "d: touch d"),
+    ]
+    text = "\n".join(lines)
     process = start(machine, text)
-    wait_until(
-        lambda: all(path.exists() and path.read_text() for path in (machine / "a.session", machine / "b.session"))
-    )
+    sessions = [machine / f"{name}.session" for name in ("a", "b")]
+    wait_until(lambda: all(path.exists() and path.read_text() for path in sessions))
     (os.kill if number == signal.SIGTERM else os.killpg)(process.pid, number)  # a terminal's go to the whole group
     output, errors = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, errors) == (128 + number, "")
     assert (machine / "a").read_text() == (machine / "b").read_text() == "state\n"
     assert not any((machine / name).exists() for name in ("went_on", "c", "d"))
     assert output.splitlines()[-1] == f"stopped by {number.name}; not done: a b c d; the same call goes on"
-    for name in ("a", "b"):
-        assert processes_of_session(int((machine / f"{name}.session").read_text())) == []
+    for path in sessions:
+        assert processes_of_session(int(path.read_text())) == []
 
     (machine / "quick").touch()
     assert run(machine, text).returncode == 0 and (machine / "d").exists()
@@ -224,7 +209,7 @@ def test_signals_reach_the_commands(machine, number):
 
 def test_nothing_is_left_behind(machine):
     """What a command leaves running is ended before its GPU takes the next one."""
-    write_program(machine, "training", TRAINING)
+    write_program(machine / "programs" / "training", TRAINING)
     text = "a: training a & until [[ -s a.session ]]; do sleep 0.02; done\nb: cat a\n"
     assert run(machine, text, CUDA_VISIBLE_DEVICES="0").returncode == 0
     assert (machine / "runs" / "queue" / "b.log").read_text() == "state\n"
@@ -243,28 +228,26 @@ def test_one_queue_a_folder(machine):
     assert first.returncode == 0
 
 
+LINE_RULE = "a line must be NAME: COMMAND (letters, digits, _ . -) or wait"
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("echo 1", "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got 'echo 1'; as in"),
-        ("a b: echo 1", "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got 'a b: echo 1'"),
-        ("../a: echo 1", "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got '../a:"),
-        (
-            "a:",
-            "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got 'a:'; as in first: echo 1",
-        ),
-        (
-            "wait for all",
-            "list.txt:3: a line must be NAME: COMMAND (letters, digits, _ . -) or wait, got 'wait for all'",
-        ),
-        ("one: echo 2", "list.txt:3: names must differ, got 'one' as in line 2; give it another"),
-        ("a: echo 'b", "list.txt:3: the command of 'a' must be one that bash can read, got 'echo 'b'; mend it: "),
+        ("echo 1", f"{LINE_RULE}, got 'echo 1'; as in"),
+        ("a b: echo 1", f"{LINE_RULE}, got 'a b: echo 1'"),
+        ("../a: echo 1", f"{LINE_RULE}, got '../a:"),
+        ("a:", f"{LINE_RULE}, got 'a:'; as in first: echo 1"),
+        ("wait for all", f"{LINE_RULE}, got 'wait for all'"),
+        ("one: echo 2", "names must differ, got 'one' as in line 2; give it another"),
+        ("a: echo 'b", "the command of 'a' must be one that bash can read, got 'echo 'b'; mend it: "),
     ],
 )
 def test_faulty_lines_are_refused(machine, line, message):
     """File, line, rule and remedy are told before anything begins."""
     done = run(machine, f"# list\none: touch began\n{line}\n")
-    assert done.returncode == 2 and done.stderr.startswith(f"error: {message}") and done.stderr.count("\n") == 1
+    assert done.returncode == 2 and done.stderr.startswith(f"error: list.txt:3: {message}")
+    assert done.stderr.count("\n") == 1
     assert done.stdout == "" and not (machine / "began").exists() and not (machine / "runs").exists()
 
 
@@ -284,7 +267,7 @@ def test_lists_are_refused(machine):
 
 def calls(machine, file, **variables):
     """The modules that each line of a list in jobs runs, with their arguments, in the order of the lines."""
-    write_program(machine, "python", PYTHON)
+    write_program(machine / "programs" / "python", PYTHON)
     done = run(machine, JOBS / file, CUDA_VISIBLE_DEVICES="", **variables)
     assert done.returncode == 0, done.stderr
     names = [name for _, name, what in events(done.stdout) if what == "begin"]
@@ -399,16 +382,11 @@ def test_trial_of_networks(tmp_path):
     (tmp_path / "trial").mkdir()
     whole = calls(tmp_path, "networks.txt")
     trial = calls(tmp_path / "trial", "networks.txt", SCENES="40", SHARE="1", REPORT_SECONDS="60")
-    shorter = {
-        "scenes=800": "scenes=40",
-        "dataset.training_scenes=800": "dataset.training_scenes=40",
-        "training.maximum_updates=500000": "training.maximum_updates=5000",
-        "training.maximum_updates=50000": "training.maximum_updates=500",
-        "seconds=null": "seconds=60",
-    }
-    assert trial == {
-        name: [[shorter.get(argument, argument) for argument in call] for call in lines]
-        for name, lines in whole.items()
-    }
+    shorter = {f"{key}scenes=800": f"{key}scenes=40" for key in ("", "dataset.training_")}
+    shorter |= {f"training.maximum_updates={n}": f"training.maximum_updates={n // 100}" for n in (500_000, 50_000)}
+    shorter["seconds=null"] = "seconds=60"
+    for name, lines in whole.items():
+        assert trial[name] == [[shorter.get(argument, argument) for argument in call] for call in lines]
+    assert trial.keys() == whole.keys()
     used = {argument for lines in whole.values() for call in lines for argument in call}
     assert set(shorter) <= used

@@ -53,24 +53,19 @@ def test_the_mean(tmp_path, coefficients, expected):
 
 
 @pytest.mark.parametrize(
-    ("changes", "rule"),
+    ("write", "changes", "rule"),
     [
-        ({"cell_size": 1 / 32}, r"weights\[1\] must have the obstacle_cell_size of weights\[0\]"),
-        ({"width": 32}, r"weights\[1\] must have the network of weights\[0\]"),
-        ({"rate": 30.0}, r"weights\[1\] must have the frame_rate_hz of weights\[0\]"),
+        (weights_file, {"cell_size": 1 / 32}, r"obstacle_cell_size of weights\[0\]"),
+        (weights_file, {"width": 32}, r"network of weights\[0\]"),
+        (weights_file, {"rate": 30.0}, r"frame_rate_hz of weights\[0\]"),
+        (moved, {"by": 0.1, "normaliser": 0.5}, r"normaliser of weights\[0\] .*init_weights"),
     ],
 )
-def test_others_are_refused(tmp_path, changes, rule):
-    """Weights of another network or of other data have no mean with these; nothing is written."""
-    files = [weights_file(tmp_path / "a.safetensors"), weights_file(tmp_path / "b.safetensors", **changes)]
+def test_others_are_refused(tmp_path, write, changes, rule):
+    """Weights of another network or of other data have no mean with these, nor have those of trainings from nothing on
+    data of their own, whose latents have other units; nothing is written."""
+    files = [weights_file(tmp_path / "a.safetensors", "fp32"), write(tmp_path / "b.safetensors", **changes)]
     out = tmp_path / "mean.safetensors"
-    with pytest.raises(ConfigError, match=rule):
+    with pytest.raises(ConfigError, match=rf"weights\[1\] must have the {rule}"):
         average(AverageConfig(tuple(map(str, files)), str(out)))
     assert not out.exists()
-
-
-def test_other_normalisers_are_refused(tmp_path):
-    """Their latents have other units: trainings from nothing on data of their own."""
-    files = [moved(tmp_path / "a.safetensors", 0.1), moved(tmp_path / "b.safetensors", 0.1, normaliser=0.5)]
-    with pytest.raises(ConfigError, match=r"weights\[1\] must have the normaliser of weights\[0\] .*init_weights"):
-        average(AverageConfig(tuple(map(str, files)), str(tmp_path / "mean.safetensors")))

@@ -17,18 +17,8 @@ from hgn.system.extras import EXTRA_OF
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAINING_STACK = (
-    "lightning",
-    "pytorch_lightning",
-    "hydra",
-    "omegaconf",
-    "taichi",
-    "webdataset",
-    "tensorboard",
-    "matplotlib",
-    "hgn.training",
-    "hgn.data",
-    "datagen",
-    *EXTRA_OF,
+    *("lightning", "pytorch_lightning", "hydra", "omegaconf", "taichi", "webdataset", "tensorboard", "matplotlib"),
+    *("hgn.training", "hgn.data", "datagen", *EXTRA_OF),
 )
 PROGRAM = """
 import json, sys

@@ -177,9 +177,8 @@ def test_what_loaded_weights_cannot_take(tmp_path):
     coarse = replace(start, obstacle_grid=replace(EMPTY_GRID, cell_size=1 / 32))
     for sees in (True, False):
         simulator = loaded(tmp_path, network_of(torch.float32, obstacle_features=sees))
-        with pytest.raises(
-            ConfigError, match=r"gravity must be the weights' \(0.0, -9.8, 0.0\), .* got \(0.0, 0.0, 0.0\)"
-        ):
+        message = r"gravity must be the weights' \(0.0, -9.8, 0.0\), .* got \(0.0, 0.0, 0.0\)"
+        with pytest.raises(ConfigError, match=message):
             simulator.start([floating])
         simulator.start([replace(start, gravity=(0.0, -9.8002, 1e-4))])  # as estimated from trajectories
         with pytest.raises(ConfigError, match="gravity must be the weights'"):

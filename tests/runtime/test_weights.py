@@ -12,7 +12,7 @@ from training.runs import train_mapping
 
 from hgn import train
 from hgn.export import export
-from hgn.runtime.weights import WeightsInfo, load_weights, require_frame_rate, save_weights
+from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
 from hgn.schema import ConfigError
 from hgn.training.checkpoint import network_of_checkpoint, read_checkpoint
 
@@ -42,13 +42,11 @@ def rewrite(path, change, structure=None):
     save_file(tensors, path, metadata={"hgn": json.dumps(mapping) if structure is None else structure})
 
 
-def test_exported_checkpoint_is_the_trained_network(make_config, make_dataset, tmp_path):
+def test_exported_checkpoint_is_the_trained_network(data, tmp_path):
     """A checkpoint of the trainer, exported and loaded, predicts what the checkpoint's network does (to 1e-6) and
     remembers what it was trained on."""
-    config = make_config()
-    make_dataset(config)
     changes = {"maximum_updates": 3, "monitor_every": 3, "monitor_rollout_frames": 0}
-    assert train.main(train_mapping(config, tmp_path / "run", **changes)) == 0
+    assert train.main(train_mapping(data, tmp_path / "run", **changes)) == 0
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
     path = tmp_path / "shipped" / "weights.safetensors"
     export(checkpoint, path)
@@ -145,14 +143,6 @@ def test_what_is_no_such_file_is_refused(weights, change, message):
     with pytest.raises(ConfigError, match=message):
         load_weights(weights)
     assert before == (weights.read_bytes() if weights.exists() else None)
-
-
-def test_frame_rate(weights):
-    """Data of another frame rate is refused: one step of a network is one frame."""
-    _, info = load_weights(weights)
-    require_frame_rate(info, 60.0)
-    with pytest.raises(ConfigError, match=r"frame_rate_hz must be the weights' 60\.0, got 30\.0"):
-        require_frame_rate(info, 30.0)
 
 
 def test_failed_save_leaves_the_old_file(weights, monkeypatch):
