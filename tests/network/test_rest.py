@@ -77,10 +77,9 @@ def test_a_pile_comes_to_rest(shift):
     rigid body goes on so, as on a slope, and what deforms faster than 1.5 of the threshold is left alone."""
     place_N3 = within_a_cell() * 0.7 + shift
     state, grid, touched_C = on_cells(place_N3)
-    middle_N3 = place_N3 - place_N3.mean(0)
-    rigid_N3 = torch.tensor([0.5, -2.0, 0.1]).double() + torch.linalg.cross(
-        torch.tensor([[9.0, 3.0, 5.0]]).double(), middle_N3
-    )
+    rate_13 = torch.tensor([[9.0, 3.0, 5.0]]).double()
+    turning_N3 = torch.linalg.cross(rate_13, place_N3 - place_N3.mean(0))
+    rigid_N3 = torch.tensor([0.5, -2.0, 0.1]).double() + turning_N3
     sizes = {}
     for threshold in (0.0, 0.3):
         velocity_N3, generator = rigid_N3, torch.Generator().manual_seed(1)

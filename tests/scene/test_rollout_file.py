@@ -163,10 +163,9 @@ def moving_rollout():
     quarter = np.stack([np.eye(3), euler_rotation((0.0, 90.0, 0.0))])
     times_T = np.array([0.0, (FRAMES - 1) / 60])
     motion = Motion(times_T, np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)]), quarter, (0.5, 0.5, 0.5))
-    still, moving = rollout.obstacles
-    return dataclasses.replace(
-        rollout, entry_frame_N=entry_N, obstacles=(still, dataclasses.replace(moving, motion=motion))
-    )
+    still, other = rollout.obstacles
+    moving = dataclasses.replace(other, motion=motion)
+    return dataclasses.replace(rollout, entry_frame_N=entry_N, obstacles=(still, moving))
 
 
 def test_what_enters_and_what_moves(tmp_path):

@@ -26,14 +26,8 @@ HISTORY, CELL = 5, 0.1
 
 
 def training_of(**changes):
-    values = {
-        "batch_scenes": 4,
-        "pushforward_fraction": 0.5,
-        "pushforward_frames": 3,
-        "pushforward_scenes": 2,
-        "pushforward_pull": 0.25,
-    }
-    return TrainingConfig(**values | changes)
+    values = {"batch_scenes": 4, "pushforward_fraction": 0.5, "pushforward_frames": 3}
+    return TrainingConfig(**values | {"pushforward_scenes": 2, "pushforward_pull": 0.25} | changes)
 
 
 def test_windows_are_those_of_the_simulation():
@@ -91,9 +85,8 @@ def test_the_share_is_kept(share, scenes):
 
 def samples_of(episodes, frame, seeds):
     pairs = zip(episodes, seeds, strict=True)
-    return UpdateSamples(
-        tuple(BatchSample(e, frame, window(e, frame, HISTORY), seed) for e, seed in pairs), SamplerState()
-    )
+    samples = tuple(BatchSample(e, frame, window(e, frame, HISTORY), seed) for e, seed in pairs)
+    return UpdateSamples(samples, SamplerState())
 
 
 def pool_of(network, training=None):
@@ -177,18 +170,12 @@ def test_lost_scenes_are_dropped():
 def test_a_resume_where_the_pool_is_made_anew_changes_nothing(data, tmp_path, stop_at):
     """Interrupted at a multiple of pushforward_every, a training ends where an uninterrupted one does, bit by bit, and
     it tells how many windows it has; interrupted elsewhere it goes on with a pool of its own."""
-    own = {
-        "pushforward_fraction": 0.5,
-        "pushforward_every": 4,
-        "pushforward_scenes": 3,
-        "pushforward_frames": 2,
-        "ema_decay": 0.8,
-    }
+    own = {"pushforward_fraction": 0.5, "pushforward_every": 4, "pushforward_scenes": 3, "pushforward_frames": 2}
 
     def trained(name, stops, **changes):
         for stop in (*stops, None):
             stop_at(stop)
-            train.main(train_mapping(data, tmp_path / name, backend="torch", **own | changes))
+            train.main(train_mapping(data, tmp_path / name, backend="torch", ema_decay=0.8, **own | changes))
         return read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt")
 
     whole, again, elsewhere = trained("whole", []), trained("again", [4, 8]), trained("elsewhere", [6])

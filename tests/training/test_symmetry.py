@@ -66,12 +66,11 @@ def by_hand(batch, episodes, symmetries):
         if batch.surface is not None:
             own = batch.surface.position_P3[batch.surface.scene_P == scene].numpy()
             points.append((own - CENTRE) @ matrix.T + CENTRE)
+    pairs = zip(symmetries, batch.gravity_S3, strict=True)
     return replace(
         batch,
         window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
-        gravity_S3=torch.stack(
-            [torch.tensor(matrix_of(s)) @ g for s, g in zip(symmetries, batch.gravity_S3, strict=True)]
-        ),
+        gravity_S3=torch.stack([torch.tensor(matrix_of(symmetry)) @ gravity_3 for symmetry, gravity_3 in pairs]),
         obstacles=ObstacleCells.of(grids) if batch.obstacles is not None else None,
         surface=SurfaceParticles.of(points) if batch.surface is not None else None,
     )

@@ -30,14 +30,18 @@ from hgn.training.module import TrainingModule
 from hgn.training.stop import StopRequest
 
 
+@pytest.fixture
+def run(tmp_path):
+    return tmp_path / "run"
+
+
 def weights(path):
     return read_checkpoint(path)["state_dict"]
 
 
-def test_a_run_leaves_what_it_promises(data, tmp_path):
+def test_a_run_leaves_what_it_promises(data, run):
     """Checkpoints, metrics with one-step and rollout errors of both splits, pictures, the resolved config; and in
     TensorBoard loss, errors by material, rate, gradient norm, speed, waiting, shards, pictures, hyper-parameters."""
-    run = tmp_path / "run"
     assert train.main(train_mapping(data, run, monitor_rollout_frames=4)) == 0
     checkpoint = read_checkpoint(run / "checkpoints" / "last.ckpt")
     assert checkpoint["hgn"]["updates"] == 12 and (run / "checkpoints" / "best.ckpt").is_file()
@@ -74,10 +78,10 @@ def test_a_run_leaves_what_it_promises(data, tmp_path):
     assert session.hparams["network/width"].number_value == 8
 
 
-def test_relative_inputs_train_as_all_others(data, tmp_path):
+def test_relative_inputs_train_as_all_others(data, run):
     """With all symmetries, noise, pushforward and a moving average: the normaliser has no means and one scale, the
     data's with the noise."""
-    run, options = tmp_path / "run", {"symmetry": "gravity", "pushforward_fraction": 0.5, "pushforward_frames": 2}
+    options = {"symmetry": "gravity", "pushforward_fraction": 0.5, "pushforward_frames": 2}
     mapping = train_mapping(data, run, **options, pushforward_every=4, pushforward_scenes=2, ema_decay=0.9)
     assert train.main(mapping | {"network": mapping["network"] | {"inputs": "relative"}}) == 0
     state = weights(run / "checkpoints" / "last.ckpt")
@@ -103,7 +107,7 @@ def gradients_with_faults(monkeypatch, faulty):
     monkeypatch.setattr(TrainingModule, "on_after_backward", on_after_backward)
 
 
-def test_a_scene_that_diverges_leaves_the_others_measured(data, tmp_path, monkeypatch):
+def test_a_scene_that_diverges_leaves_the_others_measured(data, run, monkeypatch):
     """Its frames count as far as it came, it is told how many came to the end, and pictures are made."""
     real = callbacks.simulate_scenes
 
@@ -112,7 +116,6 @@ def test_a_scene_that_diverges_leaves_the_others_measured(data, tmp_path, monkey
         return [RolloutResult(first.position_TN3[:2], "diverged"), *others]
 
     monkeypatch.setattr(callbacks, "simulate_scenes", cut_short)
-    run = tmp_path / "run"
     assert train.main(train_mapping(data, run, monitor_rollout_frames=4, monitor_scenes=2)) == 0
     last = [record for record in metrics(run) if "rollout/finished" in record][-1]
     assert (last["rollout/finished"], last["rollout/frames"]) == (0.5, 2.0)
@@ -120,7 +123,7 @@ def test_a_scene_that_diverges_leaves_the_others_measured(data, tmp_path, monkey
     assert (run / "pictures" / "rollout_000000012.png").is_file()
 
 
-def test_updates_without_a_finite_gradient_are_skipped(data, tmp_path, monkeypatch):
+def test_updates_without_a_finite_gradient_are_skipped(data, run, monkeypatch):
     """One NaN in a gradient leaves weights and moments bitwise as they were, is counted, and the training goes on."""
     before: dict[int, dict[str, torch.Tensor]] = {}
     original = TrainingModule.on_train_batch_start
@@ -131,7 +134,6 @@ def test_updates_without_a_finite_gradient_are_skipped(data, tmp_path, monkeypat
 
     monkeypatch.setattr(TrainingModule, "on_train_batch_start", remember)
     gradients_with_faults(monkeypatch, {2, 3, 9})
-    run = tmp_path / "run"
     assert train.main(train_mapping(data, run, maximum_skipped_updates=3)) == 0
     changed = [
         any(not torch.equal(before[n][name], before[n + 1][name]) for name in before[n]) for n in range(len(before) - 1)
@@ -144,10 +146,9 @@ def test_updates_without_a_finite_gradient_are_skipped(data, tmp_path, monkeypat
     assert {int(entry["step"]) for entry in state.values()} == {9}  # twelve updates, three of them skipped
 
 
-def test_training_ends_when_no_gradient_is_finite(data, tmp_path, monkeypatch):
+def test_training_ends_when_no_gradient_is_finite(data, run, monkeypatch):
     """At the limit of updates skipped in a row the training ends with a message; the stored weights are finite."""
     gradients_with_faults(monkeypatch, range(3, 100))
-    run = tmp_path / "run"
     with pytest.raises(ConfigError, match="gradients must be finite, got 5 updates in a row without, up to update 8"):
         train.main(train_mapping(data, run, maximum_skipped_updates=5))
     stored = read_checkpoint(run / "checkpoints" / "last.ckpt")
@@ -156,7 +157,7 @@ def test_training_ends_when_no_gradient_is_finite(data, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGINT])
-def test_signals_end_the_run_after_a_checkpoint(data, tmp_path, monkeypatch, number):
+def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, number):
     """A real signal in the middle of an update ends the run at that update, with a checkpoint and 128 + its number."""
     original = TrainingModule.on_before_optimizer_step
 
@@ -166,7 +167,6 @@ def test_signals_end_the_run_after_a_checkpoint(data, tmp_path, monkeypatch, num
         return original(module, optimizer)
 
     monkeypatch.setattr(TrainingModule, "on_before_optimizer_step", signalled)
-    run = tmp_path / "run"
     assert train.main(train_mapping(data, run)) == 128 + number
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 3
 
@@ -191,9 +191,8 @@ def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path,
         assert looks == expected
 
 
-def test_a_finished_run_stays_finished(data, tmp_path):
+def test_a_finished_run_stays_finished(data, run):
     """Starting a finished run again makes no update and changes no weight; what a crash left half-written is gone."""
-    run = tmp_path / "run"
     train.main(train_mapping(data, run))
     before = weights(run / "checkpoints" / "last.ckpt")
     (run / "checkpoints" / ".last.ckpt.1.partial").write_bytes(b"half")
@@ -239,21 +238,19 @@ def test_a_gpu_that_is_left_alone_is_no_warning(data, tmp_path, monkeypatch):
     assert train.main(train_mapping(data, tmp_path / "run", maximum_updates=1)) == 0
 
 
-def test_training_learns(make_config, make_dataset, tmp_path):
+def test_training_learns(make_config, make_dataset, run):
     """On free fall with strong velocity noise, 240 updates learn to undo a good part of the noise."""
     config = make_config(training_scenes=6, frames=30)
     make_dataset(config)
-    run = tmp_path / "run"
     changes = {"maximum_updates": 240, "log_every": 10, "monitor_every": 240, "learning_rate": 1e-2, "noise_std": 0.02}
     train.main(train_mapping(config, run, **changes))
     losses = [record["loss"] for record in metrics(run) if "loss" in record]
     assert sum(losses[-4:]) < 0.8 * sum(losses[:4])
 
 
-def test_damaged_checkpoints_are_refused(data, tmp_path, capsys):
+def test_damaged_checkpoints_are_refused(data, run, capsys):
     """Of the last three checkpoints the newest whole one is gone on with: one that was cut, or of which a bit changed,
     is named and stays. Where none is whole the training ends with a message."""
-    run = tmp_path / "run"
     train.main(train_mapping(data, run))
     paths = [run / "checkpoints" / name for name in LAST_NAMES]
     assert [read_checkpoint(path)["hgn"]["updates"] for path in paths] == [12, 10, 5]
@@ -277,9 +274,8 @@ def test_damaged_checkpoints_are_refused(data, tmp_path, capsys):
     assert paths[0].read_bytes() == flipped
 
 
-def test_two_trainings_in_one_folder(data, tmp_path):
+def test_two_trainings_in_one_folder(data, run):
     """A run that another training is in is refused, and can be gone on with when that has ended."""
-    run = tmp_path / "run"
     with held(run / ".lock", "run", ""), pytest.raises(ConfigError, match="run must be a folder of its own, got"):
         train.main(train_mapping(data, run))
     assert train.main(train_mapping(data, run, maximum_updates=1)) == 0
@@ -308,17 +304,16 @@ def other(make_config, make_dataset, tmp_path):
     return config
 
 
-def test_more_data(data, other, tmp_path):
+def test_more_data(data, other, run, tmp_path):
     """A run on two data sets has the episodes and the statistics of both, and goes on with both; without the second it
     is not gone on with in the middle of an epoch."""
-    run, more = tmp_path / "run", {"more_data": [other.dataset.folder], "minimum_episodes": 8}
+    more = {"more_data": [other.dataset.folder], "minimum_episodes": 8}
     assert train.main(train_mapping(data, run, **more, maximum_updates=6)) == 0
     assert {record["episodes"] for record in metrics(run) if "loss" in record} == {8}
     stores = [EpisodeStore(config.dataset.folder, "train") for config in (other, data)]
     mean = merge_statistics(store.statistics() for store in stores).velocity.mean
-    assert weights(run / "checkpoints" / "last.ckpt")["network.normaliser.velocity_mean"].tolist() == pytest.approx(
-        mean
-    )
+    stored = weights(run / "checkpoints" / "last.ckpt")
+    assert stored["network.normaliser.velocity_mean"].tolist() == pytest.approx(mean)
     with pytest.raises(ConfigError, match="data set must still hold the 8 training episodes"):
         train.main(train_mapping(data, run))
     assert train.main(train_mapping(data, run, **more)) == 0

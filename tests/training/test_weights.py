@@ -40,9 +40,8 @@ def weights_file(path, stored_precision="fp16", rate=60.0, cell_size=1 / 64, **n
 def evaluate(data, weights):
     mapping = {"weights": str(weights), "data": data.dataset.folder, "rollout_frames": 0, "device": "cpu"}
     config = EvaluateConfig(**mapping)
-    rows = one_step_rows(
-        Backend(load_weights(weights)[0]), first_episodes(EpisodeStore(config.data, config.split), 5), config
-    )
+    episodes = first_episodes(EpisodeStore(config.data, config.split), 5)
+    rows = one_step_rows(Backend(load_weights(weights)[0]), episodes, config)
     return next(row["one_step_mse"] for row in rows if row["system"] == "network")
 
 
@@ -143,11 +142,8 @@ def test_the_average_is_what_is_measured_and_exported(data, tmp_path, monkeypatc
     for name, parameter in exported.named_parameters():
         torch.testing.assert_close(parameter.double(), expected[name], rtol=1e-5, atol=1e-7)
     assert any(not torch.equal(exported.get_parameter(name), tensor) for name, tensor in seen[-1].items())
-    measured = {
-        record["update"]: record["one_step/validation"]
-        for record in metrics(tmp_path / "run")
-        if "one_step/validation" in record
-    }
+    records = [record for record in metrics(tmp_path / "run") if "one_step/validation" in record]
+    measured = {record["update"]: record["one_step/validation"] for record in records}
     assert measured[12] == pytest.approx(evaluate(data, tmp_path / "out.safetensors"), rel=1e-4)
     checkpoint = last(tmp_path / "run")
     checkpoint["state_dict"] = {k: v for k, v in checkpoint["state_dict"].items() if not k.startswith("averaged.")}
