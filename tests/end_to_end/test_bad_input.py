@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +12,12 @@ from typing import Any
 import pytest
 import torch
 from network.states import network_of
-from processes import PATIENCE_S
+from processes import PATIENCE_S, exit_code
 from training.runs import train_arguments, train_mapping
 
 import datagen.__main__
 from hgn import evaluate, export, rollout, train
-from hgn.command import EXIT_INPUT, EXIT_MACHINE, run_command
+from hgn.command import EXIT_INPUT, EXIT_MACHINE
 from hgn.config import DatagenConfig
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, load_weights, save_weights
@@ -58,6 +57,12 @@ class Place:
     def scene(self, text):
         self.path("scene.yaml").write_text(text)
 
+    def accelerate(self, by):
+        """Puts weights in the place of those that throw all particles out of the domain."""
+        network = network_of(torch.float32)
+        network.normaliser.set("acceleration", torch.full((3,), by), torch.ones(3), 0.0)
+        save_weights(self.path("weights.safetensors"), network, WeightsInfo(network.config, 60.0, 1 / 64))
+
     def train(self, *arguments, run="run"):
         return ["+experiment=obstacles", *train_arguments(self.config, self.path(run)), *arguments]
 
@@ -91,15 +96,13 @@ def content(folder):
 
 def refused(command, arguments, capsys, monkeypatch):
     """Runs a command as its module would; returns the exit code and the one error line."""
-    monkeypatch.setattr(sys, "argv", [command, *arguments])
     capsys.readouterr()
-    with pytest.raises(SystemExit) as raised:
-        run_command(COMMANDS[command], command)
+    code = exit_code(COMMANDS[command], command, arguments, monkeypatch)
     lines = capsys.readouterr().err.splitlines()
     errors = [line for line in lines if line.startswith("error: ")]
     # a progress bar may have begun; after the error there is nothing
     assert errors == lines[-1:] and "Traceback" not in "".join(lines), lines
-    return int(str(raised.value.code)), errors[0]
+    return code, errors[0]
 
 
 def check(place, command, arguments, message, capsys, patch):
@@ -251,9 +254,8 @@ def test_checkpoint_of_another_configuration(place, arguments, message, capsys, 
 def test_damaged_checkpoint(place, command, capsys, monkeypatch):
     """A cut checkpoint is named; weights that were exported earlier stay."""
     truncate(place.path("run/checkpoints/last.ckpt"))
-    arguments = (
-        place.train() if command == "train" else ["checkpoint=run/checkpoints/last.ckpt", "out=weights.safetensors"]
-    )
+    export_again = ["checkpoint=run/checkpoints/last.ckpt", "out=weights.safetensors"]
+    arguments = place.train() if command == "train" else export_again
     check(place, command, arguments, "checkpoint must be a whole checkpoint file, got", capsys, monkeypatch)
 
 
@@ -310,9 +312,7 @@ def test_data_of_other_weights(place, info, message, capsys, monkeypatch):
 
 def test_diverging_weights(place, capsys, monkeypatch):
     """A rollout that flies apart says at which frame, and leaves an earlier rollout as it was."""
-    network = network_of(torch.float32)
-    network.normaliser.set("acceleration", torch.full((3,), 5.0), torch.ones(3), 0.0)
-    save_weights(place.path("weights.safetensors"), network, WeightsInfo(network.config, 60.0, 1 / 64))
+    place.accelerate(5.0)
     place.path("made").mkdir()
     place.path("made/rollout.vtkhdf").write_bytes(b"an earlier one")
     message = "weights must keep the simulation together, got weights.safetensors: the simulation diverged at frame 1:"
@@ -321,9 +321,7 @@ def test_diverging_weights(place, capsys, monkeypatch):
 
 def test_diverging_scenes_are_told(place, capsys):
     """An evaluation keeps what each scene came to, and says which one diverged first, and why."""
-    network = network_of(torch.float32)
-    network.normaliser.set("acceleration", torch.full((3,), 0.4), torch.ones(3), 0.0)
-    save_weights(place.path("weights.safetensors"), network, WeightsInfo(network.config, 60.0, 1 / 64))
+    place.accelerate(0.4)
     options = {"weights": "weights.safetensors", "data": "data", "json": "made/errors.json"}
     assert evaluate.main(options) == 0
     row = json.loads(place.path("made/errors.json").read_text())["rows"][-1]
@@ -378,10 +376,7 @@ def test_output_is_looked_at_before_the_work(place, command, arguments, message,
 
 def test_errors_file_makes_its_folder(place, monkeypatch):
     """The folder of json=… is made, as those of the other outputs are: an evaluation is not lost at its end."""
-    monkeypatch.setattr(sys, "argv", ["evaluate", *EVALUATE])
-    with pytest.raises(SystemExit) as raised:
-        run_command(evaluate.main, "evaluate")
-    assert raised.value.code == 0
+    assert exit_code(evaluate.main, "evaluate", EVALUATE, monkeypatch) == 0
     last = json.loads(place.path("made/errors.json").read_text())["rows"][-1]
     keys = {"episode", "frames", "cause", "penetration", "reference_penetration", "outside_domain"}
     assert last["by_material"].keys() <= {"water", "sand", "snow"} and last["ends"][0].keys() == keys

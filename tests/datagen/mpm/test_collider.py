@@ -59,9 +59,8 @@ def test_sheet_nodes():
         side = np.where(height > 0, 1.0, -1.0)  # what lies on the sheet is on the side of its normal, below
         near = np.abs(height) <= 0.25
         for field, expected in ((SEEN, np.where(near, side, 0.0)), (HIDDEN, -side)):
-            assert np.allclose(
-                collider.normal_K23[:, field], np.stack([0 * height, expected, 0 * height], 1), atol=1e-6
-            )
+            expected_K3 = np.stack([0 * height, expected, 0 * height], 1)
+            assert np.allclose(collider.normal_K23[:, field], expected_K3, atol=1e-6)
         # a spline's share of what lies more than 0.75 cells from the sheet, by summing
         place = np.arange(-2, 2, 1e-3) + 5e-4
         weight = 1e-3 * np.where(np.abs(place) < 0.5, 0.75 - place**2, 0.5 * np.clip(1.5 - np.abs(place), 0, None) ** 2)
@@ -100,10 +99,8 @@ def test_sheet_nodes_of_a_crumpled_mesh():
     """Of 120 random triangles of mixed size the normal of each node is that of the nearest, as a search over all finds
     it, and every node that one passes within a particle's reach has two fields.
     """
-    corner = np.random.default_rng(0).uniform(0, 1, (120, 1, 3))
-    corner = (
-        corner + np.random.default_rng(1).uniform(-1, 1, (120, 3, 3)) * np.geomspace(0.005, 0.2, 120)[:, None, None]
-    )
+    aside = np.random.default_rng(1).uniform(-1, 1, (120, 3, 3)) * np.geomspace(0.005, 0.2, 120)[:, None, None]
+    corner = np.random.default_rng(0).uniform(0, 1, (120, 1, 3)) + aside
     mesh = Obstacle("crumpled", corner.reshape(-1, 3), np.arange(360).reshape(-1, 3).astype(np.int32), False)
     collider = build_collider(scene_of(mesh, gravity=(0.0, 0.0, 0.0)), 1.5)
     node = np.stack(np.unravel_index(np.arange(16**3), (16,) * 3), axis=1)

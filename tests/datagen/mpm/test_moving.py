@@ -146,9 +146,8 @@ def test_bad_motion_is_refused():
         moving(still, [1.0, 0.5], [(0, 0, 0)] * 2)
     shot = moving(still, [0.0, 0.1], [(0, 0, 0), (0, 90, 0)])
     scene = block(SNOW, (-1, 0, -1), (2, 1, 2), np.eye(3), shot, 9.8)
-    with pytest.raises(
-        ConfigError, match=r"obstacles\[0\].keyframes of scene 0 must be no faster than 100 cells a frame"
-    ):
+    message = r"obstacles\[0\].keyframes of scene 0 must be no faster than 100 cells a frame"
+    with pytest.raises(ConfigError, match=message):
         motion_parts([scene], 0.0, 1 / RATE_HZ)
     slow = moving(still, [0.0, 0.1], [(0, 0, 0), (0, 0.01, 0)])
     scene = dataclasses.replace(scene, obstacles=(slow,))

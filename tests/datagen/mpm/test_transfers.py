@@ -123,9 +123,8 @@ def test_bodies_of_different_steps_that_meet():
         )
         assert 64 * np.abs(fine.position_TN3[-1].mean(0) - whole.position_TN3[-1].mean(0)).max() < 0.02
         assert 64 * np.abs(fine.position_TN3[-1].std(0) - whole.position_TN3[-1].std(0)).max() < 0.02
-        free = dataclasses.replace(
-            scene, gravity=(0.0, 0.0, 0.0), position_N3=scene.position_N3 + np.float32([0, 0.3, 0])
-        )
+        lifted_N3 = scene.position_N3 + np.float32([0, 0.3, 0])
+        free = dataclasses.replace(scene, gravity=(0.0, 0.0, 0.0), position_N3=lifted_N3)
         path_TN3 = run(free, CONFIG, 7, 240.0).position_TN3.astype(np.float64)
         velocity_T3 = 240 * np.diff(path_TN3.mean(1), axis=0)
         assert np.abs(velocity_T3 - scene.velocity_N3.mean(0)).max() < 1e-4, velocity_T3
