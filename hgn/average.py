@@ -16,7 +16,7 @@ from hgn.command import run_command
 from hgn.config import StoredPrecision
 from hgn.network.base import ParticleNetwork
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
-from hgn.schema import ConfigError, from_mapping, require, require_bounds
+from hgn.schema import ConfigError, FileName, from_mapping, require, require_bounds
 from hgn.system.provenance import provenance
 
 Loaded = tuple[ParticleNetwork, WeightsInfo]
@@ -29,7 +29,7 @@ class AverageConfig:
 
     # files of python -m hgn.export or names of shipped weights, as in [a.safetensors,b.safetensors]
     weights: tuple[str, ...]
-    out: str
+    out: FileName
     coefficients: tuple[float, ...] | None = None  # of each, together 1, as in [0.7,0.3]; null: equal ones
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
 

@@ -22,7 +22,7 @@ from hgn.runtime.weights import find_weights, require_frame_rate
 from hgn.scene.distance import share_inside
 from hgn.scene.episode import Episode
 from hgn.scene.rollout_file import obstacles_of_episode
-from hgn.schema import NonNegative, Positive, from_mapping, require_bounds
+from hgn.schema import FileName, NonNegative, Positive, from_mapping, require_bounds
 from hgn.system.files import require_place, write_json
 from hgn.system.progress import bar
 from hgn.system.provenance import provenance
@@ -52,7 +52,7 @@ class EvaluateConfig:
     device: str = "auto"  # or cpu, cuda, cuda:1
     backend: BackendName = "auto"  # of the rollouts: torch, triton, cpu; auto: the fastest that runs
     precision: Precision = "tf32"  # of matrix products: fp32, tf32, fp16 (rollouts of backend triton, and GNS)
-    json: str | None = None  # also write the figures to this file
+    json: FileName | None = None  # also write the figures to this file
 
     def __post_init__(self) -> None:
         require_bounds(self)

@@ -15,7 +15,7 @@ from hgn.runtime.exported_step import initial_arrays, traced_step, write_onnx, w
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import from_mapping, require, require_bounds
+from hgn.schema import FileName, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.provenance import provenance
@@ -26,10 +26,10 @@ class ExportConfig:
     """`python -m hgn.export`."""
 
     checkpoint: str | None = None  # whose network is written to `out` as weights
-    out: str | None = None
+    out: FileName | None = None
     stored_precision: StoredPrecision = "fp32"  # of the learned tensors; fp16: files half as large
     weights: str | None = None  # what onnx, package and arrays are of: a file or shipped weights; null: `out`
-    onnx: str | None = None  # file of a step's graph, for ONNX Runtime
+    onnx: FileName | None = None  # file of a step's graph, for ONNX Runtime
     package: str | None = None  # file of a step compiled for `device`, for PyTorch's C++ (.pt2)
     device: str = "cpu"  # or cuda, cuda:1
     arrays: str | None = None  # folder of what a step is first given for `scene`, as .npy files

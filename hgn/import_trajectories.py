@@ -5,6 +5,7 @@ Reads DeepMind's TFRecords, geoelements' npz, LagrangeBench's and NeuralMPM's HD
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ def main(mapping: dict[str, Any]) -> int:
     mapping = dict(mapping)
     source = mapping.pop("from", None)
     require(isinstance(source, str) and source != "", "from", "the folder with the trajectories", source)
-    materials = mapping.get("materials") or {}
-    mapping["materials"] = {str(key): value for key, value in materials.items()}
+    mapping["materials"] = mapping.get("materials") or {}
+    if isinstance(mapping["materials"], Mapping):
+        mapping["materials"] = {str(key): value for key, value in mapping["materials"].items()}
     config = from_mapping(ImportConfig, mapping)
     with bar("importing", total=None, unit="episode") as progress:
         manifest = import_set(Path(str(source)), config, lambda _: progress.update())

@@ -20,7 +20,7 @@ from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import shipped_weights
 from hgn.scene.rollout_file import read_rollout
 from hgn.scene.scene_file import find_scene, load_scene
-from hgn.schema import Port, Positive, from_mapping, require, require_bounds
+from hgn.schema import FileName, Port, Positive, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
 from hgn.system.files import write_atomically
@@ -33,7 +33,7 @@ class PlayConfig:
     weights: str | None = None  # a file or the name of shipped ones; null: obstacles on a GPU, else obstacles_small
     scene: str = "play"  # a scene file, or the name of one in conf/example
     rollout: str | None = None  # a file of hgn.rollout to look at instead
-    html: str | None = None  # with rollout: write a page that plays it by itself to this file, and end
+    html: FileName | None = None  # with rollout: write a page that plays it by itself to this file, and end
     every: Positive[int] = 2  # with html: of its frames
     host: str = "127.0.0.1"  # to listen on; 0.0.0.0: whoever reaches this machine and has the token
     port: Port = 8080  # or the next that is free; 0: any

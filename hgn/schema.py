@@ -16,6 +16,7 @@ import re
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from hgn.renamed import KEYS, current_names, gone_remedy, key_remedy, value_remedy
@@ -50,6 +51,7 @@ BelowOne = Annotated[N, Bound("0 or more and below 1", lambda value: 0 <= value 
 OneOrMore = Annotated[int, Bound("at least 1", lambda value: value >= 1)]
 Port = Annotated[int, Bound("0 to 65535", lambda value: 0 <= value < 65536)]
 FolderName = Annotated[str, Bound("a folder name", bool)]
+FileName = Annotated[str, Bound("a file name", lambda name: Path(name).name != "")]
 FrameCount = Annotated[
     int,
     Bound("at least 2", lambda value: value >= 2),

@@ -121,9 +121,7 @@ class Published:
         known = self._listed
         first = len(known) if known is not None and known.state.generation == index.state.generation else 0
         new = {shard.name: (shard.sha256, shard.bytes) for shard in index.since(first)}
-        if not first:
-            self._shards.clear()
-        self._shards.update(new)
+        self._shards = (self._shards if first else {}) | new  # as a whole: requests read it meanwhile
         self._listed = index
 
 

@@ -307,6 +307,12 @@ def test_gravity_that_the_metadata_contradict_is_refused(tmp_path):
         assert episode.gravity == pytest.approx(expected, abs=2e-3)
 
 
+def test_materials_that_are_no_mapping(tmp_path):
+    """Names without their types are refused by name."""
+    with pytest.raises(ConfigError, match="materials must be a mapping, got 3"):
+        import_trajectories.main({"from": str(tmp_path), "out": "x", "materials": 3})
+
+
 def flights(*gravities):
     time_T11 = np.arange(20)[:, None, None] / 60
     start = np.random.default_rng(1).uniform(0.4, 0.6, (10, 3))

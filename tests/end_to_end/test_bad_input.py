@@ -143,6 +143,7 @@ EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "jso
         ),
         ("train", ["+experiment=moon"], "Could not find 'experiment/moon'"),
         ("export", ["checkpoint=none.ckpt", "out=x"], "checkpoint must be an existing file, got none.ckpt; hgn.train"),
+        ("export", ["checkpoint=none.ckpt", "out="], "out must be a file name, got ''"),
         ("export", ["out=x"], "out must be given with checkpoint, and only then, got 'x'"),
         ("rollout", [*ROLLOUT, "frames=1"], "frames must be at least 2, got 1"),
         ("rollout", ["--frames", "3"], "--frames is not an option; settings are given as frames=VALUE"),
@@ -164,6 +165,7 @@ EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "jso
             "; python -m hgn.export checkpoint=run/checkpoints/last.ckpt out=…",
         ),
         ("evaluate", [*EVALUATE, "scenes=0"], "scenes must be a finite number > 0, got 0"),
+        ("evaluate", [*EVALUATE, "json="], "json must be a file name, got ''"),
         ("evaluate", [*EVALUATE, "split=moon"], "split must be one of train, validation, test, got 'moon'"),
         (
             "evaluate",

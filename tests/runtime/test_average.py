@@ -69,3 +69,9 @@ def test_others_are_refused(tmp_path, write, changes, rule):
     with pytest.raises(ConfigError, match=rf"weights\[1\] must have the {rule}"):
         average(AverageConfig(tuple(map(str, files)), str(out)))
     assert not out.exists()
+
+
+def test_a_name_is_needed():
+    """An empty name is no file to write."""
+    with pytest.raises(ConfigError, match="out must be a file name, got ''"):
+        AverageConfig(("a.safetensors",) * 2, "")

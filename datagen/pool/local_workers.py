@@ -1,0 +1,290 @@
+"""Workers that are processes of this machine.
+
+Started with `spawn` (a forked Taichi hangs). A worker ends when its parent does, and leaves signals from the
+terminal to it. Whatever goes wrong inside is sent to the parent; a worker that dies without a word is its affair too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import pkgutil
+import signal
+import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from datagen.pool.plan import SceneTask
+from datagen.pool.shard import stage_episode
+from datagen.pool.worker import (
+    Backend,
+    BuiltGrid,
+    GridTask,
+    MadeScene,
+    Worker,
+    build_grid,
+    error_message,
+    failure_of,
+    make_episode,
+    make_scene,
+    simulate_batch,
+)
+from datagen.pool.worker_plan import WorkerPlan
+from hgn.config import DatagenConfig
+from hgn.data.identity import dataset_identity, identity_hash
+from hgn.scene.obstacle_grid import ObstacleGrid
+from hgn.system.processes import die_with_parent
+
+_FRAME_REPORT_SECONDS = 1.0  # between reports of a worker; each is a line of a log with progress=json
+_STAGING_THREADS = 8
+_END_SECONDS = 10.0  # which a dismissed worker has
+
+
+class LocalWorker(Worker):
+    """A process of this machine."""
+
+    speaks = True
+
+    def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
+        super().__init__()
+        context = multiprocessing.get_context("spawn")
+        self.connection, child = context.Pipe()
+        self.process = context.Process(target=_run, args=(target, child, *arguments), daemon=True)
+        with _terminal_signals_blocked():
+            self.process.start()
+        child.close()
+        self.idle, self._patience_s = True, 0.0
+
+    def give(self, message: object) -> None:
+        self.idle, self.heard_at = False, time.monotonic()
+        self.tell(message)
+
+    def tell(self, message: object) -> None:
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send(message)
+
+    def dismiss(self) -> None:
+        # Taichi writes what it compiled to its cache as the process ends
+        self.connection.close()
+        self._patience_s = _END_SECONDS
+
+    def kill(self) -> None:
+        # staged files appear whole or not at all, so nothing is half-written
+        self.process.join(self._patience_s)
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+    def cause_of_death(self) -> str:
+        self.process.join(timeout=10)
+        code = self.process.exitcode
+        if code is not None and code < 0:
+            return f"its process was ended by {signal.Signals(-code).name}"
+        return f"its process ended with exit code {code}"
+
+
+class LocalWorkerFactory:
+    """Processes of this machine."""
+
+    def __init__(self, config: DatagenConfig, backend: Backend, plan: WorkerPlan) -> None:
+        self.plan, self._config, self._backend = plan, config, backend
+
+    def start_maker(self) -> Worker:
+        """A process that answers each SceneTask with a MadeScene, or a cause, and each GridTask with a BuiltGrid."""
+        return LocalWorker(_make_scenes, self._config, self._backend)
+
+    def start_solver(self, number: int) -> Worker:
+        """A process that simulates lists of MadeScene, and takes the BuiltGrid of those that lack one at any time.
+
+        Of several it sees one CUDA device alone.
+        """
+        plan = self.plan
+        gpu = plan.gpus[number % len(plan.gpus)] if plan.solvers > 1 and plan.gpus else None
+        return LocalWorker(_solve, self._config, self._backend, plan.threads, gpu, plan.first_launch)
+
+    def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
+        by_connection = {worker.connection: worker for worker in workers if isinstance(worker, LocalWorker)}
+        for connection in wait(list(by_connection), timeout):
+            worker = by_connection[connection]  # type: ignore[index]
+            try:
+                message = worker.connection.recv()
+            except (EOFError, ConnectionResetError):
+                message = None
+            yield worker, message
+
+
+def _run(target: Callable[..., None], connection: Connection, *arguments: Any) -> None:
+    _end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    send = _Sender(connection)
+    with _errors_sent(send):
+        target(connection, send, *arguments)
+
+
+class _Sender:
+    """Sends from the main thread and from the staging thread."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._lock = connection, threading.Lock()
+
+    def __call__(self, *message: object) -> None:
+        with self._lock:
+            try:
+                self._connection.send(message)
+            except (BrokenPipeError, ConnectionResetError):
+                os._exit(0)  # the parent has gone
+
+
+@contextlib.contextmanager
+def _errors_sent(send: _Sender) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001 - not swallowed: the parent stops with this text
+        send(*error_message(error))
+
+
+def _make_scenes(connection: Connection, send: _Sender, config: DatagenConfig, backend: Backend) -> None:
+    for task in _received(connection):
+        if isinstance(task, GridTask):
+            send("grid", build_grid(task, backend))
+        else:
+            send(*make_scene(task, config, backend, with_grid=False))
+        send("idle")
+
+
+class _Inbox:
+    """What the pool sends to a solver, read while it simulates: lists of scenes, and grids."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._batches: SimpleQueue[list[MadeScene] | None] = SimpleQueue()
+        self._grids: defaultdict[SceneTask, Future[ObstacleGrid | str]] = defaultdict(Future)
+        self._lock = threading.Lock()
+        threading.Thread(target=self._read, args=(connection,), name="inbox", daemon=True).start()
+
+    def batches(self) -> Iterator[list[MadeScene]]:
+        """Until the pool has gone."""
+        while (batch := self._batches.get()) is not None:
+            yield batch
+
+    def grid(self, made: MadeScene) -> ObstacleGrid | str:
+        """The grid of a scene, or why there is none; waits for it."""
+        if made.obstacle_grid is not None:
+            return made.obstacle_grid
+        grid = self._coming(made.task).result()
+        with self._lock:
+            self._grids.pop(made.task, None)
+        return grid
+
+    def _coming(self, task: SceneTask) -> Future[ObstacleGrid | str]:
+        with self._lock:
+            return self._grids[task]
+
+    def _read(self, connection: Connection) -> None:
+        for message in _received(connection):
+            if isinstance(message, BuiltGrid):
+                self._coming(message.task).set_result(message.grid)
+            else:
+                self._batches.put(message)
+        self._batches.put(None)
+        with self._lock:
+            for grid in self._grids.values():
+                grid.cancel()
+
+
+def _solve(
+    connection: Connection,
+    send: _Sender,
+    config: DatagenConfig,
+    backend: Backend,
+    threads: int | None,
+    gpu: str | None,
+    first_launch: int,
+) -> None:
+    if gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+    config_hash = identity_hash(dataset_identity(config))
+    inbox = _Inbox(connection)
+    on_gpu = threads is None
+    if on_gpu:  # it compiles while the first scenes are made
+        pkgutil.resolve_name(backend.warm_up)(config.scene, config.mpm, first_launch)
+    # one batch is staged while the next is simulated, so that a GPU does not wait for the disk
+    with ThreadPoolExecutor(max_workers=_STAGING_THREADS) as stager:
+        staging: list[Future[None]] = []
+        for batch in inbox.batches():
+            if on_gpu:  # the next may come already
+                send("idle")
+            results = simulate_batch(batch, config, backend, threads, lambda count: _frame_reporter(send, count))
+            for future in staging:
+                future.result()
+            staging = [
+                stager.submit(_stage, send, config, config_hash, inbox, made, result)
+                for made, result in zip(batch, results, strict=True)
+            ]
+            send("frame", 0, 0)
+            if not on_gpu:
+                send("idle")
+
+
+def _stage(send: _Sender, config: DatagenConfig, config_hash: str, inbox: _Inbox, made: MadeScene, result: Any) -> None:
+    with _errors_sent(send):
+        cause = failure_of(result)
+        grid = inbox.grid(made) if cause is None else cause
+        if isinstance(grid, str):
+            send("failed", made.task.key, grid)
+            return
+        stage_episode(
+            Path(config.dataset.folder),
+            make_episode(replace(made, obstacle_grid=grid), result, config, config_hash),
+        )
+        send("staged", made.task.key)
+
+
+def _frame_reporter(send: _Sender, scenes: int) -> Callable[[int], None]:
+    last = 0.0
+
+    def report(frame: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > _FRAME_REPORT_SECONDS:
+            last = time.monotonic()
+            send("frame", int(frame), scenes)
+
+    return report
+
+
+def _received(connection: Connection) -> Iterator[Any]:
+    while True:
+        try:
+            yield connection.recv()
+        except (EOFError, ConnectionResetError):
+            return
+
+
+def _end_with_parent() -> None:
+    # on Linux the kernel does it; elsewhere a worker ends when it next touches its closed pipe
+    die_with_parent(signal.SIGKILL)
+    if sys.platform == "linux":
+        parent = multiprocessing.parent_process()
+        if parent is None or os.getppid() != parent.pid:
+            os._exit(0)
+
+
+@contextlib.contextmanager
+def _terminal_signals_blocked() -> Iterator[None]:
+    # a child inherits the mask: Ctrl-C reaches the whole process group, and only the parent may act on it.
+    # Starting the resource tracker unblocks the signal, so it is started before.
+    resource_tracker.ensure_running()
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
