@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from types import FrameType
@@ -15,28 +15,22 @@ from datagen.pool.progress import Progress
 from datagen.pool.worker import Backend, WorkerFactory
 from datagen.pool.worker_plan import plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
-from hgn.command import section
 from hgn.config import DatagenConfig
 from hgn.data.fresh import draw_fresh
-from hgn.schema import from_mapping, require
+from hgn.schema import ConfigError, from_mapping, known_keys, require
 from hgn.system.machine import available_cpus, available_memory
 
-# an experiment file serves all commands: what only hgn.train needs is left out
-KEYS = {
-    "scene": "scene",
-    "mpm": "mpm",
-    "dataset": "dataset",
-    "scenes": "dataset.training_scenes",
-    "out": "dataset.folder",
-    "pool": "dataset.pool",
-    "array_task": "dataset.array_task",
-    "array_tasks": "dataset.array_tasks",
-    "frozen": None,
-    "name": None,
-    "network": None,
-    "training": None,
-    "progress": None,
+_SECTIONS = ("scene", "mpm", "dataset")
+# keys of the command that are of the section `dataset`, there under these names
+_OF_DATASET = {
+    "scenes": "training_scenes",
+    "out": "folder",
+    "pool": "pool",
+    "array_task": "array_task",
+    "array_tasks": "array_tasks",
 }
+# an experiment file serves all commands: what only hgn.train needs is left out
+_OTHERS = ("frozen", "name", "network", "training", "progress")
 
 
 class StopSignal:
@@ -66,9 +60,18 @@ class StopSignal:
             signal.signal(number, handler)
 
 
-def datagen_config(mapping: Mapping[str, Any], keys: Mapping[str, str | None] = KEYS) -> DatagenConfig:
-    """The generator's configuration out of a composed one; with `frozen` its seed is drawn. Raises: ConfigError."""
-    config = from_mapping(DatagenConfig, section(mapping, keys))
+def datagen_config(mapping: Mapping[str, Any], others: Sequence[str] = ()) -> DatagenConfig:
+    """The generator's configuration out of a composed one; with `frozen` its seed is drawn.
+
+    Raises: ConfigError, also for a key that is neither its own nor one of `others`, which the caller reads.
+    """
+    names = (*_SECTIONS, *_OF_DATASET, *_OTHERS, *others)
+    for key in mapping:
+        if key not in names:
+            raise ConfigError(f"{key} is not a known key; {known_keys(key, names)}")
+    sections = {name: mapping[name] for name in _SECTIONS if name in mapping}
+    dataset = {name: mapping[key] for key, name in _OF_DATASET.items() if key in mapping}
+    config = from_mapping(DatagenConfig, sections | {"dataset": {**mapping.get("dataset", {}), **dataset}})
     weights = mapping.get("frozen")
     if not weights:
         return config

@@ -11,12 +11,12 @@ import itertools
 import os
 import select
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
 from hgn.config import config_directory
-from hgn.schema import ConfigError, known_keys, require
+from hgn.schema import ConfigError, require
 from hgn.system.extras import missing_extra
 
 EXIT_MACHINE, EXIT_INPUT, EXIT_INTERRUPTED, EXIT_UNREAD = 1, 2, 130, 141
@@ -100,29 +100,6 @@ def _unread() -> bool:
     for stream in (sys.stdout, sys.stderr):
         poll.register(stream.fileno(), 0)
     return any(event & select.POLLERR for _, event in poll.poll(0))
-
-
-def section(mapping: Mapping[str, Any], names: Mapping[str, str | None]) -> dict[str, Any]:
-    """Picks a command's own keys out of a composed config, which experiment files share with other commands.
-
-    `known` maps each key that may occur to the dotted name under which it is wanted; None leaves it out. Aliases
-    must come after the sections that they write into.
-    Raises: ConfigError for a key that is not known.
-    """
-    for key in mapping:
-        if key not in names:
-            raise ConfigError(f"{key} is not a known key; {known_keys(str(key), names)}")
-    picked: dict[str, Any] = {}
-    for key, name in names.items():
-        if name is None or key not in mapping:
-            continue
-        *folders, leaf = name.split(".")
-        place = picked
-        for folder in folders:
-            place = place.setdefault(folder, {})
-        value = mapping[key]
-        place[leaf] = dict(value) if isinstance(value, Mapping) else value
-    return picked
 
 
 def _compose(config_name: str, complete: bool = True) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from datagen.generate import KEYS, StopSignal, datagen_config, require_local_folder
+from datagen.generate import StopSignal, datagen_config, require_local_folder
 from datagen.pool.progress import PROGRESS_KINDS, make_progress
 from datagen.pool.worker import Backend
 from datagen.service.health import HealthPage
@@ -36,7 +36,7 @@ def main(mapping: dict[str, Any], backend: Backend | None = None) -> int:
     """Serves until it is stopped; the exit code is 128 + the signal."""
     kind = mapping.get("progress", "bar")
     require(kind in PROGRESS_KINDS, "progress", f"one of {', '.join(PROGRESS_KINDS)}", kind)
-    config = datagen_config(mapping, KEYS | dict.fromkeys(_SERVICE_KEYS))
+    config = datagen_config(mapping, _SERVICE_KEYS)
     service = from_mapping(ServiceConfig, {key: mapping[key] for key in _SERVICE_KEYS if key in mapping})
     require_local_folder(config)
     folder = Path(config.dataset.folder)

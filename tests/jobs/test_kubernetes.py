@@ -15,7 +15,7 @@ import pytest
 import yaml
 from kubeflow_trainer_api.models import TrainerV1alpha1TrainJob
 
-from datagen.generate import KEYS, datagen_config
+from datagen.generate import datagen_config
 from datagen.service.server import _GRACE_S
 from datagen.service.supervisor import _STOP_PATIENCE_S
 from hgn.command import _compose
@@ -131,7 +131,7 @@ def test_commands_take_what_the_files_give_them(monkeypatch):
     (container,) = documents("service.yaml")[0]["spec"]["template"]["spec"]["containers"]
     assert container["command"] == ["python", "-m", "datagen.service"]
     mapping = composed(monkeypatch, "service", container["args"])
-    assert datagen_config(mapping, KEYS | dict.fromkeys(SERVICE_KEYS)).dataset.folder == "/shared/data/obstacles"
+    assert datagen_config(mapping, SERVICE_KEYS).dataset.folder == "/shared/data/obstacles"
     service = from_mapping(ServiceConfig, {key: mapping[key] for key in SERVICE_KEYS})
     assert [port["containerPort"] for port in container["ports"]] == [service.port, service.health_port]
     trainer = documents("train.yaml")[0]["spec"]["trainer"]

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from datagen.generate import KEYS, datagen_config
+from datagen.generate import datagen_config
 from datagen.pool.locks import LOCK_NAME
 from hgn.command import run_command
 from hgn.data.index import INDEX_NAME
@@ -65,7 +65,7 @@ class Kill:
 def main(mapping: dict[str, Any]) -> int:
     """Prints what was killed and whether it did harm; the exit code is 1 where it did."""
     kills_config = from_mapping(KillsConfig, {key: mapping[key] for key in _KEYS if key in mapping})
-    config = datagen_config(mapping, KEYS | dict.fromkeys(_KEYS))
+    config = datagen_config(mapping, _KEYS)
     require(sys.platform == "linux", "tools.studies.kills", "run on Linux", sys.platform)
     out = Path(config.dataset.folder)
     peaceful, killed = out / "peaceful", out / "killed"
