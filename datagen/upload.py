@@ -89,12 +89,12 @@ class Target:
         manifest, there = Manifest.parse(content, folder), self._manifest
         if there is not None:
             self._require_beginning(there, manifest)
-        known = 0 if there is None else len(there.shards)
+        copied = 0 if there is None else len(there.shards)
         size = sum(total.bytes for total in manifest.totals.values()) - (
             0 if there is None else sum(total.bytes for total in there.totals.values())
         )
         with bar("copying", total=size, unit="byte") as progress:
-            for shard in manifest.shards.since(known):
+            for shard in manifest.shards.since(copied):
                 if stop.requested():
                     return
                 path = open_storage(folder).shard(shard.name, shard.sha256, shard.bytes)

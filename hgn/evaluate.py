@@ -135,19 +135,19 @@ def rollout_row(trials: Sequence[RolloutResult], episodes: list[Episode], frames
     """
     mse_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
     frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
-    told = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
-    reached = {str(n): sum(trial.frame_count > n for trial in trials) for n in told}
+    reported = sorted({n for n in (*REPORTED_FRAMES, frames - 1) if n < frames})
+    reached = {str(n): sum(trial.frame_count > n for trial in trials) for n in reported}
     return {
         "system": "network rollout",
-        "position_mse": _told(mse_T["all"], told),
+        "position_mse": _at_frames(mse_T["all"], reported),
         "scenes_reached": reached,
         "mean_position_mse": float(np.nanmean(mse_T["all"])),
-        "by_material": {name: _told(of_T, told) for name, of_T in mse_T.items() if name != "all"},
+        "by_material": {name: _at_frames(of_T, reported) for name, of_T in mse_T.items() if name != "all"},
         "ends": [end_of_rollout(trial, episode) for trial, episode in zip(trials, episodes, strict=True)],
     }
 
 
-def _told(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
+def _at_frames(mse_T: np.ndarray, frames: list[int]) -> dict[str, float]:
     return {str(n): float(mse_T[n]) for n in frames if n < len(mse_T) and np.isfinite(mse_T[n])}
 
 
@@ -183,8 +183,8 @@ def table(rows: list[dict[str, Any]], config: EvaluateConfig, scenes: int) -> st
             short = [end for end in row["ends"] if end["cause"] is not None]
             if short:
                 first = min(short, key=lambda end: end["frames"])
-                told = f"{first['episode']} at frame {first['frames']}: {first['cause']}"
-                lines.append(f"{'diverged':<20} {len(short)} of {len(row['ends'])} scenes, first {told}")
+                place = f"{first['episode']} at frame {first['frames']}: {first['cause']}"
+                lines.append(f"{'diverged':<20} {len(short)} of {len(row['ends'])} scenes, first {place}")
             fractions = ("penetration", "reference_penetration", "outside_domain")
             mean = {name: np.mean([end[name] for end in row["ends"]]) for name in fractions}
             worst = max(end["penetration"] - end["reference_penetration"] for end in row["ends"])

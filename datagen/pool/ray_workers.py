@@ -71,8 +71,8 @@ class RayWorkerFactory:
 
     def start_solver(self, number: int) -> Worker:
         threads = self.plan.threads
-        room = {"num_gpus": 1, "num_cpus": 0} if threads is None else {"num_cpus": threads}
-        return self._start(_Solver, self._config, self._backend, threads, **room)
+        resources = {"num_gpus": 1, "num_cpus": 0} if threads is None else {"num_cpus": threads}
+        return self._start(_Solver, self._config, self._backend, threads, **resources)
 
     def receive(self, workers: Sequence[Worker], timeout: float) -> Iterator[tuple[Worker, tuple[Any, ...] | None]]:
         waiting = {ref: worker for worker in workers if isinstance(worker, RayWorker) for ref in worker.answers}

@@ -367,10 +367,10 @@ class DatasetWriter:
             manifest = Manifest.parse(content, self.folder)
             if self._content:
                 require_same_dataset(manifest.config, self.config, self.folder)
-            known = self.manifest.shards
-            if self._listed and manifest.shards.state.generation != known.state.generation:
+            before = self.manifest.shards
+            if self._listed and manifest.shards.state.generation != before.state.generation:
                 self._forget_published()
-            self.manifest = dataclasses.replace(manifest, shards=known.continued(manifest.shards))
+            self.manifest = dataclasses.replace(manifest, shards=before.continued(manifest.shards))
             self._note_published()
             self._content = content
 

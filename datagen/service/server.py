@@ -118,8 +118,8 @@ class Published:
             self._stamp = stamp
 
     def _list(self, index: Index) -> None:
-        known = self._listed
-        first = len(known) if known is not None and known.state.generation == index.state.generation else 0
+        listed = self._listed
+        first = len(listed) if listed is not None and listed.state.generation == index.state.generation else 0
         new = {shard.name: (shard.sha256, shard.bytes) for shard in index.since(first)}
         self._shards = (self._shards if first else {}) | new  # as a whole: requests read it meanwhile
         self._listed = index
@@ -167,8 +167,8 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
     """The service as an ASGI application."""
     published, counters = Published(folder), Counter[str]()
     hashing: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
-    told: dict[tuple[int, int, int], str] = {}  # what came after so many shards, of so many
-    telling = asyncio.Lock()
+    answers: dict[tuple[int, int, int], str] = {}  # what came after so many shards, of so many
+    answering = asyncio.Lock()
 
     async def manifest(request: Request) -> Response:
         snapshot = await published.snapshot()
@@ -200,13 +200,13 @@ def make_app(folder: Path, token: str | None, pool: Callable[[], PoolState]) -> 
 
         # after a publication a thousand ask for the same
         key = index.state.generation, len(index), int(asked)
-        if key not in told:
-            async with telling:
-                if key not in told:
-                    told[key] = await to_thread.run_sync(lines)
-        text = told[key]
-        while len(told) > _ANSWERS:
-            del told[next(iter(told))]
+        if key not in answers:
+            async with answering:
+                if key not in answers:
+                    answers[key] = await to_thread.run_sync(lines)
+        text = answers[key]
+        while len(answers) > _ANSWERS:
+            del answers[next(iter(answers))]
         return Response(text, headers={"cache-control": "no-cache"}, media_type="application/jsonl")
 
     async def shard(request: Request) -> Response:

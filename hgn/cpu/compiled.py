@@ -160,5 +160,5 @@ def _load(path: Path) -> ctypes.CDLL:
 def _cpu() -> list[str]:
     """What the compiler's `native` depends on: folders are shared by machines."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
-    told = ("vendor_id", "cpu family", "model", "stepping", "flags", "CPU ", "Features")
-    return [platform.machine(), *(line for line in lines if line.startswith(told))]
+    fields = ("vendor_id", "cpu family", "model", "stepping", "flags", "CPU ", "Features")
+    return [platform.machine(), *(line for line in lines if line.startswith(fields))]

@@ -152,12 +152,12 @@ def triton_unsupported_reason(device: torch.device, config: NetworkConfig, preci
 
 def _too_little_shared_memory(device: torch.device, width: int) -> str | None:
     """Kernels keep their weights there: five of the cells' MLP in float16, or as much of others in TF32."""
-    needed = room = 10 * width**2
+    needed = shared = 10 * width**2
     if torch.cuda.is_available():
         # a name that torch's own annotations leave out
-        room = getattr(torch.cuda.get_device_properties(device), "shared_memory_per_block_optin", needed)
-    if room < needed:
-        return f"its kernels need {needed >> 10} KB of shared memory at width {width}, and this GPU has {room >> 10}"
+        shared = getattr(torch.cuda.get_device_properties(device), "shared_memory_per_block_optin", needed)
+    if shared < needed:
+        return f"its kernels need {needed >> 10} KB of shared memory at width {width}, and this GPU has {shared >> 10}"
     return None
 
 

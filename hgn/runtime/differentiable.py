@@ -99,8 +99,8 @@ class _Frame(torch.autograd.Function):
         with torch.enable_grad():
             outputs = context.step(*variables)
         wanted = [tensor for tensor in variables if tensor.requires_grad]
-        found = iter(torch.autograd.grad(outputs, wanted, gradients, allow_unused=True))
-        return None, *(next(found) if tensor.requires_grad else None for tensor in variables)
+        computed = iter(torch.autograd.grad(outputs, wanted, gradients, allow_unused=True))
+        return None, *(next(computed) if tensor.requires_grad else None for tensor in variables)
 
 
 def _variables(state: ParticleState) -> list[torch.Tensor]:

@@ -75,20 +75,22 @@ def _update_launches(job: PrecompileJob, device: str) -> None:
     updates.average = torch.zeros_like(updates.values) if job.averages else None
     updates.allocate(job.particles, job.cells)
     updates.launches()
-    for scenes in job.pushforward_scenes:
+    for scenes in job.pushforward_scenes:  # of hgn.training.graph_pushforward, or of a monitored rollout
         assert isinstance(network, HierarchicalGraphNetwork)
-        _rollout_launches(job, scenes, network, device)
+        fraction = scenes / job.settings.scenes
+        particles = round(fraction * job.particles)
+        capacities = first_capacities([round(fraction * cells) for cells in job.cells], particles)
+        cell_size = job.settings.obstacle_cell_size
+        _simulation_launches(network, job.precision, scenes, particles, capacities, cell_size, device)
 
 
 def _frame_launches(config: NetworkConfig, precision: str, sizes: tuple[tuple[int, int], ...], device: str) -> None:
-    """Those of a frame of hgn.runtime.simulator; a level has a quarter of the cells of the one below."""
+    """Those of hgn.runtime.simulator; a level has a quarter of the cells of the one below."""
     with torch.device(device):
         network = HierarchicalGraphNetwork(config)
-    obstacles = ObstacleTable([None], 1.0, torch.device(device)) if config.obstacle_features else None
     for particles, cells in sizes:
         capacities = tuple(max(1, cells >> 2 * level) for level in range(config.levels))
-        state = _nowhere(config, particles, 1, device)
-        _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
+        _simulation_launches(network, precision, 1, particles, capacities, 1.0, device)
 
 
 class _Unplaced(TritonRollout):
@@ -98,8 +100,20 @@ class _Unplaced(TritonRollout):
         return Window.around((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), self.config.cell_size, self.config.levels)
 
 
-def _nowhere(config: NetworkConfig, particles: int, scenes: int, device: str) -> ParticleState:
-    return ParticleState(
+def _simulation_launches(
+    network: HierarchicalGraphNetwork,
+    precision: str,
+    scenes: int,
+    particles: int,
+    capacities: tuple[int, ...],
+    obstacle_cell_size: float,
+    device: str,
+) -> None:
+    """Those of a frame."""
+    config, obstacles = network.config, None
+    if config.obstacle_features:
+        obstacles = ObstacleTable([None] * scenes, obstacle_cell_size, torch.device(device))
+    state = ParticleState(
         config.cell_size * torch.arange(particles, device=device)[:, None].expand(-1, 3),  # apart: none is crowded
         torch.zeros(particles, config.velocity_history, 3, device=device),
         torch.zeros(particles, dtype=torch.int32, device=device),
@@ -108,19 +122,7 @@ def _nowhere(config: NetworkConfig, particles: int, scenes: int, device: str) ->
         torch.zeros(scenes, 3, device=device),
         None,
     )
-
-
-def _rollout_launches(job: PrecompileJob, scenes: int, network: HierarchicalGraphNetwork, device: str) -> None:
-    """Those of a frame of hgn.training.graph_pushforward, or of a monitored rollout."""
-    config = job.network
-    fraction = scenes / job.settings.scenes
-    particles = round(fraction * job.particles)
-    obstacles = None
-    if config.obstacle_features:
-        obstacles = ObstacleTable([None] * scenes, job.settings.obstacle_cell_size, torch.device(device))
-    capacities = first_capacities([round(fraction * cells) for cells in job.cells], particles)
-    state = _nowhere(config, particles, scenes, device)
-    _Unplaced(network, state, job.precision, capacities, obstacles=obstacles).frame_launches()
+    _Unplaced(network, state, precision, capacities, obstacles=obstacles).frame_launches()
 
 
 def compile_part(job: PrecompileJob | FrameJob, part: int, parts: int) -> int:

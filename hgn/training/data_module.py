@@ -106,7 +106,7 @@ class EpisodeDataModule(LightningDataModule):
         order = self._order()
         begun = update = self._update()
         held: OrderedDict[int, None] = OrderedDict()  # episodes that the trainer has, the longest unused first
-        room = self._room()
+        most = self._most_held()
 
         def draw() -> tuple[tuple[list[tuple[Sample, ...]], Starts], SamplerState]:
             nonlocal update
@@ -123,7 +123,7 @@ class EpisodeDataModule(LightningDataModule):
             for episode in sorted(needed):
                 held[episode] = None
                 held.move_to_end(episode)
-            dropped = list(islice(held, max(0, len(held) - max(room, len(needed)))))
+            dropped = list(islice(held, max(0, len(held) - max(most, len(needed)))))
             for episode in dropped:
                 del held[episode]
             episodes = self._whole(new)
@@ -139,7 +139,7 @@ class EpisodeDataModule(LightningDataModule):
             self._fetched_from = place
             self.store.fetch_ahead(order.upcoming(order.window_samples + quarter))
 
-    def _room(self) -> int:
+    def _most_held(self) -> int:
         """How many episodes stay on the device: two windows of the order, where it has windows."""
         window = self.training.shuffle_episodes
         return 2 * max(window, BLOCK_EPISODES) if window else sys.maxsize
