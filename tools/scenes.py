@@ -37,6 +37,5 @@ def some(scene: Scene, chosen_N: np.ndarray) -> Scene:
 
 def joined(scenes: Sequence[Scene]) -> Scene:
     """The first scene with the particles of all."""
-    return replace(
-        scenes[0], **{name: np.concatenate([getattr(scene, name) for scene in scenes]) for name in OF_PARTICLES}
-    )
+    whole: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in scenes]) for name in OF_PARTICLES}
+    return replace(scenes[0], **whole)

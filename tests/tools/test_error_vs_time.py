@@ -29,7 +29,7 @@ from tools.error_vs_time.contenders import (
 )
 from tools.error_vs_time.run import Run
 from tools.error_vs_time.settings import ErrorVsTimeConfig
-from tools.error_vs_time.timing import Timing
+from tools.error_vs_time.timing import Stopwatch
 from tools.solver_rollouts import Setting, SolverLaunches
 
 SHORT = {"split": "validation", "device": "cpu", "frame_stride": 5, "timed_frames": 4, "rounds": 1, "timed_scenes": 1}
@@ -240,9 +240,8 @@ def test_the_solver_is_timed_over_whole_rollouts(system, frames):
 
     options = {"out": "report", "data": "data", "timed_frames": 8, "mpm_timed_frames": 300, "timed_batches": [2]}
     episode: Any = SimpleNamespace(material_N=np.zeros(3), position_TN3=np.zeros((12, 3, 3)))
-    timing = Timing([episode], from_mapping(ErrorVsTimeConfig, options), CPU)
     contender: Any = Recorder()
-    timing.round(timing.begun(contender))
+    Stopwatch(contender, [episode], from_mapping(ErrorVsTimeConfig, options), CPU).round()
     assert max(contender.asked) == frames
 
 

@@ -204,18 +204,17 @@ def fitting_weights(episodes: Sequence[Episode]) -> list[Path]:
 
 def _why_unfit(info: WeightsInfo, episodes: Sequence[Episode]) -> str | None:
     """What the data has that the weights do not know; none where nothing is."""
-    first = episodes[0]
+    network, rate, cell_size = info.network, episodes[0].frame_rate_hz, episodes[0].obstacle_grid.cell_size
     present = {MATERIALS[i] for episode in episodes for i in np.unique(episode.material_N)}
-    cell_size = first.obstacle_grid.cell_size
-    if info.frame_rate_hz != first.frame_rate_hz:
-        return f"frames at {first.frame_rate_hz:g} Hz, not {info.frame_rate_hz:g}"
-    if not present <= set(info.network.materials):
-        return f"with {', '.join(sorted(present))}, not {', '.join(info.network.materials)} alone"
-    other = [e.gravity for e in episodes if tuple(e.gravity) != info.gravity and not info.network.relative]
-    if other:
-        return f"with the gravity {other[0]}, not {info.gravity}"
-    obstacles = info.network.sees_obstacles and any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
-    if obstacles and info.obstacle_cell_size != cell_size:
+    others = [e.gravity for e in episodes if tuple(e.gravity) != info.gravity and not network.relative]
+    seen = network.sees_obstacles and any(len(episode.obstacle_grid.cell_K3) for episode in episodes)
+    if info.frame_rate_hz != rate:
+        return f"frames at {rate:g} Hz, not {info.frame_rate_hz:g}"
+    if not present <= set(network.materials):
+        return f"with {', '.join(sorted(present))}, not {', '.join(network.materials)} alone"
+    if others:
+        return f"with the gravity {others[0]}, not {info.gravity}"
+    if seen and info.obstacle_cell_size != cell_size:
         return f"with obstacles in cells of {cell_size:g}, not {info.obstacle_cell_size:g}"
     return None
 

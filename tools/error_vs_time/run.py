@@ -27,7 +27,7 @@ from tools.error_vs_time.paired import paired_rows
 from tools.error_vs_time.plot import draw_frames, draw_pareto
 from tools.error_vs_time.score import label, score
 from tools.error_vs_time.settings import UNTIMED, ErrorVsTimeConfig
-from tools.error_vs_time.timing import Stopwatch, Timing
+from tools.error_vs_time.timing import Stopwatch
 
 # of the seconds given: until when a contender, and a further round of run times, may be begun
 BEGIN_FRACTION, ROUND_FRACTION = 0.85, 0.95
@@ -96,7 +96,6 @@ class Run:
         self.begun, self.earlier = begun, list(earlier)
         self.meta = meta | {"not_run": [], "not_timed": []}
         self.failed = 0  # contenders, by a fault of the program or the machine
-        self.timing = Timing(references, config, device)
         self.watches: dict[int, Stopwatch] = {}
         of_contenders = {i: same_row(contender.row, untimed) for i, contender in enumerate(contenders)}
         self._rows: dict[int, dict[str, Any]] = {i: dict(row) for i, row in of_contenders.items() if row is not None}
@@ -114,16 +113,14 @@ class Run:
         return self.config.seconds is not None and time.monotonic() - self.begun > fraction * self.config.seconds
 
     def score_beside(self, compiling: Callable[[], bool]) -> None:
-        """Scores what is simulated already, then, as long as kernels are being compiled, what launches none of them:
+        """Scores what is simulated already and, as long as kernels are being compiled, what launches none of them:
         baselines, GNS at the precision that tells most, and the solver on coarse grids.
         """
-        for i, contender in enumerate(self.contenders):
-            if isinstance(contender, SolverContender) and contender.launches.knows(contender.setting):
-                self._attempt(i, self._errors)
-        self.write()
         for i in self._by_importance():
-            idle = self.contenders[i].importance in BESIDE or isinstance(self.contenders[i], BaselineContender)
-            if idle and compiling() and not self.is_past(BEGIN_FRACTION):
+            contender = self.contenders[i]
+            known = isinstance(contender, SolverContender) and contender.launches.knows(contender.setting)
+            idle = contender.importance in BESIDE or isinstance(contender, BaselineContender)
+            if known or (idle and compiling() and not self.is_past(BEGIN_FRACTION)):
                 self._attempt(i, self._errors)
 
     def measure(self) -> None:
@@ -176,14 +173,14 @@ class Run:
     def _times(self, i: int) -> None:
         if self.contenders[i].row["system"] not in UNTIMED:
             begun = time.monotonic()
-            self.watches[i] = self.timing.begun(self.contenders[i])
+            self.watches[i] = Stopwatch(self.contenders[i], self.references, self.config, self.device)
             self._time(i)
             self._rows[i]["timing_s"] = time.monotonic() - begun
             if i in self._scored_before:
                 self._rows[i]["timed"] = {name: self.meta[name] for name in ("device", "commit", "date")}
 
     def _time(self, i: int) -> None:
-        self._rows[i] |= self.timing.round(self.watches[i])
+        self._rows[i] |= self.watches[i].round()
 
     def _attempt(self, i: int, work: Callable[[int], None]) -> None:
         """The others need not wait for what fails; that is named, and counted where nobody foresaw it."""

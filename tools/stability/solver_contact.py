@@ -24,12 +24,11 @@ from hgn.scene.rotation import euler_rotation, rotate
 from hgn.scene.scene import Obstacle, Scene
 from tools.scenes import filled, random_places
 from tools.stability.row import Row, within
-from tools.stability.solver_scenes import positions
+from tools.stability.solver_scenes import ORIENTATIONS, positions
 
 DOMAIN_CELLS = 32
 GRAVITY = 9.8  # m/s²
 FRAME_RATE_HZ = 120.0
-ORIENTATIONS = {"aligned": (0.0, 0.0, 0.0), "tilted": (27.0, 0.0, 13.0), "turned over": (180.0, 40.0, 0.0)}
 OFFSETS = (0.0, 0.1, 0.2, 0.3, 0.36, 0.41, 0.5, 0.7, 0.8, 0.9)  # of a surface above a node, in cells
 GAPS = (0.25, 0.5, 0.85, 1.2)  # between a sheet and the block below it
 LEAVING_SPEEDS = (0.3, 1.0, 3.0)  # m/s

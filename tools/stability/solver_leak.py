@@ -28,10 +28,9 @@ from hgn.scene.scene import Obstacle, Scene
 from hgn.scene.shapes import shape_obstacle
 from hgn.system.machine import available_cpus
 from tools.stability.row import Row, within
-from tools.stability.solver_scenes import CELL, block
+from tools.stability.solver_scenes import CELL, ORIENTATIONS, block
 
 SHAPES = {"sheet": "square", "cone": "cone", "bowl": "half_sphere"}
-ORIENTATIONS = {"aligned": (0.0, 0.0, 0.0), "tilted": (27.0, 0.0, 13.0), "turned over": (180.0, 40.0, 0.0)}
 OFFSETS = tuple((0.125 * i, 0.37 * i % 1, 0.61 * i % 1) for i in range(8))  # of a cell
 SPEEDS = (3.0, 10.0)
 FRAME_RATE_HZ = 240.0

@@ -16,6 +16,8 @@ from tools.scenes import filled, random_places
 
 CELL = 1 / 64
 FLOOR_CELLS = 3  # nodes below it belong to the walls
+# of obstacles, degrees about x, y and z
+ORIENTATIONS = {"aligned": (0.0, 0.0, 0.0), "tilted": (27.0, 0.0, 13.0), "turned over": (180.0, 40.0, 0.0)}
 
 
 def block(
