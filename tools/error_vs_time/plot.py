@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import cycle, repeat
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ SHOWN_FRAME = 50  # in a panel of its own, beside the last one
 HGN_COLORS = ("#0b3c8c", "#2f7fd6", "#12a3a8", "#7b5cd6", "#5aa9e6", "#2b2f77")
 GNS_COLORS = ("#d9480f", "#a61e4d", "#f08c00", "#862e9c")
 GRID_COLORS = ("#111111", "#5c5c5c", "#9a9a9a", "#c0c0c0")  # the finest first
-PRECISIONS = {"fp32": ("o", "fp32"), "tf32": ("s", "TF32"), "fp16": ("D", "fp16")}  # markers and names
+PRECISION_MARKERS = {"fp32": "o", "tf32": "s", "fp16": "D"}
 STEP_MARKERS = ("^", "v", "<", ">")  # the largest step first
 FLOOR_COLOR, BASELINE_COLOR = "#2b8a3e", "#868e96"
 FLOOR_LINES, BASELINE_LINES = ("-", "--"), (":", "--", "-.")
@@ -65,23 +66,20 @@ def draw_frames(rows: Sequence[Row], meta: Mapping[str, Any]) -> bytes:
     """Position MSE over the frames, of each network at the precision that came farthest; PNG bytes."""
     figure, ((panel,),) = new_figure(1, 1, (11.0, 6.4))
     looks = _looks(rows)
+    networks = [row for row in rows if row["system"] in NETWORK_KINDS]
     best: dict[str, Row] = {}
-    for row in rows:
-        if row["system"] in NETWORK_KINDS:
-            best[row["weights"]] = max(
-                best.get(row["weights"], row), row, key=lambda r: sum(v is not None for v in r["curve"])
-            )
+    for row in sorted(networks, key=lambda row: sum(value is None for value in row["curve"])):
+        best.setdefault(row["weights"], row)
     for row in rows:
         network = row["system"] in NETWORK_KINDS
         if network and row is not best[row["weights"]]:
             continue
-        look, curve_T = looks[_name(row)], np.array([np.nan if v is None else v for v in row["curve"]])
+        look, curve_T = looks[label(row, setting=False)], np.array([np.nan if v is None else v for v in row["curve"]])
         time_T = np.flatnonzero(curve_T > 0)
         style = {"color": look["color"], "linestyle": look.get("line", "-"), "linewidth": 2.0 if network else 1.2}
         if row["system"] == "mpm":
             style |= {"marker": look["markers"][row["step"]], "markevery": 0.15, "markersize": 5}
-        name = f"{_name(row)}, {PRECISIONS[row['precision']][1]}" if network else label(row)
-        panel.plot(time_T, curve_T[time_T], label=name, **style)
+        panel.plot(time_T, curve_T[time_T], label=label(row), **style)
     panel.set_xlabel("frame", fontsize=TEXT)
     panel.set_ylabel("position MSE (domain lengths²)", fontsize=TEXT)
     panel.set_yscale("log")
@@ -102,7 +100,7 @@ def _pareto(panel: Any, rows: Sequence[Row], frame: int | None, key: str, looks:
     low, high = _limits(rows, frame)
     groups: dict[str, list[Row]] = {}
     for row in rows:
-        groups.setdefault(_name(row), []).append(row)
+        groups.setdefault(label(row, setting=False), []).append(row)
     for name, some in groups.items():
         look, error = looks[name], _error(some[0], frame)
         if some[0]["system"] not in UNTIMED:
@@ -140,7 +138,7 @@ def _limits(rows: Sequence[Row], frame: int | None) -> tuple[float, float]:
 
 
 def _point(panel: Any, row: Row, frame: int | None, key: str, look: Mapping[str, Any], highest: float) -> None:
-    marker = look["markers"][row["step"]] if row["system"] == "mpm" else PRECISIONS[row["precision"]][0]
+    marker = look["markers"][row["step"]] if row["system"] == "mpm" else PRECISION_MARKERS[row["precision"]]
     style = {"color": look["color"], "markeredgecolor": "white", "markeredgewidth": 0.7, "markersize": 8.5, "zorder": 4}
     x, error, scenes = row[key], _error(row, frame), len(row["seeds"])
     reached = scenes if frame is None else int(row["scenes_reached"].get(str(frame), 0))
@@ -179,10 +177,11 @@ def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
     for name, look in looks.items():
         kind = networks if look["system"] in NETWORK_KINDS else grids if look["system"] == "mpm" else lines
         style = {"linestyle": look["line"], "linewidth": 1.5} if kind is lines else {"linewidth": 3.5}
-        kind.append(Line2D([], [], color=look["color"], label=name, **style))
+        text = f"learns nothing: {name}" if look["system"] == "baseline" else name
+        kind.append(Line2D([], [], color=look["color"], label=text, **style))
         steps |= look.get("markers", {})
     present = {row["precision"] for row in rows if row["system"] in NETWORK_KINDS}
-    precisions = [_mark(*PRECISIONS[name]) for name in PRECISIONS if name in present]
+    precisions = [_mark(marker, name) for name, marker in PRECISION_MARKERS.items() if name in present]
     marks = [_mark(m, f"solver, {step:g} of the stable step") for step, m in sorted(steps.items(), reverse=True)]
     notes: list[Any] = []
     if networks or grids:
@@ -197,43 +196,24 @@ def _legend(rows: Sequence[Row], looks: Mapping[str, Any]) -> list[list[Any]]:
 
 def _looks(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
     """Colours and markers by name: one of each network, each grid of the solver, and each line across."""
-    hgn, gns = iter(HGN_COLORS * len(rows)), iter(GNS_COLORS * len(rows))
-    floors, baselines = iter(FLOOR_LINES * len(rows)), iter(BASELINE_LINES * len(rows))
     grids = sorted({row["grid"] for row in rows if row["system"] == "mpm"}, reverse=True)
     steps = sorted({row["step"] for row in rows if row["system"] == "mpm"}, reverse=True)
-    markers = dict(zip(steps, STEP_MARKERS * len(steps), strict=False))
+    gns = cycle(GNS_COLORS)
+    colors = {"hgn": cycle(HGN_COLORS), "chaos": repeat(FLOOR_COLOR), "baseline": repeat(BASELINE_COLOR)}
+    lines = {"chaos": cycle(FLOOR_LINES), "baseline": cycle(BASELINE_LINES)}
     looks: dict[str, dict[str, Any]] = {}
     for row in rows:
-        name, system = _name(row), row["system"]
+        name, system = label(row, setting=False), row["system"]
         if name in looks:
             continue
+        looks[name] = {"system": system}
         if system == "mpm":
             color = GRID_COLORS[min(grids.index(row["grid"]), len(GRID_COLORS) - 1)]
-            looks[name] = {"color": color, "markers": markers}
-        elif system == "chaos":
-            looks[name] = {"color": FLOOR_COLOR, "line": next(floors)}
-        elif system == "baseline":
-            looks[name] = {"color": BASELINE_COLOR, "line": next(baselines)}
+            looks[name] |= {"color": color, "markers": dict(zip(steps, cycle(STEP_MARKERS), strict=False))}
         else:
-            looks[name] = {"color": next(hgn if system == "hgn" else gns)}
-        looks[name]["system"] = system
+            looks[name] |= {"color": next(colors.get(system, gns))}
+            looks[name] |= {"line": next(lines[system])} if system in lines else {}
     return looks
-
-
-def _name(row: Row) -> str:
-    match row["system"]:
-        case "mpm":
-            return f"MPM solver, {row['grid']}³ cells"
-        case "baseline":
-            return f"learns nothing: {row['predictor']}"
-        case "chaos":
-            return f"chaos floor: {row['floor']}"
-        case "hgn":
-            size = f"HGN, L = {row['levels']}, M = {row['message_passing_steps']}"
-        case system:
-            obstacles = " with static particles" if system == "gns_particles" else ""
-            size = f"GNS{obstacles}, M = {row['message_passing_steps']}"
-    return f"{size} ({row['weights'].rsplit('.', 1)[0]})"
 
 
 def _error(row: Row, frame: int | None) -> float | None:

@@ -124,18 +124,19 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     return report.table(head, lines)
 
 
-def label(row: Mapping[str, Any]) -> str:
-    """A contender's name."""
+def label(row: Mapping[str, Any], setting: bool = True) -> str:
+    """A contender's name; without its `setting` that of all steps of a grid, or of all precisions of a network."""
     match row["system"]:
         case "mpm":
-            return f"MPM {row['grid']}³, step {row['step']:g}"
+            return f"MPM {row['grid']}³" + (f", step {row['step']:g}" if setting else "")
         case "baseline":
             return str(row["predictor"])
         case "chaos":
             return f"chaos floor: {row['floor']}"
     size = f"M = {row['message_passing_steps']}"
     size = f"L = {row['levels']}, {size}" if row["system"] == "hgn" else size
-    return f"{row['system'].upper().replace('_', ' ')} {size}, {row['backend']} {row['precision']} ({row['weights']})"
+    size += f", {row['backend']} {row['precision']}" if setting else ""
+    return f"{row['system'].upper().replace('_', ' ')} {size} ({row['weights']})"
 
 
 # The same for every contender.
