@@ -3,12 +3,11 @@
 import json
 import shutil
 import signal
-import socket
 from pathlib import Path
 
 import pytest
 from docs.pages import ROOT, Runner, blocks_of, run_module, shell_lines
-from processes import PATIENCE_S
+from processes import PATIENCE_S, free_port
 
 from hgn.scene.scene_file import load_scene
 
@@ -104,9 +103,8 @@ def test_scene(here):
 
 def test_train(here):
     """Training on scenes of one's own: an experiment file, a run that goes on, export, errors, other weights."""
-    Runner(SETTINGS | {"hgn.train": [*SETTINGS["hgn.train"], "training.maximum_updates=2"]}).run_first(
-        TUTORIALS / "train.md", "hgn.train"
-    )
+    shorter = {"hgn.train": [*SETTINGS["hgn.train"], "training.maximum_updates=2"]}
+    Runner(SETTINGS | shorter).run_first(TUTORIALS / "train.md", "hgn.train")
     Runner(SETTINGS).run(TUTORIALS / "train.md")
     updates = [json.loads(line)["update"] for line in (here / "runs/mine/metrics.jsonl").read_text().splitlines()]
     assert sorted(set(updates)) == [1, 2, 3, 4]
@@ -117,12 +115,8 @@ def test_train(here):
 
 def test_program(here):
     """Weights in a program: a scene file as a whole, frame by frame from particles and a mesh, one that changes."""
-    fewer = {
-        "frames=300": "frames=2",
-        "frame == 300": "frame == 1",
-        "range(120)": "range(2)",
-        "frame == 60": "frame == 0",
-    }
+    fewer = {"frames=300": "frames=2", "frame == 300": "frame == 1"}
+    fewer |= {"range(120)": "range(2)", "frame == 60": "frame == 0"}
     runner = Runner(SETTINGS, fewer, INSTALLS)
     runner.run(TUTORIALS / "program.md")
     assert runner.names["frame"] == 1 and (here / "my_scene.vtkhdf").is_file()
@@ -132,12 +126,10 @@ def test_program(here):
 @pytest.fixture
 def port(monkeypatch):
     """A free one, at which the tutorial's program looks too."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        number = listener.getsockname()[1]
+    number = free_port()
     monkeypatch.setenv("DATASET", f"http://127.0.0.1:{number}")
     monkeypatch.setenv("HGN_DATASET_TOKEN", "")
-    yield number
+    return number
 
 
 def test_serve(here, port, monkeypatch):
@@ -164,10 +156,8 @@ def test_network(here):
     """The network: built, looked into, changed by settings and by a subclass with gradients."""
     runner = Runner(SETTINGS)
     runner.run(TUTORIALS / "network.md")
-    assert (
-        "`{parameter_count:,} parameters".format(parameter_count=runner.names["network"].parameter_count)
-        in (TUTORIALS / "network.md").read_text()
-    )
+    parameters = f"`{runner.names['network'].parameter_count:,} parameters"
+    assert parameters in (TUTORIALS / "network.md").read_text()
     assert (runner.names["changed"].speed.weight.grad != 0).any()
 
 
