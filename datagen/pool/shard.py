@@ -18,7 +18,7 @@ from hgn.data.manifest import EpisodeEntry, ShardEntry
 from hgn.data.reader import read_episode
 from hgn.data.shard import episode_tar, locate_members, tar_end
 from hgn.data.statistics import episode_statistics, merge_statistics
-from hgn.data.storage import file_sha256
+from hgn.data.verification import file_sha256
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError
 from hgn.system.files import sync_file, temporary_file

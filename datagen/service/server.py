@@ -41,7 +41,7 @@ from datagen.service.supervisor import PoolState
 from datagen.service.uvicorn_compat import SendfileProtocol
 from hgn.data.index import INDEX_NAME, SEGMENT_SHARDS, Index
 from hgn.data.manifest import MANIFEST_NAME, Manifest
-from hgn.data.storage import verify_file
+from hgn.data.verification import verify_file
 from hgn.schema import ConfigError, to_mapping
 from hgn.system.files import read_replaced
 

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from hgn.data.manifest import MANIFEST_NAME
-from hgn.data.storage import file_sha256, is_remote
+from hgn.data.storage import is_remote
+from hgn.data.verification import file_sha256
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import write_json
 

@@ -20,10 +20,12 @@ from typing import Any
 import numpy as np
 
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, EpisodeEntry, Manifest, ShardEntry
+from hgn.data.shard_cache import holders
 from hgn.data.statistics import Statistics
-from hgn.data.storage import UnreachableError, holders, is_remote, open_storage
+from hgn.data.storage import is_remote, open_storage
 from hgn.scene.episode import POSITION_MEMBER, Episode, decode_episode
 from hgn.schema import ConfigError, require
+from hgn.system.patience import UnreachableError
 
 MAPPED_SHARDS = 256  # at once; a process may have 1,024 files open where nothing else is said
 

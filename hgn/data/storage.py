@@ -1,71 +1,40 @@
 """Where a data set lies: a folder of this machine, or a URL (a dataset service, a file server, an object store).
 
-Shards of a URL are kept in a cache on this machine, under their sha256, so that no two data sets collide there; one
-process of the machine brings a shard, the others wait for it. `HGN_CACHE` names the cache's folder (default
-`~/.cache/hgn`), `HGN_CACHE_GB` how much may be in it (default: all that fits on its disk; the shard that was brought
-first makes room), `HGN_DATASET_TOKEN` the token that a dataset service asks for,
-`HGN_DATASET_HOST` the only host (or host:port) that it is for.
+Shards of a URL are kept on this machine (`hgn.data.shard_cache`). `HGN_DATASET_TOKEN` is the token that a dataset
+service asks for, `HGN_DATASET_HOST` the only host (or host:port) that it is for.
 """
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import fcntl
 import functools
 import hashlib
-import io
-import math
 import os
-import random
-import sys
 import threading
 import time
-import weakref
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
+from io import BufferedRandom
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 
+from hgn.data.shard_cache import cached_shard
+from hgn.data.verification import verify_file
 from hgn.schema import ConfigError, require
 from hgn.system.extras import missing_extra
-from hgn.system.files import NO_LOCKS, TEMPORARY_SUFFIX, read_replaced, sync_folder
+from hgn.system.files import read_replaced
 from hgn.system.hub import PREFIX, HubPlace, hub_token
+from hgn.system.patience import UnreachableError, patiently
 
 TOKEN_VARIABLE = "HGN_DATASET_TOKEN"
 TOKEN_HOST_VARIABLE = "HGN_DATASET_HOST"
-CACHE_VARIABLE = "HGN_CACHE"
-LIMIT_VARIABLE = "HGN_CACHE_GB"
 PATIENCE_S = 300.0  # with a server that does not answer: time enough to start a service again
 _CHUNK_BYTES = 16 * 2**20  # of a shard at a time: what is lost when a connection is
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 10.0
 _CONNECT_S, _SILENCE_S = 10.0, 60.0
 _AWAY_S = 10.0
-_LOCK_PAUSE_S = 0.05
 _NETWORK_PACKAGES = {"aiohttp", "botocore", "aiobotocore", "gcsfs", "google", "azure"}
 
 T = TypeVar("T")
-_without_patience = threading.Event()
-_verified: set[tuple[str | int, ...]] = set()  # the files that this process has verified
-
-
-class UnreachableError(OSError):
-    """A server did not answer for as long as it was waited for."""
-
-    def __init__(self, url: str, patience_s: float, cause: str) -> None:
-        self.cause = cause
-        super().__init__(errno.ETIMEDOUT, f"no answer for {patience_s:.0f} s (at last: {cause})", url)
-
-
-class Holder(Protocol):
-    """Who has files of the cache open, which take their room until they are closed."""
-
-    def release(self, path: Path) -> None:
-        """Closes a file that is about to go."""
-        ...
-
-
-holders: weakref.WeakSet[Holder] = weakref.WeakSet()
 
 
 class Storage(Protocol):
@@ -110,16 +79,6 @@ def write_remote(url: str, name: str, source: Path | bytes) -> None:
     _remote(url.rstrip("/")).write(name, source)
 
 
-@contextlib.contextmanager
-def without_patience() -> Iterator[None]:
-    """While it is entered no thread of this process waits for a server that does not answer: nobody needs it now."""
-    _without_patience.set()
-    try:
-        yield
-    finally:
-        _without_patience.clear()
-
-
 def dataset_token() -> str | None:
     """The token of $HGN_DATASET_TOKEN. Raises: ConfigError when it could not stand in a header."""
     token = os.environ.get(TOKEN_VARIABLE)
@@ -135,65 +94,6 @@ def dataset_token() -> str | None:
 def _token_is_for(url: str) -> bool:
     named, address = os.environ.get(TOKEN_HOST_VARIABLE), urlsplit(url)
     return not named or named in (address.hostname, f"{address.hostname}:{address.port}")
-
-
-def _make_folder(folder: Path) -> None:
-    """Raises: ConfigError, which says what to name, where it may not be."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR):
-            raise
-        raise ConfigError(
-            f"{CACHE_VARIABLE} must name a folder for a server's shards that can be written to, got {folder} "
-            f"({error.strerror})"
-        ) from None
-
-
-def cache_folder() -> Path:
-    """Where shards of URLs are kept.
-
-    Raises: ConfigError where nothing is named and there is no home folder.
-    """
-    named = os.environ.get(CACHE_VARIABLE)
-    if named:
-        return Path(named) / "shards"
-    try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hgn" / "shards"
-    except RuntimeError:
-        raise ConfigError(
-            f"{CACHE_VARIABLE} must name a folder for a server's shards where there is no home folder, got none"
-        ) from None
-
-
-def file_sha256(path: Path) -> str:
-    """The sha256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
-    """Checks size and sha256 of a file, once a process as long as the file does not change.
-
-    Raises: ConfigError naming the file, what was expected and found, and the remedy; FileNotFoundError.
-    """
-    status = path.stat()
-    if status.st_size != size:
-        raise ConfigError(f"{path} must have {size} bytes, got {status.st_size}; {remedy}")
-    identity = _identity(path, sha256)
-    if identity in _verified:
-        return
-    actual = file_sha256(path)
-    if actual != sha256:
-        raise ConfigError(f"{path} must have sha256 {sha256}, got {actual}: it was altered; {remedy}")
-    _verified.add(identity)
-
-
-def _identity(path: Path, sha256: str) -> tuple[str | int, ...]:
-    """Another one as soon as the file may have changed: a modification time can be set back, a change's cannot."""
-    status = path.stat()
-    times = status.st_mtime_ns, status.st_ctime_ns
-    return str(path.resolve()), status.st_dev, status.st_ino, status.st_size, *times, sha256
 
 
 class _Folder:
@@ -262,7 +162,7 @@ class _Remote:
             raise ConfigError(
                 f"dataset.folder must be a folder or a URL that fsspec can read, got {url!r} ({reason})"
             ) from None
-        self._known: tuple[bytes, str] | None = None  # the manifest last read, and its ETag at a dataset service
+        self._manifest: tuple[bytes, str] | None = None  # the manifest last read, and its ETag at a dataset service
         self._lock = threading.Lock()
         self._away = (0.0, "")  # until when, and why, who has no patience need not ask
 
@@ -270,12 +170,12 @@ class _Remote:
         with self._lock:
             self._require_not_away(name, patience_s)
             options: dict[str, Any] = {}
-            if self._http and self._known is not None:
-                options["headers"] = {"If-None-Match": self._known[1]}
+            if self._http and self._manifest is not None:
+                options["headers"] = {"If-None-Match": self._manifest[1]}
             content = self._patiently(name, patience_s, lambda path: self._files.cat_file(path, **options))
-            if not content and self._known is not None:  # not modified
-                return self._known[0]
-            self._known = content, f'"{hashlib.sha256(content).hexdigest()}"'
+            if not content and self._manifest is not None:  # not modified
+                return self._manifest[0]
+            self._manifest = content, f'"{hashlib.sha256(content).hexdigest()}"'
             return content
 
     def read(self, name: str, start: int, stop: int) -> bytes:
@@ -295,26 +195,15 @@ class _Remote:
     def shard(
         self, name: str, sha256: str, size: int, patience_s: float = PATIENCE_S, spared: Collection[str] | None = ()
     ) -> Path:
-        path = cache_folder() / f"{sha256}.tar"
-        remedy = "it is fetched again"
-        for again in (True, False):
-            if not path.exists():
-                try:
-                    self._fetch(name, sha256, size, path, patience_s, spared)
-                except FileNotFoundError:
-                    raise ConfigError(
-                        f"{self._url}/{name} is listed in the manifest but missing; run the generator again"
-                    ) from None
+        def fill(file: BufferedRandom) -> None:
             try:
-                verify_file(path, sha256, size, remedy)
-            except (ConfigError, FileNotFoundError) as error:  # this machine's disk, or somebody cleaning up
-                if not again:
-                    raise
-                print(error, file=sys.stderr)
-                path.unlink(missing_ok=True)
-            else:
-                break
-        return path
+                self._fill_whole(file, name, sha256, size, patience_s)
+            except FileNotFoundError:
+                raise ConfigError(
+                    f"{self._url}/{name} is listed in the manifest but missing; run the generator again"
+                ) from None
+
+        return cached_shard(f"{self._url}/{name}", sha256, size, patience_s, spared, fill)
 
     def write(self, name: str, source: Path | bytes) -> None:
         def put(path: str) -> None:
@@ -336,48 +225,19 @@ class _Remote:
         if written != expected:
             raise ConfigError(f"{self._url}/{name} must have {expected} bytes, got {written}; copy it again")
 
-    def _fetch(
-        self, name: str, sha256: str, size: int, path: Path, patience_s: float, spared: Collection[str] | None
-    ) -> None:
+    def _fill_whole(self, file: BufferedRandom, name: str, sha256: str, size: int, patience_s: float) -> None:
         self._require_not_away(name, patience_s)
-        _make_folder(path.parent)
-        with _owned(path, f"{self._url}/{name}", patience_s) as file:
-            if file is None:
-                return
-            while True:  # room is made by the file's owner alone: two that need one shard would make it twice
-                over = _bytes_over(path.parent, size)
-                try:
-                    if over > 0:
-                        raise OSError(errno.ENOSPC, f"the cache is full ({LIMIT_VARIABLE})", str(path))
-                    self._fill_whole(file, name, sha256, size, patience_s)
-                    break
-                except OSError as error:
-                    if error.errno not in (errno.ENOSPC, errno.EDQUOT) or spared is None:
-                        raise
-                    if not _make_room(path.parent, max(over, size), spared):
-                        raise
-            # it is the last one that was brought, wherever this machine's clock stood before
-            latest = max((time_ns for time_ns, _, _ in _cached(path.parent)), default=0)
-            if os.fstat(file.fileno()).st_mtime_ns <= latest:
-                os.utime(file.fileno(), ns=(latest + 1, latest + 1))
-            Path(file.name).replace(path)
-        sync_folder(path.parent)
-        _verified.add(_identity(path, sha256))
-
-    def _fill_whole(self, file: io.BufferedRandom, name: str, sha256: str, size: int, patience_s: float) -> None:
         # what a process that ended had fetched is gone on with, unless the disk did not keep it
         for resume in (True, False):
             if not resume:
                 file.truncate(0)
             if self._fill(file, name, size, patience_s) == sha256:
-                break
-        else:
-            raise ConfigError(
-                f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
-            )
-        os.fsync(file.fileno())
+                return
+        raise ConfigError(
+            f"{self._url}/{name} must have sha256 {sha256}, got other bytes: it was altered; generate it again"
+        )
 
-    def _fill(self, file: io.BufferedRandom, name: str, size: int, patience_s: float) -> str:
+    def _fill(self, file: BufferedRandom, name: str, size: int, patience_s: float) -> str:
         """Appends what is missing and returns the sha256 of the whole."""
         if os.fstat(file.fileno()).st_size > size:
             file.truncate(0)
@@ -405,28 +265,15 @@ class _Remote:
 
     def _patiently(self, name: str, patience_s: float, read: Callable[[str], T]) -> T:
         """Reads, again and again while the server is away. Raises: as `Storage.manifest`."""
-        begin, pause, said = time.monotonic(), _FIRST_PAUSE_S, False
-        while True:
-            try:
-                result = read(f"{self._root}/{name}")
-                self._away = 0.0, ""
-                return result
-            except FileNotFoundError:
-                raise
-            except Exception as error:
-                cause = _transient(error, f"{self._url}/{name}")
-                if cause is None:
-                    raise
-                if time.monotonic() - begin + pause > patience_s or _without_patience.is_set():
-                    # a machine that is switched off costs _CONNECT_S at each asking
-                    self._away = time.monotonic() + _AWAY_S, cause
-                    raise UnreachableError(f"{self._url}/{name}", patience_s, cause) from error
-                if not said and pause > 1:
-                    said = True
-                    print(f"{self._url} does not answer ({cause}); trying for {patience_s:.0f} s", file=sys.stderr)
-                # no two readers come back at the same moment
-                _without_patience.wait(pause * random.uniform(0.5, 1.0))
-                pause = min(2 * pause, _LONGEST_PAUSE_S)
+        url, path = f"{self._url}/{name}", f"{self._root}/{name}"
+        try:
+            result = patiently(lambda: read(path), lambda error: _transient(error, url), url, self._url, patience_s)
+        except UnreachableError as error:
+            # a machine that is switched off costs _CONNECT_S at each asking
+            self._away = time.monotonic() + _AWAY_S, error.cause
+            raise
+        self._away = 0.0, ""
+        return result
 
 
 def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:
@@ -435,50 +282,14 @@ def _whole(data: bytes, path: str, start: int, stop: int) -> bytes:
     return data
 
 
-def _cached(folder: Path) -> list[tuple[int, int, Path]]:
-    """Of each shard in the cache when it was brought, its bytes and path; others may take them away meanwhile."""
-    found = []
-    for path in folder.glob("*.tar"):
-        with contextlib.suppress(FileNotFoundError):
-            status = path.stat()
-            found.append((status.st_mtime_ns, status.st_size, path))
-    return sorted(found)
-
-
-def _bytes_over(folder: Path, size: int) -> float:
-    """By how much the cache would be over its limit with one more file. Raises: ConfigError."""
-    limit = os.environ.get(LIMIT_VARIABLE)
-    if not limit:
-        return 0
-    try:
-        allowed = float(limit) * 1e9
-    except ValueError:
-        allowed = 0.0
-    require(0 < allowed < math.inf, LIMIT_VARIABLE, "a number of gigabytes > 0", limit)
-    return sum(cached for _, cached, _ in _cached(folder)) + size - allowed
-
-
-def _make_room(folder: Path, size: float, spared: Collection[str]) -> bool:
-    """Removes the shards that were brought first, but those that are spared; whether there was any."""
-    freed = 0
-    for _, cached, path in _cached(folder):
-        if freed >= size:
-            break
-        if path.stem in spared:
-            continue
-        for holder in list(holders):
-            holder.release(path)
-        path.unlink(missing_ok=True)
-        freed += cached
-    return freed > 0
-
-
 def _read_range(files: Any, start: int, stop: int) -> Callable[[str], bytes]:
     return lambda path: files.cat_file(path, start=start, end=stop)
 
 
 def _transient(error: Exception, url: str) -> str | None:
     """What to say of an error that may pass; none of one that is not the network's. Raises: ConfigError (refused)."""
+    if isinstance(error, FileNotFoundError):
+        return None
     status = getattr(error, "status", None)
     if status in (401, 403) or isinstance(error, PermissionError):
         raise ConfigError(
@@ -499,74 +310,3 @@ def _transient(error: Exception, url: str) -> str | None:
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return None
     return " ".join(str(error).split()) or type(error).__name__
-
-
-@contextlib.contextmanager
-def _owned(path: Path, url: str, patience_s: float) -> Iterator[io.BufferedRandom | None]:
-    """The partial file of `path`, for this process alone and with what others had written; none when `path` is there.
-
-    The kernel frees a process's hold when it ends, so the next one goes on.
-    Raises: UnreachableError when another one has it, and brings nothing for as long as there is patience.
-    """
-    partial = path.with_name(f".{path.name}{TEMPORARY_SUFFIX}")
-    while True:
-        try:
-            opened = open(partial, "a+b", opener=_open_file)  # noqa: SIM115 - a path's takes no opener
-        except OSError as error:
-            if error.errno != errno.ELOOP:
-                raise
-            raise ConfigError(f"{partial} must be a file, got a symbolic link to another; delete it") from None
-        with opened as file:
-            try:
-                _take(file, url, patience_s)
-            except OSError as error:
-                if error.errno not in NO_LOCKS:
-                    raise
-                raise ConfigError(
-                    f"{CACHE_VARIABLE} must name a folder on a file system with file locks, got {path.parent} "
-                    f"({error.strerror}); take one of this machine's own disks"
-                ) from None
-            if not _is_same(file, partial):
-                continue  # whoever had it before has given it its name
-            if path.exists():
-                partial.unlink()
-                yield None
-                return
-            try:
-                yield file
-            except (ConfigError, FileNotFoundError):
-                partial.unlink(missing_ok=True)
-                raise
-            except OSError as error:
-                if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                    error.filename = error.filename or str(path)
-                    partial.unlink(missing_ok=True)
-                raise
-            return
-
-
-def _take(file: io.BufferedRandom, url: str, patience_s: float) -> None:
-    """The file's lock. A process that was stopped may have it: it is waited for while what it brings grows."""
-    size, begin = -1, time.monotonic()
-    while True:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except BlockingIOError:
-            now, size = size, os.fstat(file.fileno()).st_size
-            if now != size:
-                begin = time.monotonic()
-            if time.monotonic() - begin >= patience_s or _without_patience.is_set():
-                raise UnreachableError(url, patience_s, "another process is fetching it") from None
-            _without_patience.wait(_LOCK_PAUSE_S)
-
-
-def _open_file(name: str, flags: int) -> int:
-    return os.open(name, flags | os.O_NOFOLLOW, 0o644)
-
-
-def _is_same(file: io.BufferedRandom, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
-        return False

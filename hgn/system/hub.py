@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import functools
 import os
-import random
 import re
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +16,12 @@ from typing import Any, TypeVar
 from urllib.parse import quote
 
 from hgn.schema import ConfigError
+from hgn.system.patience import UnreachableError, patiently
 
 PREFIX = "hf://"
 _NAME = r"[\w.-]+"
 _PATTERN = re.compile(rf"hf://(datasets/)?({_NAME}/{_NAME})(?:@([^/]+))?(?:/(.*))?")
-_PATIENCE_S, _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 60.0, 0.25, 10.0
+_PATIENCE_S = 60.0
 _PACKAGES = ("httpx", "httpx2", "httpcore", "httpcore2")
 _PASSING = (408, 425, 429)
 
@@ -92,21 +91,13 @@ def hub_weights(url: str, field: str = "weights", patience_s: float = _PATIENCE_
 
 def _patiently(ask: Callable[[], T], url: str, field: str, patience_s: float) -> T:
     """Asks again while the server is away: huggingface_hub's and httpx' errors are none of OSError's kinds."""
-    begin, pause = time.monotonic(), _FIRST_PAUSE_S
-    while True:
-        try:
-            return ask()
-        except Exception as error:
-            cause = _passing(error, url, field)
-            if cause is None:
-                raise
-            if time.monotonic() - begin + pause > patience_s:
-                raise ConfigError(
-                    f"{field} must be within reach, got no answer from {endpoint()} for {url} in {patience_s:.0f} s "
-                    f"(at last: {cause})"
-                ) from error
-            time.sleep(pause * random.uniform(0.5, 1.0))
-            pause = min(2 * pause, _LONGEST_PAUSE_S)
+    try:
+        return patiently(ask, lambda error: _passing(error, url, field), url, endpoint(), patience_s)
+    except UnreachableError as error:
+        raise ConfigError(
+            f"{field} must be within reach, got no answer from {endpoint()} for {url} in {patience_s:.0f} s "
+            f"(at last: {error.cause})"
+        ) from error
 
 
 def _passing(error: Exception, url: str, field: str) -> str | None:
@@ -122,5 +113,5 @@ def _passing(error: Exception, url: str, field: str) -> str | None:
     if missing or (isinstance(status, int) and 400 <= status < 500 and status not in _PASSING):
         raise ConfigError(f"{field} must be a file of the repository, got {url}, which has no such file") from None
     packages: set[Any] = {kind.__module__.partition(".")[0] for kind in type(error).__mro__}
-    known = isinstance(error, (errors.LocalEntryNotFoundError, OSError)) or packages & set(_PACKAGES)
-    return (" ".join(str(error).split())[:200] or type(error).__name__) if known else None
+    passes = isinstance(error, (errors.LocalEntryNotFoundError, OSError)) or packages & set(_PACKAGES)
+    return (" ".join(str(error).split())[:200] or type(error).__name__) if passes else None

@@ -20,10 +20,10 @@ from hgn.data.episode_tensors import EpisodeTensors, UpdateChunk, whole_episode
 from hgn.data.importance import FrameImportance
 from hgn.data.pooled import AnyStore
 from hgn.data.sampler import BLOCK_EPISODES, EpisodeSampler, Sample, SamplerState
-from hgn.data.storage import without_patience
 from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.schema import ConfigError
+from hgn.system.patience import without_patience
 from hgn.training import lightning_compat
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import Starts, drawn_starts

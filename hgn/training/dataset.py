@@ -12,8 +12,9 @@ from hgn.data.identity import identity_differences, physics_settings
 from hgn.data.manifest import SPLITS, Manifest
 from hgn.data.pooled import AnyStore, PooledStore
 from hgn.data.reader import EpisodeStore
-from hgn.data.storage import UnreachableError, is_remote
+from hgn.data.storage import is_remote
 from hgn.schema import ConfigError, from_stored, require
+from hgn.system.patience import UnreachableError
 from hgn.system.progress import bar
 from hgn.training.distributed import first_rank
 from hgn.training.generator import Generator

@@ -8,7 +8,7 @@ import pytest
 from datagen.generate import datagen_config
 from hgn.data.fresh import draw_fresh, read_fresh, set_record
 from hgn.data.manifest import Manifest
-from hgn.data.storage import file_sha256
+from hgn.data.verification import file_sha256
 from hgn.schema import ConfigError
 
 

@@ -12,7 +12,6 @@ from hgn import card
 from hgn.data.reader import EpisodeStore
 from hgn.runtime.weights import WeightsInfo, find_weights, load_weights, save_weights
 from hgn.schema import ConfigError
-from hgn.system import hub as hub_module
 from hgn.system.hub import HubPlace, hub_weights
 
 
@@ -29,7 +28,7 @@ def hub(tmp_path, monkeypatch):
     monkeypatch.setenv("HGN_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub_cache"))
     monkeypatch.delenv("HF_TOKEN", raising=False)
-    monkeypatch.setattr(hub_module, "_FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
     hub_weights.cache_clear()
     with served(tmp_path / "hub") as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)
@@ -81,9 +80,8 @@ def test_a_server_that_fails_is_asked_again(hub, monkeypatch):
         hub_weights("hf://one/two/a.safetensors", patience_s=0.05)
 
 
-def test_a_data_set_is_read_from_a_repository(hub, folder, monkeypatch):
+def test_a_data_set_is_read_from_a_repository(hub, folder):
     """dataset.folder=hf://datasets/…: the episodes are the folder's, with errors on the way, in a folder of it too."""
-    monkeypatch.setattr("hgn.data.storage._FIRST_PAUSE_S", 0.01)
     for place in ("one/data", "one/several/part", "one/private"):
         shutil.copytree(folder, hub.folder / "datasets" / place)
     hub.failures = 2

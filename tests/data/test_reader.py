@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from written_files import first_release
 
-import hgn.data.storage
+import hgn.data.verification
 from datagen.pool.writer import DatasetWriter
 from hgn.config import SceneConfig
 from hgn.data.index import ListedIndex
@@ -103,8 +103,8 @@ def test_shard_cut_at_a_member_boundary_is_refused(folder):
 def test_shards_are_hashed_once(folder, monkeypatch):
     """A process verifies a shard once, however many stores open it."""
     hashed: list[str] = []
-    real = hgn.data.storage.file_sha256
-    monkeypatch.setattr(hgn.data.storage, "file_sha256", lambda path: hashed.append(path.name) or real(path))
+    real = hgn.data.verification.file_sha256
+    monkeypatch.setattr(hgn.data.verification, "file_sha256", lambda path: hashed.append(path.name) or real(path))
     for _ in range(2):
         _ = list(EpisodeStore(folder, "train").episodes)
     assert len(hashed) == len(set(hashed)) == 4

@@ -26,19 +26,11 @@ from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.storage import (
-    CACHE_VARIABLE,
-    LIMIT_VARIABLE,
-    TOKEN_VARIABLE,
-    UnreachableError,
-    cache_folder,
-    file_sha256,
-    is_remote,
-    open_storage,
-    verify_file,
-    without_patience,
-)
+from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE, cache_folder
+from hgn.data.storage import TOKEN_VARIABLE, is_remote, open_storage
+from hgn.data.verification import file_sha256, verify_file
 from hgn.schema import ConfigError
+from hgn.system.patience import UnreachableError, without_patience
 
 TOKEN = "correct-horse-battery"
 
@@ -47,7 +39,7 @@ TOKEN = "correct-horse-battery"
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    monkeypatch.setattr(hgn.data.storage, "_FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr("hgn.system.patience.FIRST_PAUSE_S", 0.01)
     return tmp_path / "cache" / "shards"
 
 

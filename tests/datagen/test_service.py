@@ -30,7 +30,8 @@ from datagen.service.__main__ import main
 from datagen.service.server import make_app
 from datagen.service.supervisor import PoolState, Supervisor
 from hgn.data.manifest import Manifest, ShardEntry
-from hgn.data.storage import TOKEN_VARIABLE, file_sha256
+from hgn.data.storage import TOKEN_VARIABLE
+from hgn.data.verification import file_sha256
 from hgn.schema import to_mapping
 
 TOKEN = "correct-horse-battery"

@@ -10,11 +10,11 @@ import fsspec
 import pytest
 from processes import exit_code
 
-import hgn.data.storage
+import hgn.system.patience
 from datagen.upload import main
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.storage import CACHE_VARIABLE
+from hgn.data.shard_cache import CACHE_VARIABLE
 from hgn.schema import ConfigError
 
 
@@ -22,7 +22,7 @@ from hgn.schema import ConfigError
 def store(tmp_path, monkeypatch):
     """fsspec's memory as the object store, empty; and a cache of our own."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setattr(hgn.data.storage, "_FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(hgn.system.patience, "FIRST_PAUSE_S", 0.01)
     files = fsspec.filesystem("memory")
     files.store.clear()
     return files

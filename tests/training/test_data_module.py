@@ -14,7 +14,7 @@ from training.runs import NETWORK, TRAINING
 from hgn.config import NetworkConfig, TrainingConfig
 from hgn.data.episode_tensors import EpisodeTensors
 from hgn.data.reader import EpisodeStore
-from hgn.data.storage import CACHE_VARIABLE, LIMIT_VARIABLE
+from hgn.data.shard_cache import CACHE_VARIABLE, LIMIT_VARIABLE
 from hgn.schema import ConfigError
 from hgn.training.data_module import EpisodeDataModule, agreed_count
 

@@ -16,7 +16,8 @@ from datagen.pool.plan import scene_seed
 from hgn import train
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.storage import CACHE_VARIABLE, TOKEN_VARIABLE
+from hgn.data.shard_cache import CACHE_VARIABLE
+from hgn.data.storage import TOKEN_VARIABLE
 from hgn.training.checkpoint import read_checkpoint
 
 SCENES = 5

@@ -25,7 +25,7 @@ from hgn.command import run_command
 from hgn.data.index import INDEX_NAME
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.reader import EpisodeStore
-from hgn.data.storage import verify_file
+from hgn.data.verification import verify_file
 from hgn.scene.episode import Episode
 from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require, require_bounds, to_mapping
 from hgn.system.files import TEMPORARY_SUFFIX, write_json

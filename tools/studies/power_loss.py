@@ -34,7 +34,8 @@ from datagen.pool.writer import DatasetWriter
 from hgn.command import run_command
 from hgn.config import DatagenConfig, DatasetConfig
 from hgn.data.manifest import Manifest
-from hgn.data.storage import CACHE_VARIABLE, open_storage
+from hgn.data.shard_cache import CACHE_VARIABLE
+from hgn.data.storage import open_storage
 from hgn.scene.episode import Episode
 from hgn.scene.obstacle_grid import ObstacleGrid
 from hgn.schema import ConfigError, NonNegative, Positive, from_mapping, require_bounds

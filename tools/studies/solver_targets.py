@@ -27,7 +27,7 @@ from datagen.mpm.collider import Collider, build_collider
 from hgn.command import run_command
 from hgn.config import MpmConfig, Processor, SceneConfig, config_directory
 from hgn.data.manifest import MANIFEST_NAME, Manifest
-from hgn.data.storage import verify_file
+from hgn.data.verification import verify_file
 from hgn.scene.random_scene import REPORT_SEED, generate_scene
 from hgn.scene.scene import Scene
 from hgn.schema import Positive, from_mapping, require, require_bounds

@@ -20,7 +20,7 @@ from hgn.data.index import EpisodeEntry, ListedIndex, ShardEntry
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.shard import episode_tar, locate_members, tar_end
 from hgn.data.statistics import Statistics, episode_statistics, merge_statistics
-from hgn.data.storage import file_sha256
+from hgn.data.verification import file_sha256
 from hgn.scene.episode import SCHEMA_VERSION, Episode
 from hgn.schema import ConfigError, require
 from hgn.system.files import make_folder, sync_file, sync_folder, temporary_file

@@ -1,0 +1,45 @@
+"""Files that are what they should be: size and sha256, looked at once."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from hgn.schema import ConfigError
+
+_verified: set[tuple[str | int, ...]] = set()  # the files that this process has verified
+
+
+def file_sha256(path: Path) -> str:
+    """The sha256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def verify_file(path: Path, sha256: str, size: int, remedy: str) -> None:
+    """Checks size and sha256 of a file, once a process as long as the file does not change.
+
+    Raises: ConfigError naming the file, what was expected and found, and the remedy; FileNotFoundError.
+    """
+    status = path.stat()
+    if status.st_size != size:
+        raise ConfigError(f"{path} must have {size} bytes, got {status.st_size}; {remedy}")
+    identity = _identity(path, sha256)
+    if identity in _verified:
+        return
+    actual = file_sha256(path)
+    if actual != sha256:
+        raise ConfigError(f"{path} must have sha256 {sha256}, got {actual}: it was altered; {remedy}")
+    _verified.add(identity)
+
+
+def note_verified(path: Path, sha256: str) -> None:
+    """For whoever has hashed a file while writing it."""
+    _verified.add(_identity(path, sha256))
+
+
+def _identity(path: Path, sha256: str) -> tuple[str | int, ...]:
+    """Another one as soon as the file may have changed: a modification time can be set back, a change's cannot."""
+    status = path.stat()
+    times = status.st_mtime_ns, status.st_ctime_ns
+    return str(path.resolve()), status.st_dev, status.st_ino, status.st_size, *times, sha256
