@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hgn.data.manifest import MANIFEST_NAME
-from hgn.data.storage import is_remote
+from hgn.data.storage import is_remote, local_folder
 from hgn.data.verification import file_sha256
 from hgn.schema import ConfigError, from_mapping, require, to_mapping
 from hgn.system.files import write_json
@@ -40,26 +40,26 @@ def draw_fresh(folder: Path | str, weights: Sequence[str]) -> FreshSeed:
     for i, file in enumerate(files):
         require(file.is_file(), f"frozen[{i}]", "an existing file of weights", str(file))
     hashes = {file.name: file_sha256(file) for file in files}
-    known = read_fresh(folder)
-    if known is None:
-        there = (Path(folder) / MANIFEST_NAME).exists()
-        require(not there, "frozen", f"left out: {folder} holds a data set whose seed was chosen before", list(weights))
-        known = FreshSeed(secrets.randbelow(2**31), datetime.now(UTC).isoformat(timespec="seconds"), hashes)
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        write_json(Path(folder) / FRESH_NAME, to_mapping(known))
+    fresh = read_fresh(folder)
+    if fresh is None:
+        chosen = (Path(folder) / MANIFEST_NAME).exists()
+        rule = f"left out: {folder} holds a data set whose seed was chosen before"
+        require(not chosen, "frozen", rule, list(weights))
+        fresh = FreshSeed(secrets.randbelow(2**31), datetime.now(UTC).isoformat(timespec="seconds"), hashes)
+        write_json(Path(folder) / FRESH_NAME, to_mapping(fresh))
     remedy = "weights that changed need another folder, and so another seed"
-    require(known.weights == hashes, "frozen", f"the weights of {folder}/{FRESH_NAME}", list(weights), remedy)
-    return known
+    require(fresh.weights == hashes, "frozen", f"the weights of {folder}/{FRESH_NAME}", list(weights), remedy)
+    return fresh
 
 
 def read_fresh(folder: Path | str) -> FreshSeed | None:
-    """What a folder says of its seed; none where it was chosen, or the folder is a URL."""
-    path = Path(folder) / FRESH_NAME
+    """What a folder says of its seed; none where it was chosen, or the folder is at a server."""
+    path = local_folder(folder) / FRESH_NAME
     if is_remote(folder) or not path.is_file():
         return None
     try:
         return from_mapping(FreshSeed, json.loads(path.read_text()), str(path))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path} must be what python -m datagen frozen=… wrote, got {error}") from error
 
 

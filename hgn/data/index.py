@@ -262,16 +262,16 @@ class Index(Sequence[ShardEntry]):
 
     def particles(self, split: str, episodes: Sequence[int]) -> list[int]:
         """How many particles these have, by their places in the split; a segment is read for it once."""
-        known = self._read.particles[split]
+        particles = self._read.particles[split]
         with self._read.lock:
-            known.extend([-1] * (self.totals[split].episodes - len(known)))
+            particles.extend([-1] * (self.totals[split].episodes - len(particles)))
             for episode in episodes:
-                if known[episode] < 0:
+                if particles[episode] < 0:
                     segment = self._first_beyond(split, episode)
                     counts = [e.particles for s in self._segment(segment) if s.split == split for e in s.episodes]
                     before = self._before(segment)[split].episodes
-                    known[before : before + len(counts)] = array("i", counts)
-        return [known[episode] for episode in episodes]
+                    particles[before : before + len(counts)] = array("i", counts)
+        return [particles[episode] for episode in episodes]
 
     def digest(self, split: str, episodes: int) -> str | None:
         """The digest of the shards that hold the first `episodes` of a split; none where no shard ends there."""
@@ -286,8 +286,8 @@ class Index(Sequence[ShardEntry]):
 
     def continues(self, earlier: Index, split: str) -> bool:
         """Whether the shards of a split begin with those of `earlier`."""
-        known = earlier.totals[split]
-        return self.digest(split, known.episodes) == known.digest
+        before = earlier.totals[split]
+        return self.digest(split, before.episodes) == before.digest
 
     def quarantined(self) -> list[QuarantinedScene]:
         """The scenes that could not be simulated, the first one first."""
@@ -295,20 +295,23 @@ class Index(Sequence[ShardEntry]):
 
     def files(self) -> Iterator[tuple[str, int]]:
         """Names and sizes of the files that hold it, what is read first last."""
-        state = self.state
         for kind in (*range(len(self) // SEGMENT_SHARDS + 1), "segments", "quarantined"):
-            if size := self.size(state.path(kind)):
-                yield state.path(kind), size
+            if size := self._bytes(kind):
+                yield self.state.path(kind), size
 
     def size(self, name: str) -> int | None:
         """How many bytes of a file count; none where the index has no such file. Slow once, for a full segment."""
+        match = re.fullmatch(r".*-(\d{6,}|segments|quarantined)\.jsonl", name)
+        kind: int | str = "" if match is None else int(match[1]) if match[1].isdecimal() else match[1]
+        return self._bytes(kind) or None if name == self.state.path(kind) else None
+
+    def _bytes(self, kind: int | str) -> int:
+        """Of segment number `kind`, or of another file; 0 of what is not there."""
         state, full = self.state, len(self) // SEGMENT_SHARDS
-        sizes: dict[int | str, int] = {full: state.segment_bytes, "segments": state.table_bytes}
-        match = re.fullmatch(r".*-(\d{6,})\.jsonl", name)
-        if match and int(match[1]) < full and name == state.path(int(match[1])):
-            return self._ends()[int(match[1])].bytes
-        sizes["quarantined"] = state.quarantine_bytes
-        return {state.path(kind): size for kind, size in sizes.items()}.get(name) or None
+        if isinstance(kind, int) and kind < full:
+            return self._ends()[kind].bytes
+        others = {full: state.segment_bytes, "segments": state.table_bytes, "quarantined": state.quarantine_bytes}
+        return others.get(kind, 0)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_read"}
@@ -408,11 +411,8 @@ def extend(
     make_folder(folder / INDEX_NAME)
     rest = list(shards)
     while rest:
-        number = state.shards // SEGMENT_SHARDS
-        part, rest = (
-            rest[: SEGMENT_SHARDS - state.shards % SEGMENT_SHARDS],
-            rest[SEGMENT_SHARDS - state.shards % SEGMENT_SHARDS :],
-        )
+        number, filled = divmod(state.shards, SEGMENT_SHARDS)
+        part, rest = rest[: SEGMENT_SHARDS - filled], rest[SEGMENT_SHARDS - filled :]
         size = _append(folder / state.path(number), state.segment_bytes, part)
         totals = totals_of(part, totals)
         state = replace(state, shards=state.shards + len(part), segment_bytes=size)
@@ -429,13 +429,11 @@ def extend(
 def begin(folder: Path, current: int = 0) -> Index:
     """An empty index beside those that are there. Those before the `current` generation, the head's, go: nobody reads
     them any more. A later one, whose head was never written, may be there too."""
-    generations: dict[int, list[Path]] = {}
-    for path in (folder / INDEX_NAME).glob("[0-9]*-*.jsonl"):
-        generations.setdefault(int(path.name.partition("-")[0]), []).append(path)
-    last = max(generations, default=0)
-    for path in (path for generation, paths in generations.items() if generation < current for path in paths):
-        path.unlink()
-    return Index(folder, IndexState(last + 1), no_totals())
+    files = {path: int(path.name.partition("-")[0]) for path in (folder / INDEX_NAME).glob("[0-9]*-*.jsonl")}
+    for path, generation in files.items():
+        if generation < current:
+            path.unlink()
+    return Index(folder, IndexState(max(files.values(), default=0) + 1), no_totals())
 
 
 def parse_json(content: bytes, path: str) -> Any:

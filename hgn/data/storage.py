@@ -64,6 +64,11 @@ def is_remote(folder: Path | str) -> bool:
     return "://" in str(folder) and not str(folder).startswith("file://")
 
 
+def local_folder(folder: Path | str) -> Path:
+    """The path of a data set that is no remote one."""
+    return Path(str(folder).removeprefix("file://"))
+
+
 def open_storage(folder: Path | str) -> Storage:
     """The storage of a data set; of a URL the same one each time.
 
@@ -71,7 +76,7 @@ def open_storage(folder: Path | str) -> Storage:
     """
     if is_remote(folder):
         return _remote(str(folder).rstrip("/"))
-    return _Folder(Path(str(folder).removeprefix("file://")))
+    return _Folder(local_folder(folder))
 
 
 def write_remote(url: str, name: str, source: Path | bytes) -> None:

@@ -38,6 +38,7 @@ def test_what_reports_say_of_a_set(weights, tmp_path):
     fresh = draw_fresh(folder, [str(weights)])
     said = set_record(folder, fresh.seed, [weights])
     assert said == {"seed": fresh.seed, "drawn": fresh.drawn, "not_frozen_before": []}
+    assert read_fresh(f"file://{folder}") == fresh
     weights.write_bytes(b"trained on")
     assert set_record(folder, fresh.seed, [weights])["not_frozen_before"] == ["own.safetensors"]
     chosen = set_record(tmp_path, 3, [weights])

@@ -1,17 +1,20 @@
 """Reading published episodes: memory-mapped, verified, and growing with the data set."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import pickle
 
 import numpy as np
 import pytest
+from data.test_index import shard
 from written_files import first_release
 
 import hgn.data.verification
 from datagen.pool.writer import DatasetWriter
 from hgn.config import SceneConfig
+from hgn.data.identity import identity_hash
 from hgn.data.index import ListedIndex
 from hgn.data.manifest import Manifest
 from hgn.data.reader import EpisodeStore
@@ -32,6 +35,15 @@ def test_positions_are_read_only_memory_maps(folder):
     assert [episode.key for episode in store.episodes[1:3]] == ["train-000001", "train-000002"]
     with pytest.raises(IndexError):
         store.episodes[5]
+
+
+def test_a_shard_of_no_bytes(tmp_path):
+    """A manifest that lists an empty file is refused with a message: there is no map of nothing."""
+    empty = dataclasses.replace(shard(0), sha256=hashlib.sha256().hexdigest(), bytes=0)
+    Manifest(identity_hash({}), {}, {"train": 1}, 1, ListedIndex([empty])).save(tmp_path)
+    (tmp_path / empty.name).touch()
+    with pytest.raises(ConfigError, match="must lie within 0 bytes"):
+        EpisodeStore(tmp_path, "train").episodes[0]
 
 
 def test_one_map_a_shard(folder):
