@@ -80,7 +80,7 @@ def test_a_server_that_fails_is_asked_again(hub, monkeypatch):
         hub_weights("hf://one/two/a.safetensors", patience_s=0.05)
 
 
-def test_a_data_set_is_read_from_a_repository(hub, folder):
+def test_a_data_set_is_read_from_a_repository(hub, folder, monkeypatch):
     """dataset.folder=hf://datasets/…: the episodes are the folder's, with errors on the way, in a folder of it too."""
     for place in ("one/data", "one/several/part", "one/private"):
         shutil.copytree(folder, hub.folder / "datasets" / place)
