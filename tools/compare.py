@@ -85,8 +85,7 @@ def _run_bench(folder: Path, options: Sequence[str], out: Path) -> dict[str, Any
     if not out.exists():
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
         return {"failed": f"the bench ended with exit code {done.returncode}: {last[0]}", "rows": []}
-    written: dict[str, Any] = json.loads(out.read_text())
-    return written
+    return json.loads(out.read_text())
 
 
 def compared(runs: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:

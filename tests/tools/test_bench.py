@@ -90,7 +90,7 @@ def test_no_time_where_a_check_is_red(tmp_path, monkeypatch, capsys):
 
 def test_checks_see_small_faults(monkeypatch):
     """Backend torch passes in float32; a 0.01 % error of the output does not."""
-    frame = contenders.Frame(NetworkConfig(width=16, levels=2), Workload(50, 1), CPU)
+    frame = contenders.Frame(NetworkConfig(width=16, levels=2), Workload(50, 1), CPU, "fp32")
     assert frame.check("fp32") == "pass"
     predict = frame.simulator.backend.predict
     frame.simulator.backend.predict = lambda state: 1.0001 * predict(state)

@@ -82,13 +82,9 @@ class Frame(Contender):
     """One frame of a simulation: features, grid or neighbours, network, integration."""
 
     def __init__(
-        self,
-        config: NetworkConfig,
-        work: Workload,
-        device: torch.device,
-        precision: str = "fp32",
-        backend: str | None = None,  # none: the fastest that makes frames one by one
+        self, config: NetworkConfig, work: Workload, device: torch.device, precision: str, backend: str | None = None
     ) -> None:
+        """`backend`: none is the fastest that makes frames one by one."""
         self.device = device
         self.network = bench_network(config, device)
         chosen = build(backend, self.network, precision) if backend else fastest_stepped(self.network, precision)
@@ -105,7 +101,7 @@ class Frame(Contender):
 class Train(Contender):
     """One training step on data that is on the device: noise, jitter, forward, backward, Adam."""
 
-    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str = "fp32") -> None:
+    def __init__(self, config: NetworkConfig, work: Workload, device: torch.device, precision: str) -> None:
         self.device = device
         self.module = training_module(config, work.scenes, device)
         self.module.backend = with_gradients(self.module.network, precision)

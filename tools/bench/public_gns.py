@@ -68,7 +68,7 @@ def public_simulator(module: ModuleType, network: GraphNetworkSimulator, domain_
         name: {"mean": getattr(normaliser, f"{name}_mean"), "std": getattr(normaliser, f"{name}_std")}
         for name in ("velocity", "acceleration")
     }
-    simulator: nn.Module = module.LearnedSimulator(
+    return module.LearnedSimulator(
         particle_dimensions=3,
         nnode_in=3 * config.velocity_history + 6 + config.material_embedding,
         nedge_in=4,
@@ -83,8 +83,7 @@ def public_simulator(module: ModuleType, network: GraphNetworkSimulator, domain_
         particle_type_embedding_size=config.material_embedding,
         boundary_clamp_limit=config.wall_distance_cells,
         device=str(domain_3.device),
-    )
-    return simulator.to(domain_3)
+    ).to(domain_3)
 
 
 @torch.no_grad()
@@ -134,14 +133,13 @@ class PublicGns(Contender):
     def output(self, window_WN3: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Their normalised acceleration and its target, [N, 3] each; noise is in the window already."""
         sequence_NH3 = window_WN3[:-1].transpose(0, 1).contiguous()
-        output: tuple[torch.Tensor, torch.Tensor] = self.simulator.predict_accelerations(
+        return self.simulator.predict_accelerations(
             next_positions=window_WN3[-1],
             position_sequence_noise=torch.zeros_like(sequence_NH3),
             position_sequence=sequence_NH3,
             nparticles_per_example=self.batch.particles_S,
             particle_types=self.batch.material_N,
         )
-        return output
 
     def expected(self) -> torch.Tensor:
         """What our network gives in float64 on the same neighbours, normalised, [N, 3]."""

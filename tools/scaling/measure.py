@@ -182,8 +182,7 @@ class TritonUpdates:
         return (self.ours.first_moment - 0.9 * before) * 10
 
     def weights(self) -> torch.Tensor:
-        values: torch.Tensor = self.ours.values
-        return values
+        return self.ours.values
 
 
 class _Loss(nn.Module):
