@@ -50,11 +50,12 @@ def train_network(
     from lightning.pytorch.loggers import TensorBoardLogger
 
     from hgn.training import lightning_compat
-    from hgn.training.callbacks import Checkpoints, LogLines, Monitor, SameWeights, Stopper
+    from hgn.training.callbacks import Checkpoints, LogLines, SameWeights, Stopper
     from hgn.training.checkpoint_writer import CheckpointWriter
     from hgn.training.data_module import EpisodeDataModule
     from hgn.training.gradients import GradientGuard
     from hgn.training.module import TrainingModule
+    from hgn.training.monitor import Monitor
     from hgn.training.tensorboard import FinalMetrics
 
     training, run = config.training, Path(config.run)
@@ -88,7 +89,7 @@ def train_network(
     checkpoints = Checkpoints(run / "checkpoints", training.checkpoint_every, writer)
     monitor = Monitor(run, store, stop, checkpoints)
     guard = GradientGuard(training.maximum_skipped_updates)
-    lines = LogLines(run, monitor, guard, feed, published)
+    lines = LogLines(run, monitor.last, guard, feed, published)
     final = FinalMetrics(to_mapping(config), monitor.last, stop)
     trainer = Trainer(
         accelerator=training.accelerator,

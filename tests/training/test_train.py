@@ -23,7 +23,7 @@ from hgn.data.statistics import merge_statistics
 from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.files import held
-from hgn.training import callbacks
+from hgn.training import monitor
 from hgn.training.checkpoint import LAST_NAMES, read_checkpoint, sampler_state_of_checkpoint
 from hgn.training.dataset import PublishedEpisodes
 from hgn.training.module import TrainingModule
@@ -109,13 +109,13 @@ def gradients_with_faults(monkeypatch, faulty):
 
 def test_a_scene_that_diverges_leaves_the_others_measured(data, run, monkeypatch):
     """Its frames count as far as it came, it is told how many came to the end, and pictures are made."""
-    real = callbacks.simulate_scenes
+    real = monitor.simulate_scenes
 
     def cut_short(*arguments):
         first, *others = real(*arguments)
         return [RolloutResult(first.position_TN3[:2], "diverged"), *others]
 
-    monkeypatch.setattr(callbacks, "simulate_scenes", cut_short)
+    monkeypatch.setattr(monitor, "simulate_scenes", cut_short)
     assert train.main(train_mapping(data, run, monitor_rollout_frames=4, monitor_scenes=2)) == 0
     last = [record for record in metrics(run) if "rollout/finished" in record][-1]
     assert (last["rollout/finished"], last["rollout/frames"]) == (0.5, 2.0)

@@ -1,0 +1,155 @@
+"""What is measured while a training runs: one-step errors and rollouts on fixed scenes."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from hgn.data.lookup import first_indices
+from hgn.data.pooled import AnyStore
+from hgn.data.storage import PATIENCE_S
+from hgn.render.pictures import rollout_of_episode
+from hgn.runtime.backend import fastest_stepped
+from hgn.runtime.rollouts import simulate_scenes
+from hgn.runtime.simulator import InitialState, Simulator
+from hgn.scene.episode import Episode
+from hgn.training.callbacks import Checkpoints, log
+from hgn.training.data_module import agreed_count
+from hgn.training.errors import (
+    REPORTED_FRAMES,
+    SquaredError,
+    baselines,
+    frame_batches,
+    network_predictor,
+    one_step_errors,
+    rollout_errors,
+)
+from hgn.training.module import TrainingModule
+from hgn.training.stop import StopRequest
+from hgn.training.tensorboard import show_rollout
+
+
+class Monitor(Callback):
+    """Measures one-step errors on fixed scenes of both splits, and rollouts of the validation scenes."""
+
+    def __init__(self, run: Path, training: AnyStore, stop: StopRequest, checkpoints: Checkpoints):
+        self.run, self.stop, self.checkpoints = run, stop, checkpoints
+        self.stores = {"training": training, "validation": training.of_split("validation")}
+        self.last: dict[str, float] = {}
+        self._measured_update = -1
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        assert isinstance(pl_module, TrainingModule)
+        if trainer.global_step % pl_module.training_config.monitor_every == 0:
+            self.measure(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, TrainingModule)
+        if not self._interrupted(trainer):
+            self.measure(trainer, pl_module, PATIENCE_S)
+
+    def measure(self, trainer: Trainer, module: TrainingModule, patience_s: float = 0.0) -> None:
+        """The one-step frames are divided among the ranks; rank 0 does the rollouts. Ends early on a stop request.
+
+        Where a server has scenes that are not here yet and does not answer, measures nothing and says so.
+        """
+        if self._measured_update == trainer.global_step:
+            return
+        self._measured_update = trainer.global_step
+        config, network = module.training_config, module.result
+        network.eval()
+        started = time.monotonic()
+        self.stores["validation"].refresh()
+        chosen = {
+            split: first_indices(store, config.monitor_scenes, agreed_count(store, trainer))
+            for split, store in self.stores.items()
+        }
+        here = all(store.within_reach(chosen[split], patience_s) for split, store in self.stores.items())
+        if not trainer.strategy.reduce_boolean_decision(here, all=True):
+            network.train()
+            if trainer.is_global_zero:
+                text = "the scenes to measure on are not all here, and their server does not send them now"
+                print(f"nothing is measured at update {trainer.global_step}: {text}", file=sys.stderr)
+            return
+        scenes = {split: [store.episodes[i] for i in chosen[split]] for split, store in self.stores.items()}
+        values: dict[str, float] = {}
+        for split, episodes in scenes.items():
+            if not episodes or self._interrupted(trainer):
+                continue
+            values |= self._one_step(trainer, module, split, episodes)
+        if "one_step/validation" in values and not self._interrupted(trainer):
+            if config.monitor_rollout_frames >= 2 and trainer.is_global_zero:
+                values |= self._rollout(trainer, module, scenes["validation"], config.monitor_rollout_frames)
+            self.checkpoints.offer(trainer, values["one_step/validation"])
+        values["monitor/seconds"] = time.monotonic() - started
+        network.train()
+        self.last |= values
+        log(trainer, self.run, values)
+
+    def _one_step(
+        self, trainer: Trainer, module: TrainingModule, split: str, episodes: list[Episode]
+    ) -> dict[str, float]:
+        config, network = module.training_config, module.result
+        batches = frame_batches(
+            episodes,
+            network,
+            config.monitor_frame_stride,
+            config.monitor_particles_per_batch,
+            trainer.global_rank,
+            trainer.world_size,
+        )
+        backend = fastest_stepped(network, module.training_config.precision)
+        predictors = {"network": network_predictor(backend)} | baselines(network)
+        materials = network.config.materials
+        interrupted: Callable[[], bool] = lambda: trainer.world_size == 1 and self.stop.signal is not None  # noqa: E731
+        errors = one_step_errors(predictors, batches, module.device, materials, interrupted)
+        if trainer.world_size > 1:
+            errors = {name: _reduce(trainer, module.device, error, materials) for name, error in errors.items()}
+        values = {f"one_step/{split}": errors["network"].mse}
+        best = min(error.mse for name, error in errors.items() if name != "network")
+        if values[f"one_step/{split}"] > 0:
+            values[f"baseline_ratio/{split}"] = best / values[f"one_step/{split}"]
+        for name, mse in errors["network"].by_material().items():
+            values[f"one_step/{split}_{name}"] = mse
+        for name, error in errors.items():
+            if name != "network":
+                values[f"baseline/{split}_{name.replace(' ', '_')}"] = error.mse
+        return values
+
+    def _rollout(
+        self, trainer: Trainer, module: TrainingModule, episodes: list[Episode], frames: int
+    ) -> dict[str, float]:
+        """Errors are means over the scenes that came so far; told beside them is how many came to the end."""
+        simulator = Simulator(module.result, episodes[0].frame_rate_hz, module.simulating_backend())
+        frames = min(frames, *(len(episode.position_TN3) for episode in episodes))
+        trials = simulate_scenes(simulator, [InitialState.of_episode(episode) for episode in episodes], frames)
+        error_T = rollout_errors([trial.position_TN3 for trial in trials], episodes)
+        reached = [n for n in REPORTED_FRAMES if n < len(error_T["all"])]
+        values = {f"rollout/mse_frame_{n}": float(error_T["all"][n]) for n in reached}
+        values["rollout/finished"] = sum(trial.cause is None for trial in trials) / len(trials)
+        values["rollout/frames"] = float(min(trial.frame_count for trial in trials))
+        for name, mse_T in error_T.items():
+            values["rollout/mse" if name == "all" else f"rollout/mse_{name}"] = float(np.nanmean(mse_T))
+        shown = rollout_of_episode(episodes[0], trials[0].position_TN3)
+        show_rollout(trainer, self.run / "pictures", shown, error_T)
+        return values
+
+    def _interrupted(self, trainer: Trainer) -> bool:
+        return bool(trainer.strategy.reduce_boolean_decision(self.stop.signal is not None, all=False))
+
+
+def _reduce(trainer: Trainer, device: torch.device, error: SquaredError, materials: tuple[str, ...]) -> SquaredError:
+    rows = [[error.total.get(name, 0.0), float(error.count.get(name, 0))] for name in materials]
+    summed = trainer.strategy.reduce(torch.tensor(rows, dtype=torch.float64, device=device), reduce_op="sum")
+    assert isinstance(summed, torch.Tensor)
+    return SquaredError(
+        {name: row[0] for name, row in zip(materials, summed.tolist(), strict=True)},
+        {name: int(row[1]) for name, row in zip(materials, summed.tolist(), strict=True)},
+    )
