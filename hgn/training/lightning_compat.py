@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -46,6 +48,15 @@ class _Rounded(DDPStrategy):
         super().configure_ddp()
         assert isinstance(self.model, DistributedDataParallel)
         self.model.register_comm_hook(RoundedSum(), rounded_average)
+
+
+@contextmanager
+def interrupts_passed_on() -> Iterator[None]:
+    """Lightning makes an exit of its own of a KeyboardInterrupt, with the code of a fault."""
+    try:
+        yield
+    except SystemExit as end:
+        raise KeyboardInterrupt from end
 
 
 def skip_sigterm_broadcast(trainer: Trainer) -> None:

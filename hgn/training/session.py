@@ -112,7 +112,8 @@ def train_network(
     )
     if precompilation is not None:
         print(precompilation.wait(lambda: stop.requested), file=sys.stderr)
-    trainer.fit(module, feed, ckpt_path=checkpoint[0] if checkpoint else None, weights_only=True)
+    with lightning_compat.interrupts_passed_on():
+        trainer.fit(module, feed, ckpt_path=checkpoint[0] if checkpoint else None, weights_only=True)
     if trainer.is_global_zero:
         _report(config, trainer.global_step, monitor.last, stop)
     # a signal that came after the last update changed nothing

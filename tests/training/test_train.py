@@ -171,6 +171,21 @@ def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, number):
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 3
 
 
+def test_a_second_interrupt_does_not_wait(data, tmp_path, monkeypatch):
+    """Ctrl-C twice within an update leaves at once, and as every command does, by an interrupt."""
+    run = tmp_path / "run"
+    assert train.main(train_mapping(data, run, maximum_updates=2)) == 0
+
+    def signalled(module, optimizer):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(TrainingModule, "on_before_optimizer_step", signalled)
+    with pytest.raises(KeyboardInterrupt):
+        train.main(train_mapping(data, run))
+    assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 2
+
+
 def test_progress_reads_the_data_set_seldom(make_config, make_dataset, tmp_path, monkeypatch):
     """Reading a manifest of hundreds of scenes with every line cost a third of the updates: it is read once in a while,
     and never again once all scenes are there."""
