@@ -190,6 +190,7 @@ class Stopper(Callback):
         # Lightning has just put a handler of its own before ours: on SIGTERM it talks to the other ranks from within
         # the handler, and leaves the loop by an exception, past the checkpoint.
         self.stop.listen()
+        lightning_compat.forget_sigterm(trainer)
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if trainer.world_size > 1 and trainer.global_step < self._agreed_update + self.AGREE_EVERY:

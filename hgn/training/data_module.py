@@ -24,7 +24,6 @@ from hgn.scene.episode import Episode
 from hgn.scene.history import window
 from hgn.schema import ConfigError
 from hgn.system.patience import without_patience
-from hgn.training import lightning_compat
 from hgn.training.noise import noise_scale
 from hgn.training.pushforward import Starts, drawn_starts
 
@@ -231,7 +230,7 @@ class EpisodeDataModule(LightningDataModule):
         trainer = self.trainer
         if trainer is None:
             return self.interrupted()
-        if trainer.world_size > 1 or not (self.interrupted() or lightning_compat.received_sigterm(trainer)):
+        if trainer.world_size > 1 or not self.interrupted():
             return False
         trainer.should_stop = True
         return True

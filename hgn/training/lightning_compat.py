@@ -66,9 +66,11 @@ def skip_sigterm_broadcast(trainer: Trainer) -> None:
     trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
 
 
-def received_sigterm(trainer: Trainer) -> bool:
-    """Whether a SIGTERM reached Lightning's own handler, which is in place until the first update begins."""
-    return trainer.received_sigterm
+def forget_sigterm(trainer: Trainer) -> None:
+    """Of a SIGTERM that came while Lightning's own handler was in place, which calls ours, too: after an update it
+    would leave the loop by an exception, past the checkpoint and with exit code 0.
+    """
+    trainer._signal_connector.received_sigterm = False
 
 
 def count_updates(trainer: Trainer, count: int) -> None:

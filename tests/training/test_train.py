@@ -24,6 +24,7 @@ from hgn.runtime.rollouts import RolloutResult
 from hgn.schema import ConfigError, from_mapping
 from hgn.system.files import held
 from hgn.training import monitor
+from hgn.training.callbacks import LogLines
 from hgn.training.checkpoint import LAST_NAMES, read_checkpoint, sampler_state_of_checkpoint
 from hgn.training.dataset import PublishedEpisodes
 from hgn.training.module import TrainingModule
@@ -169,6 +170,19 @@ def test_signals_end_the_run_after_a_checkpoint(data, run, monkeypatch, number):
     monkeypatch.setattr(TrainingModule, "on_before_optimizer_step", signalled)
     assert train.main(train_mapping(data, run)) == 128 + number
     assert read_checkpoint(run / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 3
+
+
+def test_a_signal_before_the_first_update(data, tmp_path, monkeypatch):
+    """SIGTERM while Lightning's own handler is in place ends the run after a checkpoint, with 128 + its number."""
+    original = LogLines.on_train_start
+
+    def signalled(*arguments):
+        os.kill(os.getpid(), signal.SIGTERM)
+        original(*arguments)
+
+    monkeypatch.setattr(LogLines, "on_train_start", signalled)
+    assert train.main(train_mapping(data, tmp_path / "run")) == 128 + signal.SIGTERM
+    assert read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["hgn"]["updates"] == 1
 
 
 def test_a_second_interrupt_does_not_wait(data, tmp_path, monkeypatch):
