@@ -38,12 +38,9 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 ROLLOUT_ENDINGS = (".vtkhdf", ".hdf", ".hdf5", ".h5")
 GROUP_SHAPES = ("cube", "sphere")
 NETWORK_KINDS = ("hgn", "gns", "gns_particles")
-SYMMETRIES = ("none", "gravity")
-NETWORK_INPUTS = ("absolute", "relative")
 CONTACT_GATES = ("particle", "cell")
 CONTACT_FORCES = ("any", "normal")
 BACKENDS = ("auto", "torch", "triton", "cpu")
-TRAINING_BACKENDS = ("auto", "torch", "triton")
 PRECISIONS = ("fp32", "tf32", "fp16")
 Material = Annotated[str, one_of(*MATERIALS)]
 MaterialName = Annotated[
@@ -53,15 +50,6 @@ MaterialName = Annotated[
 Processor = Annotated[str, one_of("auto", "cpu", "gpu")]
 BackendName = Annotated[str, one_of(*BACKENDS)]
 Precision = Annotated[str, one_of(*PRECISIONS)]
-SandFrictionLaw = Annotated[str, one_of("matsuoka_nakai", "mohr_coulomb", "compression", "plane_strain")]
-SandVolumeCorrection = Annotated[str, one_of("tampubolon", "taichi_elements")]
-WaterEquation = Annotated[str, one_of("linear", "stiffening")]
-WaterVolumeUpdate = Annotated[str, one_of("trace", "taichi_elements")]
-TimeIntegration = Annotated[str, one_of("leapfrog", "symplectic_euler")]
-NetworkKind = Annotated[str, one_of(*NETWORK_KINDS)]
-SymmetryName = Annotated[str, one_of(*SYMMETRIES)]
-TrainingBackendName = Annotated[str, one_of(*TRAINING_BACKENDS)]
-GradientMessages = Annotated[str, one_of("fp32", "bf16")]
 StoredPrecision = Annotated[str, one_of("fp32", "fp16")]
 Split = Annotated[str, one_of("train", "validation", "test")]
 
@@ -153,8 +141,10 @@ class MpmConfig:
     # mohr_coulomb: the angle on every path; matsuoka_nakai: in triaxial compression and extension, more in plane strain
     # (34.8 for 31); or a cone (Drucker-Prager) that has it in triaxial compression alone (Taichi Elements, with 45) or
     # in plane_strain
-    sand_friction_law: SandFrictionLaw = "mohr_coulomb"  # or matsuoka_nakai, compression, plane_strain
-    sand_volume_correction: SandVolumeCorrection = "tampubolon"  # or taichi_elements
+    sand_friction_law: Annotated[str, one_of("matsuoka_nakai", "mohr_coulomb", "compression", "plane_strain")] = (
+        "mohr_coulomb"
+    )
+    sand_volume_correction: Annotated[str, one_of("tampubolon", "taichi_elements")] = "tampubolon"
     # of grains that make friction grow with the rate of flow, mu(I) (Jop, Forterre and Pouliquen 2006), which tall
     # columns show: those judged are 200 of these in radius; 0: the same friction at any rate
     sand_grain_diameter_m: NonNegative[float] = 0.0025
@@ -162,10 +152,10 @@ class MpmConfig:
     snow_critical_compression: BelowOne[float] = 0.025
     snow_critical_stretch: NonNegative[float] = 0.0045
     snow_maximum_hardening: Positive[float] = 20.0  # bound on exp(hardening * (1 - Jp)), counted; beyond 5 m/s raise it
-    water_equation: WaterEquation = (
-        "linear"  # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
-    )
-    water_volume_update: WaterVolumeUpdate = "trace"  # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
+    # pressure lambda (1 - J); or stiffening, beyond 15 m/s: lambda / 7 (J^-7 - 1)
+    water_equation: Annotated[str, one_of("linear", "stiffening")] = "linear"
+    # J *= 1 + dt tr C; or taichi_elements: det(1 + dt C)
+    water_volume_update: Annotated[str, one_of("trace", "taichi_elements")] = "trace"
     # fraction of its tension that stretched water bears; 1: Taichi Elements'
     water_tension: AtMostOne[NonNegative[float]] = 1.0
     water_viscosity_pa_s: NonNegative[float] = 0.0  # beside that of the grid, which is larger than real water's
@@ -173,9 +163,8 @@ class MpmConfig:
     water_density_relaxation_s: Positive[float] | None = 1.0
     water_minimum_volume_ratio: Positive[float] = 0.1  # floor on J; hits are counted
     minimum_singular_value: Positive[float] = 0.05  # floor on the singular values of F; hits are counted
-    time_integration: TimeIntegration = (
-        "leapfrog"  # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
-    )
+    # free fall is exact; or symplectic_euler, which is ahead by g t dt / 2
+    time_integration: Annotated[str, one_of("leapfrog", "symplectic_euler")] = "leapfrog"
     time_step: Annotated[str, one_of("adaptive", "fixed")] = "adaptive"  # or fixed
     fixed_time_step_s: Positive[float] = 0.02 / 64
     # of the single-particle limit dx sqrt(rho / (3 lambda + 2 mu))
@@ -312,7 +301,8 @@ class ImportConfig:
 class NetworkConfig:
     """The hierarchical graph network (paper sec. 3.1, 3.2), or one it is compared with. Lengths in domain units."""
 
-    kind: NetworkKind = "hgn"  # or gns; or gns_particles, which sees obstacles as static particles
+    # or gns; or gns_particles, which sees obstacles as static particles
+    kind: Annotated[str, one_of(*NETWORK_KINDS)] = "hgn"
     cell_size: Positive[float] = 0.035  # R: the finest level; the connectivity radius of GNS
     levels: FewLayers = 4  # L; GNS has one, the particles
     message_passing_steps: FewLayers = 4  # M, in each of the 2 L - 1 blocks
@@ -323,7 +313,7 @@ class NetworkConfig:
     obstacle_features: bool = True
     # absolute: velocities and wall distances, the paper's; relative: hgn.network.relative, where free motion and
     # gravity are exact
-    inputs: Annotated[str, one_of(*NETWORK_INPUTS)] = "absolute"
+    inputs: Annotated[str, one_of("absolute", "relative")] = "absolute"
     contact_reach_cells: Positive[float] = 1.5  # of relative inputs: walls are seen from so many R on
     # what relative inputs show a particle's velocity against surfaces by: its own reach; or cell: that of all that is
     # in its coarsest cells and across their faces, so that it is known inside a pile too
@@ -442,9 +432,8 @@ class TrainingConfig:
     more_data: tuple[str, ...] = ()
     # episodes whose samples are shuffled together, for data larger than the cache or the GPU's memory; 0: all
     shuffle_episodes: NonNegative[int] = 0
-    symmetry: SymmetryName = (
-        "none"  # gravity: samples are turned and mirrored at random, by what keeps gravity and domain
-    )
+    # gravity: samples are turned and mirrored at random, by what keeps gravity and domain
+    symmetry: Annotated[str, one_of("none", "gravity")] = "none"
     # of the scenes of an update, taken from the network's own simulations, for example 0.25; 0: none are made
     pushforward_fraction: BelowOne[float] = 0.0
     pushforward_every: Positive[int] = 500  # updates between such simulations
@@ -455,9 +444,11 @@ class TrainingConfig:
     accelerator: Processor = "auto"  # or cpu, gpu
     devices: OneOrMore | None = None  # on each machine; null: as launched, without a launcher all GPUs, or one CPU
     nodes: OneOrMore | None = None  # machines; null: as launched, without a launcher one
-    gradient_messages: GradientMessages = "fp32"  # between ranks; bf16: half the bytes, for slow networks
+    # between ranks; bf16: half the bytes, for slow networks
+    gradient_messages: Annotated[str, one_of("fp32", "bf16")] = "fp32"
     precision: Precision = "tf32"  # of matrix products: fp32, tf32 (on a GPU), fp16 (backend triton, and GNS)
-    backend: TrainingBackendName = "auto"  # torch, triton (kernels in CUDA graphs); auto: triton where it runs
+    # torch, triton (kernels in CUDA graphs); auto: triton where it runs
+    backend: Annotated[str, one_of("auto", "torch", "triton")] = "auto"
     minimum_episodes: Positive[int] = 1  # training starts once that many training episodes are published
     generate: bool = True  # start the generator where the data set is missing or incomplete
     maximum_skipped_updates: Positive[int] = 100  # in a row, for gradients that are not finite; then training ends

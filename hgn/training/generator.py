@@ -97,11 +97,9 @@ class Generator:
                 self._process.wait()
 
     def _last_error(self) -> str:
-        lines = [line for line in self._tail() if line.strip() and not line.startswith("{")]
-        return lines[-1] if lines else "no message"
-
-    def _tail(self) -> list[str]:
         with self.log_path.open("rb") as log:
             log.seek(0, os.SEEK_END)
             log.seek(max(log.tell() - 8192, 0))
-            return log.read().decode("utf-8", "replace").splitlines()
+            tail = log.read().decode("utf-8", "replace").splitlines()
+        lines = [line for line in tail if line.strip() and not line.startswith("{")]
+        return lines[-1] if lines else "no message"

@@ -66,14 +66,13 @@ class TrainingModule(LightningModule):
     def set_statistics(self, statistics: Statistics) -> None:
         """Freezes the normaliser; noise enters in quadrature. Done once, when a run begins."""
         noise, axes = self.training_config.noise_std, self.network.config.dimensions
+        normaliser = self.network.normaliser
         if self.network.config.relative:
-            self.network.normaliser.set_isotropic(torch.tensor(statistics.acceleration.std), noise, axes)
-            self._begin_average()
-            return
-        for quantity in ("velocity", "acceleration"):
-            moments = getattr(statistics, quantity)
-            mean_3, std_3 = torch.tensor(moments.mean), torch.tensor(moments.std)
-            self.network.normaliser.set(quantity, mean_3, std_3, noise, axes)
+            normaliser.set_isotropic(torch.tensor(statistics.acceleration.std), noise, axes)
+        else:
+            for quantity in ("velocity", "acceleration"):
+                moments = getattr(statistics, quantity)
+                normaliser.set(quantity, torch.tensor(moments.mean), torch.tensor(moments.std), noise, axes)
         self._begin_average()
 
     def load_weights(self, network: ParticleNetwork) -> None:
