@@ -1,5 +1,7 @@
 """Whole data sets of the ballistic stand-in, made in this process."""
 
+import time
+
 import ballistic_solver
 
 from datagen.pool.shard import stage_episode
@@ -20,12 +22,19 @@ def stage(writer, split, index):
     writer.add_staged(split, index)
 
 
+def publish(writer):
+    """The next shard that is published, once it is packed; none where the episodes of none are all staged."""
+    while (entry := writer.publish_next()) is None and writer.packing:
+        time.sleep(0.001)
+    return entry
+
+
 def make_dataset(config):
     """Makes a whole data set, or what is missing of it, without any worker process."""
     with DatasetWriter(config) as writer:
         while writer.claim_next():
             for split, index in writer.remaining():
                 stage(writer, split, index)
-            writer.publish_next()
+            publish(writer)
         assert writer.complete
     return writer.folder
