@@ -18,6 +18,7 @@ from hgn.scene.scene_file import find_scene, load_scene
 from hgn.schema import FileName, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
+from hgn.system.files import require_place
 from hgn.system.provenance import provenance
 
 
@@ -53,6 +54,9 @@ def main(mapping: dict[str, Any]) -> int:
     config = from_mapping(ExportConfig, mapping)
     if config.onnx is not None:
         require_installed("onnxscript")
+    for file in (config.out, config.onnx, config.package):
+        if file is not None:
+            require_place(Path(file))
     if config.checkpoint is not None:
         assert config.out is not None
         export(Path(config.checkpoint), Path(config.out), config.stored_precision)

@@ -25,7 +25,9 @@ def first_episodes(store: EpisodeStore, count: int) -> list[Episode]:
     Raises: ConfigError when there are none.
     """
     if not len(store):
-        raise ConfigError(f"data must hold episodes of the split {store.split}, got none in {store.folder}")
+        others = ", ".join(f"split={split}" for split in SPLITS if len(store.of_split(split)))
+        remedy = f"; it has others: {others}" if others else ""
+        raise ConfigError(f"data must hold episodes of the split {store.split}, got none in {store.folder}{remedy}")
     return [store.open(i) for i in first_indices(store, count)]
 
 

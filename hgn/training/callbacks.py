@@ -26,6 +26,7 @@ from hgn.training.checkpoint import LAST_NAMES
 from hgn.training.checkpoint_writer import CheckpointWriter
 from hgn.training.data_module import EpisodeDataModule
 from hgn.training.distributed import checksum, same_on_all_ranks
+from hgn.training.errors import format_ratio
 from hgn.training.gradients import GradientGuard
 from hgn.training.module import TrainingModule
 from hgn.training.stop import BY_WEIGHT, StopRequest
@@ -167,7 +168,7 @@ class LogLines(Callback):
         if self._bar is not None:
             notes = f"loss {values.get('loss', math.nan):.3f}"
             if "baseline_ratio/validation" in self.measured:
-                notes += f", {self.measured['baseline_ratio/validation']:.2f}x below the best baseline"
+                notes += f", {format_ratio(self.measured['baseline_ratio/validation'])} the best baseline"
             self._bar.set_postfix_str(f"{notes}, {self.published()}", refresh=False)
             self._bar.update(trainer.global_step - self._bar.n)
 

@@ -27,6 +27,8 @@ def simulate(model: str, arrays: str, frames: int) -> np.ndarray:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 5:
+        sys.exit(f"usage: {__doc__}")
     start = time.perf_counter()
     positions = simulate(sys.argv[1], sys.argv[2], int(sys.argv[3]))
     print(f"{1000 * (time.perf_counter() - start) / (len(positions) - 1):.1f} ms a frame, loading included")
