@@ -19,7 +19,7 @@ from hgn.config import BackendName, Precision
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.weights import shipped_weights
 from hgn.scene.rollout_file import read_rollout
-from hgn.scene.scene_file import find_scene, load_scene
+from hgn.scene.scene_file import find_scene, load_scene, notes_on_meshes
 from hgn.schema import FileName, Port, Positive, from_mapping, require, require_bounds
 from hgn.system.device import choose_device
 from hgn.system.extras import require_installed
@@ -80,7 +80,10 @@ def play_page(config: PlayConfig) -> Any:
 
     simulator, path = load(name), find_scene(config.scene)
     print(simulator.backend.note, file=sys.stderr)
-    session = PlaySession(simulator, load_scene(path), path.parent, config.particles, config.keep_mb << 20, name)
+    scene = load_scene(path)
+    for note in notes_on_meshes(scene):
+        print(note, file=sys.stderr)
+    session = PlaySession(simulator, scene, path.parent, config.particles, config.keep_mb << 20, name)
     names = [name, *(shipped for shipped in shipped_weights() if shipped != name)]
     return PlayPage(session, names, load, config.host, config.port)
 

@@ -91,9 +91,11 @@ class LiveSimulation:
             ("velocity_A3", velocity_A3, (count, 3)),
             ("material_A", material_A, (count,)),
         ):
-            require(np.shape(value) == shape, name, f"of shape {shape}", np.shape(value))
+            require(isinstance(value, np.ndarray), name, "a NumPy array", type(value).__name__)
+            require(value.shape == shape, name, f"of shape {shape}", value.shape)
             unusable = np.asarray(value)[~np.isfinite(value)]
             require(not len(unusable), name, "finite", float(unusable[0]) if len(unusable) else 0.0)
+        require(material_A.dtype.kind in "iu", "material_A", "whole numbers", str(material_A.dtype))
         entering = replace(self.scene, position_N3=position_A3, velocity_N3=velocity_A3, material_N=material_A)
         new = self.simulator.start([entering])
         if count:

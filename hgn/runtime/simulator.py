@@ -160,7 +160,7 @@ class Simulator:
         loaded, a gravity that they cannot take (absolute inputs: another, relative: a huge one) or obstacle cells of
         another size.
         """
-        config, states = self.network.config, [InitialState.of(scene) for scene in scenes]
+        config, states = self.network.config, _initial(scenes)
         for state in states:
             self.require_fits(state)
         gravity_S3 = np.array([state.gravity for state in states], np.float64).reshape(-1, 3) / self.frame_rate_hz**2
@@ -199,7 +199,7 @@ class Simulator:
         then.
         """
         require(frames >= 1, "frames", "at least 1", frames)
-        states = [InitialState.of(scene) for scene in scenes]
+        states = _initial(scenes)
         state = self.start(states)
         with self.backend.rollout(state) as rollout:
             positions = [state.position_N3[None].cpu().numpy(), rollout.run(frames - 1, on_frame)]
@@ -244,7 +244,8 @@ class Simulator:
         """Raises ConfigError where weights that were loaded cannot take a scene; of its materials `start` says so."""
         info, cell_size = self._info, scene.obstacle_grid.cell_size
         dimensions = self.network.config.dimensions
-        rule, remedy = f"the network's {dimensions}", f"take weights of {scene.dimensions}D data, or such an episode"
+        rule = f"the network's {dimensions}"
+        remedy = f"take weights of {scene.dimensions}D data, or an episode of {dimensions}D data"
         require(scene.dimensions == dimensions, "dimensions", rule, scene.dimensions, remedy)
         if info is None:
             return
@@ -260,6 +261,12 @@ class Simulator:
         if info.network.sees_obstacles:
             rule = f"the weights' {info.obstacle_cell_size}, the size of the cells that they know obstacles by"
             require(cell_size == info.obstacle_cell_size, "cell_size", rule, cell_size)
+
+
+def _initial(scenes: Sequence[InitialState | Scene]) -> list[InitialState]:
+    alone = isinstance(scenes, (InitialState, Scene))
+    require(not alone, "scenes", "a list of them", type(scenes).__name__, "as in rollout([scene], frames)")
+    return [InitialState.of(scene) for scene in scenes]
 
 
 def _surface(obstacles: Sequence[Obstacle], cell_size: float, spacing_cells: float) -> np.ndarray:

@@ -148,6 +148,14 @@ def test_what_is_refused_changes_nothing():
         live.add_particles(position_13, 0 * position_13, np.array([2]))
     with pytest.raises(ConfigError, match=r"velocity_A3 must be of shape \(1, 3\), got \(1, 2\)"):
         live.add_particles(position_13, position_13[:, :2], np.array([0]))
+    with pytest.raises(ConfigError, match=r"position_A3 must be a NumPy array, got 'list'"):
+        live.add_particles([[0.5, 0.5, 0.5]], 0 * position_13, np.array([0]))
+    with pytest.raises(ConfigError, match=r"material_A must be whole numbers, got 'float64'"):
+        live.add_particles(position_13, 0 * position_13, np.zeros(1))
+    with pytest.raises(
+        ConfigError, match=r"scenes must be a list of them, got 'InitialState'; as in rollout\(\[scene\], fr"
+    ):
+        simulator.rollout(first, 3)
     with pytest.raises(ConfigError, match=r"position_A3 must be finite, got nan"):
         live.add_particles(position_13 * np.nan, 0 * position_13, np.array([0]))
     with pytest.raises(ConfigError, match="gravity must be the weights'"):
