@@ -242,9 +242,15 @@ _Loader.add_implicit_resolver(
 
 
 def find_scene(name: str) -> Path:
-    """The file that `name` means: a path, or an example by its name, as in `funnel`."""
-    example = config_directory() / "example" / f"{name}.yaml"
-    return example if re.fullmatch(r"\w+", name) and not Path(name).is_file() and example.is_file() else Path(name)
+    """The file that `name` means: a path, or an example by its name, as in `funnel`.
+
+    Raises: ConfigError for what is neither a file nor an example, and has no ending.
+    """
+    if Path(name).is_file() or not re.fullmatch(r"\w+", name):
+        return Path(name)
+    examples = {path.stem: path for path in sorted((config_directory() / "example").glob("*.yaml"))}
+    require(name in examples, "scene", f"a YAML file or the name of an example ({', '.join(examples)})", name)
+    return examples[name]
 
 
 def load_scene(path: str | Path) -> Scene:

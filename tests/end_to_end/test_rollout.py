@@ -126,6 +126,7 @@ def test_what_is_faster_than_the_data_is_said(tmp_path, capsys):
             r"out must be a name that ends in .vtkhdf, .hdf, .hdf5, .h5, .usdc, .usda, .usd or .ply, got .a.png.",
         ),
         ({"out": "pictures"}, r"out must be a name that ends in .vtkhdf, .* or .ply, got 'pictures'"),
+        ({"scene": "funnle"}, r"scene must be a YAML file or the name of an example \(funnel, .*\), got 'funnle'"),
         ({"seed": -1}, "seed must be a finite number >= 0, got -1"),
     ],
 )
