@@ -99,49 +99,36 @@ class UpdateSamples:
 
     def batch(self, network: NetworkConfig) -> Batch:
         """The samples as tensors."""
-        return make_batch(
-            [(sample.episode, sample.frame) for sample in self.samples],
-            network,
-            [sample.seed for sample in self.samples],
-            self.sampler_state,
-            [sample.weight for sample in self.samples],
-            [sample.window_WN3 for sample in self.samples],
-            [sample.noise_scale for sample in self.samples],
-        )
+        return _joined(self.samples, network, self.sampler_state)
 
 
 def make_batch(
-    samples: Sequence[tuple[Episode, int]],
-    network: NetworkConfig,
-    seeds: Sequence[int] | None = None,
-    sampler_state: SamplerState | None = None,
-    weights: Sequence[float] = (),
-    windows: Sequence[np.ndarray] | None = None,
-    noise_scales: Sequence[float] = (),
+    frames: Sequence[tuple[Episode, int]], network: NetworkConfig, seeds: Sequence[int] | None = None
 ) -> Batch:
-    """Reads the windows of (episode, frame) pairs, where they are not given, and joins them, with what the network sees
-    of the obstacles.
-    """
-    if windows is None:
-        windows = [window(episode, frame, network.velocity_history) for episode, frame in samples]
-    episodes = [episode for episode, _ in samples]
+    """The windows of (episode, frame) pairs, with what the network sees of the obstacles."""
+    pairs = zip(frames, seeds or [0] * len(frames), strict=True)
+    history = network.velocity_history
+    return _joined([BatchSample(e, frame, window(e, frame, history), seed) for (e, frame), seed in pairs], network)
+
+
+def _joined(samples: Sequence[BatchSample], network: NetworkConfig, sampler_state: SamplerState | None = None) -> Batch:
+    episodes = [sample.episode for sample in samples]
     surface = None
     if network.obstacle_particles:
         surface = SurfaceParticles.of([episode_surface(e, network.static_spacing_cells) for e in episodes])
     particles = tuple(len(episode.material_N) for episode in episodes)
-    gravity_S3 = np.array([frame_gravity(episode) for episode in episodes], np.float32)
     return Batch(
-        window_WN3=torch.from_numpy(np.concatenate(windows, axis=1)),
+        window_WN3=torch.from_numpy(np.concatenate([sample.window_WN3 for sample in samples], axis=1)),
         material_N=torch.cat([material_rows(e.material_N, network.materials, e.materials) for e in episodes]),
         scene_N=torch.from_numpy(np.repeat(np.arange(len(episodes)), particles)),
         particles_S=particles,
         domain_S3=torch.tensor([episode.domain_size for episode in episodes], dtype=torch.float32),
-        gravity_S3=torch.from_numpy(gravity_S3),
+        gravity_S3=torch.tensor([frame_gravity(episode) for episode in episodes], dtype=torch.float32),
         obstacles=ObstacleCells.of([e.obstacle_grid for e in episodes]) if network.obstacle_features else None,
         surface=surface,
-        seeds_S=tuple(seeds) if seeds is not None else (0,) * len(episodes),
+        seeds_S=tuple(sample.seed for sample in samples),
         sampler_state=sampler_state,
-        weight_S=tuple(weights),
-        noise_scale_S=tuple(noise_scales),
+        weight_S=tuple(sample.weight for sample in samples),
+        noise_scale_S=tuple(sample.noise_scale for sample in samples),
         symmetries_S=tuple(shown_symmetries(e, network) for e in episodes),
     )
