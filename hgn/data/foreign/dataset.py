@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from hgn.data.identity import identity_hash
 from hgn.data.index import EpisodeEntry, ListedIndex, ShardEntry
 from hgn.data.manifest import MANIFEST_NAME, SPLITS, Manifest
 from hgn.data.shard import episode_tar, locate_members, tar_end
-from hgn.data.statistics import Statistics, episode_statistics, merge_statistics
+from hgn.data.statistics import Statistics, episode_statistics
 from hgn.data.verification import file_sha256
 from hgn.scene.episode import SCHEMA_VERSION, Episode
 from hgn.schema import ConfigError, require
@@ -81,15 +82,15 @@ def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
     if without:
         return _estimated(without, info)
     for trajectory in first if info.format == "neuralmpm" else ():  # whose units nobody has written down
-        told = np.array(trajectory.gravity)
+        stored_3 = np.array(trajectory.gravity)
         try:
-            shown = np.array(_estimated([trajectory], info))
+            estimated_3 = np.array(_estimated([trajectory], info))
         except ConfigError:  # too little flies
             continue
-        if np.linalg.norm(shown - told) > 0.1 * np.linalg.norm(told):
+        if np.linalg.norm(estimated_3 - stored_3) > 0.1 * np.linalg.norm(stored_3):
             raise ConfigError(
                 f"{trajectory.name}: gravity must be what flies there shows, length per second squared, got "
-                f"{told.tolist()} where it shows {shown.round(3).tolist()}; check dt, or give gravity=…"
+                f"{stored_3.tolist()} where it shows {estimated_3.round(3).tolist()}; check dt, or give gravity=…"
             )
     assert first[0].gravity is not None
     return first[0].gravity
@@ -97,14 +98,14 @@ def _gravity(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
 
 def _estimated(first: list[Trajectory], info: SetInfo) -> tuple[float, ...]:
     free = [t.position_TND[:, ~np.isin(t.type_N, list(info.boundary_types))] for t in first]
-    found = estimate_gravity(free, info.frame_dt_s)
-    size = float(np.linalg.norm(found))
+    gravity = estimate_gravity(free, info.frame_dt_s)
+    size = float(np.linalg.norm(gravity))
     if info.gravity_size is not None and abs(size - info.gravity_size) > 0.1 * info.gravity_size:
         raise ConfigError(
             f"gravity must be given where what flies does not show metadata.json's g_ext_magnitude of "
             f"{info.gravity_size:g}, got {size:.3g}; as in gravity=[0,-{info.gravity_size:g}]"
         )
-    return found
+    return gravity
 
 
 def _boundary(trajectory: Trajectory, info: SetInfo) -> np.ndarray:
@@ -117,37 +118,29 @@ def _shards(
     folder: Path, split: str, episodes: Iterator[Episode], progress: Callable[[Episode], Any]
 ) -> Iterator[ShardEntry]:
     """Writes shard after shard, each whole or not at all."""
-    waiting = next(episodes, None)
+    following = next(episodes, None)
     first = 0
-    while waiting is not None:
+    while following is not None:
         with temporary_file(folder / f"{split}.tar") as temporary:
-            taken: list[tuple[str, int, int, int, Statistics]] = []
-            written = 0
+            entries: list[EpisodeEntry] = []
+            statistics, written = Statistics(), 0
             with temporary.open("wb") as file:
-                while waiting is not None and (not taken or written < SHARD_BYTES):
-                    *parts, _ = episode_tar(waiting)
+                while (episode := following) is not None and (not entries or written < SHARD_BYTES):
+                    *parts, _ = episode_tar(episode)
                     written += sum(file.write(part) for part in parts)
-                    taken.append(_noted(waiting))
-                    progress(waiting)
-                    waiting = next(episodes, None)
+                    count, frames = episode.particle_count, episode.frame_count
+                    entries.append(EpisodeEntry(episode.key, first + len(entries), episode.seed, 0, count, frames, {}))
+                    statistics = statistics.merge(episode_statistics(episode.position_TN3))
+                    progress(episode)
+                    following = next(episodes, None)
                 file.write(tar_end(written))
                 sync_file(file)
-            stop = first + len(taken)
+            stop = first + len(entries)
             target = folder / f"{split}-{first:06d}-{stop:06d}.tar"
             located = locate_members(temporary)
             temporary.replace(target)
-        entries = tuple(
-            EpisodeEntry(key, first + place, seed, 0, particles, frames, located[key])
-            for place, (key, seed, particles, frames, _) in enumerate(taken)
-        )
-        yield ShardEntry(
-            target.name, split, first, stop, file_sha256(target), target.stat().st_size, entries,
-            merge_statistics(statistics for *_, statistics in taken),
-        )  # fmt: skip
+        whole = tuple(replace(entry, members=located[entry.key]) for entry in entries)
+        sha256, size = file_sha256(target), target.stat().st_size
+        yield ShardEntry(target.name, split, first, stop, sha256, size, whole, statistics)
         first = stop
     sync_folder(folder)
-
-
-def _noted(episode: Episode) -> tuple[str, int, int, int, Statistics]:
-    statistics = episode_statistics(episode.position_TN3)
-    return episode.key, episode.seed, episode.particle_count, episode.frame_count, statistics

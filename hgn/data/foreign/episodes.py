@@ -8,7 +8,6 @@ Shape legend: T frames, N particles, P particles of the boundary, K obstacle cel
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -88,10 +87,10 @@ class Converter:
         speed = float(np.linalg.norm(velocity_N3, axis=-1).max(initial=0))
         self.maximum_initial_speed = max(self.maximum_initial_speed, speed)
         self.with_obstacles |= len(grid.cell_K3) > 0
-        own: Mapping[str, np.ndarray] = {}
+        properties: dict[str, np.ndarray] = {}
         if trajectory.property_NK is not None:
             columns = np.ascontiguousarray(trajectory.property_NK[~fixed_N].T)
-            own = {"material_property" + (f"_{k}" if k else ""): column for k, column in enumerate(columns)}
+            properties = {"material_property" + (f"_{k}" if k else ""): column for k, column in enumerate(columns)}
         return Episode(
             key=key,
             position_TN3=free_TN3[first:],
@@ -110,7 +109,7 @@ class Converter:
                 "offset": list(self.offset),  # what was taken from positions
             },
             solver={},
-            material_parameters=dict(own),
+            material_parameters=properties,
             materials=self.materials if set(self.materials) != set(MATERIALS) else MATERIALS,
             past_HN3=free_TN3[:first],
             boundary_P3=boundary_P3 if len(boundary_P3) else None,
@@ -131,10 +130,10 @@ class Converter:
         if outside > OUTSIDE:
             place_N3 = position_N3.astype(np.float64) + self.offset
             corners = (place_N3.min(0), place_N3.max(0))
-            found = [[round(float(c[axis]), 4) for c in corners] for axis in range(self.info.dimensions)]
+            extent = [[round(float(c[axis]), 4) for c in corners] for axis in range(self.info.dimensions)]
             raise ConfigError(
                 f"bounds must hold the particles, got {[list(pair) for pair in self.info.bounds]} with {outside:.0%} "
-                f"of those of {name} outside, which lie in {found}; give bounds=…"
+                f"of those of {name} outside, which lie in {extent}; give bounds=…"
             )
 
     def _require_not_across(self, name: str, free_TN3: np.ndarray) -> None:
@@ -166,10 +165,8 @@ class Converter:
             remedy = f"give it one, as in materials={{{unknown[0]}: clay}}"
             raise ConfigError(f"{name}: particle_type must have a name for each number, got {unknown}; {remedy}")
         index = {number: self.materials.index(value) for number, value in names.items()}
-        material_N = np.zeros(len(type_N), np.uint8)
-        for number in np.unique(type_N):
-            material_N[type_N == number] = index[int(number)]
-        return material_N
+        types, of_type_N = np.unique(type_N, return_inverse=True)
+        return np.array([index[int(number)] for number in types], np.uint8)[of_type_N]
 
 
 def obstacle_cell_size(info: SetInfo, boundaries: list[np.ndarray]) -> float:

@@ -36,25 +36,26 @@ _LAGRANGEBENCH = {0: "fluid", 3: "rigid", 5: "water", 6: "sand", 7: "goop"}  # t
 def find_format(folder: Path, asked: str) -> str:
     """The format of a folder's files. Raises: ConfigError where there are none, or none of the format asked for."""
     require(folder.is_dir(), "from", "a folder with trajectories", str(folder))
-    found = []
+    formats = []
     if _file(folder, "train", ".tfrecord"):
-        found.append("deepmind")
+        formats.append("deepmind")
     if any((folder / name).is_dir() for name in SPLIT_NAMES["train"]):
-        found.append("neuralmpm")
+        formats.append("neuralmpm")
     if archive := _file(folder, "train", ".npz"):
         _, first = next(read_npz(archive, objects=True), ("", np.zeros(0)))
-        found.append("geoelements" if first.dtype.hasobject else "plain")
+        formats.append("geoelements" if first.dtype.hasobject else "plain")
     if _file(folder, "train", ".h5"):
         metadata = _metadata(folder)
         bench = {"solver", "write_every", "periodic_boundary_conditions"} & set(metadata)
-        found.append("lagrangebench" if bench else "plain")
+        formats.append("lagrangebench" if bench else "plain")
     names = "train.tfrecord, train.npz, train.h5 or train/sim_0.h5"
-    require(bool(found), "from", f"a folder with {names}", str(folder), "see docs/how_to/import.md")
+    require(bool(formats), "from", f"a folder with {names}", str(folder), "see docs/how_to/import.md")
     if asked == "auto":
-        require(len(found) == 1, "format", f"one of {', '.join(found)}, which {folder} has", asked)
-        return found[0]
-    ours = {"lagrangebench", "plain"}  # the same files
-    require(asked in found or (asked in ours and bool(ours & set(found))), "format", " or ".join(found), asked)
+        require(len(formats) == 1, "format", f"one of {', '.join(formats)}, which {folder} has", asked)
+        return formats[0]
+    alike = {"lagrangebench", "plain"}  # the same files
+    fits = asked in formats or (asked in alike and bool(alike & set(formats)))
+    require(fits, "format", " or ".join(formats), asked)
     return asked
 
 
@@ -224,9 +225,9 @@ def _of_members(name: str, members: Mapping[str, np.ndarray], info: SetInfo) -> 
         require(info.format == "plain", f"{name}: particle_type", "there", None)
         types = np.full((), FLUID)
     position_TND, type_N = checked(name, position, types, info.dimensions)
-    kept_N = ~np.isin(type_N, list(info.ignored_types))
-    if not kept_N.all():
-        position_TND, type_N = position_TND[:, kept_N], type_N[kept_N]
+    real_N = ~np.isin(type_N, list(info.ignored_types))
+    if not real_N.all():
+        position_TND, type_N = position_TND[:, real_N], type_N[real_N]
     boundary, cell, normal = (members.get(key) for key in ("boundary", "obstacle_cell", "obstacle_normal"))
     if boundary is not None:
         boundary = floats(f"{name}: boundary", boundary, (None, info.dimensions))
@@ -241,9 +242,9 @@ def _of_members(name: str, members: Mapping[str, np.ndarray], info: SetInfo) -> 
     gravity = members.get("gravity")
     if gravity is not None:
         gravity = floats(f"{name}: gravity", gravity, (info.dimensions,))
-    own = _properties(name, members.get("material_property"), len(kept_N))
+    property_NK = _properties(name, members.get("material_property"), len(real_N))
     return Trajectory(
-        name, position_TND, type_N, boundary, None if own is None else own[kept_N], cell, normal,
+        name, position_TND, type_N, boundary, None if property_NK is None else property_NK[real_N], cell, normal,
         None if gravity is None else tuple(float(value) for value in gravity),
     )  # fmt: skip
 
@@ -271,8 +272,7 @@ def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
 
 
 def _read_neuralmpm(folder: Path, split: str, info: SetInfo) -> Iterator[Trajectory]:
-    there = [folder / name for name in SPLIT_NAMES[split] if (folder / name).is_dir()]
-    files = [path for place in there for path in place.glob("sim_*.h5")]
+    files = [path for name in SPLIT_NAMES[split] for path in (folder / name).glob("sim_*.h5")]
     for path in sorted(files, key=lambda path: (len(path.stem), path.stem)):
         with _opened(path) as file:
             axes = info.dimensions
@@ -333,11 +333,11 @@ def _metadata(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        found = json.loads(path.read_text("utf-8"))
+        metadata = json.loads(path.read_text("utf-8"))
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path} must be JSON, got {error}") from None
-    require(isinstance(found, dict), str(path), "a JSON object", type(found).__name__)
-    return dict(found)
+    require(isinstance(metadata, dict), str(path), "a JSON object", type(metadata).__name__)
+    return dict(metadata)
 
 
 def _number(key: object, folder: Path) -> int:

@@ -1,6 +1,6 @@
 """Gravity, where no file says it: what flies freely has it as its acceleration.
 
-Shape legend: T frames, N particles, D dimensions, W frames of a stretch.
+Shape legend: T frames, N particles, D dimensions, S stretches, W frames of a stretch.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ def estimate_gravity(paths: Sequence[np.ndarray], frame_dt_s: float) -> tuple[fl
     is left out. Positions in float32 bound the accuracy.
     Raises: ConfigError where too little flies, or different ways.
     """
-    found = np.concatenate([_flights(path_TND) for path_TND in paths])
-    remedy = f"give it, as in gravity={'[0,-9.8]' if found.shape[-1] == 2 else '[0,-9.8,0]'}"
-    if len(found) < FEWEST:
-        raise ConfigError(f"gravity must be given where fewer than {FEWEST} particles fall, got {len(found)}; {remedy}")
-    middle_D = np.median(found, axis=0)
-    alike = np.linalg.norm(found - middle_D, axis=-1) <= ALIKE * np.linalg.norm(middle_D)
-    if alike.mean() < 0.5:
+    acceleration_SD = np.concatenate([_flights(path_TND) for path_TND in paths])
+    count = len(acceleration_SD)
+    remedy = f"give it, as in gravity={'[0,-9.8]' if acceleration_SD.shape[-1] == 2 else '[0,-9.8,0]'}"
+    if count < FEWEST:
+        raise ConfigError(f"gravity must be given where fewer than {FEWEST} particles fall, got {count}; {remedy}")
+    middle_D = np.median(acceleration_SD, axis=0)
+    alike_S = np.linalg.norm(acceleration_SD - middle_D, axis=-1) <= ALIKE * np.linalg.norm(middle_D)
+    if alike_S.mean() < 0.5:
         raise ConfigError(
-            f"gravity must be given where particles fly differently: {alike.mean():.0%} of {len(found)} accelerate "
+            f"gravity must be given where particles fly differently: {alike_S.mean():.0%} of {count} accelerate "
             f"alike; {remedy}"
         )
-    mean_D = found[alike].mean(axis=0) / frame_dt_s**2
+    mean_D = acceleration_SD[alike_S].mean(axis=0) / frame_dt_s**2
     size = np.linalg.norm(mean_D)
     # an axis across it: what is there is rounding
     return tuple(float(value) if abs(value) > 0.01 * size else 0.0 for value in mean_D)
@@ -47,10 +48,10 @@ def _flights(position_TND: np.ndarray) -> np.ndarray:
     frames, count, axes = position_TND.shape
     step = max(1, frames * count * axes // LARGEST)
     path_TND = np.asarray(position_TND[:, ::step], np.float64)
-    acceleration = np.diff(path_TND, 2, axis=0)[: (frames - 2) // STRETCH * STRETCH]
-    if not len(acceleration):
+    acceleration_FND = np.diff(path_TND, 2, axis=0)[: max(frames - 2, 0) // STRETCH * STRETCH]
+    if not len(acceleration_FND):
         return np.zeros((0, axes))
-    parts_SWND = acceleration.reshape(-1, STRETCH, *acceleration.shape[1:])
+    parts_SWND = acceleration_FND.reshape(-1, STRETCH, *acceleration_FND.shape[1:])
     mean_SND = parts_SWND.mean(axis=1)
     spread_SN = np.linalg.norm(parts_SWND - mean_SND[:, None], axis=-1).max(axis=1)
     size_SN = np.linalg.norm(mean_SND, axis=-1)

@@ -52,9 +52,9 @@ def masked_crc(data: bytes) -> int:
 
 
 def _require_crc(name: str, data: bytes, stored: bytes) -> None:
-    found, expected = masked_crc(data), int.from_bytes(stored, "little")
-    if found != expected:
-        raise ConfigError(f"{name} must have CRC {expected:#010x}, got {found:#010x}: it was altered; fetch it again")
+    actual, expected = masked_crc(data), int.from_bytes(stored, "little")
+    if actual != expected:
+        raise ConfigError(f"{name} must have CRC {expected:#010x}, got {actual:#010x}: it was altered; fetch it again")
 
 
 def parse_sequence_example(data: bytes, name: str) -> tuple[dict[str, list[bytes]], dict[str, list[bytes]]]:
