@@ -225,6 +225,7 @@ def pickled(content):
         ("geoelements", pickled(lambda _: ([[1.0], [1.0, 2.0]], 5)), r"gns_data\[0\]: position must be an array, got"),
         ("geoelements", pickled(lambda _: (WALK, [5, np.inf])), r"gns_data\[0\]: particle_type must be whole numbers"),
         ("geoelements", pickled(lambda _: (WALK, 5, np.ones(7))), r"material_property must be numbers of one or 2"),
+        ("geoelements", pickled(lambda _: (WALK, 5, [[1.0], [1.0, 2.0]])), r"material_property must be an array, got"),
         ("geoelements", pickled(lambda _: (np.zeros((9, 2, 3)), [5, 6, 5])), r"\[0\]: particle_type must be one"),
         ("geoelements", pickled(lambda _: (np.zeros((9, 2, 2)), 5)), r"position must have shape \[any, any, 3\], got"),
         ("lagrangebench", cut("train.h5", 2000), r"train.h5 must be a whole HDF5 file"),

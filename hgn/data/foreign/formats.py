@@ -21,7 +21,7 @@ import numpy as np
 
 from hgn.config import ImportConfig
 from hgn.data.foreign.tfrecord import parse_sequence_example, read_records
-from hgn.data.foreign.trajectory import FLUID, SetInfo, Trajectory, checked, floats
+from hgn.data.foreign.trajectory import FLUID, SetInfo, Trajectory, as_array, checked, floats
 from hgn.scene.hdf5 import damage_named, open_hdf5
 from hgn.scene.material import MATERIAL_NAME
 from hgn.scene.npz import read_npz
@@ -262,7 +262,7 @@ def _properties(name: str, given: Any, count: int) -> np.ndarray | None:
     """One number for all particles, one for each, or several for each, as float32 [N, K]."""
     if given is None:
         return None
-    array = np.asarray(given)
+    array = as_array(f"{name}: material_property", given)
     rule = f"numbers of one or {count} particles"
     fits = array.dtype.kind in "iuf" and array.ndim <= 2 and (array.ndim == 0 or len(array) in (1, count))
     require(fits, f"{name}: material_property", rule, f"{array.dtype} {list(array.shape)}")

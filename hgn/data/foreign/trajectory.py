@@ -77,7 +77,7 @@ def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.n
     Raises: ConfigError naming the file and the field, for another type or shape, and for what is not finite.
     """
     position_TND = floats(f"{name}: position", position, (None, None, dimensions))
-    type_N = _array(f"{name}: particle_type", types)
+    type_N = as_array(f"{name}: particle_type", types)
     if type_N.dtype.kind not in "iu":
         whole = type_N.dtype.kind == "f" and bool((np.isfinite(type_N) & (type_N == np.round(type_N))).all())
         if not whole:  # geoelements' own writers keep some as float64
@@ -90,7 +90,8 @@ def checked(name: str, position: Any, types: Any, dimensions: int) -> tuple[np.n
     return position_TND, type_N.astype(np.int64)
 
 
-def _array(name: str, value: Any) -> np.ndarray:
+def as_array(name: str, value: Any) -> np.ndarray:
+    """A file's value as an array. Raises: ConfigError in the name of `name` for lists of different lengths."""
     try:
         return np.asarray(value)
     except ValueError as error:  # lists of different lengths
@@ -102,7 +103,7 @@ def floats(name: str, array: Any, shape: tuple[int | None, ...]) -> np.ndarray:
 
     Raises: ConfigError naming the file and the field.
     """
-    array = _array(name, array)
+    array = as_array(name, array)
     if array.dtype.kind != "f" or array.dtype.itemsize < 4:
         raise ConfigError(f"{name} must be float32 or float64, got {array.dtype}")
     fits = array.ndim == len(shape) and all(
