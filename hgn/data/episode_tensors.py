@@ -65,6 +65,6 @@ def frame_gravity(episode: Episode) -> Vector:
 
 def shown_symmetries(episode: Episode, network: NetworkConfig) -> tuple[Symmetry, ...]:
     """What training may show instead of the scene: where inputs are relative, gravity turns with it."""
-    kept = (0.0, 0.0, 0.0) if network.relative else episode.gravity
+    gravity = (0.0, 0.0, 0.0) if network.relative else episode.gravity
     size, cell_size = episode.domain_size, episode.obstacle_grid.cell_size
-    return scene_symmetries(kept, size, cell_size, int(not episode.imported), episode.dimensions)
+    return scene_symmetries(gravity, size, cell_size, int(not episode.imported), episode.dimensions)

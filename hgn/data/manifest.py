@@ -106,11 +106,8 @@ class Manifest:
         if "index" not in mapping:
             listing = from_mapping(_Listing, mapping, path)
             shards: Index = ListedIndex(listing.shards, listing.quarantined)
-            head = _Head(
-                **{k: v for k, v in vars(listing).items() if k not in ("shards", "quarantined")},
-                index=shards.state,
-                totals=shards.totals,
-            )
+            fields = {k: v for k, v in vars(listing).items() if k not in ("shards", "quarantined")}
+            head = _Head(**fields, index=shards.state, totals=shards.totals)
         else:
             head = from_mapping(_Head, mapping, path)
             shards = Index(folder, head.index, no_totals() | head.totals)
@@ -121,8 +118,8 @@ class Manifest:
             require_sound(totals.statistics or Statistics())
         count = sum(totals.shards for totals in shards.totals.values())
         require(count == len(shards), f"{path}.index.shards", f"{count}, as in totals", len(shards))
-        found = identity_hash(head.config)
-        require(head.config_hash == found, f"{path}.config_hash", f"{found}, as config has it", head.config_hash)
+        expected = identity_hash(head.config)
+        require(head.config_hash == expected, f"{path}.config_hash", f"{expected}, as config has it", head.config_hash)
         return Manifest(head.config_hash, head.config, head.requested, head.revision, shards, head.schema_version)
 
     def save(self, folder: Path | str) -> Manifest:

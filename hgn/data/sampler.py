@@ -169,8 +169,8 @@ class EpisodeSampler:
         frame_counts = frame_counts[: episodes or len(frame_counts)]
         if not frame_counts:
             raise ConfigError("data set must hold at least one training episode, got none; generate some first")
-        found = self._digest(len(frame_counts)) or ""
-        if digest not in ("", found):
+        stored = self._digest(len(frame_counts)) or ""
+        if digest not in ("", stored):
             raise ConfigError(
                 f"data set must still hold the shards that epoch {epoch} began with, in the order they were published "
                 "in, got others or another order; restore them, or start another run"
@@ -178,4 +178,4 @@ class EpisodeSampler:
         self._first_sample = np.concatenate([[0], np.cumsum(np.asarray(frame_counts) - 1)])
         self._order = epoch_order(self.seed, epoch, self._first_sample, self._window)
         self._first_seed = np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0]
-        self.state = SamplerState(epoch, position, len(frame_counts), found, self._window, self.seed)
+        self.state = SamplerState(epoch, position, len(frame_counts), stored, self._window, self.seed)

@@ -118,10 +118,10 @@ def animate(
     versions = _versions(rollout, label, others)
 
     def drawn() -> Iterator[Image.Image]:
-        for done, frame in enumerate(frames, start=1):
+        for count, frame in enumerate(frames, start=1):
             yield _animation_picture(stage, rollout, versions, frame, size)
             if progress is not None:
-                progress(done, len(frames))
+                progress(count, len(frames))
 
     buffer = io.BytesIO()
     if webp:
@@ -138,8 +138,8 @@ def animate(
             method=3,
         )
     else:
-        some = [_animation_picture(stage, rollout, versions, frames[i], size) for i in spread(len(frames), 6)]
-        pictures = map(_Palette(some).apply, drawn())
+        samples = [_animation_picture(stage, rollout, versions, frames[i], size) for i in spread(len(frames), 6)]
+        pictures = map(_Palette(samples).apply, drawn())
         duration = 10 * round(100 / rate)
         next(pictures).save(
             buffer,
@@ -241,8 +241,8 @@ def particle_spacing(position_N3: np.ndarray) -> float:
     position_N3 = position_N3[np.isfinite(position_N3).all(axis=1)]
     if len(position_N3) < 4:
         return 1 / 128  # the usual eight particles in a cell of 1/64
-    some = position_N3[:: max(1, len(position_N3) // 2000)]
-    return max(float(np.median(KDTree(position_N3).query(some, k=4)[0][:, 3])), 1e-6)
+    sample_N3 = position_N3[:: max(1, len(position_N3) // 2000)]
+    return max(float(np.median(KDTree(position_N3).query(sample_N3, k=4)[0][:, 3])), 1e-6)
 
 
 def rollout_spacing(rollout: Rollout, of_N: np.ndarray | slice = slice(None)) -> float:

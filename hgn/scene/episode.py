@@ -272,10 +272,10 @@ def _decode_description(key: str, text: bytes) -> _Description:
 
 def require_schema_version(mapping: object, name: str) -> None:
     """Raises ConfigError unless `mapping["schema_version"]` is this version's, before anything else is looked at."""
-    found = mapping.get("schema_version") if isinstance(mapping, Mapping) else None
-    if found != SCHEMA_VERSION:
+    version = mapping.get("schema_version") if isinstance(mapping, Mapping) else None
+    if version != SCHEMA_VERSION:
         raise ConfigError(
-            f"{name}: schema_version must be {SCHEMA_VERSION}, got {found!r}; generate the data set again with this "
+            f"{name}: schema_version must be {SCHEMA_VERSION}, got {version!r}; generate the data set again with this "
             "version, or use the version that made it"
         )
 

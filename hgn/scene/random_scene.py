@@ -109,13 +109,13 @@ def _place_obstacle(config: SceneConfig, placed: list[_Placed], index: int, rng:
         turned = shape_obstacle(shape, size, rotation_33=rotation)
         low, high = turned.vertex_V3.min(axis=0), turned.vertex_V3.max(axis=0)
         first = -low + ROUNDING * domain
-        room = domain - ROUNDING * domain - high - first
-        if (room < 0).any():
+        span = domain - ROUNDING * domain - high - first
+        if (span < 0).any():
             continue
         unit_surface, unit_gap = _unit_surface_points(shape)
         surface, gap = rotate(size * unit_surface, rotation), size * unit_gap
         for _ in range(PLACES_PER_SHAPE):
-            centre = first + room * rng.random(3)
+            centre = first + span * rng.random(3)
             position = _triple(centre)
             obstacle = shape_obstacle(shape, size, position, rotation, f"obstacle_{index}_{Path(shape).stem}")
             point = surface + centre
@@ -138,8 +138,8 @@ def _too_near(obstacle: Obstacle, point: np.ndarray, gap: float, other: _Placed,
     if (low > other.high + bound).any() or (high < other.low - bound).any():
         return False
     point = point[((point >= other.low - bound) & (point <= other.high + bound)).all(axis=1)]
-    for some in (point[::FEW], point):  # most overlaps show at a few points already
-        if np.isfinite(other.tree.query(some, distance_upper_bound=bound)[0]).any():
+    for subset in (point[::FEW], point):  # most overlaps show at a few points already
+        if np.isfinite(other.tree.query(subset, distance_upper_bound=bound)[0]).any():
             return True
     # the surfaces do not meet, so one vertex tells whether one body holds the other
     holds = contains(obstacle.vertex_V3[:1], other.obstacle) | contains(other.obstacle.vertex_V3[:1], obstacle)
@@ -162,12 +162,12 @@ def _place_group(
 ) -> tuple[str, Region]:
     clearance = config.clearance_cells * config.cell_size + ROUNDING
     margin = WALL_CELLS * config.cell_size + clearance + 0.5 * config.group_size
-    room = np.array(config.domain_size) - 2 * margin
+    span = np.array(config.domain_size) - 2 * margin
     size = (config.group_size,) * 3
-    for _ in range(SHAPES_PER_ITEM if (room >= 0).all() else 0):
+    for _ in range(SHAPES_PER_ITEM if (span >= 0).all() else 0):
         shape = _choice(config.group_shapes, rng)
         for _ in range(PLACES_PER_SHAPE):
-            region = region_of(shape, size, _triple(margin + room * rng.random(3)))
+            region = region_of(shape, size, _triple(margin + span * rng.random(3)))
             if any(region.distance(other) < clearance for other in groups):
                 continue
             if any(_blocked(region, item, clearance) for item in obstacles):
@@ -186,11 +186,11 @@ def _place_lone_particles(
     near = LONE_CELLS * config.cell_size
     clearance = config.clearance_cells * config.cell_size + ROUNDING
     margin = WALL_CELLS * config.cell_size + clearance
-    room = np.array(config.domain_size) - 2 * margin
+    span = np.array(config.domain_size) - 2 * margin
     placed: list[Region] = []
     for index in range(config.lone_particles):
-        for _ in range(SHAPES_PER_ITEM * PLACES_PER_SHAPE if (room >= 0).all() else 0):
-            region = Region(_triple(margin + room * rng.random(3)))
+        for _ in range(SHAPES_PER_ITEM * PLACES_PER_SHAPE if (span >= 0).all() else 0):
+            region = Region(_triple(margin + span * rng.random(3)))
             if any(region.distance(other) < near for other in (*groups, *placed)):
                 continue
             if not any(_blocked(region, item, clearance) for item in obstacles):

@@ -142,9 +142,8 @@ class GroupEntry(MaterialEntry):
         for name in ("shape", "size", "position"):
             require(name in given, name, "given", None, "or particles, a file of them")
         require(self.shape in GROUP_SHAPES, "shape", f"one of {', '.join(GROUP_SHAPES)}", self.shape)
-        if isinstance(self.size, tuple) != (self.shape == "box"):
-            rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
-            require(False, "size", rule, self.size)
+        rule = "a list of three edges for a box" if self.shape == "box" else f"one number for a {self.shape}"
+        require(isinstance(self.size, tuple) == (self.shape == "box"), "size", rule, self.size)
         for edge in self.edges:
             require(0 < edge < math.inf, "size", "finite and > 0", self.size)
         assert self.position is not None
@@ -176,9 +175,8 @@ class EmitterEntry(MaterialEntry):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.shape in EMITTER_SHAPES, "shape", f"one of {', '.join(EMITTER_SHAPES)}", self.shape)
-        if isinstance(self.size, tuple) != (self.shape == "rectangle"):
-            rule = "a list of two edges for a rectangle" if self.shape == "rectangle" else "one number for a disc"
-            require(False, "size", rule, self.size)
+        rule = "a list of two edges for a rectangle" if self.shape == "rectangle" else "one number for a disc"
+        require(isinstance(self.size, tuple) == (self.shape == "rectangle"), "size", rule, self.size)
         for edge in self.size if isinstance(self.size, tuple) else (self.size,):
             require(0 < edge < math.inf, "size", "finite and > 0", self.size)
         require(any(self.velocity), "velocity", "other than zero, for it brings the particles in", self.velocity)

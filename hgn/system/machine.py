@@ -26,16 +26,16 @@ def available_cpus() -> int:
 def available_memory() -> int:
     """Bytes of memory that this process may use: the machine's, or the least of its groups' limits."""
     machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    told = [_read(group / name) for group in _groups("memory") for name in ("memory.max", "memory.limit_in_bytes")]
-    return min([machine, *(int(limit) for limit in told if limit not in (None, "max"))])
+    limits = [_read(group / name) for group in _groups("memory") for name in ("memory.max", "memory.limit_in_bytes")]
+    return min([machine, *(int(limit) for limit in limits if limit not in (None, "max"))])
 
 
 def writable_folder(usual: Path, name: str) -> Path:
     """A cache's usual folder, or where that cannot be written to, as in a container, one of this user's own among
     temporary files, NAME-UID, which nobody else can have put there.
     """
-    there = next((folder for folder in (usual, *usual.parents) if os.path.lexists(folder)), usual)
-    if usual.is_absolute() and there.is_dir() and os.access(there, os.W_OK | os.X_OK):
+    existing = next((folder for folder in (usual, *usual.parents) if os.path.lexists(folder)), usual)
+    if usual.is_absolute() and existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
         return usual
     own = Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"
     own.mkdir(mode=0o700, exist_ok=True)
@@ -67,10 +67,10 @@ def _groups(controller: str) -> Iterator[Path]:
 
 def _quota(group: Path) -> float | None:
     """Cores' time that a group may use; none without a limit of its own."""
-    told = _read(group / "cpu.max")
-    if told is None:
-        told = f"{_read(group / 'cpu.cfs_quota_us') or 'max'} {_read(group / 'cpu.cfs_period_us') or 0}"
-    quota, _, period = told.partition(" ")
+    limit = _read(group / "cpu.max")
+    if limit is None:
+        limit = f"{_read(group / 'cpu.cfs_quota_us') or 'max'} {_read(group / 'cpu.cfs_period_us') or 0}"
+    quota, _, period = limit.partition(" ")
     return None if quota == "max" or int(quota) <= 0 else int(quota) / int(period)
 
 

@@ -32,7 +32,7 @@ from hgn.viewer.session import PlaySession, Spout
 from hgn.viewer.stage import StageView, quaternion
 from hgn.viewer.viser_compat import start_server, stop_server
 
-TOLD_S = 0.25  # between two tellings of frame and speed
+STATUS_S = 0.25  # between two updates of frame and speed
 BACK_S = {"a frame": 0.0, "1 s": 1.0, "5 s": 5.0}
 TURN_DEGREES = 360.0  # by a drag across the whole window
 HELP = """
@@ -65,7 +65,7 @@ class PlayPage:
         self.ended, self.playing, self.steps = threading.Event(), True, 0
         self.diverged = False  # it pauses for that, not because somebody asked for it
         self.viewed = threading.Event()  # until somebody looks nothing happens
-        self.wanted: queue.SimpleQueue[tuple[object, Callable[[], Any], Any]] = queue.SimpleQueue()
+        self.actions: queue.SimpleQueue[tuple[object, Callable[[], Any], Any]] = queue.SimpleQueue()
         self.meshes: dict[int, viser.MeshHandle] = {}
         self.shown: dict[int, PlacedObstacle] = {}
         self.chosen: int | None = None
@@ -75,34 +75,34 @@ class PlayPage:
         self._add_mouse()
         self.server.on_client_connect(lambda _: self.viewed.set())
         self._show()
-        self._tell()
+        self._show_status()
 
     # between the viewers and the session
 
     def do(self, action: Callable[[], Any], client: viser.ClientHandle | None = None, key: object = None) -> None:
         """Queues what is to be done before the next frame; of actions with one key only the last is done."""
-        self.wanted.put((next(self._numbers) if key is None else key, action, client))
+        self.actions.put((next(self._numbers) if key is None else key, action, client))
 
     def _do_all(self) -> bool:
         latest: dict[object, tuple[Callable[[], Any], Any]] = {}
-        while not self.wanted.empty():
-            key, action, client = self.wanted.get()
+        while not self.actions.empty():
+            key, action, client = self.actions.get()
             latest.pop(key, None)
             latest[key] = action, client
         for action, client in latest.values():
             try:
                 action()
-            except (ConfigError, DivergedError) as error:
-                self._say(str(error), client)
+            except (ConfigError, DivergedError, OSError) as error:  # a full disk ends no session
+                self._notify(str(error), client)
         return bool(latest)
 
-    def _say(self, message: str, client: viser.ClientHandle | None = None) -> None:
+    def _notify(self, message: str, client: viser.ClientHandle | None = None) -> None:
         for one in [client] if client is not None else list(self.server.get_clients().values()):
             one.add_notification("HGN", message, auto_close_seconds=10)
 
     def run(self) -> None:
         """Simulates from the first viewer's coming until `close`, at most as fast as time passes."""
-        due = told = time.monotonic()
+        due = updated = time.monotonic()
         frames = 0
         while not self.ended.is_set():
             changed = self._do_all()
@@ -112,15 +112,15 @@ class PlayPage:
                     self.session.step()
                 except DivergedError as error:
                     self.playing, self.diverged = False, True
-                    self._say(f"{error}; paused a frame before. Back by or Restart")
+                    self._notify(f"{error}; paused a frame before. Back by or Restart")
                 frames, changed = frames + 1, True
             if changed:
                 self._show()
             now = time.monotonic()
-            if now - told >= TOLD_S:
-                self.frames_a_second = frames / (now - told)
-                told, frames = now, 0
-                self._tell()
+            if now - updated >= STATUS_S:
+                self.frames_a_second = frames / (now - updated)
+                updated, frames = now, 0
+                self._show_status()
             due = max(due + 1 / self.rate, now)
             self.ended.wait(max(0.0, due - now) if due > now else 0)
 
@@ -148,11 +148,11 @@ class PlayPage:
         if self.chosen not in obstacles:
             self.chosen = next(reversed(obstacles), None)
 
-    def _tell(self) -> None:
+    def _show_status(self) -> None:
         session = self.session
-        told = f"**{self.frames_a_second:.0f}** frames a second · **{len(session.newest.position_N3):,}** particles"
+        speed = f"**{self.frames_a_second:.0f}** frames a second · **{len(session.newest.position_N3):,}** particles"
         backend = f"{session.weights} on {session.simulator.device.type}"
-        self.status.content = f"{told}\n\nframe {session.frame} · {backend}"
+        self.status.content = f"{speed}\n\nframe {session.frame} · {backend}"
         self.play_button.label = "Pause" if self.playing else "Play"
         self.gravity.value = session.gravity
         name = self.shown[self.chosen].body.name if self.chosen is not None else "none"
@@ -304,7 +304,7 @@ class PlayPage:
 
     def _drop(self, spout: Spout) -> None:
         if not self.session.drop(spout.material, spout.position, spout.diameter, spout.speed):
-            self._say("there is no room for a ball here")
+            self._notify("there is no room for a ball here")
 
     def _spout(self, origin_3: np.ndarray, direction_3: np.ndarray) -> Spout:
         """Above what a ray hits in the room: the floor, or else the wall it leaves through."""
@@ -321,7 +321,17 @@ class PlayPage:
         rotation = quaternion(obstacle.rotation_33)
         mesh = self.stage.add_obstacle(obstacle.body.name, obstacle.body.mesh, obstacle.position, rotation)
         self.meshes[number] = mesh
-        begin: list[PlacedObstacle] = []  # where a drag began
+        grabbed: list[tuple[PlacedObstacle, Any]] = []  # where it was when a drag began, and the event that began it
+
+        def drag(event: Any, moved: Callable[[PlacedObstacle, Any], PlacedObstacle]) -> None:
+            if number not in self.shown:
+                return
+            if event.phase == "start":
+                grabbed[:] = [(self.shown[number], event)]
+                self.chosen = number
+            if grabbed:
+                placed = moved(*grabbed[0])
+                self.do(lambda: self.session.move_obstacle(placed), event.client, number)
 
         @mesh.on_click
         async def _(event: Any) -> None:
@@ -329,22 +339,16 @@ class PlayPage:
 
         @mesh.on_drag("left")
         async def _(event: viser.SceneNodeDragEvent) -> None:
-            if event.phase == "start":
-                begin[:] = [self.shown[number]]
-                self.grabbed_3 = np.array(event.start_position)
-                self.chosen = number
-            if begin and number in self.shown:
-                x, y, z = (np.array(begin[0].position) + np.array(event.end_position) - self.grabbed_3).tolist()
-                moved = replace(self.shown[number], position=(x, y, z))
-                self.do(lambda: self.session.move_obstacle(moved), event.client, number)
+            def moved(before: PlacedObstacle, begin: Any) -> PlacedObstacle:
+                x, y, z = (np.array(before.position) + event.end_position - begin.start_position).tolist()
+                return replace(self.shown[number], position=(x, y, z))
+
+            drag(event, moved)
 
         @mesh.on_drag("left", modifier="cmd/ctrl")
         async def _(event: viser.SceneNodeDragEvent) -> None:
-            if event.phase == "start":
-                begin[:] = [self.shown[number]]
-                self.grabbed_x = event.end_screen_pos[0]
-                self.chosen = number
-            if begin and number in self.shown:
-                degrees = TURN_DEGREES * (event.end_screen_pos[0] - self.grabbed_x)
-                turned = replace(begin[0].turned(degrees), position=self.shown[number].position)
-                self.do(lambda: self.session.move_obstacle(turned), event.client, number)
+            def turned(before: PlacedObstacle, begin: Any) -> PlacedObstacle:
+                degrees = TURN_DEGREES * (event.end_screen_pos[0] - begin.end_screen_pos[0])
+                return replace(before.turned(degrees), position=self.shown[number].position)
+
+            drag(event, turned)

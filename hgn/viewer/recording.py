@@ -80,14 +80,15 @@ class Recording:
         count, length = len(self[frame].position_N3), self.entry_NM3.shape[1]
         history_NM3 = np.empty((count, length, 3), np.float32)
         for row in range(length):
-            then = frame - row
-            there = 0
-            if then >= self.first:
-                velocity_N3 = self[then].velocity_N3[:count]
-                there = len(velocity_N3)
-                history_NM3[:there, row] = velocity_N3
-            later = np.arange(there, count)
-            history_NM3[there:, row] = self.entry_NM3[later, np.minimum(self.entered_N[later] - then, length - 1)]
+            earlier = frame - row
+            present = 0
+            if earlier >= self.first:
+                velocity_N3 = self[earlier].velocity_N3[:count]
+                present = len(velocity_N3)
+                history_NM3[:present, row] = velocity_N3
+            later = np.arange(present, count)
+            age = np.minimum(self.entered_N[later] - earlier, length - 1)
+            history_NM3[present:, row] = self.entry_NM3[later, age]
         return history_NM3
 
     def back_to(self, frame: int) -> None:

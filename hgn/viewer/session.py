@@ -1,11 +1,10 @@
 """A scene that someone plays with: what the page's buttons do, without the page.
 
-Shape legend: N particles, C candidates to enter.
+Shape legend: N particles, A particles of a place, C candidates to enter.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import math
 import zipfile
@@ -25,7 +24,7 @@ from hgn.scene.material import MATERIALS, material_index
 from hgn.scene.mesh import load_mesh
 from hgn.scene.rollout_file import Rollout
 from hgn.scene.scene import Scene
-from hgn.scene.scene_file import ObstacleEntry, SceneFile
+from hgn.scene.scene_file import ObstacleEntry
 from hgn.schema import Vector, from_mapping, require, to_mapping
 from hgn.viewer.placed import PlacedObstacle, placed_at_rest, placed_by, with_obstacles
 from hgn.viewer.recording import Frame, Recording
@@ -124,7 +123,7 @@ class PlaySession:
         Raises: DivergedError; the scene then is as it was a frame earlier.
         """
         if self.spout is not None:
-            self._run(self.spout)
+            self._pour(self.spout)
         try:
             position_N3 = self.live.step()
         except DivergedError:
@@ -163,7 +162,7 @@ class PlaySession:
         position_C3 = fill(region, count, self.random)
         return self._enter(position_C3[self._free(position_C3)], spout)
 
-    def _run(self, spout: Spout) -> int:
+    def _pour(self, spout: Spout) -> None:
         """What leaves a spout in one frame: as dense as the material at rest."""
         length = spout.speed / self.simulator.frame_rate_hz
         radius = 0.5 * spout.diameter
@@ -176,10 +175,10 @@ class PlaySession:
         height_C = length * (self.random.random(count) - 0.5)
         offset_C3 = np.stack([distance_C * np.cos(angle_C), height_C, distance_C * np.sin(angle_C)], axis=1)
         away_3 = np.array([radius, 0.5 * length, radius])
-        there_A3 = self._between(np.array(centre) - away_3, np.array(centre) + away_3) - centre
-        if (np.hypot(there_A3[:, 0], there_A3[:, 2]) < radius).sum() > FULL_SHARE * count:
-            return 0  # what left it has not gone
-        return self._enter((np.array(centre) + offset_C3).astype(np.float32), spout)
+        near_A3 = self._between(np.array(centre) - away_3, np.array(centre) + away_3) - centre
+        if (np.hypot(near_A3[:, 0], near_A3[:, 2]) < radius).sum() > FULL_SHARE * count:
+            return  # what left it has not gone
+        self._enter((np.array(centre) + offset_C3).astype(np.float32), spout)
 
     def _inside(self, position: Vector, radius: float, half_height: float | None = None) -> Vector:
         """The nearest place where a ball or a disc is between the walls."""
@@ -206,14 +205,14 @@ class PlaySession:
         """Where no other particle is near, bool [C]."""
         near = CLEARANCE * self.cell_size / self.particles_per_cell ** (1 / 3)
         low, high = position_C3.min(axis=0) - near, position_C3.max(axis=0) + near
-        there_N3 = self._between(low, high)
-        if not len(there_N3):
+        others_A3 = self._between(low, high)
+        if not len(others_A3):
             return np.ones(len(position_C3), bool)
-        distance_C, _ = KDTree(there_N3).query(position_C3, distance_upper_bound=near)
+        distance_C, _ = KDTree(others_A3).query(position_C3, distance_upper_bound=near)
         return np.asarray(distance_C >= near)  # infinite where nothing is nearer
 
     def _between(self, low_3: np.ndarray, high_3: np.ndarray) -> np.ndarray:
-        """The particles in a box, float32 [N, 3]."""
+        """The particles in a box, float32 [A, 3]."""
         position_N3 = self.live.state.position_N3.cpu().numpy()
         return position_N3[((position_N3 >= low_3) & (position_N3 <= high_3)).all(axis=1)]
 
@@ -222,7 +221,7 @@ class PlaySession:
     def _placed_by(self, scene: Scene, folder: Path) -> list[PlacedObstacle]:
         if scene.specification.get("kind") != "file":  # a random scene's obstacles have no entries
             return [placed_at_rest(obstacle, scene.cell_size) for obstacle in scene.obstacles]
-        entries = from_mapping(SceneFile, {k: v for k, v in scene.specification.items() if k in _FIELDS}).obstacles
+        entries = (from_mapping(ObstacleEntry, entry) for entry in scene.specification["obstacles"])
         return [placed_by(entry, folder, scene.cell_size) for entry in entries]
 
     def add_obstacle(self, entry: ObstacleEntry, folder: Path = Path()) -> PlacedObstacle:
@@ -323,6 +322,3 @@ class PlaySession:
         return self.recording.rollout(
             self.domain_size, rate, self.cell_size, {"weights": self.weights, "scene": "play"}
         )
-
-
-_FIELDS = {field.name for field in dataclasses.fields(SceneFile)}

@@ -1,5 +1,6 @@
 """The page in a real browser, headless, one session of it for all tests; skipped where there is none."""
 
+import errno
 import io
 import re
 import shutil
@@ -306,11 +307,15 @@ def test_a_film_plays_by_itself(browser, play, tmp_path):
 
 
 def test_it_begins_when_somebody_looks_and_restarts_as_it_was():
-    """No frame before the first viewer. Restart goes on after a divergence, and stays paused where a viewer paused."""
+    """No frame before the first viewer. Restart goes on after a divergence, and stays paused where a viewer paused. A
+    disk that is full for a download is told, and ends nothing."""
     session = PlaySession(floating(), load_scene(CONF / "example/play.yaml"), CONF / "example")
     page = PlayPage(session, port=0)
     thread = threading.Thread(target=page.run)
     thread.start()
+
+    def full():
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     def done(action):
         """Done between two frames, and the frame behind it, too."""
@@ -333,6 +338,11 @@ def test_it_begins_when_somebody_looks_and_restarts_as_it_was():
         done(lambda: page.play(False))
         done(page.restart)
         assert not page.playing and session.frame == 0
+        notes: list[str] = []
+        page._notify = lambda message, client=None: notes.append(message)  # type: ignore[method-assign]
+        page.do(full)
+        done(lambda: None)
+        assert notes == ["[Errno 28] No space left on device"] and thread.is_alive()
     finally:
         page.ended.set()
         thread.join()
