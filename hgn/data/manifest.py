@@ -41,41 +41,38 @@ MANIFEST_NAME = "manifest.json"
 
 
 @dataclass(frozen=True)
-class _Head:
-    """`manifest.json`."""
-
-    config_hash: str
-    config: dict[str, Any]
-    requested: dict[str, int]
-    revision: int
-    index: IndexState
-    totals: dict[str, SplitTotals]
-    schema_version: int
-
-
-@dataclass(frozen=True)
-class _Listing:
-    """`manifest.json` of the first release."""
-
-    config_hash: str
-    config: dict[str, Any]
-    requested: dict[str, int]
-    revision: int = 0
-    shards: tuple[ShardEntry, ...] = ()
-    quarantined: tuple[QuarantinedScene, ...] = ()
-    schema_version: int = SCHEMA_VERSION
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """`requested` counts episodes per split; `config` is the mapping whose hash is `config_hash`."""
+class _Identity:
+    """What manifests of every release say. `requested` counts episodes per split; `config` is the mapping whose hash is
+    `config_hash`."""
 
     config_hash: str
     config: dict[str, Any]
     requested: dict[str, int]
     revision: int = 0  # grows by one with each publication
+    schema_version: int = field(default=SCHEMA_VERSION, kw_only=True)
+
+
+@dataclass(frozen=True)
+class _Head(_Identity):
+    """`manifest.json`."""
+
+    index: IndexState = field(kw_only=True)
+    totals: dict[str, SplitTotals] = field(kw_only=True)
+
+
+@dataclass(frozen=True)
+class _Listing(_Identity):
+    """`manifest.json` of the first release."""
+
+    shards: tuple[ShardEntry, ...] = ()
+    quarantined: tuple[QuarantinedScene, ...] = ()
+
+
+@dataclass(frozen=True)
+class Manifest(_Identity):
+    """What is published of a data set."""
+
     shards: Index = field(default_factory=lambda: ListedIndex(()))  # in publication order
-    schema_version: int = SCHEMA_VERSION
 
     @staticmethod
     def load(folder: Path | str, patience_s: float = PATIENCE_S) -> Manifest:
@@ -106,21 +103,19 @@ class Manifest:
         if "index" not in mapping:
             listing = from_mapping(_Listing, mapping, path)
             shards: Index = ListedIndex(listing.shards, listing.quarantined)
-            fields = {k: v for k, v in vars(listing).items() if k not in ("shards", "quarantined")}
-            head = _Head(**fields, index=shards.state, totals=shards.totals)
+            head: _Identity = listing
         else:
             head = from_mapping(_Head, mapping, path)
             shards = Index(folder, head.index, no_totals() | head.totals)
-        for name in ("requested", "totals"):
-            splits = sorted(getattr(head, name))
-            require(set(splits) <= set(SPLITS), f"{path}.{name}", f"of {', '.join(SPLITS)}", splits)
+        for name, splits in (("requested", head.requested), ("totals", shards.totals)):
+            require(set(splits) <= set(SPLITS), f"{path}.{name}", f"of {', '.join(SPLITS)}", sorted(splits))
         for totals in shards.totals.values():
             require_sound(totals.statistics or Statistics())
         count = sum(totals.shards for totals in shards.totals.values())
         require(count == len(shards), f"{path}.index.shards", f"{count}, as in totals", len(shards))
         expected = identity_hash(head.config)
         require(head.config_hash == expected, f"{path}.config_hash", f"{expected}, as config has it", head.config_hash)
-        return Manifest(head.config_hash, head.config, head.requested, head.revision, shards, head.schema_version)
+        return Manifest(head.config_hash, head.config, head.requested, head.revision, shards)
 
     def save(self, folder: Path | str) -> Manifest:
         """Replaces what the folder lists by this, in an index of a new generation; returns it as it is read there."""

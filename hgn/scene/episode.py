@@ -2,7 +2,7 @@
 
 Stored as plain members, one file a field (`position.npy`, `material.npy`, ..., `json`), so that any WebDataset
 or tar client reads it and a trainer can memory-map the positions. Nothing is ever unpickled.
-Shape legend: T frames, N particles, K obstacle cells.
+Shape legend: T frames, N particles, K obstacle cells, H frames before frame 0, P particles of obstacles.
 """
 
 from __future__ import annotations
@@ -25,14 +25,20 @@ from hgn.schema import BoxSize, ConfigError, Positive, Vector, from_mapping, req
 SCHEMA_VERSION = 1
 
 POSITION_MEMBER = "position.npy"
-VELOCITY_MEMBER = "velocity.npy"
-MATERIAL_MEMBER = "material.npy"
-OBSTACLE_CELL_MEMBER = "obstacle_cell.npy"
-OBSTACLE_NORMAL_MEMBER = "obstacle_normal.npy"
-PAST_MEMBER = "past.npy"  # these two in imported episodes alone, where there are any
-BOUNDARY_MEMBER = "boundary.npy"
-PARAMETER_PREFIX = "parameter_"
 DESCRIPTION_MEMBER = "json"
+PARAMETER_PREFIX = "parameter_"
+# the arrays, each a member NAME.npy: type as stored, and axes by the shape legend
+_ARRAYS = {
+    "position": ("<f4", "TN3"),
+    "velocity": ("<f4", "N3"),
+    "material": ("|u1", "N"),
+    "obstacle_cell": ("<i4", "K3"),
+    "obstacle_normal": ("<f4", "K3"),
+    "past": ("<f4", "HN3"),
+    "boundary": ("<f4", "P3"),
+}
+_PARAMETER = ("<f4", "N")
+_OPTIONAL = ("past", "boundary")  # in imported episodes alone, where there are any
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -69,20 +75,21 @@ class Episode:
         position = self.position_TN3
         if position.ndim != 3 or position.shape[0] < 1 or position.shape[2] != 3:
             raise ConfigError(f"{self.key}: position must have shape [frames >= 1, N, 3], got {position.shape}")
-        count, cells = position.shape[1], len(self.obstacle_grid.cell_K3)
-        self._check_array("position", position, np.float32, position.shape, scan=False)
-        self._check_array("velocity", self.initial_velocity_N3, np.float32, (count, 3))
-        self._check_array("material", self.material_N, np.uint8, (count,))
-        self._check_array("obstacle_cell", self.obstacle_grid.cell_K3, np.int32, (cells, 3))
-        self._check_array("obstacle_normal", self.obstacle_grid.normal_K3, np.float32, (cells, 3))
-        for name, value in self.material_parameters.items():
+        for name in self.material_parameters:
             if not _NAME.fullmatch(name):
                 raise ConfigError(f"{self.key}: parameter names must be letters, digits, - and _, got {name!r}")
-            self._check_array(PARAMETER_PREFIX + name, value, np.float32, (count,))
-        if self.past_HN3 is not None:
-            self._check_array("past", self.past_HN3, np.float32, (len(self.past_HN3), count, 3))
-        if self.boundary_P3 is not None:
-            self._check_array("boundary", self.boundary_P3, np.float32, (len(self.boundary_P3), 3))
+        arrays = self.arrays()
+        lengths = dict(zip("TN3", position.shape, strict=True)) | {"K": len(self.obstacle_grid.cell_K3)}
+        lengths |= {"H": len(arrays.get("past", ())), "P": len(arrays.get("boundary", ()))}
+        for name, array in arrays.items():
+            stored, axes = _ARRAYS.get(name, _PARAMETER)
+            dtype, shape = np.dtype(stored).newbyteorder("="), tuple(lengths[axis] for axis in axes)
+            if array.dtype != dtype:
+                raise ConfigError(f"{self.key}: {name} must be of type {dtype.name}, got {array.dtype}")
+            if array.shape != shape:
+                raise ConfigError(f"{self.key}: {name} must have shape {shape}, got {array.shape}")
+            if name != "position" and not np.isfinite(array).all():
+                raise ConfigError(f"{self.key}: {name} must be finite, got {_first_not_finite(array)}")
         require_materials(f"{self.key}: material", self.material_N, self.materials)
         try:
             require_bounds(self)
@@ -109,15 +116,19 @@ class Episode:
     def particle_count(self) -> int:
         return int(self.position_TN3.shape[1])
 
-    def _check_array(
-        self, name: str, array: np.ndarray, dtype: type, shape: tuple[int, ...], scan: bool = True
-    ) -> None:
-        if array.dtype != np.dtype(dtype):
-            raise ConfigError(f"{self.key}: {name} must be of type {np.dtype(dtype).name}, got {array.dtype}")
-        if array.shape != shape:
-            raise ConfigError(f"{self.key}: {name} must have shape {shape}, got {array.shape}")
-        if scan and not np.isfinite(array).all():
-            raise ConfigError(f"{self.key}: {name} must be finite, got {_first_not_finite(array)}")
+    def arrays(self) -> dict[str, np.ndarray]:
+        """By the names of their members, in the order they are stored in."""
+        arrays = {
+            "position": self.position_TN3,
+            "velocity": self.initial_velocity_N3,
+            "material": self.material_N,
+            "obstacle_cell": self.obstacle_grid.cell_K3,
+            "obstacle_normal": self.obstacle_grid.normal_K3,
+            "past": self.past_HN3,
+            "boundary": self.boundary_P3,
+        }
+        parameters = {PARAMETER_PREFIX + name: value for name, value in sorted(self.material_parameters.items())}
+        return {name: array for name, array in (arrays | parameters).items() if array is not None}
 
 
 @dataclass(frozen=True)
@@ -145,17 +156,9 @@ def encode_episode(episode: Episode) -> dict[str, bytes]:
     """
     _require_finite_positions(episode)
     members = {
-        POSITION_MEMBER: _encode_array(episode.position_TN3, "<f4"),
-        VELOCITY_MEMBER: _encode_array(episode.initial_velocity_N3, "<f4"),
-        MATERIAL_MEMBER: _encode_array(episode.material_N, "|u1"),
-        OBSTACLE_CELL_MEMBER: _encode_array(episode.obstacle_grid.cell_K3, "<i4"),
-        OBSTACLE_NORMAL_MEMBER: _encode_array(episode.obstacle_grid.normal_K3, "<f4"),
+        f"{name}.npy": _encode_array(array, _ARRAYS.get(name, _PARAMETER)[0])
+        for name, array in episode.arrays().items()
     }
-    for name, array in ((PAST_MEMBER, episode.past_HN3), (BOUNDARY_MEMBER, episode.boundary_P3)):
-        if array is not None:
-            members[name] = _encode_array(array, "<f4")
-    for name in sorted(episode.material_parameters):
-        members[f"{PARAMETER_PREFIX}{name}.npy"] = _encode_array(episode.material_parameters[name], "<f4")
     description = {
         "schema_version": SCHEMA_VERSION,
         "seed": episode.seed,
@@ -192,46 +195,35 @@ def decode_episode(key: str, members: Mapping[str, bytes | np.ndarray], scan_pos
         raise ConfigError(f"{key}: member {DESCRIPTION_MEMBER} is missing; generate the data set again")
     description = _decode_description(key, bytes(members[DESCRIPTION_MEMBER]))
     arrays: dict[str, np.ndarray] = {}
-    parameters: dict[str, np.ndarray] = {}
-    needed = {
-        POSITION_MEMBER: ("<f4", 3),
-        VELOCITY_MEMBER: ("<f4", 2),
-        MATERIAL_MEMBER: ("|u1", 1),
-        OBSTACLE_CELL_MEMBER: ("<i4", 2),
-        OBSTACLE_NORMAL_MEMBER: ("<f4", 2),
-    }
-    formats = needed | {PAST_MEMBER: ("<f4", 3), BOUNDARY_MEMBER: ("<f4", 2)}
-    for name, data in members.items():
-        if name in formats:
-            arrays[name] = decode_array(f"{key}.{name}", data, *formats[name])
-        elif name.startswith(PARAMETER_PREFIX) and name.endswith(".npy"):
-            parameter = name.removeprefix(PARAMETER_PREFIX).removesuffix(".npy")
-            parameters[parameter] = decode_array(f"{key}.{name}", data, "<f4", 1)
-        elif name != DESCRIPTION_MEMBER:
-            raise ConfigError(f"{key}.{name} is not a known member; known: {', '.join((*formats, 'json'))}")
-    for name in needed:
-        if name not in arrays:
-            raise ConfigError(f"{key}: member {name} is missing; generate the data set again")
+    for member, data in members.items():
+        name = member.removesuffix(".npy")
+        if name != member and (name in _ARRAYS or name.startswith(PARAMETER_PREFIX)):
+            dtype, axes = _ARRAYS.get(name, _PARAMETER)
+            arrays[name] = decode_array(f"{key}.{member}", data, dtype, len(axes))
+        elif member != DESCRIPTION_MEMBER:
+            known = ", ".join((*(f"{name}.npy" for name in _ARRAYS), "json"))
+            raise ConfigError(f"{key}.{member} is not a known member; known: {known}")
+    for name in _ARRAYS:
+        if name not in arrays and name not in _OPTIONAL:
+            raise ConfigError(f"{key}: member {name}.npy is missing; generate the data set again")
     episode = Episode(
         key=key,
-        position_TN3=arrays[POSITION_MEMBER],
-        initial_velocity_N3=arrays[VELOCITY_MEMBER],
-        material_N=arrays[MATERIAL_MEMBER],
-        obstacle_grid=ObstacleGrid(
-            cell_size=description.cell_size,
-            cell_K3=arrays[OBSTACLE_CELL_MEMBER],
-            normal_K3=arrays[OBSTACLE_NORMAL_MEMBER],
-        ),
+        position_TN3=arrays["position"],
+        initial_velocity_N3=arrays["velocity"],
+        material_N=arrays["material"],
+        obstacle_grid=ObstacleGrid(description.cell_size, arrays["obstacle_cell"], arrays["obstacle_normal"]),
         domain_size=description.domain_size,
         gravity=description.gravity,
         frame_rate_hz=description.frame_rate_hz,
         seed=description.seed,
         specification=description.specification,
         solver=description.solver,
-        material_parameters=parameters,
+        material_parameters={
+            name.removeprefix(PARAMETER_PREFIX): array for name, array in arrays.items() if name not in _ARRAYS
+        },
         materials=description.materials,
-        past_HN3=arrays.get(PAST_MEMBER),
-        boundary_P3=arrays.get(BOUNDARY_MEMBER),
+        past_HN3=arrays.get("past"),
+        boundary_P3=arrays.get("boundary"),
     )
     if scan_positions:
         _require_finite_positions(episode)
