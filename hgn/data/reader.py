@@ -169,11 +169,6 @@ class EpisodeStore(Episodes):
         return self.manifest.shards.digest(self.split, count)
 
     @property
-    def revision(self) -> int:
-        """The manifest revision last read."""
-        return self.manifest.revision
-
-    @property
     def entries(self) -> Iterator[EpisodeEntry]:
         """What the index says of each episode (key, particles, frames), without opening any shard."""
         return (entry for shard in self.manifest.shards_of(self.split) for entry in shard.episodes)

@@ -116,11 +116,9 @@ def _samples(
     corner_F33 = all_corners(obstacles)
     if domain_size is not None:
         box = (np.full(3, -cell_size), np.array(domain_size, np.float64) + cell_size)
-        corner_F33, _ = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)
-    vertex_V3 = corner_F33.reshape(-1, 3)
-    triangle_F3 = np.arange(len(vertex_V3)).reshape(-1, 3)
+        corner_F33 = split_long_edges(corner_F33, SPLIT_CELLS * cell_size, box)
     rng = np.random.Generator(np.random.PCG64(seed))
-    point_S3, owner_S = sample_surface(vertex_V3, triangle_F3, spacing_cells * cell_size, rng)
+    point_S3, owner_S = sample_surface(corner_F33, spacing_cells * cell_size, rng)
     if domain_size is not None:
         near = ((point_S3 >= box[0]) & (point_S3 < box[1])).all(axis=1)
         point_S3, owner_S = point_S3[near], owner_S[near]

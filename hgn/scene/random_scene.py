@@ -326,7 +326,7 @@ def _assemble(config: SceneConfig, seed: int, gravity: Vector, obstacles: list[_
 def _unit_surface_points(shape: str) -> tuple[np.ndarray, float]:
     """Points on the shape of size 1, and how far the rest of its surface is from them at most."""
     vertex, triangle, _ = unit_shape(shape)
-    pieces, _ = split_long_edges(vertex[triangle], SURFACE_DETAIL)
+    pieces = split_long_edges(vertex[triangle], SURFACE_DETAIL)
     centroid = (pieces[:, 0] + pieces[:, 1] + pieces[:, 2]) / 3
     offset = pieces - centroid[:, None]  # the farthest point of a triangle from its centroid is a corner
     return centroid, float(np.sqrt((offset * offset).sum(axis=2).max())) + ROUNDING

@@ -1,6 +1,6 @@
 """Points on triangle surfaces: Poisson-disk samples, and splitting of long triangles.
 
-Shape legend: V vertices, F triangles, S samples.
+Shape legend: F triangles, S samples.
 """
 
 from __future__ import annotations
@@ -21,10 +21,8 @@ MINIMUM_CANDIDATES = 64
 MAXIMUM_SAMPLES = 5_000_000
 
 
-def sample_surface(
-    vertex_V3: np.ndarray, triangle_F3: np.ndarray, spacing: float, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Random surface points, no two closer than `spacing` (Paper sec. 3: Poisson disks).
+def sample_surface(corner_F33: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Random points of triangles, no two closer than `spacing` (Paper sec. 3: Poisson disks).
 
     Returns float64 [S, 3] and the triangle of each, int64 [S]. Candidates are drawn by area, slivers narrower
     than about the spacing by length, and kept unless too near to an earlier one, in rounds until nearly
@@ -32,8 +30,7 @@ def sample_surface(
 
     Raises: ConfigError when the surface is too large for the spacing.
     """
-    corner = np.asarray(vertex_V3, np.float64).reshape(-1, 3)[np.asarray(triangle_F3).reshape(-1, 3)]
-    weight = _weights(corner, spacing)
+    weight = _weights(corner_F33, spacing)
     usable = np.flatnonzero(weight > 0)
     running = np.cumsum(weight[usable])
     if len(usable) == 0:
@@ -49,7 +46,7 @@ def sample_surface(
     for round_index in range(MAXIMUM_ROUNDS):
         chosen = np.searchsorted(running, rng.random(candidate_count) * running[-1], side="right")
         owner = usable[np.minimum(chosen, len(usable) - 1)]
-        point = _uniform_in_triangles(corner[owner], rng)
+        point = _uniform_in_triangles(corner_F33[owner], rng)
         if len(points):
             near = point_tree(points).query(point, distance_upper_bound=spacing)[0]
             free = near >= spacing  # infinite where nothing is nearer
@@ -64,32 +61,27 @@ def sample_surface(
 
 def split_long_edges(
     corner_F33: np.ndarray, longest: float, box: tuple[np.ndarray, np.ndarray] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Bisects triangles at their longest edge until no edge exceeds `longest`.
+) -> np.ndarray:
+    """Bisects triangles at their longest edge until no edge exceeds `longest`: corners, float64 [F', 3, 3].
 
-    Returns corners, float64 [F', 3, 3], and the index of the triangle that each came from, int64 [F'].
     With `box` (lowest and highest corner) pieces whose bounding box misses it are dropped.
     """
     corner = np.asarray(corner_F33, np.float64)
-    source = np.arange(len(corner))
-    done_corner, done_source = [corner[:0]], [source[:0]]
+    pieces = [corner[:0]]
     while len(corner):
         if box is not None:
-            touches = ((corner.max(axis=1) >= box[0]) & (corner.min(axis=1) <= box[1])).all(axis=1)
-            corner, source = corner[touches], source[touches]
+            corner = corner[((corner.max(axis=1) >= box[0]) & (corner.min(axis=1) <= box[1])).all(axis=1)]
         edge = np.roll(corner, -1, axis=1) - corner
         length_square = (edge * edge).sum(axis=2)
         short = ~(length_square > longest * longest).any(axis=1)
-        done_corner.append(corner[short])
-        done_source.append(source[short])
-        corner, source = corner[~short], source[~short]
+        pieces.append(corner[short])
+        corner = corner[~short]
         start = length_square[~short].argmax(axis=1)
         rows = np.arange(len(corner))
         a, b, c = (corner[rows, (start + i) % 3] for i in range(3))
         middle = 0.5 * (a + b)
         corner = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-        source = np.concatenate([source, source])
-    return np.concatenate(done_corner), np.concatenate(done_source)
+    return np.concatenate(pieces)
 
 
 def area_vectors(corner_F33: np.ndarray) -> np.ndarray:

@@ -6,9 +6,10 @@ Shape legend: N particles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+import trimesh
 import viser
 from scipy.spatial.transform import Rotation
 
@@ -49,8 +50,9 @@ class StageView:
         server.initial_camera.position = tuple(self.middle_3 + size * np.array([0.55, 0.45, 1.55]))
         server.initial_camera.look_at = tuple(self.middle_3 - size * np.array([0.0, 0.08, 0.0]))
         # seen from inside: its near walls are not there
+        box = trimesh.creation.box(bounds=((0.0, 0.0, 0.0), domain_size))
         self.room = self.scene.add_mesh_simple(
-            "/room", *_box(domain_size), color=ROOM_COLOR, side="back", flat_shading=True, cast_shadow=False
+            "/room", box.vertices, box.faces, color=ROOM_COLOR, side="back", flat_shading=True, cast_shadow=False
         )
         self.scene.add_line_segments("/edges", box_corners(domain_size)[np.array(BOX_EDGES)], BOX_COLOR)
         self.clouds = [
@@ -88,15 +90,3 @@ class StageView:
             position=position,
             wxyz=rotation,
         )
-
-
-def _box(domain_size: Vector) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles, oriented outwards."""
-    corner_83 = box_corners(domain_size)
-    sides: list[Any] = []
-    for axis in range(3):
-        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
-        for high in (0, 1 << axis):
-            a, b, c, d = high, high | u, high | u | v, high | v
-            sides += [(a, b, c), (a, c, d)] if high else [(a, c, b), (a, d, c)]
-    return corner_83, np.array(sides, np.int32)

@@ -73,7 +73,7 @@ def test_store_grows_with_the_dataset(make_config, make_dataset):
     make_dataset(make_config(training_scenes=9))
     assert train.refresh() and not test.refresh()
     assert len(train) == len(train.episodes) == 9 and train.episodes[0] is first
-    assert train.revision == Manifest.load(folder).revision
+    assert train.manifest.revision == Manifest.load(folder).revision
     assert train.statistics() == Manifest.load(folder).statistics("train")
 
 

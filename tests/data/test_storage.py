@@ -121,7 +121,7 @@ def test_manifest_is_sent_once(folder, serve, monkeypatch):
     assert not store.refresh()
     manifest = Manifest.load(folder)
     dataclasses.replace(manifest, revision=99).save(folder)
-    assert not store.refresh() and store.revision == 99
+    assert not store.refresh() and store.manifest.revision == 99
     assert sizes[0] == 0 and sizes[1] > 1000
 
 

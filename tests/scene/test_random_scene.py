@@ -69,7 +69,7 @@ def test_obstacles_are_inside_the_domain_and_disjoint(seed):
         assert one.vertex_V3.max() <= 1
         assert 0.1 <= scene.specification["obstacles"][i]["size"] <= 0.5
         for other in scene.obstacles[:i]:
-            pieces, _ = split_long_edges(one.vertex_V3[one.triangle_F3], 0.02)
+            pieces = split_long_edges(one.vertex_V3[one.triangle_F3], 0.02)
             points = np.concatenate([pieces.mean(axis=1), one.vertex_V3])
             assert surface_distances(points, other).min() >= 2 * CELL
             assert not contains(points[:1], other).any()
