@@ -116,12 +116,14 @@ def frame_velocity(position_TN3: np.ndarray, frame_rate_hz: float) -> np.ndarray
 
 
 def rollout_velocity(rollout: Rollout) -> np.ndarray:
-    """`frame_velocity` of a rollout; what enters has in its first frame the velocity of its second."""
+    """`frame_velocity` of a rollout; what enters has in its first frame the velocity of its second, or none."""
     velocity_TN3 = frame_velocity(rollout.position_TN3, rollout.frame_rate_hz)
     if rollout.entry_frame_N is not None:
-        late = np.flatnonzero((rollout.entry_frame_N > 0) & (rollout.entry_frame_N < rollout.frame_count))
+        last = rollout.frame_count - 1
+        late = np.flatnonzero((rollout.entry_frame_N > 0) & (rollout.entry_frame_N <= last))
         entry = rollout.entry_frame_N[late]
-        velocity_TN3[entry, late] = velocity_TN3[np.minimum(entry + 1, rollout.frame_count - 1), late]
+        velocity_TN3[entry, late] = velocity_TN3[np.minimum(entry + 1, last), late]
+        velocity_TN3[last, late[entry == last]] = 0.0
     return velocity_TN3
 
 

@@ -239,6 +239,16 @@ def test_frame_velocity():
     assert not frame_velocity(position_TN3[:1], 50.0).any()
 
 
+def test_velocity_of_what_enters_last():
+    """A particle that is seen in the last frame alone has no velocity yet; others have that of their second frame."""
+    rollout = make_rollout(None)
+    position_TN3, entry_N = rollout.position_TN3.copy(), np.array([0] * 5 + [2, 3])
+    position_TN3[:2, 5] = position_TN3[:3, 6] = np.nan
+    velocity_TN3 = rollout_velocity(dataclasses.replace(rollout, position_TN3=position_TN3, entry_frame_N=entry_N))
+    np.testing.assert_array_equal(velocity_TN3[2, 5], velocity_TN3[3, 5])
+    assert np.isfinite(velocity_TN3[2:, 5]).all() and not velocity_TN3[3, 6].any()
+
+
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     """An error while writing keeps the file that was there and leaves no temporary file."""
     path = tmp_path / "rollout.h5"
