@@ -39,7 +39,11 @@ def draw_fresh(folder: Path | str, weights: Sequence[str]) -> FreshSeed:
     files = [Path(name) for name in weights]
     for i, file in enumerate(files):
         require(
-            file.is_file(), f"frozen[{i}]", "an existing file", str(file), "as in hgn/weights/obstacles.safetensors"
+            file.is_file(),
+            f"frozen[{i}]",
+            "an existing file of weights",
+            str(file),
+            "as in hgn/weights/obstacles.safetensors",
         )
     hashes = {file.name: file_sha256(file) for file in files}
     fresh = read_fresh(folder)
