@@ -521,7 +521,7 @@ def test_a_flat_set_goes_the_whole_way(flat, tmp_path, make_config):
     figures = tmp_path / "figures.json"
     options = {"weights": str(weights), "data": str(flat), "split": "train", "rollout_frames": 24, "backend": "torch"}
     assert evaluate.main(options | {"device": "cpu", "json": str(figures)}) == 0
-    with pytest.raises(ConfigError, match="split test, got none in .*; it has others: split=train, split=validation"):
+    with pytest.raises(ConfigError, match=r"got none in .*; it has others: split=train, split=validation"):
         evaluate.main(options | {"device": "cpu", "split": "test"})
     report = json.loads(figures.read_text())
     own, (ours, *_, simulated) = report["set_convention"], report["rows"]
