@@ -23,15 +23,11 @@ from hgn.schema import ConfigError
 
 _MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 _PLAIN_TYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
-# of a header, which NumPy evaluates as Python, and of sizes that it claims
-_HEADER_ERRORS = (
-    *(ValueError, TypeError, OverflowError, EOFError, OSError, SyntaxError, tokenize.TokenError),
-    *(RecursionError, MemoryError),
-)
-# whatever a damaged or hostile pickle makes of the few pieces it is given
-_PICKLE_ERRORS = (
-    *(pickle.UnpicklingError, ValueError, TypeError, OverflowError, EOFError, AttributeError, LookupError),
-    *(RecursionError, MemoryError),
+# of a header, which NumPy evaluates as Python, of sizes that it claims, and of whatever a damaged or hostile pickle makes
+# of the few pieces that it is given
+_ERRORS = (
+    *(pickle.UnpicklingError, ValueError, TypeError, OverflowError, EOFError, OSError, AttributeError, LookupError),
+    *(SyntaxError, tokenize.TokenError, RecursionError, MemoryError),
 )
 
 
@@ -115,7 +111,7 @@ def read_header(
         shape, fortran_order, dtype = read(file)
         if any(type(length) is not int or length < 0 for length in shape):
             raise ValueError(f"the shape {shape}")
-    except _HEADER_ERRORS as error:
+    except _ERRORS as error:
         raise ConfigError(f"{name} must be a plain .npy file, got {error}") from None
     return shape, fortran_order, dtype
 
@@ -130,7 +126,7 @@ def _read_array(data: bytes, name: str, objects: bool) -> np.ndarray:
         if not objects:
             raise pickle.UnpicklingError("a pickle")
         array = _ArraysAlone(file).load()
-    except _PICKLE_ERRORS as error:
+    except _ERRORS as error:
         raise ConfigError(f"{name} must be an array, or a pickle of arrays alone, got {error}") from None
     if not isinstance(array, np.ndarray) or array.shape != shape:
         raise ConfigError(f"{name} must be an array of shape {shape}, got {type(array).__name__}")

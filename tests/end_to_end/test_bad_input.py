@@ -173,7 +173,7 @@ EVALUATE = ["weights=weights.safetensors", "data=data", "rollout_frames=3", "jso
             "manifest.json must be the manifest of a data set, got no such file;",
         ),
         ("render", ["rollout=none.vtkhdf"], "rollout must be an existing file, got none.vtkhdf"),
-        ("render", ["rollout=scene.yaml"], "got scene.yaml"),
+        ("render", ["rollout=scene.yaml"], "scene.yaml: rollout must be a complete HDF5 file, got"),
     ],
 )
 def test_values(place, command, arguments, message, capsys, monkeypatch):
