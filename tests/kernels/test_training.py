@@ -82,7 +82,7 @@ def test_a_part_of_the_data_is_enough(make_config, make_dataset, tmp_path, monke
     updates = {"maximum_updates": 9, "batch_scenes": 2, "log_every": 2, "checkpoint_every": 9, "monitor_every": 9}
     ends, most = [], []
     original = GraphTrainer.run
-    for room in (6, 14):
+    for held in (6, 14):
         sizes: list[int] = []
 
         def run(trainer, *arguments, sizes=sizes):
@@ -90,9 +90,9 @@ def test_a_part_of_the_data_is_enough(make_config, make_dataset, tmp_path, monke
             sizes.append(len(trainer._episodes))
 
         monkeypatch.setattr(GraphTrainer, "run", run)
-        monkeypatch.setattr(EpisodeDataModule, "_room", lambda feed, room=room: room)
-        assert train.main(run_mapping(config, tmp_path / str(room), shuffle_episodes=3, **updates)) == 0
-        ends.append(read_checkpoint(tmp_path / str(room) / "checkpoints" / "last.ckpt")["state_dict"])
+        monkeypatch.setattr(EpisodeDataModule, "_most_held", lambda feed, held=held: held)
+        assert train.main(run_mapping(config, tmp_path / str(held), shuffle_episodes=3, **updates)) == 0
+        ends.append(read_checkpoint(tmp_path / str(held) / "checkpoints" / "last.ckpt")["state_dict"])
         most.append(max(sizes))
     assert most[0] <= 6 < most[1]
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
