@@ -2,7 +2,7 @@
 
 Each shard is checked against the manifest (size, then sha256) before anything in it is used: a tar cut at a
 member boundary would otherwise read as fewer samples without any error. Shards of a URL are read from the cache that
-`hgn.data.storage` keeps on this machine.
+`hgn.data.shard_cache` keeps on this machine.
 """
 
 from __future__ import annotations

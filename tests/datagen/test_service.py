@@ -24,7 +24,7 @@ from written_files import Recorder
 
 import datagen.service.server
 import datagen.service.supervisor
-import hgn.data.storage
+import hgn.data.verification
 from datagen.pool.progress import Progress
 from datagen.service.__main__ import main
 from datagen.service.server import make_app
@@ -123,7 +123,7 @@ def test_many_ask_at_once(folder, monkeypatch):
 
     monkeypatch.setattr(Manifest, "parse", staticmethod(counted("parse", slowly)))
     monkeypatch.setattr(ShardEntry, "__post_init__", counted("line", ShardEntry.__post_init__))
-    monkeypatch.setattr(hgn.data.storage, "file_sha256", counted("hash", slow))
+    monkeypatch.setattr(hgn.data.verification, "file_sha256", counted("hash", slow))
     monkeypatch.setattr(datagen.service.server, "to_mapping", counted("told", to_mapping))
 
     async def crowd():
