@@ -23,7 +23,7 @@ from hgn.schema import ConfigError
 
 _MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 _PLAIN_TYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
-# of a header, which NumPy evaluates as Python, of sizes that it claims, and of what hostile pickles make of a few pieces
+# of a header, which NumPy evaluates as Python, of sizes that it claims, and of what pickles make of the pieces they get
 _ERRORS = (
     *(pickle.UnpicklingError, ValueError, TypeError, OverflowError, EOFError, OSError, AttributeError, LookupError),
     *(SyntaxError, tokenize.TokenError, RecursionError, MemoryError),
