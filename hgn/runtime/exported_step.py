@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -142,8 +143,8 @@ def _added_in_order(
 def write_package(path: Path, program: torch.export.ExportedProgram, info: WeightsInfo) -> None:
     """The graph compiled for the device it was traced on, as PyTorch's C++ loads it; minutes, with a C++ compiler."""
     make_folder(path.parent)
-    temporary = path.with_name(f".{path.stem}.pt2")
-    with warnings.catch_warnings():
+    with TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as folder, warnings.catch_warnings():
+        temporary = Path(folder) / path.name
         warnings.simplefilter("ignore")
         torch._inductor.aoti_compile_and_package(
             program,
@@ -151,8 +152,8 @@ def write_package(path: Path, program: torch.export.ExportedProgram, info: Weigh
             # threads as the program that runs it has them, not as this one
             inductor_configs={"aot_inductor.metadata": {"hgn": _description(info)}, "cpp.dynamic_threads": True},
         )
-    sync_written(temporary)
-    temporary.replace(path)
+        sync_written(temporary)
+        temporary.replace(path)
     sync_folder(path.parent)
 
 

@@ -17,7 +17,7 @@ from network.states import network_of, random_state
 from hgn import export
 from hgn.config import config_directory
 from hgn.network.hgn import HierarchicalGraphNetwork
-from hgn.runtime.exported_step import INPUTS, initial_arrays
+from hgn.runtime.exported_step import INPUTS, initial_arrays, write_package
 from hgn.runtime.simulator import Simulator
 from hgn.runtime.stepped_rollout import stepped
 from hgn.runtime.weights import WeightsInfo, save_weights
@@ -120,6 +120,20 @@ def test_what_is_refused(options, message):
     """By name, with the rule, before anything is written."""
     with pytest.raises(ConfigError, match=message):
         export.main(options)
+
+
+def test_a_package_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):
+    """Ctrl-C while the compiler is at it."""
+
+    def interrupted(program, package_path, inductor_configs):
+        Path(package_path).write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch._inductor, "aoti_compile_and_package", interrupted)
+    info = WeightsInfo(network_of(torch.float32).config, 60.0, 1 / 64)
+    with pytest.raises(KeyboardInterrupt):
+        write_package(tmp_path / "step.pt2", None, info)
+    assert not list(tmp_path.iterdir())
 
 
 def exported(folder, name, kind):
