@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from datagen.pool.local_workers import LocalWorker, LocalWorkerFactory
-from datagen.pool.worker_plan import WorkerPlan, plan_workers, visible_gpus
 from written_files import Recorder, hashes, simulated
 
+from datagen.pool.local_workers import LocalWorker, LocalWorkerFactory
 from datagen.pool.plan import SceneTask, scene_seed
 from datagen.pool.pool import Pool, Stopped
 from datagen.pool.worker import Backend, MadeScene, Worker
+from datagen.pool.worker_plan import WorkerPlan, plan_workers, visible_gpus
 from datagen.pool.writer import DatasetWriter
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig, SceneConfig
 from hgn.data.manifest import Manifest

@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from datagen.pool.worker_plan import WorkerPlan, plan_cluster
 from processes import BALLISTIC_PATH, PATIENCE_S
 
 from datagen.pool.ray_workers import RayWorkerFactory
 from datagen.pool.worker import Backend
+from datagen.pool.worker_plan import WorkerPlan, plan_cluster
 from hgn.config import DatagenConfig, DatasetConfig, MpmConfig
 from hgn.schema import ConfigError
 
