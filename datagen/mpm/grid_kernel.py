@@ -23,6 +23,7 @@ from datagen.mpm.mls_mpm import (
     interpolate_hidden,
     is_fluid,
     mark,
+    mark_changed,
     move,
     node_places,
     node_velocity,
@@ -47,7 +48,10 @@ def _particle_to_grid(
     affine: ti.template(),
     deformation: ti.template(),
     volume: ti.template(),
+    strained: ti.template(),
     covered: ti.template(),
+    spread: ti.template(),
+    response: ti.template(),
     label: ti.template(),
     law_row: ti.template(),
     hidden: ti.template(),
@@ -63,8 +67,8 @@ def _particle_to_grid(
     contact_normal: ti.template(),
     variant: ti.template(),
 ):
-    """Updates the particle's deformation and adds what it gives to its nodes to one copy of the grid: momentum and mass
-    in the first substep of an interval, later what its stress changes alone.
+    """Updates the particle's deformation where it acts, and adds what it gives to its nodes to one copy of the grid:
+    momentum and mass in the first substep of an interval, later what its stress changes alone.
     """
     dx = setting[SETTING.cell_size]
     inverse_dx = setting[SETTING.inverse_cell_size]
@@ -72,10 +76,6 @@ def _particle_to_grid(
     row = 0
     if ti.static(bool(variant & VARIANT.several_laws)):
         row = law_row[p]
-    F = ti.Matrix.identity(ti.f32, 3)
-    if ti.static(has_solid(variant)):
-        if ti.static(not variant & VARIANT.water) or not is_fluid(material):
-            F = deformation[p]
     begins = scene_value[scene, VALUE.begins]
     hidden_here = 0
     if ti.static(bool(variant & VARIANT.sheets)):
@@ -83,51 +83,53 @@ def _particle_to_grid(
             elapsed = scene_value[scene, VALUE.frame] - scene_value[scene, VALUE.remaining] - step
             hidden[p] = find_hidden(position[p], scene, elapsed, contact, contact_normal, setting, shape, variant)
         hidden_here = hidden[p]
-    C = affine[p]
-    stretch = ti.Matrix.zero(ti.f32, 3, 3)
-    if begins == 0.0:
-        stretch = affine[p]  # which holds it until the interval ends
-        v_now, C_now = interpolate(
-            position[p], scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, node, inverse_dx, shape
-        )
-        if ti.static(bool(variant & VARIANT.sheets)):
-            v_now, C_now = interpolate_hidden(
-                position[p], v_now, C_now, hidden_here, scene, node, inverse_dx, shape, contact
+    marks = 3 * shape[SHAPE.all_blocks] + 2
+    A = ti.Matrix.zero(ti.f32, 3, 3)
+    if acts(covered[p], begins, step, scene, scene_value):
+        F = ti.Matrix.identity(ti.f32, 3)
+        if ti.static(has_solid(variant)):
+            if ti.static(not variant & VARIANT.water) or not is_fluid(material):
+                F = deformation[p]
+        C = affine[p]
+        stretch = ti.Matrix.zero(ti.f32, 3, 3)
+        if begins == 0.0:
+            stretch = affine[p]  # which holds it until the interval ends
+            v_now, C_now = interpolate(
+                position[p], scene * shape[SHAPE.scene_blocks] * BLOCK_NODES, node, inverse_dx, shape
             )
-        C = C_now
-        raise_maximum(counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
-    length, until, many = own_step(
-        covered[p],
-        position[p],
-        C,
-        volume[p],
-        material,
-        row,
-        begins,
-        step,
-        scene,
-        counter,
-        shape,
-        block,
-        3 * shape[SHAPE.all_blocks] + 2,
-        scene_value,
-        setting,
-        law,
-        variant,
-    )
-    covered[p] = until
-    A, new_stretch, new_F, new_volume, stiffness = respond(
-        C, stretch, F, volume[p], material, row, length, begins, scene, counter, setting, law, variant
-    )
-    if many > 1.0:
-        raise_maximum(counter, scene, COUNT.held_stiffness_bits, stiffness)
-    if scene_value[scene, VALUE.interval_remaining] > 0.0:
-        affine[p] = new_stretch
-    volume[p] = new_volume
-    if ti.static(has_solid(variant)):
-        if ti.static(not variant & VARIANT.water) or not is_fluid(material):
-            deformation[p] = new_F
-    raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
+            if ti.static(bool(variant & VARIANT.sheets)):
+                v_now, C_now = interpolate_hidden(
+                    position[p], v_now, C_now, hidden_here, scene, node, inverse_dx, shape, contact
+                )
+            C = C_now
+            raise_maximum(counter, scene, COUNT.speed_square_bits, v_now.dot(v_now))
+        length, until, acts_until, many, spreads, acting = own_step(
+            strained[p], covered[p], spread[p], position[p], C, volume[p], material, row, begins, step, scene, counter,
+            shape, block, marks, scene_value, setting, law, variant,
+        )  # fmt: skip
+        strained[p] = until
+        covered[p] = acts_until
+        spread[p] = spreads
+        answer, new_stretch, new_F, new_volume, stiffness = respond(
+            C, stretch, F, volume[p], material, row, length, scene, counter, setting, law, variant
+        )
+        if spreads:
+            response[p] = answer
+        A = begins * C + acting * answer
+        if many > 1.0:
+            raise_maximum(counter, scene, COUNT.held_stiffness_bits, stiffness)
+        if scene_value[scene, VALUE.interval_remaining] > 0.0:
+            affine[p] = new_stretch
+        volume[p] = new_volume
+        if ti.static(has_solid(variant)):
+            if ti.static(not variant & VARIANT.water) or not is_fluid(material):
+                deformation[p] = new_F
+        raise_maximum(counter, scene, COUNT.stiffness_bits, stiffness)
+    else:
+        A = step * response[p]
+        if scene_value[scene, VALUE.interval_remaining] > 0.0:
+            now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+            mark_changed(position[p], scene, now, 1.0, inverse_dx, shape, block, marks)
 
     x = position[p] * inverse_dx
     base = ti.floor(x - 0.5, ti.i32)
@@ -220,7 +222,10 @@ def substep(
     affine: Matrices,
     deformation: Matrices,
     volume: Scalars,
+    strained: Scalars,
     covered: Scalars,
+    spread: Integers,
+    response: Matrices,
     label: Integers,
     law_row: Integers,
     hidden: Integers,
@@ -268,11 +273,13 @@ def substep(
         for p in range(position.shape[0]):
             scene = label[p] >> MATERIAL_BITS
             step = scene_value[scene, VALUE.time_step]
-            if step > 0.0 and acts(covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value):
+            if step > 0.0 and (
+                spread[p] == 1 or acts(covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value)
+            ):
                 _particle_to_grid(
-                    p, 0, scene, step, position, velocity, affine, deformation, volume, covered, label, law_row,
-                    hidden, node, gain, block, scene_value, counter, setting, law, shape, contact, contact_normal,
-                    variant,
+                    p, 0, scene, step, position, velocity, affine, deformation, volume, strained, covered, spread,
+                    response, label, law_row, hidden, node, gain, block, scene_value, counter, setting, law, shape,
+                    contact, contact_normal, variant,
                 )  # fmt: skip
     else:
         for task in range(scene_value.shape[0] * ti.static(variant // VARIANT.parts)):
@@ -282,13 +289,13 @@ def substep(
             if step > 0.0:
                 copy = (task - scene * parts) * shape[SHAPE.all_blocks]
                 for p in range(shape[SHAPE.part_begin + task], shape[SHAPE.part_begin + task + 1]):
-                    if label[p] >> MATERIAL_BITS == scene and acts(
-                        covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value
+                    if label[p] >> MATERIAL_BITS == scene and (
+                        spread[p] == 1 or acts(covered[p], scene_value[scene, VALUE.begins], step, scene, scene_value)
                     ):
                         _particle_to_grid(
-                            p, copy, scene, step, position, velocity, affine, deformation, volume, covered, label,
-                            law_row, hidden, node, gain, block, scene_value, counter, setting, law, shape, contact,
-                            contact_normal, variant,
+                            p, copy, scene, step, position, velocity, affine, deformation, volume, strained,
+                            covered, spread, response, label, law_row, hidden, node, gain, block, scene_value, counter,
+                            setting, law, shape, contact, contact_normal, variant,
                         )  # fmt: skip
 
     for n in range(block[3 * shape[SHAPE.all_blocks]] * BLOCK_NODES):
@@ -300,11 +307,13 @@ def substep(
         scene = global_block // shape[SHAPE.scene_blocks]
         begins = scene_value[scene, VALUE.begins] == 1.0
         many = 1.0
-        if scene_value[scene, VALUE.interval_remaining] > 0.0:
+        if scene_value[scene, VALUE.synchronised] == 1.0 and scene_value[scene, VALUE.interval_remaining] > 0.0:
             now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
             many = change_of(block[3 * shape[SHAPE.all_blocks] + 2 + global_block], now)
         if scene_value[scene, VALUE.time_step] > 0.0 and many > 0.0:
-            lead = (many - 1.0) * scene_value[scene, VALUE.time_step]
+            lead = ti.min(
+                (many - 1.0) * scene_value[scene, VALUE.whole_step], scene_value[scene, VALUE.interval_remaining]
+            )
             gravity_time = scene_value[scene, VALUE.gravity_time]
             fallen_before = scene_value[scene, VALUE.fallen]
             entry = -1

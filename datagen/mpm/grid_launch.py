@@ -69,8 +69,11 @@ class GridLaunch(Launch):
         self.affine = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)
         self.deformation = ti.Matrix.ndarray(3, 3, ti.f32, self.particles if has_solid(self.variant) else 1)
         self.volume, self.covered = (ti.ndarray(ti.f32, self.particles) for _ in range(2))
+        self.strained = device_array(np.full(self.particles, -1, np.float32))
         self.covered.fill(0)
-        self.block = device_array(np.zeros(6 * self.all_blocks + 2, np.int32))
+        self.spread = device_array(np.zeros(self.particles, np.int32))
+        self.response = ti.Matrix.ndarray(3, 3, ti.f32, self.particles)
+        self.block = device_array(np.zeros(8 * self.all_blocks + 2, np.int32))
         grid_kernel.start(
             self.velocity, self.affine, self.deformation, self.volume, self.label, self.law_row, self.counter,
             self.law,
@@ -83,7 +86,7 @@ class GridLaunch(Launch):
         return ti.Vector.ndarray(4, ti.f32, nodes // self.copies)
 
     def _vector_arrays(self) -> list[Any]:
-        own = [self.node, self.gain, self.position, self.velocity, self.affine, self.deformation]
+        own = [self.node, self.gain, self.position, self.velocity, self.affine, self.deformation, self.response]
         return super()._vector_arrays() + own
 
     def _advance(self, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -127,10 +130,10 @@ class GridLaunch(Launch):
         while pending:
             for _ in range(min(pending, SUBSTEPS_PER_CHECK)):
                 grid_kernel.substep(
-                    self.position, self.velocity, self.affine, self.deformation, self.volume, self.covered,
-                    self.label, self.law_row, self.hidden, self.scene_value, self.counter, self.setting, self.law,
-                    self.shape, self.node, self.gain, self.fallen, self.block, self.contact, self.contact_normal,
-                    self.variant,
+                    self.position, self.velocity, self.affine, self.deformation, self.volume, self.strained,
+                    self.covered, self.spread, self.response, self.label, self.law_row, self.hidden, self.scene_value,
+                    self.counter, self.setting, self.law, self.shape, self.node, self.gain, self.fallen, self.block,
+                    self.contact, self.contact_normal, self.variant,
                 )  # fmt: skip
             value = self.scene_value.to_numpy()
             busy = value[:, VALUE.remaining] > 0

@@ -85,7 +85,9 @@ class SceneValue(NamedTuple):
     stiffness: int = 20  # largest in the step before, m²/s²
     last_interval: int = 21  # how long the interval before was, s
     fallen: int = 22  # for which gravity has acted in this interval before the present substep, s
-    length: int = 23
+    synchronised: int = 23  # 1 where the interval's first and last substep are half as long as others, else 0
+    whole_step: int = 24  # of the others, s
+    length: int = 25
 
 
 class Status(NamedTuple):

@@ -8,10 +8,11 @@ density.
 
 Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
 as the stiffest particle needs. Others take steps of their own, each of several substeps, as long as their own wave
-speed allows (impulse multiple time stepping, Tuckerman et al. 1992; regional steps of the material point method, Fang
-et al. 2018): the impulse of such a step goes to the nodes in its first substep, at once, as does that of gravity where
-all particles of a block of nodes take several; until the next of them acts the block is left as it is. What shares a
-block with stiffer particles takes their step: beside impulses of long steps a stiff body rebounds too fast.
+speed allows (multiple time stepping; Streett et al. 1978): stress is found once a step and acts evenly over its
+substeps, for whatever takes others beside it looks at the nodes meanwhile, and of an impulse at once would see
+velocities that nothing has, even of what is at rest. Where all that share a block of nodes take the same steps nobody
+looks: there the impulse of a step goes to the nodes in its first substep, with that of gravity, and until the next the
+block is left as it is.
 
 In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
 they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the
@@ -29,7 +30,15 @@ Everything is per scene: time step, interval, remaining time, state, counters. A
 
 import taichi as ti
 
-from datagen.mpm.constitutive import count_event, foreseen_stiffness, hardening, settled, solid, water
+from datagen.mpm.constitutive import (
+    STIFFENING_MARGIN,
+    count_event,
+    foreseen_stiffness,
+    hardening,
+    settled,
+    solid,
+    water,
+)
 from datagen.mpm.layout import (
     BLOCK,
     BLOCK_NODES,
@@ -45,8 +54,7 @@ from datagen.mpm.layout import (
 from datagen.mpm.surface_kernel import MOVING_NODE_VECTORS, NODE_VECTORS, hidden_nodes, meet, stop_at_surface
 from hgn.scene.material import FLUIDS, SNOW
 
-SPLIT = 4.0  # substeps of an interval, from which on particles take steps of their own: those of fewer are too uneven
-MANY = 32  # substeps at most that a change of nodes is for
+MANY = 32  # substeps at most of a step of a particle's own
 SLACK = 1e-3  # of a substep, within which times are the same
 SMALLEST_MASS = 1e-10  # of a particle; lighter nodes are at the rounding of the weights
 
@@ -133,62 +141,66 @@ def mark(
 
 
 @ti.func
+def _corner_block(first, last, n: ti.template(), scene: ti.i32, shape: ti.template()) -> ti.i32:
+    """Of the blocks from `first` to `last` that a particle's nodes lie in, the one at corner n of eight."""
+    corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
+    index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
+    return index + scene * shape[SHAPE.scene_blocks]
+
+
+@ti.func
 def mark_changed(
     x,
     scene: ti.i32,
     now: ti.i32,
     many: ti.f32,
-    interval: ti.i32,
-    own: ti.f32,
     inverse_dx: ti.f32,
     shape: ti.template(),
     block: ti.template(),
     begin: ti.i32,
 ):
     """Writes down, from block[begin] on, that the blocks of the particle's nodes change in the substep `now`, and for
-    how many substeps, the fewest of all that change them (see change_of). In one of two arrays after that, in turns for
-    intervals, the fewest that any bears by itself.
+    how many substeps, the fewest of all that change them (see change_of).
     """
-    first = base_node(x, inverse_dx)
-    last = (first + 2) >> 2
-    first = first >> 2
-    change = now * MANY + MANY - ti.min(ti.cast(many, ti.i32), MANY)
-    least = interval * MANY + MANY - ti.cast(ti.min(own, ti.cast(MANY, ti.f32)), ti.i32)
-    turn = (1 + (interval & 1)) * shape[SHAPE.all_blocks]
+    base = base_node(x, inverse_dx)
+    change = now * MANY + MANY - ti.cast(many, ti.i32)
     for n in ti.static(range(8)):
-        corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
-        index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
-        index += begin + scene * shape[SHAPE.scene_blocks]
+        index = begin + _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
         if block[index] < change:
             ti.atomic_max(block[index], change)
-        if block[index + turn] < least:
-            ti.atomic_max(block[index + turn], least)
 
 
 @ti.func
-def fewest_around(
+def _alike_around(
     x,
     scene: ti.i32,
     interval: ti.i32,
+    own: ti.f32,
     inverse_dx: ti.f32,
     shape: ti.template(),
     block: ti.template(),
     begin: ti.i32,
-) -> ti.f32:
-    """The fewest substeps that a particle beside bore by itself in the interval before; marks begin at `begin`."""
-    first = base_node(x, inverse_dx)
-    last = (first + 2) >> 2
-    first = first >> 2
-    turn = (1 + ((interval - 1) & 1)) * shape[SHAPE.all_blocks]
-    found = 0
+) -> ti.i32:
+    """Whether all particles in the blocks of a particle's nodes began the interval before with steps of `own` substeps;
+    what this one takes is written down for the next. Marks begin at block[begin]: of even intervals the fewest substeps
+    and the most, then of odd ones.
+    """
+    base = base_node(x, inverse_dx)
+    blocks = shape[SHAPE.all_blocks]
+    present = begin + 2 * (interval & 1) * blocks
+    former = begin + 2 * ((interval - 1) & 1) * blocks
+    many = ti.cast(own, ti.i32)
+    fewest, most = interval * MANY + MANY - many, interval * MANY + many - 1
+    alike = 1
     for n in ti.static(range(8)):
-        corner = ti.Vector([last[axis] if n >> (2 - axis) & 1 else first[axis] for axis in range(3)])
-        index = (corner[0] * shape[SHAPE.blocks + 1] + corner[1]) * shape[SHAPE.blocks + 2] + corner[2]
-        found = ti.max(found, block[index + begin + scene * shape[SHAPE.scene_blocks] + turn])
-    fewest = ti.cast(MANY, ti.f32)
-    if found // MANY == interval - 1:
-        fewest = ti.cast(MANY - found % MANY, ti.f32)
-    return fewest
+        index = _corner_block(base >> 2, (base + 2) >> 2, n, scene, shape)
+        if block[former + index] != fewest - MANY or block[former + blocks + index] != most - MANY:
+            alike = 0
+        if block[present + index] < fewest:
+            ti.atomic_max(block[present + index], fewest)
+        if block[present + blocks + index] < most:
+            ti.atomic_max(block[present + blocks + index], most)
+    return alike
 
 
 @ti.func
@@ -208,7 +220,9 @@ def acts(covered: ti.f32, begins: ti.f32, step: ti.f32, scene: ti.i32, scene_val
 
 @ti.func
 def own_step(
+    strained: ti.f32,
     covered: ti.f32,
+    spread: ti.i32,
     x,
     C,
     volume: ti.f32,
@@ -226,40 +240,73 @@ def own_step(
     law: ti.template(),
     variant: ti.template(),
 ):
-    """How long a step a particle takes that acts now, until when in the interval that is, and over how many substeps:
-    what is left of the interval in equal parts, as few as its own stiffness allows, and no longer than what is stiffer
-    beside it takes (else bodies that meet rebound too fast). Marks of all are left from block[marks] on.
+    """The step of a particle that acts now: how long it is strained, and until when in the interval that is; until when
+    its stress then acts, over how many substeps, whether evenly over these, and for how long in this one: its share of
+    the step where it does, else all of it. Marks of all are left from block[marks] on.
 
-    `covered` is until when in the interval its steps before reach.
+    In a synchronised interval stress acts from half a step before to half a step after the time that it is of: the
+    first, of what the interval before has left, and the last act for half a step. What is left is cut into as few
+    equal steps as the particle's own stiffness allows, rounded down to substeps. Particles of the same `alike` have the
+    same steps.
+
+    `strained` and `covered` are until when the steps before have strained it, and their stresses act; `spread` whether
+    evenly. `strained` is less than 0 before the first step of all.
     """
+    elapsed = scene_value[scene, VALUE.interval_elapsed]
     left = scene_value[scene, VALUE.interval_remaining]
-    begin = scene_value[scene, VALUE.interval_elapsed] - step
-    reached = covered
-    if begins == 1.0:  # where the last interval ended before its time
-        reached = covered - scene_value[scene, VALUE.last_interval]
+    begin = elapsed - step
+    before = strained
+    ahead = covered - begin
+    if begins == 1.0:
+        before -= scene_value[scene, VALUE.last_interval]
+        ahead -= scene_value[scene, VALUE.last_interval]
+    if strained < 0.0:
+        before, ahead = begin, 0.0
+    if spread:
+        ahead = 0.0
+    spreads = spread
+    if begins == 1.0:
+        spreads = 0
     many = 1.0
-    if left > 0.0:
-        substeps = ti.round(left / step) + 1.0
-        stiffness = foreseen_stiffness(
-            C, volume, material, left + step, setting[SETTING.inverse_cell_size], law, row, variant
-        )
-        longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
-        longest /= ti.sqrt(ti.max(stiffness, 1e-3))
-        most = ti.max(ti.floor(longest / step + 1e-4), 1.0)
-        if ti.round((begin + step + left) / step) < SPLIT:
-            most = 1.0
-        own = ti.ceil(substeps / ti.ceil(substeps / ti.min(most, substeps)))
-        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
-        interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
+    acting = step
+    until = elapsed
+    if scene_value[scene, VALUE.synchronised] == 1.0 and left > 0.0:
+        whole = scene_value[scene, VALUE.whole_step]
         inverse_dx = setting[SETTING.inverse_cell_size]
-        many = ti.min(own, fewest_around(x, scene, interval, inverse_dx, shape, block, marks))
-        mark_changed(x, scene, now, many, interval, most, inverse_dx, shape, block, marks)
-    length = many * step
-    until = begin + length
-    if ti.abs(reached - begin) > SLACK * step and (begins == 0.0 or reached > begin):
-        length = ti.max(until - reached, SLACK * step)
-        until = reached + length
-    return length, until, many
+        stiffness = foreseen_stiffness(C, volume, material, left + step, inverse_dx, law, row, variant)
+        longest = scene_value[scene, VALUE.stability_fraction] * setting[SETTING.cell_size]
+        longest /= ti.sqrt(ti.max(stiffness, 1e-3)) * whole
+        longest = ti.min(ti.max(ti.floor(longest + 1e-4), 1.0), ti.cast(MANY, ti.f32))
+        total = (elapsed + left) / whole
+        alike = ti.ceil(total / ti.ceil(total / longest - 1e-3) - 1e-3)
+        steps = ti.ceil((elapsed + left - before) / (whole * alike) - 1e-3)
+        if begins == 1.0:
+            many = ti.floor(0.5 * total / ti.ceil(total / alike - 1e-3) + 0.501)
+            until = begin
+            interval = ti.cast(counter[scene, COUNT.transfers], ti.i32)
+            others = marks + shape[SHAPE.all_blocks]
+            if not _alike_around(x, scene, interval, alike, inverse_dx, shape, block, others):
+                spreads = 1
+        elif steps <= 1.0:
+            many = 1.0 + ti.round(left / whole + 0.5)
+            until = elapsed + left
+        else:
+            many = ti.floor(2.0 * (before + (elapsed + left - before) / steps - begin) / whole + 1e-3)
+            many = ti.min(ti.max(many, 1.0), ti.round(left / whole + 0.5))
+            until = begin + 0.5 * many * whole
+        now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
+        mark_changed(x, scene, now, 1.0 if spreads else ti.min(many, MANY), inverse_dx, shape, block, marks)
+        acting = step + ti.min((many - 1.0) * whole, left)
+    acts_until = begin + acting
+    length = until - before
+    if ti.abs(before - begin) <= SLACK * step and until == elapsed:
+        length = step
+    length = ti.max(length, SLACK * step)
+    if spreads:
+        acting = step
+    elif ahead > SLACK * step:
+        acting = ti.max(acting - ahead, 0.0)
+    return length, before + length, acts_until, many, spreads, acting
 
 
 @ti.func
@@ -287,7 +334,6 @@ def respond(
     material: ti.i32,
     row: ti.i32,
     step: ti.f32,
-    carried: ti.f32,
     scene: ti.i32,
     counter: ti.template(),
     setting: ti.template(),
@@ -298,16 +344,15 @@ def respond(
 
     `stretch` is the sum of dt (C + Cᵀ) / 2 over the interval's steps so far: per length of now C - (C + Cᵀ) / 2 stretch
     is the gradient, in first order, so that the steps of an interval together stretch F as one step would.
-    Returns what the particle adds to the momentum around it, A = carried C - dt V0 (4 / dx²) stress / mass, where
-    `carried` is 1 in the interval's first step, which brings momentum to the nodes, and 0 later; the new stretch, F
-    (both as they were for water) and volume; and its present (3 lambda + 2 mu) / density.
+    Returns the response, - V0 (4 / dx²) stress / mass, by which stress changes C in a second; the new stretch and F,
+    both as they were for water, and volume; and the present (3 lambda + 2 mu) / density.
     """
     has_water = ti.static(bool(variant & VARIANT.water))
     solids = ti.static(has_solid(variant))
     inverse_dx = setting[SETTING.inverse_cell_size]
     density = law[row + CONSTANT.density]
-    scale = -step * 4.0 * inverse_dx * inverse_dx / density  # V0 / mass = 1 / density
-    A = carried * C
+    scale = -4.0 * inverse_dx * inverse_dx / density  # V0 / mass = 1 / density
+    response = ti.Matrix.zero(ti.f32, 3, 3)
     new_stretch = stretch
     new_F = F
     new_volume = volume
@@ -321,16 +366,18 @@ def respond(
                 volume, expansion, law, row, counter, scene, ti.static(bool(variant & VARIANT.stiffening_water))
             )
             new_volume = J
+            if ti.static(bool(variant & VARIANT.stiffening_water)):
+                water_stiffness *= STIFFENING_MARGIN if J < 1.0 else 1.0
             stiffness = water_stiffness
             viscosity = law[row + CONSTANT.viscosity]
             if viscosity > 0.0:
                 rate = 0.5 * (C + C.transpose())
-                A += scale * 2.0 * viscosity * J * (rate - C.trace() / 3.0 * ti.Matrix.identity(ti.f32, 3))
+                response += scale * 2.0 * viscosity * J * (rate - C.trace() / 3.0 * ti.Matrix.identity(ti.f32, 3))
                 # the shear of a lone particle is reversed, no smaller, by a step of rho dx² / (4 viscosity)
                 rough = ti.sqrt(water_stiffness) + 4.0 * viscosity * inverse_dx / ti.sqrt(density)
                 stiffness = rough * rough
             for i in ti.static(range(3)):
-                A[i, i] += scale * pressure
+                response[i, i] += scale * pressure
     if ti.static(solids):
         if ti.static(not has_water) or not is_fluid(material):
             rate = 0.5 * (C + C.transpose())
@@ -351,8 +398,8 @@ def respond(
             new_F = solid_F
             new_volume = solid_volume
             stiffness = solid_stiffness
-            A += scale * stress
-    return A, new_stretch, new_F, new_volume, stiffness / density
+            response += scale * stress
+    return response, new_stretch, new_F, new_volume, stiffness / density
 
 
 @ti.func

@@ -26,6 +26,7 @@ from datagen.mpm.mls_mpm import (
     find_hidden,
     initial_stiffness,
     mark,
+    mark_changed,
     move,
     own_step,
     respond,
@@ -78,7 +79,10 @@ def _strain(
     begins: ti.f32,
     state: ti.template(),
     tag: ti.template(),
+    strained: ti.template(),
     covered: ti.template(),
+    spread: ti.template(),
+    response: ti.template(),
     hidden: ti.template(),
     node: ti.template(),
     block: ti.template(),
@@ -94,7 +98,8 @@ def _strain(
     threads: ti.template(),
 ):
     """The materials' answer of each particle that acts to the gradient of the nodes' velocities, left in place of C; in
-    the first step of an interval to C, and also which nodes it touches. `covered` is less than 0 for what acts now.
+    the first step of an interval to C, and also which nodes it touches; of one whose stress is spread over several
+    substeps its share. `covered` is less than 0 for what gives to nodes now.
     """
     solid = ti.static(has_solid(variant))
     largest = 0.0
@@ -106,11 +111,21 @@ def _strain(
         own += threads
         last = covered[first + p]
         reached = ti.abs(last)
+        place = particles + p
         if not acts(reached, begins, step, scene, scene_value):
-            if last < 0.0:
+            if spread[first + p] == 1:
+                six = ti.Vector([step * response[first + p + i * stride] for i in range(6)])
+                A = ti.Matrix([[six[0], six[3], six[4]], [six[3], six[1], six[5]], [six[4], six[5], six[2]]])
+                put_matrix(state, place, stride, FIELD.affine, A)
+                if scene_value[scene, VALUE.interval_remaining] > 0.0:
+                    mark_changed(
+                        get_vector(state, place, stride, FIELD.position), scene,
+                        ti.cast(counter[scene, COUNT.substeps], ti.i32), 1.0, setting[SETTING.inverse_cell_size], shape,
+                        block, 3 * shape[SHAPE.all_blocks],
+                    )  # fmt: skip
+            elif last < 0.0:
                 covered[first + p] = reached
             continue
-        place = particles + p
         x = get_vector(state, place, stride, FIELD.position)
         C = ti.Matrix.zero(ti.f32, 3, 3)
         stretch = ti.Matrix.zero(ti.f32, 3, 3)
@@ -139,30 +154,20 @@ def _strain(
             row = tag[tags + TAG.law_row * stride + p]
         material = tag[tags + TAG.material * stride + p]
         old_volume = load(state, place + FIELD.volume * stride)
-        length, until, many = own_step(
-            reached,
-            x,
-            C,
-            old_volume,
-            material,
-            row,
-            begins,
-            step,
-            scene,
-            counter,
-            shape,
-            block,
-            3 * shape[SHAPE.all_blocks],
-            scene_value,
-            setting,
-            law,
-            variant,
+        length, until, acts_until, many, spreads, acting = own_step(
+            strained[first + p], reached, spread[first + p], x, C, old_volume, material, row, begins, step, scene,
+            counter, shape, block, 3 * shape[SHAPE.all_blocks], scene_value, setting, law, variant,
+        )  # fmt: skip
+        strained[first + p] = until
+        covered[first + p] = -acts_until
+        spread[first + p] = spreads
+        answer, new_stretch, new_F, volume, stiffness = respond(
+            C, stretch, F, old_volume, material, row, length, scene, counter, setting, law, variant
         )
-        covered[first + p] = -until
-        A, new_stretch, new_F, volume, stiffness = respond(
-            C, stretch, F, old_volume, material, row, length, begins, scene, counter, setting, law, variant
-        )
-        put_matrix(state, place, stride, FIELD.affine, A)
+        if spreads:
+            for i, j, k in ti.static(((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (4, 0, 2), (5, 1, 2))):
+                response[first + p + i * stride] = answer[j, k]
+        put_matrix(state, place, stride, FIELD.affine, begins * C + acting * answer)
         if ti.static(solid):
             put_matrix(state, place, stride, FIELD.deformation, new_F)
             put_symmetric(state, place, stride, FIELD.stretch, new_stretch)
@@ -239,7 +244,10 @@ def advance(
     node_entries: ti.i32,
     tag: Integers,
     rank: Integers,
+    strained: Scalars,
     covered: Scalars,
+    spread: Integers,
+    response: Scalars,
     hidden: Integers,
     cell_count: Integers,
     column_count: Integers,
@@ -264,14 +272,14 @@ def advance(
 ):
     """Advances every scene by `frames` frames, and writes each frame's positions to output[frame, particle, axis].
 
-    Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another; with `several` blocks
-    all of the launch have to run at once. Particles are sorted at the begin of each frame. With P particles and G nodes
-    of all scenes there are at addresses (see device_memory) state [2 * fields * P], and node [2, G, 4], which holds
-    what comes to momentum in a step and to mass in an interval, zero between them, and then velocities, with the mass
-    for an interval's end. Arrays: tag [2 * 3 * P]; rank, hidden (see grid_kernel.substep) and column_list [P] are work
-    space; cell_count [G], column_count [G / 4], the flags in block [3 * G / 64], columns [3 * blocks * teams] and
-    meeting [MEETING * (teams + 1)] are zero at first; turn [scenes] says which scene comes when (long ones first). A
-    scene that failed keeps still.
+    Each of `teams` has `blocks` blocks of `threads` threads, and takes one scene after another; with `several`
+    blocks all of the launch have to run at once. Particles are sorted at the begin of each frame. With P particles
+    and G nodes of all scenes there are at addresses (see device_memory) state [2 * fields * P], and node [2, G, 4],
+    which holds what comes to momentum in a step and to mass in an interval, zero between them, and then velocities,
+    with the mass for an interval's end. Arrays: tag [2 * 3 * P]; rank, spread, response [6 * P], hidden (see
+    grid_kernel.substep) and column_list [P] are work space; cell_count [G], column_count [G / 4], the flags in
+    block [8 * G / 64], columns [3 * blocks * teams] and meeting [MEETING * (teams + 1)] are zero at first; turn
+    [scenes] says which scene comes when (long ones first). A scene that failed keeps still.
     """
     ti.loop_config(block_dim=threads)
     for item in range(teams * (blocks * ti.static(threads if threads > 1 else CPU_ITEMS))):
@@ -326,7 +334,10 @@ def advance(
                 while going:
                     step = scene_value[scene, VALUE.time_step]
                     begins = scene_value[scene, VALUE.begins]
-                    ends = scene_value[scene, VALUE.interval_remaining] == 0.0
+                    left = scene_value[scene, VALUE.interval_remaining]
+                    ends = left == 0.0
+                    whole = scene_value[scene, VALUE.whole_step]
+                    some_wait = not ends and scene_value[scene, VALUE.synchronised] == 1.0
                     gravity_time = scene_value[scene, VALUE.gravity_time]
                     fallen = scene_value[scene, VALUE.fallen]
                     now = ti.cast(counter[scene, COUNT.substeps], ti.i32)
@@ -344,8 +355,8 @@ def advance(
                             sorted_already = True
                         _strain(
                             owned, part, chunk, blocks, lane, scene, first, particles, tags, stride, velocities, step,
-                            begins, state, tag, covered, hidden, node, block, live, scene_value, counter,
-                            setting, law, shape, contact, contact_normal, variant, threads,
+                            begins, state, tag, strained, covered, spread, response, hidden, node, block, live,
+                            scene_value, counter, setting, law, shape, contact, contact_normal, variant, threads,
                         )  # fmt: skip
                         wait(threads)
                         scatter(
@@ -357,8 +368,8 @@ def advance(
                         if not ends and member == members - 1:
                             choose(scene, scene_value, counter, setting, shape, live)
                         update_nodes(
-                            member, scene, velocities, begins, ends, now, step, gravity_time, fallen, block, live,
-                            node, scene_value, shape, contact, contact_normal, variant, members,
+                            member, scene, velocities, begins, ends, some_wait, now, whole, left, gravity_time, fallen,
+                            block, live, node, scene_value, shape, contact, contact_normal, variant, members,
                         )  # fmt: skip
                         meet_team(at, lane, meetings, meeting, columns, segment, patience, threads, several, blocks)
                         if ends:

@@ -62,12 +62,17 @@ class TeamLaunch(Launch):
         self.rank, self.column_list = (ti.ndarray(ti.i32, self.particles) for _ in range(2))
         self.cell_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES)
         self.column_count = ti.ndarray(ti.i32, self.all_blocks * BLOCK_NODES // BLOCK)
+        self.strained = device_array(np.full(self.particles, -1, np.float32))
         self.covered = ti.ndarray(ti.f32, self.particles)
-        self.block = ti.ndarray(ti.i32, 6 * self.all_blocks)
+        self.spread = ti.ndarray(ti.i32, self.particles)
+        self.response = ti.ndarray(ti.f32, 6 * self.particles)
+        self.block = ti.ndarray(ti.i32, 8 * self.all_blocks)
         self.turn = ti.ndarray(ti.i32, len(self.scenes))
         self.meeting = ti.ndarray(ti.i32, (self.teams + 1) * MEETING)
         self.columns = ti.ndarray(ti.i32, SEGMENT * self.teams * team.blocks)
-        for array in (self.cell_count, self.column_count, self.covered, self.block, self.columns, self.node):
+        for array in (
+            self.cell_count, self.column_count, self.covered, self.spread, self.block, self.columns, self.node,
+        ):  # fmt: skip
             array.fill(0)
         self.live = device_array(np.zeros(len(self.scenes) * LIVE.length, np.int32))
         team_kernel.start_team(
@@ -133,9 +138,10 @@ class TeamLaunch(Launch):
         self.meeting.fill(0)
         team_kernel.advance(
             frames, self.teams, self.team.blocks, PATIENCE[self.team.threads > 1], self.frame_s, address(self.state),
-            address(self.node), self.node.shape[0], self.tag, self.rank, self.covered, self.hidden,
-            self.cell_count, self.column_count, self.column_list, self.block, self.live, self.columns, self.meeting,
-            self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape, self.contact,
-            self.contact_normal, output, self.variant, self.team.threads, self.team.blocks > 1, self.team.run,
+            address(self.node), self.node.shape[0], self.tag, self.rank, self.strained, self.covered, self.spread,
+            self.response, self.hidden, self.cell_count, self.column_count, self.column_list, self.block, self.live,
+            self.columns, self.meeting, self.turn, self.scene_value, self.counter, self.setting, self.law, self.shape,
+            self.contact, self.contact_normal, output, self.variant, self.team.threads, self.team.blocks > 1,
+            self.team.run,
         )  # fmt: skip
         return output

@@ -265,8 +265,10 @@ def update_nodes(
     velocities: ti.i32,
     begins: ti.f32,
     ends: ti.i32,
+    some_wait: ti.i32,
     now: ti.i32,
-    step: ti.f32,
+    whole_step: ti.f32,
+    left: ti.f32,
     gravity_time: ti.f32,
     fallen: ti.f32,
     block: ti.template(),
@@ -291,11 +293,11 @@ def update_nodes(
         local = n % BLOCK_NODES
         n += members
         many = 1.0
-        if not ends:
+        if some_wait:
             many = change_of(block[3 * shape[SHAPE.all_blocks] + touched], now)
             if many == 0.0:
                 continue
-        lead = (many - 1.0) * step
+        lead = ti.min((many - 1.0) * whole_step, left)
         # all that is read, before anything is written: Taichi looks up where an array lies anew after each store
         place = LANES * (touched * BLOCK_NODES + local)
         entry = -1

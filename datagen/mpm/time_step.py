@@ -4,6 +4,9 @@ import taichi as ti
 
 from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
 
+# steps of stress of an interval, from which on it is synchronised: of fewer, what transfers take away is more than what
+# they bring
+SYNCHRONISED_FROM = 4.0
 SPEED_MARGIN = 1.25  # times the way planned for an interval, which a particle that gains speed may go
 
 
@@ -60,6 +63,7 @@ def choose_time_step(
     speed_fraction = setting[SETTING.speed_fraction]
     leapfrog = setting[SETTING.leapfrog]
     last_interval = scene_value[scene, VALUE.last_interval]
+    synchronised = scene_value[scene, VALUE.synchronised]
     fallen = scene_value[scene, VALUE.fallen] + scene_value[scene, VALUE.gravity_time]
     step = 0.0
     if remaining > 0.0 and status == STATUS.running:
@@ -83,21 +87,33 @@ def choose_time_step(
             if fixed > 0.0:
                 interval = fixed
             shift = 0.5 * leapfrog * (last - interval)
+            synchronised = ti.cast(_parts(left, limit) >= SYNCHRONISED_FROM and fixed == 0.0, ti.f32)
         # steps in this interval, and with those after it
         ahead = _parts(left, limit)
+        whole = left / ahead
+        step = whole
+        if synchronised == 1.0:
+            if begins:
+                step = 0.5 * whole
+                ahead += 1.0
+            else:
+                full = ti.max(ti.ceil(ti.min(left / limit, 1e9) - 0.5 - 1e-4), 0.0)  # before the last, which is half
+                ahead = full + 1.0
+                whole = left / (full + 0.5)
+                step = whole if full > 0.0 else left
         total = ahead
         if remaining > left:
-            total += _parts(remaining - left, interval) * _parts(interval, limit)
+            total += _parts(remaining - left, interval) * (_parts(interval, limit) + synchronised)
         if fixed > 0.0:
             ahead = 1.0
             total = fixed_substeps - ti.cast(done, ti.f32)
-        scene_value[scene, VALUE.stiffness] = stiffness
+        if not (begins and synchronised == 1.0):  # whose first substep strains nothing
+            scene_value[scene, VALUE.stiffness] = stiffness
         scene_value[scene, VALUE.largest_speed_square] = ti.max(largest_speed_square, speed_square)
         if not total <= ti.cast(maximum_substeps - done, ti.f32):
             counter[scene, COUNT.status] = ti.cast(STATUS.too_many_substeps, ti.i64)
             scene_value[scene, VALUE.remaining] = 0.0
         else:
-            step = left / ahead
             if fixed > 0.0:
                 step = fixed
             remaining -= step
@@ -114,6 +130,8 @@ def choose_time_step(
             scene_value[scene, VALUE.interval_elapsed] = elapsed
             scene_value[scene, VALUE.interval_remaining] = left
             scene_value[scene, VALUE.begins] = ti.cast(begins, ti.f32)
+            scene_value[scene, VALUE.synchronised] = synchronised
+            scene_value[scene, VALUE.whole_step] = whole
             scene_value[scene, VALUE.gravity_time] = step + shift
             scene_value[scene, VALUE.last_interval] = last_interval
             scene_value[scene, VALUE.fallen] = fallen

@@ -55,15 +55,15 @@ def update_water(
 
 @ti.kernel
 def move_water(
-    C: Matrices, gain: Matrices, stiffness: Scalars, volume: Scalars, step: ti.f32, setting: Scalars,
+    C: Matrices, response: Matrices, stiffness: Scalars, volume: Scalars, step: ti.f32, setting: Scalars,
     constant: Scalars, counter: ti.types.ndarray(dtype=ti.i64, ndim=2), variant: ti.template(),
 ):  # fmt: skip
     for n in range(volume.shape[0]):
         A, _, _, v, k = respond(
-            C[n], ti.Matrix.zero(ti.f32, 3, 3), ti.Matrix.identity(ti.f32, 3), volume[n], WATER, 0, step, 0.0, 0,
+            C[n], ti.Matrix.zero(ti.f32, 3, 3), ti.Matrix.identity(ti.f32, 3), volume[n], WATER, 0, step, 0,
             counter, setting, constant, variant,
         )  # fmt: skip
-        gain[n] = A
+        response[n] = A
         volume[n] = v
         stiffness[n] = k
 
@@ -98,15 +98,15 @@ def run(material, F_N33, volume_N, config):
 
 
 def moved_water(C_N33, volume_N, step, variant=0, config=None, dx=1.0):
-    """What particles of water add to the momentum around them in a step, their volumes behind it, and stiffness."""
+    """The stress of particles of water, as they give it, their volumes behind a step, and stiffness."""
     setting = np.ones(SETTING.length)
     setting[SETTING.inverse_cell_size] = 1 / dx
-    gain, stiffness, volume = matrices(0 * C_N33), scalars(0 * volume_N), scalars(volume_N)
+    response, stiffness, volume = matrices(0 * C_N33), scalars(0 * volume_N), scalars(volume_N)
     law = scalars(constants(config or MpmConfig()))
     move_water(
-        matrices(C_N33), gain, stiffness, volume, step, scalars(setting), law, counters(), VARIANT.water + variant
+        matrices(C_N33), response, stiffness, volume, step, scalars(setting), law, counters(), VARIANT.water + variant
     )
-    return gain.to_numpy(), volume.to_numpy(), stiffness.to_numpy()
+    return response.to_numpy(), volume.to_numpy(), stiffness.to_numpy()
 
 
 def deformations(rng, count, spread):
@@ -281,8 +281,8 @@ def test_viscous_stress():
     rate, step, viscosity, dx = 50.0, 1e-4, 3.0, 0.1
     C_N33 = np.array([[[0.0, rate, 0], [0, 0, 0], [0, 0, 0]]])
     config = MpmConfig(water_viscosity_pa_s=viscosity)
-    gain_N33, _, stiffness_N = moved_water(C_N33, np.ones(1), step, config=config, dx=dx)
-    stress = gain_N33[0] / (-step * 4 / dx**2 / config.density_kg_m3)
+    response_N33, _, stiffness_N = moved_water(C_N33, np.ones(1), step, config=config, dx=dx)
+    stress = response_N33[0] / (-4 / dx**2 / config.density_kg_m3)
     expected = np.zeros((3, 3))
     expected[0, 1] = expected[1, 0] = viscosity * rate
     assert stress == pytest.approx(expected, rel=1e-5, abs=0.05)
