@@ -19,7 +19,7 @@ LARGEST_VOLUME = 1e12  # of an elastic solid, whose stress goes with its square
 # of an elastic solid's stiffness, for the step: a single particle that hits the floor at 10 m/s gains energy with steps
 # of 0.8 of the limit, and none with 0.65
 ELASTIC_MARGIN = 1.6
-# the same of water whose pressure grows with J^-7, and that is pressed together; at 30 m/s single particles do
+# the same of pressed water whose pressure grows with J^-7: without it a block of it at 30 m/s needs ever more steps
 STIFFENING_MARGIN = 1.6
 # mu(I) = mu_s (1 + RATE_FRICTION / (1 + RATE_NUMBER / I)), as Jop, Forterre and Pouliquen 2006 have it of glass beads:
 # mu_s = tan 20.9, mu_2 = tan 32.76 degrees

@@ -7,12 +7,17 @@ up apart from the nodes' velocities, and is zero between substeps. Masses are in
 density.
 
 Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
-as the stiffest particle needs. Others take steps of their own, each of several substeps, as long as their own wave
-speed allows (multiple time stepping; Streett et al. 1978): stress is found once a step and acts evenly over its
-substeps, for whatever takes others beside it looks at the nodes meanwhile, and of an impulse at once would see
-velocities that nothing has, even of what is at rest. Where all that share a block of nodes take the same steps nobody
-looks: there the impulse of a step goes to the nodes in its first substep, with that of gravity, and until the next the
-block is left as it is.
+as the stiffest particle needs. Of four and more its first and last are half as long as the others, and stress acts from
+half a step before to half a step after the time that it is of: so transfers find velocities of the same time as
+stresses (velocity Verlet). Were they half a step ahead, what is taken away from them would give energy to oscillations
+of half a period an interval, up to twice as much in each.
+
+Particles that bear longer steps take steps of their own of several substeps, as long as their own wave speed allows
+(multiple time stepping; Streett et al. 1978): their stress is found once a step and acts evenly over its substeps, for
+whatever takes others beside it looks at the nodes meanwhile, and would see of an impulse given at once velocities that
+nothing has, even of what is at rest. Where all that share a block of nodes take the same steps nobody looks: there the
+impulse of a step goes to the nodes in its first substep, with that of gravity, and until the next the block is left as
+it is.
 
 In an interval's first substep particles give mass and momentum to the nodes and force; in the others they stay where
 they are on the grid, take the gradient of the nodes' velocities for strain and stress, and give force alone, as in the
