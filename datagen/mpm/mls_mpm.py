@@ -7,8 +7,8 @@ up apart from the nodes' velocities, and is zero between substeps. Masses are in
 density.
 
 Transfers come at a rate of their own, since each smooths velocities: an interval between two holds as many substeps
-as the stiffest particle needs. Of four and more its first and last are half as long as the others, and stress acts from
-half a step before to half a step after the time that it is of: so transfers find velocities of the same time as
+as the stiffest particle needs. Of three and more its first and last are half as long as the others, and stress acts
+from half a step before to half a step after the time that it is of: so transfers find velocities of the same time as
 stresses (velocity Verlet). Were they half a step ahead, what is taken away from them would give energy to oscillations
 of half a period an interval, up to twice as much in each.
 

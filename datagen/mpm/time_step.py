@@ -6,7 +6,7 @@ from datagen.mpm.layout import COUNT, SETTING, STATUS, VALUE
 
 # steps of stress of an interval, from which on it is synchronised (see mls_mpm): of fewer, no material at rest was seen
 # to gain energy
-SYNCHRONISED_FROM = 4.0
+SYNCHRONISED_FROM = 3.0
 SPEED_MARGIN = 1.25  # times the way planned for an interval, which a particle that gains speed may go
 
 
