@@ -40,4 +40,7 @@ _INTERNAL += ("runtime.torch_backend.Backend", "runtime.simulator.InitialState",
 nitpick_ignore = [("py:class", f"hgn.{name}") for name in _INTERNAL]
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
+# three floats, with a bound that only settings need
+autodoc_type_aliases = {"Vector": "Vector"}
+nitpick_ignore.append(("py:class", "Vector"))
 autodoc_typehints_format = "short"
